@@ -1,0 +1,71 @@
+"""gsmap: the map-management database for 3D Gaussian Splatting.
+
+    with gsmap.open("site.gsmap") as m:
+        m.ingest("monday.ply")
+        m.update()
+        m.export("tiles")
+
+Everything public is listed in ``__all__`` and imported on first use, so ``import gsmap`` stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Cameras": "gsmap.types",
+    "Edge": "gsmap.types",
+    "Gaussians": "gsmap.types",
+    "Map": "gsmap.map",
+    "NodeLayer": "gsmap.types",
+    "PoseGraph": "gsmap.types",
+    "Prior": "gsmap.types",
+    "Registration": "gsmap.types",
+    "Scene": "gsmap.types",
+    "SceneGraph": "gsmap.types",
+    "ScenePose": "gsmap.types",
+    "Sim3": "gsmap.types",
+    "Tile": "gsmap.types",
+    "errors": "",
+    "open": "gsmap.map",
+    "read": "gsmap.formats",
+    "render": "",
+    "write": "gsmap.formats",
+}
+
+__all__ = sorted([*_HOME, "__version__"])
+
+if TYPE_CHECKING:
+    from gsmap import errors, render
+    from gsmap.formats import read, write
+    from gsmap.map import Map, open
+    from gsmap.types import (
+        Cameras,
+        Edge,
+        Gaussians,
+        NodeLayer,
+        PoseGraph,
+        Prior,
+        Registration,
+        Scene,
+        SceneGraph,
+        ScenePose,
+        Sim3,
+        Tile,
+    )
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'gsmap' has no attribute {name!r}")
+    home = _HOME[name]
+    value = getattr(importlib.import_module(home), name) if home else importlib.import_module(f"gsmap.{name}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,53 @@
+"""The errors gsmap raises.
+
+::
+
+    GsmapError
+    ├── InputError (ValueError)            a file, array or argument cannot be used as given
+    ├── ConfigError (ValueError)           an option or combination of options makes no sense
+    ├── NotFoundError (LookupError)        a scene, edge, revision or file that is named does not exist
+    ├── StoreError                         the map on disk
+    │   ├── CorruptError                   bytes differ from what was written
+    │   ├── SchemaVersionError             the map was made by another version of gsmap
+    │   └── BusyError                      another process holds the map
+    └── MissingDependencyError (ImportError)   an optional package is not installed
+
+A message says what is wrong, where, and what to do, in one line. "No overlap", "ambiguous" and "not enough nodes" are
+results with a status and a reason, never errors.
+"""
+
+
+class GsmapError(Exception):
+    """Root of every error that gsmap raises on purpose."""
+
+
+class InputError(GsmapError, ValueError):
+    """A file, array or argument cannot be used as given."""
+
+
+class ConfigError(GsmapError, ValueError):
+    """An option, or a combination of options, makes no sense."""
+
+
+class NotFoundError(GsmapError, LookupError):
+    """A scene, edge, revision or file that is named does not exist."""
+
+
+class StoreError(GsmapError):
+    """The map on disk cannot be read or written."""
+
+
+class CorruptError(StoreError):
+    """Bytes on disk differ from what was written."""
+
+
+class SchemaVersionError(StoreError):
+    """The map was written by another version of gsmap."""
+
+
+class BusyError(StoreError):
+    """Another process holds the map."""
+
+
+class MissingDependencyError(GsmapError, ImportError):
+    """An optional package is not installed."""

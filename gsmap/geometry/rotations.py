@@ -1,0 +1,84 @@
+"""Rotations: quaternions (``wxyz``), matrices, and the SO(3) and Sim(3) exponential."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.types import Sim3
+
+
+def quats_to_matrices(quats: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) ``wxyz``, normalised first; a zero quaternion is identity."""
+    q = np.asarray(quats, dtype=np.float64)
+    norm = np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(norm > 0, q / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    out = np.empty((*q.shape[:-1], 3, 3))
+    out[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    out[..., 0, 1] = 2 * (x * y - w * z)
+    out[..., 0, 2] = 2 * (x * z + w * y)
+    out[..., 1, 0] = 2 * (x * y + w * z)
+    out[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    out[..., 1, 2] = 2 * (y * z - w * x)
+    out[..., 2, 0] = 2 * (x * z - w * y)
+    out[..., 2, 1] = 2 * (y * z + w * x)
+    out[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return out
+
+
+def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4) ``wxyz`` with w >= 0 of rotation matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    matrices = np.asarray(matrices, dtype=np.float64)
+    xyzw = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
+    wxyz = xyzw[:, [3, 0, 1, 2]]
+    wxyz *= np.where(wxyz[:, :1] < 0, -1.0, 1.0)
+    return wxyz.reshape(*matrices.shape[:-2], 4)
+
+
+def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product (..., 4) of ``wxyz`` quaternions: rotating by b, then by a."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def skew(vectors: np.ndarray) -> np.ndarray:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    v = np.asarray(vectors, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle of ``a^T b`` in radians, exact for small angles (via the chord, not the arc cosine)."""
+    chord = np.linalg.norm(np.asarray(a) - np.asarray(b)) / np.sqrt(8.0)
+    return float(2.0 * np.arcsin(min(1.0, chord)))
+
+
+def exp_so3(omega: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) of a rotation vector (3,) in radians."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(np.asarray(omega, dtype=np.float64)).as_matrix()
+
+
+def retract(pose: Sim3, xi: np.ndarray) -> Sim3:
+    """``pose * Exp(xi)`` with xi = [rot_rad (3), trans (3), log_scale], first order in the coupling of the three.
+
+    The step is applied in the source frame, as gtsam does; exact where only one of the three parts is non-zero.
+    """
+    xi = np.asarray(xi, dtype=np.float64)
+    scale = float(np.exp(xi[6])) if len(xi) > 6 else 1.0
+    return pose @ Sim3(exp_so3(xi[:3]), xi[3:6], scale)

@@ -1,0 +1,25 @@
+"""The frozen nouns of gsmap. numpy only: they travel between stages, processes and machines."""
+
+from gsmap.types.cameras import Cameras
+from gsmap.types.gaussians import Gaussians
+from gsmap.types.pose_graph import Edge, PoseGraph, Prior, ScenePose
+from gsmap.types.registration import Registration
+from gsmap.types.scene import Scene
+from gsmap.types.scene_graph import NodeLayer, SceneGraph
+from gsmap.types.sim3 import Sim3
+from gsmap.types.tile import Tile
+
+__all__ = [
+    "Cameras",
+    "Edge",
+    "Gaussians",
+    "NodeLayer",
+    "PoseGraph",
+    "Prior",
+    "Registration",
+    "Scene",
+    "SceneGraph",
+    "ScenePose",
+    "Sim3",
+    "Tile",
+]

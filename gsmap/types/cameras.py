@@ -1,0 +1,107 @@
+"""Pinhole cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """C undistorted pinhole cameras (OpenCV axes: x right, y down, z forward; pixel centres at +0.5).
+
+    Args:
+        T_frame_camera: (C, 4, 4) float64, camera-to-frame (the camera's centre is the last column).
+        intrinsics_px: (C, 4) float64 ``fx fy cx cy``, in pixels of an image of ``sizes_px``.
+        sizes_px: (C, 2) int64 ``width height``.
+        names: C image names, unique; ids as text where the source has none.
+        synthesised: true when gsmap invented the cameras because the source had none.
+
+    Raises:
+        InputError: wrong shapes, NaN, a pose that is not rigid, a focal length or image size that is not positive.
+    """
+
+    T_frame_camera: np.ndarray
+    intrinsics_px: np.ndarray
+    sizes_px: np.ndarray
+    names: tuple[str, ...] = ()
+    synthesised: bool = False
+
+    def __post_init__(self) -> None:
+        pose = np.ascontiguousarray(self.T_frame_camera, dtype=np.float64)
+        intrinsics = np.ascontiguousarray(self.intrinsics_px, dtype=np.float64)
+        sizes = np.ascontiguousarray(self.sizes_px, dtype=np.int64)
+        count = pose.shape[0] if pose.ndim == 3 else 0
+        if pose.shape != (count, 4, 4) or intrinsics.shape != (count, 4) or sizes.shape != (count, 2):
+            raise InputError(
+                "Cameras need poses (C, 4, 4), intrinsics (C, 4) and sizes (C, 2), "
+                f"got {pose.shape}, {intrinsics.shape}, {sizes.shape}"
+            )
+        names = tuple(str(n) for n in self.names) or tuple(str(i) for i in range(count))
+        if len(names) != count:
+            raise InputError(f"{count} cameras but {len(names)} names")
+        bad = ~(np.isfinite(pose).all((1, 2)) & np.isfinite(intrinsics).all(1))
+        if bad.any():
+            raise InputError(f"camera {names[int(np.argmax(bad))]} holds NaN or infinity")
+        rotation = pose[:, :3, :3]
+        off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0) > 1e-3
+        off |= np.linalg.det(rotation) < 0
+        off |= np.abs(pose[:, 3] - [0, 0, 0, 1]).max(1, initial=0) > 1e-6
+        if off.any():
+            raise InputError(f"camera {names[int(np.argmax(off))]} has a pose that is not a rigid transform")
+        off = (intrinsics[:, :2] <= 0).any(1) | (sizes <= 0).any(1)
+        if off.any():
+            raise InputError(f"camera {names[int(np.argmax(off))]} has a focal length or image size that is not positive")
+        object.__setattr__(self, "T_frame_camera", pose)
+        object.__setattr__(self, "intrinsics_px", intrinsics)
+        object.__setattr__(self, "sizes_px", sizes)
+        object.__setattr__(self, "names", names)
+
+    def __len__(self) -> int:
+        return self.T_frame_camera.shape[0]
+
+    @property
+    def centers(self) -> np.ndarray:
+        """(C, 3) camera centres in the frame."""
+        return self.T_frame_camera[:, :3, 3]
+
+    @property
+    def T_camera_frame(self) -> np.ndarray:
+        """(C, 4, 4) frame-to-camera (the view matrices)."""
+        rotation = self.T_frame_camera[:, :3, :3].transpose(0, 2, 1)
+        out = np.tile(np.eye(4), (len(self), 1, 1))
+        out[:, :3, :3] = rotation
+        out[:, :3, 3] = -np.einsum("cij,cj->ci", rotation, self.centers)
+        return out
+
+    @property
+    def K(self) -> np.ndarray:
+        """(C, 3, 3) calibration matrices."""
+        out = np.tile(np.eye(3), (len(self), 1, 1))
+        out[:, 0, 0], out[:, 1, 1] = self.intrinsics_px[:, 0], self.intrinsics_px[:, 1]
+        out[:, 0, 2], out[:, 1, 2] = self.intrinsics_px[:, 2], self.intrinsics_px[:, 3]
+        return out
+
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Cameras:
+        """The cameras at an index, slice, boolean mask or integer array; always a `Cameras`."""
+        rows = np.atleast_1d(np.arange(len(self))[index])
+        names = tuple(self.names[i] for i in rows)
+        return Cameras(
+            self.T_frame_camera[rows], self.intrinsics_px[rows], self.sizes_px[rows], names, self.synthesised
+        )
+
+    def resized(self, longest_side_px: int) -> Cameras:
+        """The same views with images shrunk so that the longer side has at most ``longest_side_px`` pixels."""
+        factor = np.minimum(1.0, longest_side_px / self.sizes_px.max(1))
+        sizes = np.maximum(1, np.round(self.sizes_px * factor[:, None])).astype(np.int64)
+        # Scale by the rounded sizes, so that the principal point stays at the same place of the image.
+        ratio = sizes / self.sizes_px
+        intrinsics = self.intrinsics_px * np.concatenate([ratio, ratio], axis=1)
+        return Cameras(self.T_frame_camera, intrinsics, sizes, self.names, self.synthesised)
+
+    def __repr__(self) -> str:
+        return f"Cameras(n={len(self)}{', synthesised' if self.synthesised else ''})"

@@ -1,0 +1,97 @@
+"""A set of 3D Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import InputError
+
+_SH_DEGREE = {1: 0, 4: 1, 9: 2, 16: 3}
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N 3D Gaussians in one frame, stored as a trainer stores them (float32, C-contiguous).
+
+    Args:
+        means: (N, 3) centres, in the frame's unit.
+        quats: (N, 4) rotations ``wxyz``; need not be normalised.
+        log_scales: (N, 3) natural logarithm of the standard deviations along the rotated axes.
+        logit_opacities: (N,) opacities before the sigmoid.
+        sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour is ``max(0, SH + 0.5)``.
+
+    Raises:
+        InputError: shapes that do not fit together. Values are not checked here (`gsmap.ingest.validate` does).
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    logit_opacities: np.ndarray
+    sh: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
+            object.__setattr__(self, name, array)
+        n = self.means.shape[0] if self.means.ndim else 0
+        expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise InputError(f"Gaussians.{name} must have shape {shape}, got {getattr(self, name).shape}")
+        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3 or self.sh.shape[1] not in _SH_DEGREE:
+            raise InputError(f"Gaussians.sh must have shape ({n}, K, 3) with K = 1, 4, 9 or 16, got {self.sh.shape}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        return _SH_DEGREE[self.sh.shape[1]]
+
+    @property
+    def opacities(self) -> np.ndarray:
+        """(N,) float32 in [0, 1]."""
+        with np.errstate(over="ignore"):
+            return 1.0 / (1.0 + np.exp(-self.logit_opacities))
+
+    @property
+    def scales(self) -> np.ndarray:
+        """(N, 3) float32 standard deviations, in the frame's unit."""
+        return np.exp(self.log_scales)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(a.nbytes for a in (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh))
+
+    def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
+        """The Gaussians at a boolean mask, integer array or slice."""
+        return Gaussians(
+            self.means[index], self.quats[index], self.log_scales[index], self.logit_opacities[index], self.sh[index]
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
+        """All Gaussians of ``parts`` in order; lower SH degrees are padded with zeros to the highest."""
+        if not parts:
+            return cls.empty()
+        k = max(p.sh.shape[1] for p in parts)
+        sh = [np.pad(p.sh, ((0, 0), (0, k - p.sh.shape[1]), (0, 0))) for p in parts]
+        return cls(
+            np.concatenate([p.means for p in parts]),
+            np.concatenate([p.quats for p in parts]),
+            np.concatenate([p.log_scales for p in parts]),
+            np.concatenate([p.logit_opacities for p in parts]),
+            np.concatenate(sh),
+        )
+
+    @classmethod
+    def empty(cls, sh_degree: int = 0) -> Gaussians:
+        k = (sh_degree + 1) ** 2
+        return cls(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, k, 3)))
+
+    def __repr__(self) -> str:
+        return f"Gaussians(n={len(self)}, sh_degree={self.sh_degree})"

@@ -1,0 +1,40 @@
+"""A capture, as the catalog knows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SCALE_POLICIES = ("auto", "known", "unknown")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One ingested capture: everything about it but its arrays.
+
+    Args:
+        id: content digest (hex) of Gaussians and cameras; the same content has the same id in every map.
+        name: unique among the map's living scenes.
+        num_gaussians, sh_degree, num_cameras: sizes of its arrays.
+        bounds: (2, 3) float64 lowest and highest corner of the Gaussians' means, scene frame.
+        scale_policy: ``known`` (metres), ``unknown`` (any unit), ``auto`` (registration votes).
+        captured_at: ISO 8601 time with zone, or None.
+        ingested_at: ISO 8601 time with zone.
+        source: where it was read from, for people.
+        cameras_synthesised: true when the source had no cameras.
+        antialiased: true when trained with the 2D Mip filter (noted, not yet rendered differently).
+    """
+
+    id: str
+    name: str
+    num_gaussians: int
+    sh_degree: int
+    num_cameras: int
+    bounds: np.ndarray
+    scale_policy: str = "auto"
+    captured_at: str | None = None
+    ingested_at: str | None = None
+    source: str = ""
+    cameras_synthesised: bool = False
+    antialiased: bool = False

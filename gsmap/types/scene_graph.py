@@ -1,0 +1,84 @@
+"""An object-level scene graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class NodeLayer:
+    """M nodes of one kind whose embeddings are comparable with the same layer of another scene.
+
+    Args:
+        positions: (M, 3) float64, scene frame and unit.
+        embeddings: (M, D) float32 node embeddings ``[feature, context]``, unit length.
+        types: (M,) int32; nodes match only within a type (landmarks: channel x sign x scale; objects: all 0).
+        weights: (M,) float32 confidence (objects) or response (landmarks), larger is better.
+        extents: (M, 2, 3) float64 lowest and highest corner of the node's points, scene frame.
+        features: (M, F) float32 the embedding's own part without context; for queries by feature.
+        num_views: (M,) int32 how many rendered views saw the node; 0 where nothing was rendered.
+        method: digest of segmenter, embedder and parameters; layers of different methods are never compared.
+    """
+
+    positions: np.ndarray
+    embeddings: np.ndarray
+    types: np.ndarray
+    weights: np.ndarray
+    extents: np.ndarray
+    features: np.ndarray
+    num_views: np.ndarray
+    method: str
+
+    def __post_init__(self) -> None:
+        kinds = {
+            "positions": np.float64,
+            "embeddings": np.float32,
+            "types": np.int32,
+            "weights": np.float32,
+            "extents": np.float64,
+            "features": np.float32,
+            "num_views": np.int32,
+        }
+        m = len(self.positions)
+        for name, dtype in kinds.items():
+            array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if len(array) != m:
+                raise InputError(f"NodeLayer.{name} has {len(array)} rows, positions have {m}")
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise InputError(f"NodeLayer.{name} holds NaN or infinity")
+            object.__setattr__(self, name, array)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @classmethod
+    def empty(cls, method: str, dim: int = 1) -> NodeLayer:
+        z = np.zeros
+        return cls(z((0, 3)), z((0, dim)), z(0), z(0), z((0, 2, 3)), z((0, dim)), z(0), method)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneGraph:
+    """The nodes of one scene, by layer; edges are implied (fully connected, length = distance of positions).
+
+    Args:
+        scene_id: the scene it describes.
+        layers: by name, ``objects`` and ``landmarks``; a layer that was not made is absent.
+        up: (3,) unit vector against gravity in the scene frame, or None where it could not be told.
+        unit_m: guess of metres per scene unit used while describing (1 where the scale is known).
+        notes: what a person should know (few nodes, no gravity, ...).
+    """
+
+    scene_id: str
+    layers: dict[str, NodeLayer] = field(default_factory=dict)
+    up: np.ndarray | None = None
+    unit_m: float = 1.0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def num_nodes(self) -> int:
+        return sum(len(layer) for layer in self.layers.values())

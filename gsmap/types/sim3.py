@@ -1,0 +1,96 @@
+"""Similarity transforms of 3D space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Sim3:
+    """A similarity ``x_a = scale * R @ x_b + t``; named ``S_a_b`` where it maps frame b to frame a.
+
+    Args:
+        rotation: (3, 3) float64, orthonormal with determinant +1.
+        translation: (3,) float64, in the unit of frame a.
+        scale: positive factor; exactly 1 for a rigid transform.
+
+    Raises:
+        InputError: not finite, not a rotation within 1e-6, or a scale that is not positive.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        rotation = np.array(self.rotation, dtype=np.float64)
+        translation = np.array(self.translation, dtype=np.float64).reshape(-1)
+        scale = float(self.scale)
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise InputError(
+                f"Sim3 needs a (3, 3) rotation and a (3,) translation, got {rotation.shape} and {translation.shape}"
+            )
+        if not (np.isfinite(rotation).all() and np.isfinite(translation).all() and np.isfinite(scale)):
+            raise InputError("Sim3 holds NaN or infinity: check where the transform was computed")
+        if scale <= 0:
+            raise InputError(f"Sim3 scale must be positive, got {scale}")
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+            raise InputError("Sim3 rotation is not orthonormal with determinant +1: pass scale apart from rotation")
+        rotation.flags.writeable = False
+        translation.flags.writeable = False
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+        object.__setattr__(self, "scale", scale)
+
+    @classmethod
+    def identity(cls) -> Sim3:
+        return cls(np.eye(3), np.zeros(3), 1.0)
+
+    @classmethod
+    def from_matrix(cls, matrix: np.ndarray) -> Sim3:
+        """From a (4, 4) matrix ``[sR t; 0 1]``. The rotation part is projected to SO(3) if it is within 1e-3 of it."""
+        matrix = np.asarray(matrix, dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise InputError(f"a similarity needs a finite (4, 4) matrix, got shape {matrix.shape}")
+        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+            raise InputError(f"last row of a similarity must be 0 0 0 1, got {matrix[3].tolist()}")
+        u, singular, vt = np.linalg.svd(matrix[:3, :3])
+        scale = float(singular.mean())
+        if scale <= 0 or np.abs(singular / scale - 1).max() > 1e-3 or np.linalg.det(u @ vt) < 0:
+            raise InputError("matrix is not a similarity: its 3x3 part is not a positive multiple of a rotation")
+        if abs(scale - 1) < 1e-9:
+            scale = 1.0
+        return cls(u @ vt, matrix[:3, 3], scale)
+
+    def matrix(self) -> np.ndarray:
+        """(4, 4) float64 ``[sR t; 0 1]``."""
+        out = np.eye(4)
+        out[:3, :3] = self.scale * self.rotation
+        out[:3, 3] = self.translation
+        return out
+
+    def inverse(self) -> Sim3:
+        """``S_b_a`` of an ``S_a_b``."""
+        return Sim3(self.rotation.T, -(self.rotation.T @ self.translation) / self.scale, 1.0 / self.scale)
+
+    def __matmul__(self, other: Sim3) -> Sim3:
+        """``S_a_c = S_a_b @ S_b_c``."""
+        rotation = self.rotation @ other.rotation
+        # Long chains drift off SO(3); one polar projection keeps every product orthonormal to 1e-15.
+        u, _, vt = np.linalg.svd(rotation)
+        return Sim3(u @ vt, self.apply(other.translation), self.scale * other.scale)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Map points (..., 3) from frame b to frame a, in float64."""
+        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
+
+    @property
+    def is_rigid(self) -> bool:
+        return self.scale == 1.0
+
+    def __repr__(self) -> str:
+        return f"Sim3(t={np.round(self.translation, 4).tolist()}, scale={self.scale:.6g})"

@@ -1,0 +1,37 @@
+"""One piece of an export."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.types.sim3 import Sim3
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """A box of the map, what it was made from, and where it was written.
+
+    Args:
+        key: digest of everything that decides its content but the poses.
+        component: island it belongs to.
+        bounds: (2, 3) float64 lowest and highest corner, map frame; a Gaussian belongs where its mean is
+            (``low <= x < high``).
+        poses: the ``S_map_scene`` it was made with, by scene id.
+        num_gaussians: how many it holds.
+        method: merger and parameters, for people.
+        truncated: a time budget cut its optimisation short.
+        path: relative to the export's folder.
+        sha256: of the file written.
+    """
+
+    key: str
+    component: int
+    bounds: np.ndarray
+    poses: dict[str, Sim3] = field(default_factory=dict)
+    num_gaussians: int = 0
+    method: str = ""
+    truncated: bool = False
+    path: str = ""
+    sha256: str = ""
