@@ -36,7 +36,27 @@ _HOME = {
     "write": "gsmap.formats",
 }
 
-__all__ = sorted([*_HOME, "__version__"])
+__all__ = [
+    "Cameras",
+    "Edge",
+    "Gaussians",
+    "Map",
+    "NodeLayer",
+    "PoseGraph",
+    "Prior",
+    "Registration",
+    "Scene",
+    "SceneGraph",
+    "ScenePose",
+    "Sim3",
+    "Tile",
+    "__version__",
+    "errors",
+    "open",
+    "read",
+    "render",
+    "write",
+]
 
 if TYPE_CHECKING:
     from gsmap import errors, render

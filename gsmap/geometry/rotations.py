@@ -8,7 +8,7 @@ from gsmap.types import Sim3
 
 
 def quats_to_matrices(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) ``wxyz``, normalised first; a zero quaternion is identity."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) ``wxyz``, normalised first; zero is identity."""
     q = np.asarray(quats, dtype=np.float64)
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     q = np.where(norm > 0, q / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])

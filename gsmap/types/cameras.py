@@ -55,7 +55,9 @@ class Cameras:
             raise InputError(f"camera {names[int(np.argmax(off))]} has a pose that is not a rigid transform")
         off = (intrinsics[:, :2] <= 0).any(1) | (sizes <= 0).any(1)
         if off.any():
-            raise InputError(f"camera {names[int(np.argmax(off))]} has a focal length or image size that is not positive")
+            raise InputError(
+                f"camera {names[int(np.argmax(off))]} has a focal length or image size that is not positive"
+            )
         object.__setattr__(self, "T_frame_camera", pose)
         object.__setattr__(self, "intrinsics_px", intrinsics)
         object.__setattr__(self, "sizes_px", sizes)

@@ -1,0 +1,5 @@
+"""``python -m gsmap``: the command line."""
+
+from gsmap.cli import main
+
+main()

@@ -1,0 +1,56 @@
+"""gsmap export: tiles of the merged map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import MapPath, progress_bars, say
+
+
+def command(
+    map: MapPath,
+    out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; exporting there again updates it.")],
+    format: Annotated[str, typer.Option("--format", help="ply, compressed.ply, splat, spz, glb or 3dtiles.")] = "ply",
+    tile_size: Annotated[float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")] = 10.0,
+    bbox: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option("--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only this box of the map."),
+    ] = None,
+    merge: Annotated[str, typer.Option("--merge", help="tto, voxel, union or distance.")] = "tto",
+    revision: Annotated[int | None, typer.Option("--revision", help="Poses of this revision; the newest else.")] = None,
+    component: Annotated[int | None, typer.Option("--component", help="Only this island.")] = None,
+    steps: Annotated[
+        int | None, typer.Option("--steps", help="Optimisation steps per tile; chosen by size else.")
+    ] = None,
+    budget: Annotated[
+        float | None, typer.Option("--budget", help="Ceiling in seconds per tile; a tile it cuts short is marked.")
+    ] = None,
+    provenance: Annotated[
+        bool,
+        typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
+    ] = False,
+) -> None:
+    """Write merged tiles; only what changed since the last export to OUT is computed.
+
+    Example: `gsmap export site.gsmap tiles --format spz --tile-size 5`
+    """
+    import gsmap
+
+    with progress_bars() as progress, gsmap.open(map, progress=progress) as m:
+        report = m.export(
+            out,
+            format=format,
+            tile_size_m=tile_size,
+            bbox=bbox,
+            merge=merge,
+            revision=revision,
+            component=component,
+            steps=steps,
+            budget_s=budget,
+            provenance=provenance,
+        )
+    for tile in report.tiles:
+        print(f"{tile.path}\t{tile.num_gaussians}{chr(9) + 'truncated' if tile.truncated else ''}")
+    say(f"{report.recomputed} tiles made, {report.reused} unchanged, {report.removed} removed")

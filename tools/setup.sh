@@ -1,0 +1,63 @@
+#!/bin/sh
+# Sets gsmap up in .venv beside this checkout: system libraries, environment, native kernels, command line.
+#
+#   tools/setup.sh            what running gsmap needs
+#   tools/setup.sh test       the same, with what its tests and linters need
+#
+# PYTHON=/path/to/python3.12     another interpreter (3.11 to 3.13)
+# GSMAP_VENV=/path/to/venv       another place for the environment
+# GSMAP_TORCH_INDEX=URL          take torch from this index (see README, "CPU or CUDA")
+set -eu
+cd "$(dirname "$0")/.."
+venv=${GSMAP_VENV:-.venv}
+extras=${1:+"[$1,lint]"}
+
+say() { printf 'gsmap setup: %s\n' "$*" >&2; }
+die() { say "$*"; exit 1; }
+
+good_python() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; }
+
+find_python() {
+    for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11; do
+        if command -v "$candidate" >/dev/null && good_python "$candidate"; then command -v "$candidate"; return; fi
+    done
+}
+
+# --- what only the system can give -----------------------------------------------------------------------------------
+python=$(find_python)
+packages=""
+[ -n "$python" ] || packages="$packages python3"
+command -v g++ >/dev/null || packages="$packages g++"
+if [ -z "$python" ] || ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then packages="$packages python3-venv"; fi
+if [ -z "$python" ] || ! "$python" -c 'import os, sysconfig, sys
+sys.exit(not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")))'; then
+    packages="$packages python3-dev"
+fi
+for pair in libGL.so.1:libgl1 libgomp.so.1:libgomp1 libusb-1.0.so.0:libusb-1.0-0; do
+    # A library the loader knows is installed, whatever package it came from.
+    PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | grep -q "${pair%%:*}" || packages="$packages ${pair##*:}"
+done
+if [ -n "$packages" ]; then
+    command -v apt-get >/dev/null || die "please install the equivalents of:$packages, then run this again"
+    if [ "$(id -u)" = 0 ]; then as_root=""; elif command -v sudo >/dev/null; then as_root=sudo; else
+        die "please run as root: apt-get install$packages, then run this again"
+    fi
+    say "installing system packages:$packages"
+    $as_root apt-get update -qq
+    # shellcheck disable=SC2086  # a list of words on purpose
+    DEBIAN_FRONTEND=noninteractive $as_root apt-get install -y -qq --no-install-recommends $packages >&2
+    python=$(find_python)
+fi
+[ -n "$python" ] || die "no Python 3.11 to 3.13 found: install one and name it with PYTHON=..."
+
+# --- the environment -------------------------------------------------------------------------------------------------
+say "environment $venv with $("$python" --version)"
+[ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
+if [ -n "${GSMAP_TORCH_INDEX:-}" ]; then
+    "$venv/bin/python" -m pip install -q -c constraints.txt --index-url "$GSMAP_TORCH_INDEX" torch
+fi
+say "installing packages and building the native kernels (a few minutes)"
+# torch first and by itself: its pin must be settled before another package's open range can pull in a newer one.
+"$venv/bin/python" -m pip install -q -c constraints.txt torch
+"$venv/bin/python" -m pip install -q -c constraints.txt ".$extras"
+say "ready: $venv/bin/gsmap --help"
