@@ -1,0 +1,116 @@
+"""Files of Gaussians: one module per format, found by suffix.
+
+A module has ``read(path) -> Gaussians``, ``write(path, gaussians, **options)`` or both, and, where the format can say
+more, ``info(path) -> Info``. Modules are imported on first use.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+from gsmap.errors import InputError, NotFoundError
+from gsmap.types import Gaussians
+
+# Suffix -> module of this package. The longest suffix wins, so `.compressed.ply` goes before `.ply`.
+MODULES: dict[str, str] = {
+    ".ply": "ply",
+}
+
+
+@dataclass(frozen=True)
+class Info:
+    """What a file says about itself beside its Gaussians.
+
+    Args:
+        antialiased: trained with the 2D Mip filter.
+        notes: what a person should know about how it was read.
+    """
+
+    antialiased: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def suffix_of(path: str | os.PathLike[str]) -> str | None:
+    """The registered suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None."""
+    name = Path(path).name.lower()
+    return max((s for s in MODULES if name.endswith(s)), key=len, default=None)
+
+
+def read(path: str | os.PathLike[str]) -> Gaussians:
+    """Read the Gaussians of a file of any known format.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: unknown suffix, or a file that is not what its suffix says; values are checked by `gsmap.ingest`.
+    """
+    path = Path(path)
+    module = _module(path, "read")
+    with _explained(path, "read"):
+        return module.read(path)
+
+
+def info(path: str | os.PathLike[str]) -> Info:
+    """What the file says about itself beside its Gaussians; an empty `Info` where the format says nothing."""
+    path = Path(path)
+    module = _module(path, "read")
+    with _explained(path, "read"):
+        return module.info(path) if hasattr(module, "info") else Info()
+
+
+def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object) -> None:
+    """Write Gaussians in the format of the path's suffix; the file appears whole or not at all.
+
+    Args:
+        options: of the format; see the ``write`` of its module.
+
+    Raises:
+        NotFoundError: the folder does not exist.
+        InputError: unknown suffix, a format that is only read, or a path that cannot be written.
+    """
+    path = Path(path)
+    module = _module(path, "write")
+    staged = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        with _explained(path, "write"):
+            module.write(staged, gaussians, **options)
+            os.replace(staged, path)
+    finally:
+        with contextlib.suppress(OSError):
+            staged.unlink(missing_ok=True)
+
+
+def known(verb: str) -> list[str]:
+    """The suffixes that can be read (``verb="read"``) or written (``"write"``)."""
+    return sorted(suffix for suffix in MODULES if hasattr(_load(suffix), verb))
+
+
+def _load(suffix: str) -> ModuleType:
+    return importlib.import_module(f"gsmap.formats.{MODULES[suffix]}")
+
+
+def _module(path: Path, verb: str) -> ModuleType:
+    suffix = suffix_of(path)
+    if suffix is None:
+        what = f"has the unknown suffix {path.suffix!r}" if path.suffix else "has no suffix"
+        raise InputError(f"{path} {what}: gsmap can {verb} {', '.join(known(verb))}")
+    module = _load(suffix)
+    if not hasattr(module, verb):
+        raise InputError(f"{path}: gsmap cannot {verb} {suffix} files; it can {verb} {', '.join(known(verb))}")
+    return module
+
+
+@contextlib.contextmanager
+def _explained(path: Path, verb: str):
+    """Turn what the operating system says into one typed line."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        what = "no such file" if verb == "read" else f"no such folder: {path.parent}"
+        raise NotFoundError(f"cannot {verb} {path}: {what}") from error
+    except OSError as error:
+        raise InputError(f"cannot {verb} {path}: {error.strerror or error}") from error

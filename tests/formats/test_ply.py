@@ -1,0 +1,219 @@
+import numpy as np
+import pytest
+
+from gsmap.errors import InputError
+from gsmap.formats import info, ply, read, write
+from gsmap.types import Gaussians
+
+NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
+
+def some(n: int = 70_000, degree: int = 3) -> Gaussians:
+    rng = np.random.default_rng(7)
+    return Gaussians(
+        rng.normal(size=(n, 3)),
+        rng.normal(size=(n, 4)),
+        rng.normal(size=(n, 3)),
+        rng.normal(size=n),
+        rng.normal(size=(n, (degree + 1) ** 2, 3)),
+    )
+
+
+def assert_same(a: Gaussians, b: Gaussians) -> None:
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def columns(g: Gaussians) -> dict[str, np.ndarray]:
+    """The INRIA columns by their published meaning (f_rest is channel-major: all of red first)."""
+    out = {a: g.means[:, i] for i, a in enumerate("xyz")}
+    rest = g.sh.shape[1] - 1
+    for c in range(3):
+        out[f"f_dc_{c}"] = g.sh[:, 0, c]
+        for j in range(rest):
+            out[f"f_rest_{c * rest + j}"] = g.sh[:, 1 + j, c]
+    out["opacity"] = g.logit_opacities
+    out |= {f"scale_{i}": g.log_scales[:, i] for i in range(3)}
+    return out | {f"rot_{i}": g.quats[:, i] for i in range(4)}
+
+
+def save(path, table: dict[str, np.ndarray], *, kinds=None, encoding="binary_little_endian", comments=(), eol="\n"):
+    kinds = kinds or {}
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(encoding, "=")
+    n = len(next(iter(table.values())))
+    lines = ["ply", f"format {encoding} 1.0", *(f"comment {c}" for c in comments), f"element vertex {n}"]
+    lines += [f"property {kinds.get(k, 'float')} {k}" for k in table]
+    rows = np.empty(n, [(k, order + ply._TYPES[kinds.get(k, "float")]) for k in table])
+    for k, v in table.items():
+        rows[k] = v
+    with open(path, "wb") as f:
+        f.write((eol.join([*lines, "end_header"]) + eol).encode())
+        if encoding == "ascii":
+            f.writelines((" ".join(repr(x.item()) for x in row) + "\n").encode() for row in rows)
+        else:
+            f.write(rows.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip(tmp_path, degree):
+    g = some(degree=degree)
+    write(tmp_path / "a.ply", g)
+    assert_same(read(tmp_path / "a.ply"), g)
+
+
+def test_written_layout_is_inria(tmp_path):
+    g = some(10, 3)
+    write(tmp_path / "a.ply", g)
+    header = ply.read_header(tmp_path / "a.ply")
+    names = header.elements["vertex"].dtype.names
+    assert names[:9] == ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+    assert names[9:54] == tuple(f"f_rest_{i}" for i in range(45))
+    assert names[54:] == ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+    rows = ply.read_element(tmp_path / "a.ply", header, "vertex")
+    for name, column in columns(g).items():
+        np.testing.assert_array_equal(rows[name], column)
+
+
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize("eol", ["\n", "\r\n"])
+def test_any_order_types_and_encoding(tmp_path, encoding, eol):
+    g = some(50, 2)
+    table = columns(g)
+    names = list(table)
+    np.random.default_rng(1).shuffle(names)
+    shuffled = {"class": np.arange(50) % 200} | {n: table[n] for n in names}
+    kinds = {"class": "uchar", "x": "double", "rot_2": "float64"}
+    path = save(tmp_path / "a.ply", shuffled, kinds=kinds, encoding=encoding, eol=eol)
+    assert_same(read(path), g)
+    path = save(tmp_path / "b.ply", {n: table[n] for n in names}, encoding=encoding)
+    assert_same(read(path), g)
+
+
+def test_reads_what_another_writer_wrote(tmp_path):
+    gsply = pytest.importorskip("gsply")
+    g = some(1000, 3)
+    gsply.plywrite(
+        str(tmp_path / "a.ply"), g.means, g.log_scales, g.quats, g.logit_opacities, g.sh[:, 0], g.sh[:, 1:].copy()
+    )
+    assert_same(read(tmp_path / "a.ply"), g)
+    write(tmp_path / "b.ply", g)
+    other = gsply.plyread(str(tmp_path / "b.ply"))
+    np.testing.assert_array_equal(other.means, g.means)
+    np.testing.assert_array_equal(np.asarray(other.shN).reshape(1000, 15, 3), g.sh[:, 1:])
+
+
+def test_colours_from_uchar_rgb(tmp_path):
+    g = some(20, 0)
+    table = {k: v for k, v in columns(g).items() if not k.startswith("f_dc")}
+    rgb = np.arange(60).reshape(20, 3) * 4
+    table |= {name: rgb[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    path = save(tmp_path / "a.ply", table, kinds=dict.fromkeys(("red", "green", "blue"), "uchar"))
+    np.testing.assert_allclose(0.5 + ply.SH_C0 * read(path).sh[:, 0], rgb / 255, atol=1e-6)
+    assert "colours" in info(path).notes[0]
+
+
+def test_2dgs_becomes_flat(tmp_path):
+    table = columns(some(20, 1))
+    del table["scale_2"]
+    path = save(tmp_path / "a.ply", table)
+    scales = read(path).scales
+    np.testing.assert_allclose(scales[:, 2], 1e-3 * scales[:, :2].min(1), rtol=1e-4)
+    assert "2DGS" in info(path).notes[0]
+
+
+def test_mip_filter_keeps_the_integral(tmp_path):
+    g = some(100, 0)
+    size = np.random.default_rng(3).uniform(0, 2, 100)
+    path = save(tmp_path / "a.ply", columns(g) | {"filter_3D": size})
+    out = read(path)
+    np.testing.assert_allclose(out.scales, np.hypot(g.scales, size[:, None]), rtol=1e-5)
+    np.testing.assert_allclose(
+        out.opacities * out.scales.prod(1), g.opacities * g.scales.prod(1), rtol=1e-3
+    )  # Gaussian mass is kept
+    assert info(path).antialiased
+
+
+@pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "Generated by Postshot, antialiased"])
+def test_antialiased_is_noted(tmp_path, comment):
+    assert info(save(tmp_path / "a.ply", columns(some(2, 0)), comments=[comment])).antialiased
+    assert not info(save(tmp_path / "b.ply", columns(some(2, 0)))).antialiased
+    write(tmp_path / "c.ply", some(2, 0), antialiased=True)
+    assert info(tmp_path / "c.ply").antialiased
+
+
+def test_other_elements_around_the_vertices(tmp_path):
+    g = some(5, 0)
+    rows = np.stack(list(columns(g).values()), 1).astype("<f4")
+    head = "ply\nformat binary_little_endian 1.0\nelement extra 3\nproperty short a\nelement vertex 5\n"
+    head += "".join(f"property float {n}\n" for n in columns(g)) + "element face 1\nproperty list uchar int v\n"
+    (tmp_path / "a.ply").write_bytes((head + "end_header\n").encode() + b"\0" * 6 + rows.tobytes() + b"\x01\0\0\0\0")
+    assert_same(read(tmp_path / "a.ply"), g)
+
+
+BASE = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
+    f"property float {n}\n" for n in columns(some(1, 0))
+)
+MALFORMED = {
+    "empty": (b"", "is empty"),
+    "magic": (b"plx\nformat ascii 1.0\n", "begins with"),
+    "png": (b"\x89PNG\r\n\x1a\n" + b"\0" * 100, "begins with"),
+    "no newline": (b"ply\n" + b"x" * 1_000_000, "64 KiB"),
+    "no newline at all": (b"ply\n" + b"x" * 100, "before the file ends"),
+    "endless header": (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 10_000, "64 KiB"),
+    "no end": ((BASE.format(3)).encode(), "end_header"),
+    "no format": (b"ply\nelement vertex 0\nend_header\n", "no 'format'"),
+    "bad format": (b"ply\nformat middle_endian 1.0\nend_header\n", "line 2"),
+    "count 3e8": ((BASE.format(300_000_000) + "end_header\n").encode() + b"\0" * 560, "truncated"),
+    "count 1e12": ((BASE.format(10**12) + "end_header\n").encode() + b"\0" * 560, "truncated"),
+    "count 1e30": ((BASE.format(10**30) + "end_header\n").encode(), "line 3"),
+    "count -1": ((BASE.format(-1) + "end_header\n").encode(), "line 3"),
+    "zero": ((BASE.format(0) + "end_header\n").encode(), "no vertex rows"),
+    "short data": ((BASE.format(10) + "end_header\n").encode() + b"\0" * 559, "truncated"),
+    "bad type": (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty half x\nend_header\n", "line 4"),
+    "twice": (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty int x\nproperty int x\nend_header\n", "twice"),
+    "orphan property": (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "line 3"),
+    "points only": (
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+        b"property float z\nend_header\n" + b"\0" * 12,
+        "lack f_dc_0.*rot_3",
+    ),
+    "mesh": (b"ply\nformat ascii 1.0\nelement vertex 2\nproperty list uchar int x\nend_header\n1 2\n", "list property"),
+    "no columns": (b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n", "no properties"),
+    "bad SH": ((BASE.format(1) + "property float f_rest_0\nend_header\n").encode() + b"\0" * 60, "f_rest"),
+    "ascii words": (
+        (BASE.format(1).replace("binary_little_endian", "ascii") + "end_header\n").encode() + b"a " * 14,
+        "ASCII",
+    ),
+    "ascii short": (
+        (BASE.format(2).replace("binary_little_endian", "ascii") + "end_header\n").encode() + b"1.5 " * 13 + b"1.555\n",
+        "truncated",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_malformed_is_refused_in_one_line(tmp_path, case):
+    data, message = MALFORMED[case]
+    path = tmp_path / "bad.ply"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+    assert "bad.ply" in str(caught.value)
+
+
+def test_every_truncation_is_refused(tmp_path):
+    write(tmp_path / "a.ply", some(4, 1))
+    data = (tmp_path / "a.ply").read_bytes()
+    for size in range(len(data)):
+        (tmp_path / "b.ply").write_bytes(data[:size])
+        with pytest.raises(InputError):
+            read(tmp_path / "b.ply")
+
+
+def test_real_capture(shared_data):
+    g = read(shared_data / "house" / "c0.ply")
+    assert len(g) == 152_000
+    assert g.sh_degree == 1
+    assert np.isfinite(g.means).all()
