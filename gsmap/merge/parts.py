@@ -1,0 +1,63 @@
+"""What goes into a merge and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.types import Cameras, Gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One capture, or the piece of it that lies near a tile, in the map frame.
+
+    Args:
+        gaussians: its Gaussians, map frame.
+        cameras: its cameras, map frame; None or none where nothing is known of what it saw.
+        scene_id: which scene it is; parts are merged in the order of their ids, whatever order they come in.
+        captured_at: ISO 8601 time with zone, or None.
+        centroid: (3,) mean of the whole capture's means, map frame, where `gaussians` is only a piece of it.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras | None = None
+    scene_id: str = ""
+    captured_at: str | None = None
+    centroid: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MergeResult:
+    """The merged Gaussians and where they came from.
+
+    Args:
+        gaussians: in the map frame, only those whose mean lies in the bounds asked for.
+        origin: (N,) int32 index, in the order the parts were given, of the part each Gaussian came from (of the
+            heaviest one, where several became one).
+        num_input: Gaussians of all parts within the bounds before merging.
+        steps: optimisation steps taken, 0 for the closed-form methods.
+        truncated: a time budget cut the optimisation short.
+        notes: what a person should know.
+    """
+
+    gaussians: Gaussians
+    origin: np.ndarray
+    num_input: int = 0
+    steps: int = 0
+    truncated: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -> np.ndarray:
+    """(N,) which points (N, 3) lie in bounds (2, 3) grown by a margin (``low <= x < high``); all if None."""
+    if bounds is None:
+        return np.ones(len(points), dtype=bool)
+    return ((points >= bounds[0] - margin) & (points < bounds[1] + margin)).all(1)
+
+
+def united(parts: list[Part]) -> tuple[Gaussians, np.ndarray]:
+    """All Gaussians of the parts in order, and the index (N,) int32 of the part of each."""
+    origin = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.gaussians) for p in parts])
+    return Gaussians.concatenate([p.gaussians for p in parts]), origin

@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+
+from gsmap.errors import ConfigError, InputError
+from gsmap.merge import Part, default_params, merge, methods
+from gsmap.types import Gaussians
+
+
+def cloud(seed, n=3000, low=(-1, -1, -1), high=(1, 1, 1)):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.uniform(low, high, size=(n, 3)),
+        rng.normal(size=(n, 4)),
+        rng.normal(-4, 0.3, size=(n, 3)),
+        rng.normal(size=n),
+        rng.normal(0, 0.3, size=(n, 4, 3)),
+    )
+
+
+def rows(gaussians):
+    """Rows in an order of their own, to compare sets."""
+    flat = np.concatenate([gaussians.means, gaussians.log_scales, gaussians.logit_opacities[:, None]], axis=1)
+    return flat[np.lexsort(flat.T)]
+
+
+TILES = [np.array([[x, y, -2], [x + 1.005, y + 1.005, 2]]) for x in (-1.005, 0.0) for y in (-1.005, 0.0)]
+
+
+def test_union_keeps_everything_with_its_origin():
+    parts = [Part(cloud(0), scene_id="b"), Part(cloud(1, n=500), scene_id="a")]
+    result = merge(parts, "union")
+    assert result.num_input == len(result.gaussians) == 3500
+    np.testing.assert_array_equal(result.gaussians.means[result.origin == 1], parts[1].gaussians.means)
+
+
+def test_distance_keeps_exactly_what_is_nearer_to_its_own_centroid():
+    a, b = cloud(0), cloud(1, low=(0, -1, -1), high=(3, 1, 1))
+    result = merge([Part(a, scene_id="a"), Part(b, scene_id="b")], "distance")
+    centre_a, centre_b = a.means.mean(0), b.means.mean(0)
+    nearer_a = lambda p: np.linalg.norm(p - centre_a, axis=1) < np.linalg.norm(p - centre_b, axis=1)  # noqa: E731
+    np.testing.assert_array_equal(result.gaussians.means[result.origin == 0], a.means[nearer_a(a.means)])
+    np.testing.assert_array_equal(result.gaussians.means[result.origin == 1], b.means[~nearer_a(b.means)])
+
+
+def test_distance_alone_keeps_everything_and_a_tile_uses_the_whole_captures_centroid():
+    a, b = cloud(0), cloud(1, low=(0, -1, -1), high=(3, 1, 1))
+    assert len(merge([Part(a)], "distance").gaussians) == len(a)
+    whole = merge([Part(a, scene_id="a"), Part(b, scene_id="b")], "distance")
+    parts = [Part(g, scene_id=s, centroid=g.means.mean(0, dtype=float)) for g, s in ((a, "a"), (b, "b"))]
+    boxes = [np.array([[-9, -9, -9], [0.4, 9, 9]]), np.array([[0.4, -9, -9], [9, 9, 9]])]
+    tiles = [merge(parts, "distance", bounds=box).gaussians for box in boxes]
+    np.testing.assert_array_equal(rows(Gaussians.concatenate(tiles)), rows(whole.gaussians))
+
+
+@pytest.mark.parametrize("method", ["union", "voxel"])
+def test_tiles_made_apart_are_the_whole(method):
+    parts = [Part(cloud(s, n=20_000), scene_id=str(s)) for s in range(2)]
+    params = default_params(method)
+    if method == "voxel":
+        params = type(params)(voxel_m=0.07)
+    whole = merge(parts, method, params)
+    tiles = [merge(parts, method, params, bounds=box) for box in TILES]
+    assert sum(t.num_input for t in tiles) == 40_000
+    np.testing.assert_allclose(
+        rows(Gaussians.concatenate([t.gaussians for t in tiles])), rows(whole.gaussians), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("method", ["union", "distance", "voxel"])
+def test_order_of_parts_does_not_matter(method):
+    a, b = Part(cloud(0), scene_id="a"), Part(cloud(1), scene_id="b")
+    one, other = merge([a, b], method), merge([b, a], method)
+    np.testing.assert_array_equal(one.gaussians.means, other.gaussians.means)
+    np.testing.assert_array_equal(one.origin, 1 - other.origin)
+
+
+def test_voxel_merges_a_capture_with_its_copy_into_one():
+    g = cloud(0)
+    result = merge([Part(g, scene_id="a"), Part(g, scene_id="b")], "voxel", type(default_params("voxel"))(voxel_m=1e-4))
+    assert len(result.gaussians) == len(g)
+    joint = 1 - (1 - g.opacities.astype(float)) ** 2
+    np.testing.assert_allclose(np.sort(result.gaussians.opacities), np.sort(joint), rtol=1e-3)
+
+
+def test_bad_input_is_refused_in_words():
+    part = Part(cloud(0))
+    with pytest.raises(InputError, match="no parts"):
+        merge([], "union")
+    with pytest.raises(ConfigError, match="choose one of"):
+        merge([part], "concat")
+    with pytest.raises(ConfigError, match="budget"):
+        merge([part], "union", budget_s=0)
+    with pytest.raises(ConfigError, match="Params"):
+        merge([part], "union", default_params("voxel"))
+    with pytest.raises(InputError, match="low < high"):
+        merge([part], "union", bounds=np.zeros((2, 3)))
+    assert {"union", "distance", "voxel"} <= set(methods())
+
+
+def test_a_tile_without_anything_in_it_is_empty():
+    result = merge([Part(cloud(0))], "voxel", bounds=np.array([[50, 50, 50], [51, 51, 51]]))
+    assert len(result.gaussians) == len(result.origin) == result.num_input == 0
