@@ -1,8 +1,11 @@
 // The one extension module of gsmap. Each kernel binds itself from its own file; this one only lists them.
 #include <nanobind/nanobind.h>
 
+#include "clique.h"
+
 namespace nb = nanobind;
 
 NB_MODULE(_native, m) {
     m.doc() = "Kernels that decide gsmap's speed: rasteriser and maximum clique.";
+    bind_clique(m);
 }

@@ -1,0 +1,362 @@
+// Consistency graphs of point correspondences, and their maximum clique.
+//
+// Graphs are symmetric bit matrices: row i holds ceil(n / 64) words of 64 bits, bit j set where i and j agree. Everything
+// is single-threaded and deterministic: limits count search nodes, never time.
+#include "clique.h"
+
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <optional>
+#include <stdexcept>
+#include <tuple>
+#include <vector>
+
+namespace nb = nanobind;
+using Word = std::uint64_t;
+
+namespace {
+
+inline int popcount(Word w) { return __builtin_popcountll(w); }
+inline int lowest(Word w) { return __builtin_ctzll(w); }
+inline bool has(const Word *row, int i) { return (row[i >> 6] >> (i & 63)) & 1; }
+inline void set(Word *row, int i) { row[i >> 6] |= Word(1) << (i & 63); }
+inline void unset(Word *row, int i) { row[i >> 6] &= ~(Word(1) << (i & 63)); }
+
+template <class F> inline void for_each_bit(const Word *row, int words, F &&f) {
+    for (int w = 0; w < words; ++w)
+        for (Word bits = row[w]; bits; bits &= bits - 1) f(w * 64 + lowest(bits));
+}
+
+// A square bit matrix.
+struct BitGraph {
+    int n = 0, words = 0;
+    std::vector<Word> bits;
+    BitGraph() = default;
+    explicit BitGraph(int n_) : n(n_), words((n_ + 63) / 64), bits(std::size_t(n_) * words, 0) {}
+    Word *row(int i) { return bits.data() + std::size_t(i) * words; }
+    const Word *row(int i) const { return bits.data() + std::size_t(i) * words; }
+};
+
+int count(const Word *a, int words) {
+    int c = 0;
+    for (int w = 0; w < words; ++w) c += popcount(a[w]);
+    return c;
+}
+
+// The subgraph induced by `members`, renumbered 0, 1, ... in their order.
+BitGraph induced(const Word *bits, int words, const std::vector<int> &members) {
+    BitGraph g(int(members.size()));
+    for (int i = 0; i < g.n; ++i) {
+        const Word *row = bits + std::size_t(members[i]) * words;
+        for (int j = 0; j < i; ++j)
+            if (has(row, members[j])) set(g.row(i), j), set(g.row(j), i);
+    }
+    return g;
+}
+
+// Order that removes a vertex of lowest remaining degree each time, and each vertex's core number.
+void degeneracy(const BitGraph &g, std::vector<int> &order, std::vector<int> &core) {
+    int n = g.n;
+    std::vector<int> degree(n);
+    int top = 0;
+    for (int i = 0; i < n; ++i) top = std::max(top, degree[i] = count(g.row(i), g.words));
+    std::vector<int> start(top + 2, 0), position(n);
+    for (int d : degree) ++start[d + 1];
+    for (int d = 0; d <= top; ++d) start[d + 1] += start[d];
+    order.assign(n, 0);
+    auto next = start;
+    for (int i = 0; i < n; ++i) order[position[i] = next[degree[i]]++] = i;
+    core.assign(n, 0);
+    // Batagelj and Zaversnik: vertices stay sorted by degree; `start[d]` is the first of degree d.
+    for (int k = 0; k < n; ++k) {
+        int v = order[k];
+        core[v] = degree[v];
+        for_each_bit(g.row(v), g.words, [&](int u) {
+            if (degree[u] <= degree[v]) return;
+            int d = degree[u], pu = position[u], pw = std::max(start[d], k + 1), w = order[pw];
+            if (u != w) std::swap(order[pu], order[pw]), position[u] = pw, position[w] = pu;
+            start[d] = pw + 1;
+            --degree[u];
+        });
+    }
+}
+
+// A clique grown from `first` by always taking the candidate that keeps most candidates.
+std::vector<int> grow(const BitGraph &g, int first) {
+    std::vector<int> members;
+    for_each_bit(g.row(first), g.words, [&](int u) { members.push_back(u); });
+    BitGraph sub = induced(g.bits.data(), g.words, members);
+    std::vector<Word> left(sub.words, 0);
+    std::vector<int> degree(sub.n), clique{first};
+    for (int i = 0; i < sub.n; ++i) set(left.data(), i), degree[i] = count(sub.row(i), sub.words);
+    int remaining = sub.n;
+    while (remaining) {
+        int best = -1;
+        for_each_bit(left.data(), sub.words, [&](int i) {
+            if (best < 0 || degree[i] > degree[best]) best = i;
+        });
+        clique.push_back(members[best]);
+        unset(left.data(), best);
+        --remaining;
+        for (int w = 0; w < sub.words; ++w) {
+            Word gone = left[w] & ~sub.row(best)[w];
+            left[w] &= ~gone;
+            for (; gone; gone &= gone - 1) {
+                int u = w * 64 + lowest(gone);
+                --remaining;
+                for_each_bit(sub.row(u), sub.words, [&](int x) { --degree[x]; });
+            }
+        }
+    }
+    return clique;
+}
+
+// Exact branch and bound inside one subgraph, bounded by greedy colouring with one-step recolouring
+// (San Segundo et al. 2011, "An exact bit-parallel algorithm for the maximum clique problem", with Re-NUMBER of
+// Tomita et al. 2010).
+struct Search {
+    const BitGraph &g;
+    long long limit, &nodes;
+    std::vector<int> current, best;
+    std::size_t bound;  // cliques must be larger than this to count
+    bool stopped = false;
+    std::vector<std::vector<Word>> classes;
+
+    Search(const BitGraph &g_, std::size_t bound_, long long limit_, long long &nodes_)
+        : g(g_), limit(limit_), nodes(nodes_), bound(bound_) {}
+
+    // Tries to move `v` into a class <= keep by evicting its only neighbour there into another such class.
+    bool recolour(int v, int keep) {
+        for (int k = 1; k <= keep; ++k) {
+            int neighbour = -1, hits = 0;
+            for (int w = 0; w < g.words && hits < 2; ++w)
+                if (Word both = classes[k][w] & g.row(v)[w]) hits += popcount(both), neighbour = w * 64 + lowest(both);
+            if (hits == 0) return set(classes[k].data(), v), true;
+            if (hits > 1) continue;
+            for (int other = k + 1; other <= keep; ++other) {
+                bool free = true;
+                for (int w = 0; w < g.words && free; ++w) free = !(classes[other][w] & g.row(neighbour)[w]);
+                if (!free) continue;
+                unset(classes[k].data(), neighbour);
+                set(classes[other].data(), neighbour);
+                set(classes[k].data(), v);
+                return true;
+            }
+        }
+        return false;
+    }
+
+    // Colours `candidates`; returns those that could extend `current` past `bound`, by rising colour.
+    void colour(const std::vector<Word> &candidates, std::vector<int> &vertices, std::vector<int> &colours) {
+        int keep = int(bound) - int(current.size());
+        std::vector<Word> left(candidates), available(g.words);
+        int remaining = count(left.data(), g.words);
+        for (int k = 1; remaining; ++k) {
+            if (int(classes.size()) <= k) classes.resize(k + 1);
+            classes[k].assign(g.words, 0);
+            available = left;
+            for (int w = 0; w < g.words; ++w) {
+                while (available[w]) {
+                    int v = w * 64 + lowest(available[w]);
+                    unset(left.data(), v);
+                    unset(available.data(), v);
+                    for (int x = w; x < g.words; ++x) available[x] &= ~g.row(v)[x];
+                    --remaining;
+                    set(classes[k].data(), v);
+                    if (k <= keep) continue;
+                    if (keep >= 2) {
+                        unset(classes[k].data(), v);
+                        if (recolour(v, keep)) continue;
+                        set(classes[k].data(), v);
+                    }
+                    vertices.push_back(v);
+                    colours.push_back(k);
+                }
+            }
+        }
+    }
+
+    void expand(std::vector<Word> &candidates) {
+        if (++nodes > limit) {
+            stopped = true;
+            return;
+        }
+        std::vector<int> vertices, colours;
+        colour(candidates, vertices, colours);
+        std::vector<Word> next(g.words);
+        for (int i = int(vertices.size()) - 1; i >= 0 && !stopped; --i) {
+            if (current.size() + colours[i] <= bound) return;
+            int v = vertices[i];
+            current.push_back(v);
+            Word any = 0;
+            for (int w = 0; w < g.words; ++w) any |= next[w] = candidates[w] & g.row(v)[w];
+            if (any)
+                expand(next);
+            else if (current.size() > bound)
+                best = current, bound = current.size();
+            current.pop_back();
+            unset(candidates.data(), v);
+        }
+    }
+};
+
+}  // namespace
+
+// Maximum clique of a graph given as bit rows. Returns (members ascending, exact, search nodes).
+static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *bits, int n, int words,
+                                                                    long long limit) {
+    if (n == 0) return {{}, true, 0};
+    BitGraph g(n);
+    std::memcpy(g.bits.data(), bits, g.bits.size() * sizeof(Word));
+    for (int i = 0; i < n; ++i) unset(g.row(i), i);
+    std::vector<int> order, core;
+    degeneracy(g, order, core);
+
+    // Start from good cliques: grown from the vertices of the densest cores, spread over the order.
+    std::vector<int> best{order.back()};
+    int starts = std::min(n, 24);
+    std::vector<char> covered(n, 0);
+    for (int k = n - 1, done = 0; k >= 0 && done < starts; --k) {
+        if (covered[order[k]] || core[order[k]] < int(best.size())) continue;
+        auto clique = grow(g, order[k]);
+        for (int v : clique) covered[v] = 1;
+        ++done;
+        if (clique.size() > best.size()) best = clique;
+    }
+
+    bool exact = true;
+    long long nodes = 0;
+    std::vector<int> rank(n);
+    for (int k = 0; k < n; ++k) rank[order[k]] = k;
+    // Dense cores last removed hold the large cliques: search them first, so the bound rises early.
+    for (int k = n - 1; k >= 0; --k) {
+        int v = order[k];
+        if (core[v] < int(best.size())) continue;
+        std::vector<int> members;
+        for_each_bit(g.row(v), g.words, [&](int u) {
+            if (rank[u] > k && core[u] >= int(best.size())) members.push_back(u);
+        });
+        if (members.size() < best.size()) continue;
+        BitGraph raw = induced(g.bits.data(), g.words, members);
+        std::vector<int> inner, inner_core;
+        degeneracy(raw, inner, inner_core);
+        if (inner_core[inner.back()] + 2 <= int(best.size())) continue;
+        std::reverse(inner.begin(), inner.end());
+        BitGraph sub = induced(raw.bits.data(), raw.words, inner);
+        std::size_t bound = best.size() - 1;
+        Search search(sub, bound, limit, nodes);
+        std::vector<Word> all(sub.words, 0);
+        for (int i = 0; i < sub.n; ++i) set(all.data(), i);
+        search.expand(all);
+        if (search.best.size() > bound) {
+            best = {v};
+            for (int i : search.best) best.push_back(members[inner[i]]);
+        }
+        if (search.stopped) {
+            exact = false;
+            break;
+        }
+    }
+    std::sort(best.begin(), best.end());
+    return {best, exact, nodes};
+}
+
+using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Ids = nb::ndarray<const std::int32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Bits = nb::ndarray<const Word, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+
+// Bit rows of the graph in which correspondences i and j agree. See gsmap/register/consistency.py for the meaning.
+static void consistency_rows(int n, const double *target, const double *source, const std::int32_t *target_ids,
+                             const std::int32_t *source_ids, const double *target_heights,
+                             const double *source_heights, double scale, double slack, double relative_slack,
+                             double ratio, double min_distance, double height_slack, double height_slope, Word *out) {
+    int words = (n + 63) / 64;
+    std::memset(out, 0, std::size_t(n) * words * sizeof(Word));
+    std::vector<float> tx(n), ty(n), tz(n), sx(n), sy(n), sz(n), th(n, 0.f), sh(n, 0.f);
+    // Float keeps 1e-6 of the extent once the clouds are centred; the loop below then runs four lanes wide.
+    double ct[3] = {0, 0, 0}, cs[3] = {0, 0, 0};
+    for (int i = 0; i < n; ++i)
+        for (int k = 0; k < 3; ++k) ct[k] += target[3 * i + k] / n, cs[k] += source[3 * i + k] / n;
+    bool heights = target_heights && source_heights;
+    double mt = 0, ms = 0;
+    for (int i = 0; heights && i < n; ++i) mt += target_heights[i] / n, ms += source_heights[i] / n;
+    for (int i = 0; i < n; ++i) {
+        tx[i] = float(target[3 * i] - ct[0]), ty[i] = float(target[3 * i + 1] - ct[1]);
+        tz[i] = float(target[3 * i + 2] - ct[2]);
+        sx[i] = float(scale * (source[3 * i] - cs[0])), sy[i] = float(scale * (source[3 * i + 1] - cs[1]));
+        sz[i] = float(scale * (source[3 * i + 2] - cs[2]));
+        if (heights) th[i] = float(target_heights[i] - mt), sh[i] = float(scale * (source_heights[i] - ms));
+    }
+    const float slack_f = float(slack), rel_f = float(relative_slack), min_f = float(min_distance);
+    const float hs = float(height_slack), slope = float(height_slope), ratio_f = float(ratio);
+    std::vector<std::uint8_t> ok(n);
+    for (int i = 0; i < n; ++i) {
+        const float ax = tx[i], ay = ty[i], az = tz[i], bx = sx[i], by = sy[i], bz = sz[i], ah = th[i], bh = sh[i];
+        const std::int32_t it = target_ids[i], is = source_ids[i];
+        for (int j = i + 1; j < n; ++j) {
+            float x = ax - tx[j], y = ay - ty[j], z = az - tz[j];
+            float dt = std::sqrt(x * x + y * y + z * z);
+            x = bx - sx[j], y = by - sy[j], z = bz - sz[j];
+            float ds = std::sqrt(x * x + y * y + z * z);
+            float low = dt < ds ? dt : ds, high = dt < ds ? ds : dt;
+            float allowed = ratio_f > 0 ? ratio_f * high : slack_f + rel_f * low;
+            float dh = std::fabs((ah - th[j]) - (bh - sh[j]));
+            ok[j] = (high - low < allowed) & (low >= min_f) & (it != target_ids[j]) & (is != source_ids[j]) &
+                    ((!heights) | (dh < hs + slope * high));
+        }
+        Word *row = out + std::size_t(i) * words;
+        for (int j = i + 1; j < n; ++j)
+            if (ok[j]) set(row, j), set(out + std::size_t(j) * words, i);
+    }
+}
+
+void bind_clique(nb::module_ &m) {
+    m.def(
+        "consistency_graph",
+        [](Points target, Points source, Ids target_ids, Ids source_ids, std::optional<Numbers> target_heights,
+           std::optional<Numbers> source_heights, double scale, double slack, double relative_slack, double ratio,
+           double min_distance, double height_slack, double height_slope) {
+            std::size_t n = target.shape(0), words = (n + 63) / 64;
+            if (source.shape(0) != n || target_ids.shape(0) != n || source_ids.shape(0) != n ||
+                (target_heights && target_heights->shape(0) != n) || (source_heights && source_heights->shape(0) != n))
+                throw std::invalid_argument("consistency_graph needs arrays of one length");
+            auto *out = new Word[n * words + 1];
+            nb::capsule owner(out, [](void *p) noexcept { delete[] static_cast<Word *>(p); });
+            {
+                nb::gil_scoped_release release;
+                consistency_rows(int(n), target.data(), source.data(), target_ids.data(), source_ids.data(),
+                                 target_heights ? target_heights->data() : nullptr,
+                                 source_heights ? source_heights->data() : nullptr, scale, slack, relative_slack, ratio,
+                                 min_distance, height_slack, height_slope, out);
+            }
+            return nb::ndarray<nb::numpy, Word, nb::ndim<2>>(out, {n, words}, owner);
+        },
+        nb::arg("target"), nb::arg("source"), nb::arg("target_ids"), nb::arg("source_ids"),
+        nb::arg("target_heights").none(), nb::arg("source_heights").none(), nb::arg("scale"), nb::arg("slack"),
+        nb::arg("relative_slack"), nb::arg("ratio"), nb::arg("min_distance"), nb::arg("height_slack"),
+        nb::arg("height_slope"), "Bit rows (n, ceil(n / 64)) of the graph in which correspondences agree.");
+    m.def(
+        "maximum_clique",
+        [](Bits bits, long long node_limit) {
+            std::size_t n = bits.shape(0), words = bits.shape(1);
+            if (words != (n + 63) / 64) throw std::invalid_argument("bit rows must hold ceil(n / 64) words");
+            std::tuple<std::vector<int>, bool, long long> found;
+            {
+                nb::gil_scoped_release release;
+                found = maximum_clique(bits.data(), int(n), int(words), node_limit);
+            }
+            auto &members = std::get<0>(found);
+            auto *out = new std::int32_t[members.size() + 1];
+            std::copy(members.begin(), members.end(), out);
+            nb::capsule owner(out, [](void *p) noexcept { delete[] static_cast<std::int32_t *>(p); });
+            return nb::make_tuple(nb::ndarray<nb::numpy, std::int32_t, nb::ndim<1>>(out, {members.size()}, owner),
+                                  std::get<1>(found), std::get<2>(found));
+        },
+        nb::arg("bits"), nb::arg("node_limit"), "Largest clique: (members, exact, search nodes).");
+}

@@ -1,0 +1,46 @@
+"""The largest set of correspondences that all agree with each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Clique:
+    """A clique of a consistency graph.
+
+    Args:
+        members: indices of the correspondences, ascending.
+        exact: proved largest; False when the search stopped at its node limit with the best found so far.
+        num_search_nodes: branch-and-bound nodes visited.
+    """
+
+    members: np.ndarray
+    exact: bool
+    num_search_nodes: int
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+
+def maximum_clique(rows: np.ndarray, node_limit: int = 20_000) -> Clique:
+    """Maximum clique of a graph given as symmetric bit rows (`consistency_graph`).
+
+    Exact branch and bound over a degeneracy order, bounded by greedy colouring with recolouring (San Segundo et al.
+    2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts search nodes, not seconds, so the
+    answer is the same on every machine.
+
+    Raises:
+        InputError: rows that are not (M, ceil(M / 64)) uint64.
+    """
+    from gsmap import _native
+
+    rows = np.ascontiguousarray(rows)
+    if rows.dtype != np.uint64 or rows.ndim != 2 or rows.shape[1] != -(-len(rows) // 64):
+        raise InputError(f"a graph needs (M, ceil(M / 64)) uint64 bit rows, got {rows.shape} {rows.dtype}")
+    members, exact, nodes = _native.maximum_clique(rows, int(node_limit))
+    return Clique(members.astype(np.int64), bool(exact), int(nodes))

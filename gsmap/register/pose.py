@@ -1,0 +1,66 @@
+"""The similarity that a set of agreeing correspondences implies, or why it implies none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.umeyama import umeyama
+from gsmap.types import Sim3
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """A closed-form pose and how well it is known.
+
+    Args:
+        S_target_source: the pose.
+        rms_m: root mean square distance of the correspondences under it.
+        rotation_sigma_rad: standard deviation of the rotation about the axis the points constrain least.
+        flaw: empty when the pose may be used, else why not.
+    """
+
+    S_target_source: Sim3
+    rms_m: float
+    rotation_sigma_rad: float
+    flaw: str = ""
+
+
+def fit_pose(
+    target: np.ndarray,
+    source: np.ndarray,
+    *,
+    with_scale: bool = False,
+    sigma_m: float = 0.03,
+    max_rotation_sigma_deg: float = 3.0,
+) -> PoseFit:
+    """Least-squares pose of (N, 3) corresponding points, refusing mirrored and near-collinear sets.
+
+    Distances cannot tell a set from its mirror image, so a clique may be mirrored: then an improper rotation fits, and
+    the best proper one does not. Points along a line leave the rotation about it free: with positions known to
+    ``sigma_m``, its standard deviation is the largest of ``F^-1/2``, ``F = sum(|x|^2 I - x x^T) / (2 sigma^2)``.
+    """
+    if len(target) < 3:
+        return PoseFit(Sim3.identity(), np.inf, np.inf, "fewer than 3 correspondences")
+    pose = umeyama(target, source, with_scale=with_scale)
+    rms = _rms(target, pose.apply(source))
+    centred = target - target.mean(0)
+    squares = centred.T @ centred
+    weakest = np.linalg.eigvalsh(np.trace(squares) * np.eye(3) - squares)[0] / (2 * max(sigma_m, rms / 2.45) ** 2)
+    rotation_sigma = float(1.0 / np.sqrt(weakest)) if weakest > 0 else np.inf
+    flaw = ""
+    if rms > sigma_m:
+        mirrored = source * [1.0, 1.0, -1.0]
+        if _rms(target, umeyama(target, mirrored, with_scale=with_scale).apply(mirrored)) < 0.5 * rms:
+            flaw = "correspondences are mirrored"
+    if not flaw and rotation_sigma > np.radians(max_rotation_sigma_deg):
+        flaw = "correspondences lie along a line"
+    # An inlier's residual has standard deviation sqrt(2) sigma per axis, 2.45 sigma over three.
+    if not flaw and rms > 3.1 * sigma_m:
+        flaw = "correspondences do not fit one pose"
+    return PoseFit(pose, rms, rotation_sigma, flaw)
+
+
+def _rms(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(((a - b) ** 2).sum(1).mean()))

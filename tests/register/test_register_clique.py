@@ -1,0 +1,79 @@
+"""The native maximum clique against networkx and planted answers."""
+
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsmap.errors import InputError
+from gsmap.register.clique import maximum_clique
+from gsmap.register.consistency import pack, unpack
+
+
+def _random_graph(n: int, density: float, seed: int) -> np.ndarray:
+    upper = np.triu(np.random.default_rng(seed).random((n, n)) < density, 1)
+    return upper | upper.T
+
+
+def _is_clique(adjacency: np.ndarray, members: np.ndarray) -> bool:
+    return bool(adjacency[np.ix_(members, members)].sum() == len(members) * (len(members) - 1))
+
+
+@settings(max_examples=150, deadline=None)
+@given(n=st.integers(1, 75), density=st.floats(0, 0.7), seed=st.integers(0, 2**31))
+def test_agrees_with_networkx(n, density, seed):
+    adjacency = _random_graph(n, density, seed)
+    clique = maximum_clique(pack(adjacency), node_limit=10**8)
+    expected = max(len(c) for c in nx.find_cliques(nx.from_numpy_array(adjacency)))
+    assert clique.exact
+    assert len(clique) == expected
+    assert _is_clique(adjacency, clique.members)
+
+
+@pytest.mark.parametrize("n", [63, 64, 65, 128, 129])
+def test_word_boundaries(n):
+    full = ~np.eye(n, dtype=bool)
+    assert len(maximum_clique(pack(full))) == n
+    full[0, n - 1] = full[n - 1, 0] = False
+    assert len(maximum_clique(pack(full))) == n - 1
+
+
+def test_finds_a_planted_clique_in_a_large_graph():
+    n, size = 3000, 30
+    adjacency = _random_graph(n, 0.05, 3)
+    members = np.random.default_rng(4).choice(n, size, replace=False)
+    adjacency[np.ix_(members, members)] = True
+    np.fill_diagonal(adjacency, False)
+    clique = maximum_clique(pack(adjacency))
+    assert clique.exact
+    assert clique.members.tolist() == sorted(members.tolist())
+
+
+def test_node_limit_gives_a_clique_that_is_not_called_exact():
+    adjacency = _random_graph(300, 0.9, 5)
+    clique = maximum_clique(pack(adjacency), node_limit=50)
+    assert not clique.exact
+    assert len(clique) > 20
+    assert _is_clique(adjacency, clique.members)
+    again = maximum_clique(pack(adjacency), node_limit=50)
+    assert clique.members.tolist() == again.members.tolist()
+
+
+def test_empty_edgeless_and_malformed_graphs():
+    assert len(maximum_clique(np.zeros((0, 0), np.uint64))) == 0
+    assert len(maximum_clique(np.zeros((5, 1), np.uint64))) == 1
+    with pytest.raises(InputError, match="bit rows"):
+        maximum_clique(np.zeros((100, 1), np.uint64))
+    with pytest.raises(InputError, match="uint64"):
+        maximum_clique(np.zeros((5, 1), np.int32))
+
+
+def test_self_loops_are_ignored():
+    adjacency = np.eye(10, dtype=bool)
+    assert len(maximum_clique(pack(adjacency))) == 1
+
+
+def test_pack_round_trip():
+    adjacency = _random_graph(70, 0.3, 6)
+    assert np.array_equal(unpack(pack(adjacency)), adjacency)
