@@ -1,0 +1,90 @@
+"""How alike two pictures are: PSNR, SSIM, LPIPS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import InputError, MissingDependencyError, NotFoundError
+
+_SSIM_SIGMA_PX = 1.5
+_SSIM_RADIUS_PX = 5
+
+
+def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of images (H, W, 3) with values in [0, 1]; infinite where they are equal."""
+    image, reference = _pair(image, reference)
+    error = np.mean((image - reference) ** 2)
+    return float(-10 * np.log10(error)) if error > 0 else float("inf")
+
+
+def ssim(image: np.ndarray, reference: np.ndarray) -> float:
+    """Structural similarity of images (H, W, 3) with values in [0, 1], mean over channels and pixels.
+
+    Wang et al. 2004: an 11 x 11 Gaussian window of 1.5 px, K1 = 0.01, K2 = 0.03, only where the window fits.
+
+    Raises:
+        InputError: images smaller than the window.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    image, reference = _pair(image, reference)
+    if min(image.shape[:2]) <= 2 * _SSIM_RADIUS_PX:
+        raise InputError(f"SSIM needs images of at least 11 x 11 pixels, got {image.shape[1]} x {image.shape[0]}")
+
+    def blur(values: np.ndarray) -> np.ndarray:
+        r = _SSIM_RADIUS_PX
+        return gaussian_filter(values, (_SSIM_SIGMA_PX, _SSIM_SIGMA_PX, 0), radius=(r, r, 0))[r:-r, r:-r]
+
+    mean_a, mean_b = blur(image), blur(reference)
+    variance_a = blur(image * image) - mean_a * mean_a
+    variance_b = blur(reference * reference) - mean_b * mean_b
+    covariance = blur(image * reference) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    likeness = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return float(np.mean(likeness / ((mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2))))
+
+
+class Lpips:
+    """Learned perceptual distance (Zhang et al. 2018) by a network the user supplies; 0 is alike.
+
+    Args:
+        path: an ONNX file with two image inputs (1, 3, H, W), RGB in [-1, 1], whose first output is the distance.
+
+    Raises:
+        MissingDependencyError: no file was given (its weights are not ours to ship), or onnxruntime is missing.
+        NotFoundError: there is no such file.
+        InputError: the file is no such network.
+    """
+
+    def __init__(self, path: str | Path | None) -> None:
+        if path is None:
+            raise MissingDependencyError(
+                "LPIPS needs network weights that gsmap does not ship: pass lpips.LPIPS exported to ONNX"
+            )
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise MissingDependencyError("LPIPS needs onnxruntime: pip install onnxruntime") from error
+        if not Path(path).is_file():
+            raise NotFoundError(f"no LPIPS network at {path}")
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        except Exception as error:
+            raise InputError(f"{path} is not an ONNX network: {str(error).splitlines()[0]}") from error
+        self._inputs = [i.name for i in self._session.get_inputs()]
+        if len(self._inputs) != 2:
+            raise InputError(f"{path} takes {len(self._inputs)} inputs, an LPIPS network takes two images")
+
+    def __call__(self, image: np.ndarray, reference: np.ndarray) -> float:
+        """Distance of images (H, W, 3) with values in [0, 1]."""
+        pair = [np.ascontiguousarray(v.transpose(2, 0, 1)[None] * 2 - 1, np.float32) for v in _pair(image, reference)]
+        return float(np.mean(self._session.run(None, dict(zip(self._inputs, pair, strict=True)))[0]))
+
+
+def _pair(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    image, reference = (np.clip(np.asarray(v, dtype=np.float64), 0, 1) for v in (image, reference))
+    if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise InputError(f"images to compare must both be (H, W, 3), got {image.shape} and {reference.shape}")
+    return image, reference
