@@ -33,7 +33,7 @@ if [ -z "$python" ] || ! "$python" -c 'import os, sysconfig, sys
 sys.exit(not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")))'; then
     packages="$packages python3-dev"
 fi
-for pair in libGL.so.1:libgl1 libgomp.so.1:libgomp1 libusb-1.0.so.0:libusb-1.0-0; do
+for pair in libGL.so.1:libgl1 libEGL.so.1:libegl1 libgomp.so.1:libgomp1 libusb-1.0.so.0:libusb-1.0-0; do
     # A library the loader knows is installed, whatever package it came from.
     PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | grep -q "${pair%%:*}" || packages="$packages ${pair##*:}"
 done

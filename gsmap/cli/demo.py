@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from gsmap.cli.console import print_table, progress_bars, say
+
 
 def command(
-    folder: Annotated[
-        str, typer.Argument(metavar="[DIR]", help="Where to work; made if it is missing.")
-    ] = "gsmap-demo",
+    folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Where to work; made if missing.")] = "gsmap-demo",
     seed: Annotated[int, typer.Option("--seed", help="Another flat, other walks through it.")] = 0,
 ) -> None:
     """Make three small captures of a furnished flat, map them, and show how close the map comes to the truth.
 
     Example: `gsmap demo`
     """
-    raise NotImplementedError
+    import gsmap.map
+    from gsmap import demo
+    from gsmap.cli.update import print_map
+
+    root = Path(folder)
+    map_path = root / "demo.gsmap"
+    with progress_bars() as progress:
+        captures = demo.make_captures(seed, progress=lambda f, text: progress("capture", f, text))
+        demo.write_captures(root / "captures", captures)
+        with gsmap.map.open_or_create(map_path, progress=progress) as m:
+            m.update(root / "captures")
+            report = m.export(root / "tiles", tile_size_m=0)
+            m.draw_map(root / "map.png")
+    with gsmap.open(map_path) as m:
+        print_map(m)
+        truth = m.evaluate(root / "captures" / "truth")
+    print_table("against the truth", list(truth["pairs"][0]), [list(row.values()) for row in truth["pairs"]])
+    for tile in report.tiles:
+        say(f"merged tile: {root / 'tiles' / tile.path} ({tile.num_gaussians} Gaussians; any 3DGS viewer opens it)")
+    say(f"picture: {root / 'map.png'}")
+    say(f"look around: gsmap view {map_path}")

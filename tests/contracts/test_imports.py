@@ -25,6 +25,7 @@ MAY_IMPORT = {
     **dict.fromkeys(STAGES, BASE | TOOLS),
     "demo": BASE | TOOLS,
     "view": BASE | TOOLS,
+    "__main__": {"cli"},
     "map": BASE | TOOLS | STAGES | {"store", "view"},
     "cli": BASE | TOOLS | STAGES | {"store", "view", "map", "demo"},
 }

@@ -1,0 +1,51 @@
+"""The command line is a contract: every verb explains itself, errors are one line, exit codes are 0, 1 and 2."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsmap.cli.app import VERBS
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+def gsmap(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "gsmap", *arguments], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_shows_an_example(verb: str) -> None:
+    done = gsmap(verb, *(["add"] if verb == "models" else []), "--help")
+    assert done.returncode == 0, done.stderr
+    assert f"gsmap {verb}" in done.stdout.split("Example:")[1]
+
+
+def test_readme_names_every_verb() -> None:
+    text = README.read_text()
+    assert [verb for verb in VERBS if f"gsmap {verb}" not in text] == []
+
+
+@pytest.mark.parametrize("arguments", [["nonsense"], ["export"], ["list", "a.gsmap", "nonsense"], ["init"]])
+def test_wrong_usage_is_2(arguments: list[str]) -> None:
+    done = gsmap(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+
+
+def test_failures_are_one_line_and_1(tmp_path: Path) -> None:
+    for arguments in (
+        ["list", str(tmp_path / "missing.gsmap"), "scenes"],
+        ["list", str(tmp_path), "scenes"],
+        ["ingest", str(tmp_path / "missing.gsmap"), "a.ply"],
+        ["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz")],
+    ):
+        done = gsmap(*arguments)
+        assert done.returncode == 1, (arguments, done.stderr)
+        assert done.stdout == ""
+        assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+        assert str(tmp_path) in done.stderr
