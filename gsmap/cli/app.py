@@ -6,11 +6,9 @@ Exit codes: 0 ok, 1 failed, 2 wrong usage.
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 
 import typer
-from click.exceptions import Abort, ClickException, Exit
 
 import gsmap
 from gsmap.errors import ConfigError, GsmapError
@@ -74,34 +72,15 @@ def build() -> typer.Typer:
 
 
 def run() -> None:
-    """Run the command line and exit with its code."""
+    """Run the command line and exit with its code. typer itself exits with 2 on wrong usage."""
     try:
-        result = build()(standalone_mode=False)
-        code = result if isinstance(result, int) else 0
-    except Exit as leave:
-        code = leave.exit_code
-    except Abort:
-        print("gsmap: interrupted; the map is as it was after the last finished step", file=sys.stderr)
-        code = 130
-    except ClickException as error:
-        error.show(sys.stderr)
-        code = 2
+        build()()
     except ConfigError as error:
-        print(f"gsmap: {error}", file=sys.stderr)
-        code = 2
+        code, message = 2, str(error)
     except GsmapError as error:
-        print(f"gsmap: {error}", file=sys.stderr)
-        code = 1
-    except BrokenPipeError:
-        # Whoever read our output has left (`gsmap list ... | head`): not an error of ours.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
-    except KeyboardInterrupt:
-        print("gsmap: interrupted; the map is as it was after the last finished step", file=sys.stderr)
-        code = 130
+        code, message = 1, str(error)
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
-        print(f"gsmap: the system refused{where}: {error.strerror or error}", file=sys.stderr)
-        code = 1
-    sys.stdout.flush()
+        code, message = 1, f"the system refused{where}: {error.strerror or error}"
+    print(f"gsmap: {message}", file=sys.stderr)
     sys.exit(code)
