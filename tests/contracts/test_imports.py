@@ -26,7 +26,8 @@ MAY_IMPORT = {
     "demo": BASE | TOOLS,
     "view": BASE | TOOLS,
     "__main__": {"cli"},
-    "map": BASE | TOOLS | STAGES | {"store", "view"},
+    "engine": BASE,
+    "map": BASE | TOOLS | STAGES | {"store", "view", "engine"},
     "cli": BASE | TOOLS | STAGES | {"store", "view", "map", "demo"},
 }
 HOMES = {
