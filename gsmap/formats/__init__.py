@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 from gsmap.errors import InputError, NotFoundError
-from gsmap.types import Gaussians
+from gsmap.types import Cameras, Gaussians
 
 # Suffix -> module of this package. The longest suffix wins, so `.compressed.ply` goes before `.ply`.
 MODULES: dict[str, str] = {
@@ -82,6 +82,13 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object)
     finally:
         with contextlib.suppress(OSError):
             staged.unlink(missing_ok=True)
+
+
+def read_cameras(path: str | os.PathLike[str]) -> Cameras:
+    """Cameras of a ``cameras.json``, ``transforms.json`` or COLMAP folder; see `gsmap.formats.cameras.read`."""
+    from gsmap.formats import cameras
+
+    return cameras.read(path)
 
 
 def known(verb: str) -> list[str]:

@@ -1,0 +1,61 @@
+"""Cameras, in whichever of the usual ways they lie on disk."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from gsmap.errors import GsmapError, InputError, NotFoundError
+from gsmap.types import Cameras
+
+
+def read(path: str | os.PathLike[str]) -> Cameras:
+    """Read a ``cameras.json`` (INRIA), a ``transforms.json`` (nerfstudio, instant-ngp), or a COLMAP model folder.
+
+    A folder may be the model itself, or hold ``sparse/0``, ``sparse`` or ``transforms.json``. A file
+    ``dataparser_transforms.json`` beside ``transforms.json`` is applied. Frames: the Gaussians' own.
+
+    Raises:
+        NotFoundError: no such file or folder.
+        InputError: neither of the three, or damaged.
+    """
+    from gsmap.formats import cameras_json, colmap, nerfstudio
+
+    path = Path(path)
+    try:
+        if path.is_dir():
+            model = colmap.find_model(path)
+            if model is not None:
+                return colmap.read(model)
+            if not (path / "transforms.json").is_file():
+                raise InputError(f"{path} holds no cameras: no COLMAP model (cameras.bin/.txt) and no transforms.json")
+            path = path / "transforms.json"
+        content = load_json(path)
+        return cameras_json.parse(content, path) if isinstance(content, list) else nerfstudio.parse(content, path)
+    except OSError as error:
+        raise InputError(f"cannot read cameras from {path}: {error.strerror or error}") from error
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        if isinstance(error, GsmapError) and str(path) in str(error):
+            raise
+        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{path} does not hold cameras: {what}") from error
+
+
+def load_json(path: Path) -> object:
+    if not path.exists():
+        raise NotFoundError(f"cannot read cameras from {path}: no such file")
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not JSON: {error}") from error
+
+
+def unique(names: list[str]) -> tuple[str, ...]:
+    """The names, with ``#2`` and so on where one comes again."""
+    seen: dict[str, int] = {}
+    out = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        out.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
+    return tuple(out)

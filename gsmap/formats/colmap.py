@@ -1,0 +1,120 @@
+"""COLMAP models: ``cameras`` and ``images``, text or binary; ``points3D``, ``rigs`` and ``frames`` are not needed.
+
+pycolmap knows the camera models; the two files are walked here, because its readers hang on a truncated one.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.formats.cameras import unique
+from gsmap.types import Cameras
+
+_PLACES = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder with the model's files: the folder itself, ``sparse/0`` or ``sparse``; None where there is none."""
+    for place in _PLACES:
+        for suffix in ("bin", "txt"):
+            if all((folder / place / f"{name}.{suffix}").is_file() for name in ("cameras", "images")):
+                return folder / place
+    return None
+
+
+def read(folder: str | os.PathLike[str]) -> Cameras:
+    """Read the images of a model, sorted by name; poses are in COLMAP's world frame.
+
+    Distortion is left out: splats are trained on undistorted images.
+
+    Raises:
+        InputError: damaged, or without images.
+    """
+    from scipy.spatial.transform import Rotation
+
+    folder = Path(folder)
+    binary = (folder / "images.bin").is_file() and (folder / "cameras.bin").is_file()
+    try:
+        if binary:
+            calibrations = dict(_binary_cameras((folder / "cameras.bin").read_bytes()))
+            images = sorted(_binary_images((folder / "images.bin").read_bytes()))
+        else:
+            calibrations = dict(_text_cameras((folder / "cameras.txt").read_text(errors="replace")))
+            images = sorted(_text_images((folder / "images.txt").read_text(errors="replace")))
+        if not images:
+            raise InputError(f"{folder} holds no cameras: its list of images is empty")
+        names = unique([name for name, _, _ in images])
+        quats, translations = np.split(np.array([pose for _, pose, _ in images]), [4], axis=1)
+        R_frame_camera = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).inv().as_matrix()
+        chosen = np.array([calibrations[camera] for _, _, camera in images])
+    except KeyError as error:
+        raise InputError(f"{folder}: an image names camera {error}, which the model does not have") from error
+    except (ValueError, RuntimeError, struct.error) as error:  # RuntimeError: pycolmap does not know the model
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{folder} is not a readable COLMAP model (truncated?): {error}") from error
+    pose = np.tile(np.eye(4), (len(images), 1, 1))
+    pose[:, :3, :3] = R_frame_camera
+    pose[:, :3, 3] = -np.einsum("cij,cj->ci", R_frame_camera, translations)
+    return Cameras(pose, chosen[:, :4], chosen[:, 4:].astype(np.int64), names)
+
+
+def _calibration(model: object, width: int, height: int, params: list[float]) -> tuple[float, ...]:
+    """``fx fy cx cy width height`` of any camera model."""
+    import pycolmap
+
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
+    if not camera.verify_params():
+        raise ValueError(f"{len(params)} parameters do not fit the camera model {camera.model_name}")
+    focal = camera.focal_length_x, camera.focal_length_y
+    return *focal, camera.principal_point_x, camera.principal_point_y, width, height
+
+
+def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[float, ...]]]:
+    import pycolmap
+
+    (count,) = struct.unpack_from("<Q", data)
+    offset = 8
+    for _ in range(count):
+        camera_id, model_id, width, height = struct.unpack_from("<IiQQ", data, offset)
+        model = pycolmap.CameraModelId(model_id)
+        num_params = len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
+        params = struct.unpack_from(f"<{num_params}d", data, offset + 24)
+        offset += 24 + 8 * num_params
+        yield camera_id, _calibration(model, width, height, list(params))
+
+
+def _binary_images(data: bytes) -> Iterator[tuple[str, tuple[float, ...], int]]:
+    (count,) = struct.unpack_from("<Q", data)
+    offset = 8
+    for _ in range(count):
+        _, *pose, camera_id = struct.unpack_from("<I7dI", data, offset)
+        end = data.index(b"\0", offset + 64)
+        (num_points,) = struct.unpack_from("<Q", data, end + 1)
+        yield data[offset + 64 : end].decode("utf-8", "replace"), tuple(pose), camera_id
+        offset = end + 9 + 24 * num_points
+        if offset > len(data):
+            raise ValueError(f"images.bin ends before its {count} images do")
+
+
+def _text_cameras(text: str) -> Iterator[tuple[int, tuple[float, ...]]]:
+    for line in text.splitlines():
+        if line.strip() and not line.startswith("#"):
+            camera_id, model, width, height, *params = line.split()
+            yield int(camera_id), _calibration(model, int(width), int(height), [float(p) for p in params])
+
+
+def _text_images(text: str) -> Iterator[tuple[str, tuple[float, ...], int]]:
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    while lines and not lines[0].strip():
+        lines.pop(0)
+    for line in lines[::2]:  # every second line lists 2D points, and may be empty
+        if line.strip():
+            _, *pose, camera_id, name = line.split(maxsplit=9)
+            yield name, tuple(float(v) for v in pose), int(camera_id)

@@ -1,0 +1,83 @@
+"""``transforms.json`` of nerfstudio and instant-ngp: camera-to-world poses in OpenGL axes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.formats.cameras import load_json, unique
+from gsmap.types import Cameras, Sim3
+
+DATAPARSER = "dataparser_transforms.json"
+
+
+def parse(content: dict, path: Path, dataparser: Path | None = None) -> Cameras:
+    """Cameras of a parsed file, moved into the frame the splats were trained in.
+
+    Args:
+        path: the file; image sizes and ``dataparser_transforms.json`` are looked up beside it.
+        dataparser: that file, where it lies elsewhere.
+
+    Nerfstudio trains in ``scale * (transform @ x)`` of the *original* coordinates, while the poses of
+    ``transforms.json`` already had ``applied_transform`` and ``applied_scale`` done to them: both are taken back first.
+    """
+    frames = content["frames"]
+    if not frames:
+        raise InputError(f"{path} holds no cameras: its list of frames is empty")
+    pose = np.array([f["transform_matrix"] for f in frames], np.float64)
+    if pose.shape[1:] == (3, 4):
+        pose = np.concatenate([pose, np.tile([[[0.0, 0, 0, 1]]], (len(pose), 1, 1))], axis=1)
+    pose[:, :3, 1:3] *= -1  # OpenGL (y up, z back) to OpenCV (y down, z forward)
+    pose[:, :3, :3] /= np.cbrt(np.linalg.det(pose[:, :3, :3]))[:, None, None]
+
+    beside = dataparser or path.parent / DATAPARSER
+    if beside.is_file():
+        change = load_json(beside)
+        S_train_saved = _rows_to_matrix(change["transform"])
+        if "applied_transform" in content:
+            S_train_saved = S_train_saved @ np.linalg.inv(_rows_to_matrix(content["applied_transform"]))
+        scale = float(change["scale"]) / float(content.get("applied_scale", 1.0))
+        S = Sim3.from_matrix(S_train_saved)
+        pose[:, :3, 3] = scale * S.apply(pose[:, :3, 3])
+        pose[:, :3, :3] = S.rotation @ pose[:, :3, :3]
+
+    intrinsics, sizes = zip(*(_intrinsics(content, f, path) for f in frames), strict=True)
+    names = unique([str(f.get("file_path", i)) for i, f in enumerate(frames)])
+    return Cameras(pose, np.array(intrinsics), np.array(sizes), names)
+
+
+def _rows_to_matrix(rows: list[list[float]]) -> np.ndarray:
+    out = np.eye(4)
+    out[:3] = np.array(rows, np.float64)[:3]
+    return out
+
+
+def _intrinsics(content: dict, frame: dict, path: Path) -> tuple[tuple[float, ...], tuple[int, int]]:
+    """Of one frame; each figure may stand in the frame or once for all."""
+    both = content | frame
+    width, height = (both.get("w"), both.get("h"))
+    if width is None or height is None:
+        width, height = _image_size(path.parent / both["file_path"], path)
+    fx, fy = both.get("fl_x"), both.get("fl_y")
+    if fx is None and "camera_angle_x" in both:
+        fx = 0.5 * width / math.tan(0.5 * both["camera_angle_x"])
+    if fy is None and "camera_angle_y" in both:
+        fy = 0.5 * height / math.tan(0.5 * both["camera_angle_y"])
+    fx = fy if fx is None else fx
+    if fx is None:
+        raise InputError(f"{path}: frame {frame.get('file_path')} has no focal length (fl_x or camera_angle_x)")
+    fy = fx if fy is None else fy
+    return (fx, fy, both.get("cx", width / 2), both.get("cy", height / 2)), (int(width), int(height))
+
+
+def _image_size(image: Path, path: Path) -> tuple[int, int]:
+    from PIL import Image
+
+    for candidate in (image, image.with_name(image.name + ".png")):
+        if candidate.is_file():
+            with Image.open(candidate) as opened:
+                return opened.size
+    raise InputError(f"{path} gives no image size (w, h) and {image} is not there to tell it")

@@ -1,0 +1,177 @@
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsmap.errors import InputError, NotFoundError
+from gsmap.formats import cameras_json, read_cameras
+from gsmap.types import Cameras
+
+FLIP = np.diag([1.0, -1, -1, 1])
+
+
+def some(n: int = 6) -> Cameras:
+    rng = np.random.default_rng(2)
+    pose = np.tile(np.eye(4), (n, 1, 1))
+    pose[:, :3, :3] = Rotation.random(n, random_state=3).as_matrix()
+    pose[:, :3, 3] = rng.normal(size=(n, 3))
+    intrinsics = np.tile([500.0, 510, 322, 238], (n, 1))
+    return Cameras(pose, intrinsics, np.tile([640, 480], (n, 1)), tuple(f"img_{i}.jpg" for i in range(n)))
+
+
+def assert_close(a: Cameras, b: Cameras, atol: float = 1e-9) -> None:
+    assert a.names == b.names
+    np.testing.assert_allclose(a.T_frame_camera, b.T_frame_camera, atol=atol)
+    np.testing.assert_allclose(a.intrinsics_px, b.intrinsics_px, atol=1e-9)
+    np.testing.assert_array_equal(a.sizes_px, b.sizes_px)
+
+
+def test_inria_round_trip(tmp_path):
+    cameras_json.write(tmp_path / "cameras.json", some())
+    assert_close(read_cameras(tmp_path / "cameras.json"), some())
+
+
+def test_inria_real(shared_data):
+    cameras = read_cameras(shared_data / "house" / "c0.cameras.json")
+    assert len(cameras) == 90
+    assert cameras.intrinsics_px[0].tolist() == [280, 280, 240, 180]
+
+
+def write_colmap(folder, cameras: Cameras, *, text: bool, model: str = "PINHOLE") -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    out = pycolmap.Reconstruction()
+    fx, fy, cx, cy = cameras.intrinsics_px[0]
+    params = {"PINHOLE": [fx, fy, cx, cy], "OPENCV": [fx, fy, cx, cy, 0.01, 0, 0, 0]}[model]
+    width, height = cameras.sizes_px[0].tolist()
+    camera = pycolmap.Camera(camera_id=7, model=model, width=width, height=height, params=params)
+    out.add_camera_with_trivial_rig(camera)
+    for i in reversed(range(len(cameras))):
+        image = pycolmap.Image(name=cameras.names[i], camera_id=7, image_id=i + 1)
+        out.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cameras.T_camera_frame[i, :3]))
+    folder.mkdir(parents=True)
+    out.write_text(str(folder)) if text else out.write_binary(str(folder))
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("files", [3, 5])
+def test_colmap(tmp_path, text, files):
+    folder = tmp_path / "sparse" / "0"
+    write_colmap(folder, some(), text=text, model="OPENCV" if text else "PINHOLE")
+    if files == 3:
+        for path in [*folder.glob("rigs.*"), *folder.glob("frames.*")]:
+            path.unlink()
+    for given in (folder, tmp_path, tmp_path / "sparse"):
+        assert_close(read_cameras(given), some(), 1e-6)
+
+
+def test_damaged_colmap_is_refused(tmp_path):
+    write_colmap(tmp_path / "whole", some(), text=False)
+    files = {n: (tmp_path / "whole" / n).read_bytes() for n in ("cameras.bin", "images.bin")}
+    cases = [(name, data[:size]) for name, data in files.items() for size in range(0, len(data), 7)]
+    cases += [("images.bin", b"\xff" * 64), ("cameras.bin", b"\x01" + b"\0" * 11 + b"\xff" * 100)]
+    cases += [("images.bin", b"\0" * 8), ("cameras.bin", b"\0" * 8)]
+    for i, (name, data) in enumerate(cases):
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        for other, content in files.items():
+            (folder / other).write_bytes(data if other == name else content)
+        with pytest.raises(InputError, match=str(folder)):
+            read_cameras(folder)
+
+
+@pytest.mark.parametrize(
+    "line", ["1 PINHOLE 640 480 500", "1 NONSENSE 640 480 1 2 3 4", "1 PINHOLE", "x PINHOLE 1 1 1"]
+)
+def test_damaged_colmap_text_is_refused(tmp_path, line):
+    write_colmap(tmp_path / "model", some(), text=True)
+    (tmp_path / "model" / "cameras.txt").write_text(line + "\n")
+    with pytest.raises(InputError, match="model"):
+        read_cameras(tmp_path / "model")
+
+
+def test_nerfstudio_opengl(tmp_path):
+    c = some()
+    frames = [
+        {"file_path": n, "transform_matrix": (p @ FLIP).tolist()}
+        for n, p in zip(c.names, c.T_frame_camera, strict=True)
+    ]
+    content = {"fl_x": 500, "fl_y": 510, "cx": 322, "cy": 238, "w": 640, "h": 480, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert_close(read_cameras(tmp_path / "transforms.json"), c)
+    assert_close(read_cameras(tmp_path), c)
+
+
+def test_nerfstudio_dataparser_frame(tmp_path):
+    """Original coordinates -> (applied) -> transforms.json -> (orient, scale) -> training frame."""
+    c = some()
+    rng = np.random.default_rng(5)
+    applied, orient = np.eye(4), np.eye(4)
+    applied[:3, :3], orient[:3, :3] = Rotation.random(2, random_state=1).as_matrix()
+    orient[:3, 3] = rng.normal(size=3)
+    scale, applied_scale = 0.37, 2.5
+    saved = np.linalg.inv(orient) @ c.T_frame_camera
+    saved[:, :3, 3] = (np.linalg.inv(orient) @ np.c_[c.centers / scale, np.ones(len(c))].T).T[:, :3]
+    frames = [
+        {"file_path": n, "transform_matrix": (p @ FLIP).tolist(), "w": 640, "h": 480, "fl_x": 500, "fl_y": 510}
+        | {"cx": 322, "cy": 238}
+        for n, p in zip(c.names, saved, strict=True)
+    ]
+    content = {"frames": frames, "applied_transform": applied[:3].tolist(), "applied_scale": applied_scale}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    change = {"transform": (orient @ applied)[:3].tolist(), "scale": scale * applied_scale}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(change))
+    assert_close(read_cameras(tmp_path / "transforms.json"), c)
+
+
+def test_blender_angle_and_image_size(tmp_path):
+    from PIL import Image
+
+    Image.new("RGB", (80, 60)).save(tmp_path / "r_0.png")
+    frames = [{"file_path": "./r_0", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": frames}))
+    cameras = read_cameras(tmp_path)
+    assert cameras.sizes_px[0].tolist() == [80, 60]
+    np.testing.assert_allclose(cameras.intrinsics_px[0], [40, 40, 40, 30])
+
+
+BAD = {
+    "not json": ("{", "not JSON"),
+    "deep": ("[" * 100_000, "not JSON"),
+    "empty list": ("[]", "empty"),
+    "number": ("3", "does not hold cameras"),
+    "no frames": ("{}", "lacks 'frames'"),
+    "empty frames": ('{"frames": []}', "empty"),
+    "strings": ('["a"]', "does not hold cameras"),
+    "lacks": ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]]}]', "lacks 'position'"),
+    "nan": (
+        '[{"rotation": [[1,0,0],[0,1,0],[0,0,NaN]], "position": [0,0,0], "width": 1, "height": 1, "fx": 1, "fy": 1}]',
+        "NaN",
+    ),
+    "mirrored": (
+        '[{"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "position": [0,0,0], "width": 1, "height": 1, "fx": 1, "fy": 1}]',
+        "rigid",
+    ),
+    "no focal": (
+        '{"w": 4, "h": 4, "frames": [{"file_path": "a", "transform_matrix": '
+        "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}",
+        "focal",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files(tmp_path, case):
+    text, message = BAD[case]
+    (tmp_path / "c.json").write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_cameras(tmp_path / "c.json")
+    assert "c.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing(tmp_path):
+    with pytest.raises(NotFoundError):
+        read_cameras(tmp_path / "none.json")
+    with pytest.raises(InputError, match="no COLMAP model"):
+        read_cameras(tmp_path)
