@@ -1,0 +1,15 @@
+"""Tiles of a map on disk: which there are, which must be made again, and writing them safely.
+
+Pure but for the output folder: what a tile holds comes from a callable, so nothing here knows the store or a merger::
+
+    plan = plan_tiles(poses, scene_bounds, tile_size_m=10.0, components=components, reach_m=gsmap.merge.reach_m(method))
+    result = export_tiles(plan, make, out, map_id=map_id, method=text_of_method_and_params)
+
+where ``make(planned, progress)`` returns `gsmap.merge.tile.merge_tile` of the scenes in ``planned.poses`` within
+``planned.bounds``.
+"""
+
+from gsmap.export.plan import PlannedTile, dirty_reason, plan_tiles
+from gsmap.export.write import ExportResult, export_tiles
+
+__all__ = ["ExportResult", "PlannedTile", "dirty_reason", "export_tiles", "plan_tiles"]

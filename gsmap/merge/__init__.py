@@ -71,7 +71,6 @@ def merge(
         bounds = np.asarray(bounds, dtype=np.float64)
         if bounds.shape != (2, 3) or not (bounds[1] > bounds[0]).all():
             raise InputError(f"bounds must be a (2, 3) box with low < high on every axis, got {bounds.tolist()}")
-        parts = [_cropped(part, bounds, merger.reach_m(params)) for part in parts]
 
     # The result must not depend on the order of the parts.
     order = sorted(range(len(parts)), key=lambda i: parts[i].scene_id)
@@ -91,9 +90,3 @@ def _merger(method: str) -> ModuleType:
     if method not in methods():
         raise ConfigError(f"unknown merge method {method!r}: choose one of {', '.join(methods())}")
     return importlib.import_module(f"gsmap.merge.mergers.{method}")
-
-
-def _cropped(part: Part, bounds: np.ndarray, margin: float) -> Part:
-    # Whatever more a caller read, a tile's result depends on nothing beyond its reach.
-    keep = inside(part.gaussians.means, bounds, margin)
-    return part if keep.all() else replace(part, gaussians=part.gaussians[keep])

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+
+from gsmap.errors import ConfigError, InputError
+from gsmap.export import dirty_reason, plan_tiles
+from gsmap.geometry.rotations import exp_so3
+from gsmap.types import Sim3, Tile
+
+BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
+
+
+def at(x, y=0.0, z=0.0, turn_rad=0.0, scale=1.0):
+    return Sim3(exp_so3([0, 0, turn_rad]), [x, y, z], scale)
+
+
+def tile_of(planned, method="voxel"):
+    return Tile(planned.key(method), planned.component, planned.bounds, planned.poses)
+
+
+def test_tiles_cover_every_point_of_every_scene_exactly_once():
+    rng = np.random.default_rng(0)
+    poses = {f"s{i}": at(*rng.uniform(-6, 6, 3), turn_rad=rng.uniform(0, 6), scale=1.5) for i in range(4)}
+    tiles = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=2.0)
+    for pose in poses.values():
+        points = pose.apply(rng.uniform(-1, 1, (500, 3)))
+        holds = [((points >= t.bounds[0]) & (points < t.bounds[1])).all(1) for t in tiles]
+        np.testing.assert_array_equal(np.sum(holds, axis=0), 1)
+
+
+def test_a_tile_names_the_scenes_that_reach_into_it_and_none_far_away():
+    poses = {"a": at(0), "b": at(1.5), "c": at(40)}
+    tiles = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=4.0)
+    named = {t.name: set(t.poses) for t in tiles}
+    assert named["tile_+000_+000_+000"] == {"a", "b"}
+    assert named["tile_+010_+000_+000"] == {"c"}
+    assert set(named["tile_-001_+000_+000"]) == {"a"}
+    reaching = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=4.0, reach_m=1.0)
+    assert {t.name: set(t.poses) for t in reaching}["tile_-001_+000_+000"] == {"a", "b"}
+
+
+def test_an_oriented_box_leaves_out_corners_it_does_not_reach():
+    # A thin plank along the diagonal: the box around it would fill the whole square.
+    poses = {"a": at(5, 5, 0, turn_rad=np.pi / 4)}
+    bounds = {"a": np.array([[-6, -0.1, -0.4], [6, 0.1, 0.4]])}
+    names = {t.name for t in plan_tiles(poses, bounds, tile_size_m=1.0)}
+    assert "tile_+005_+005_+000" in names
+    assert "tile_+001_+008_+000" not in names
+
+
+def test_islands_are_planned_apart():
+    poses = {"a": at(0), "b": at(0)}
+    tiles = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=0, components={"a": 0, "b": 3})
+    assert [(t.component, t.name, list(t.poses)) for t in tiles] == [(0, "map", ["a"]), (3, "map", ["b"])]
+
+
+def test_a_box_cuts_tiles_and_must_touch_the_map():
+    poses = {"a": at(0)}
+    box = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
+    tiles = plan_tiles(poses, {"a": BOX}, tile_size_m=4.0, bbox=box)
+    assert len(tiles) == 8
+    assert sum(np.prod(t.bounds[1] - t.bounds[0]) for t in tiles) == pytest.approx(1.0)
+    with pytest.raises(InputError, match="outside the map"):
+        plan_tiles(poses, {"a": BOX}, tile_size_m=4.0, bbox=box + 50)
+    with pytest.raises(InputError, match="empty"):
+        plan_tiles(poses, {"a": BOX}, tile_size_m=4.0, bbox=box[::-1])
+    with pytest.raises(InputError, match="no scene"):
+        plan_tiles({}, {}, tile_size_m=4.0)
+    with pytest.raises(ConfigError, match="tile size"):
+        plan_tiles(poses, {"a": BOX}, tile_size_m=-1)
+    with pytest.raises(ConfigError, match="larger tiles"):
+        plan_tiles(poses, {"a": BOX}, tile_size_m=1e-4)
+
+
+def test_a_tile_is_dirty_for_content_method_or_pose_but_not_for_a_hair():
+    poses, bounds = {"a": at(0), "b": at(1)}, dict.fromkeys("abc", BOX)
+    (planned,) = plan_tiles(poses, bounds, tile_size_m=0)
+    tile = tile_of(planned)
+    assert dirty_reason(planned, None, "voxel") == "new"
+    assert dirty_reason(planned, tile, "voxel") == ""
+    assert "method" in dirty_reason(planned, tile, "union")
+    (grown,) = plan_tiles({**poses, "c": at(2)}, bounds, tile_size_m=0)
+    assert "scenes" in dirty_reason(grown, tile, "voxel")
+    (hair,) = plan_tiles({**poses, "b": at(1.003)}, bounds, tile_size_m=0)
+    assert dirty_reason(hair, tile, "voxel") == ""
+    (moved,) = plan_tiles({**poses, "b": at(1.01)}, bounds, tile_size_m=0)
+    assert "moved" in dirty_reason(moved, tile, "voxel")
+    (turned,) = plan_tiles({**poses, "b": at(1, turn_rad=0.02)}, bounds, tile_size_m=0)
+    assert "moved" in dirty_reason(turned, tile, "voxel")
+
+
+def test_slow_drift_is_noticed_in_the_end():
+    bounds = {"a": BOX}
+    (first,) = plan_tiles({"a": at(0)}, bounds, tile_size_m=0)
+    tile = tile_of(first)
+    reasons = []
+    for x in np.arange(1, 5) * 0.002:
+        (now,) = plan_tiles({"a": at(x)}, bounds, tile_size_m=0)
+        reasons.append(dirty_reason(now, tile, "voxel"))
+    assert reasons[0] == reasons[1] == ""
+    assert "moved" in reasons[-1]

@@ -1,0 +1,191 @@
+import errno
+import json
+
+import numpy as np
+import pytest
+
+from gsmap import formats
+from gsmap.errors import ConfigError, InputError, StoreError
+from gsmap.export import export_tiles, plan_tiles
+from gsmap.merge.tile import Source, merge_tile
+from gsmap.types import Gaussians, Sim3
+
+BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
+
+
+def cloud(seed, n=2000):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.uniform(-1, 1, (n, 3)),
+        rng.normal(size=(n, 4)),
+        rng.normal(-4, 0.3, size=(n, 3)),
+        rng.normal(size=n),
+        rng.normal(0, 0.3, size=(n, 1, 3)),
+    )
+
+
+class Street:
+    """Scenes a to e in a row, two metres apart; exports of them."""
+
+    def __init__(self, out):
+        self.out = out
+        self.scenes = {name: cloud(i) for i, name in enumerate("abcde")}
+        self.poses = {name: Sim3(np.eye(3), [2.0 * i, 0, 0]) for i, name in enumerate("abcde")}
+        self.made = []
+        self.fail_at = None
+
+    def export(self, scenes="abcd", map_id="street", method="voxel", **options):
+        plan = plan_tiles(
+            {s: self.poses[s] for s in scenes}, dict.fromkeys(scenes, BOX), tile_size_m=options.pop("tile_size_m", 4.0)
+        )
+        self.made = []
+
+        def make(planned, progress):
+            if len(self.made) == self.fail_at:
+                raise KeyboardInterrupt
+            self.made.append(planned.name)
+            sources = [Source(s, pose, lambda box, s=s: self.scenes[s]) for s, pose in planned.poses.items()]
+            return merge_tile(sources, method, bounds=planned.bounds, progress=progress)
+
+        return export_tiles(plan, make, self.out, map_id=map_id, method=method, **options)
+
+    def files(self):
+        return sorted(str(p.relative_to(self.out)) for p in self.out.rglob("*") if p.is_file())
+
+
+@pytest.fixture
+def street(tmp_path):
+    return Street(tmp_path / "out")
+
+
+def test_the_files_together_are_the_map(street):
+    result = street.export(method="union")
+    read = [formats.read(street.out / t.path) for t in result.tiles if t.path]
+    assert sum(len(g) for g in read) == 8000 == sum(t.num_gaussians for t in result.tiles)
+    assert street.files() == sorted(["tiles.json", *(t.path for t in result.tiles if t.path)])
+    content = json.loads((street.out / "tiles.json").read_text())
+    assert content["map_id"] == "street"
+    assert len(content["tiles"]) == len(result.tiles)
+
+
+def test_nothing_changed_means_nothing_done(street):
+    first = street.export()
+    before = {p: p.stat().st_mtime_ns for p in street.out.rglob("*")}
+    again = street.export()
+    assert street.made == []
+    assert (again.recomputed, again.reused) == (0, first.recomputed)
+    assert before == {p: p.stat().st_mtime_ns for p in street.out.rglob("*")}
+    assert [t.sha256 for t in again.tiles] == [t.sha256 for t in first.tiles]
+
+
+def test_a_new_capture_makes_only_the_tiles_it_touches(street):
+    street.export()
+    result = street.export("abcde")
+    assert 0 < result.recomputed < len(result.tiles)
+    assert all(t.bounds[1, 0] > 7 for t in result.tiles if "e" in t.poses)
+    assert {t.path.split("/")[-1][:-4] for t in result.tiles if "e" in t.poses and t.path} <= set(street.made)
+    assert all("e" in t.poses for t in result.tiles if t.path and t.path.split("/")[-1][:-4] in street.made)
+    assert result.reused == len(result.tiles) - result.recomputed
+
+
+def test_a_removed_capture_takes_its_tiles_along(street):
+    street.export("abcde")
+    result = street.export("ab")
+    assert result.removed > 0
+    assert street.files() == sorted(["tiles.json", *(t.path for t in result.tiles if t.path)])
+
+
+def test_a_moved_scene_dirties_its_tiles_and_a_lost_file_is_made_again(street):
+    first = street.export()
+    street.poses["a"] = Sim3(np.eye(3), [0.05, 0, 0])
+    moved = street.export()
+    assert 0 < moved.recomputed < len(first.tiles)
+    (street.out / moved.tiles[0].path).unlink()
+    assert street.export().recomputed == 1
+
+
+def test_an_interrupted_export_holds_whole_tiles_and_goes_on(street):
+    street.fail_at = 3
+    with pytest.raises(KeyboardInterrupt):
+        street.export()
+    whole = Street(street.out.parent / "whole").export()
+    sha256 = {t.path: t.sha256 for t in whole.tiles}
+    for file in street.files():
+        if file != "tiles.json":
+            formats.read(street.out / file)
+            assert file in sha256
+    street.fail_at = None
+    rest = street.export()
+    assert rest.reused == 3
+    assert {t.path: t.sha256 for t in rest.tiles} == sha256
+
+
+def test_a_full_disk_leaves_no_half_tile(street, monkeypatch):
+    written = []
+    real = formats.write
+
+    def full(path, gaussians):
+        if len(written) == 2:
+            path.write_bytes(b"half a tile")
+            raise InputError("cannot write") from OSError(errno.ENOSPC, "No space left on device")
+        written.append(path)
+        real(path, gaussians)
+
+    monkeypatch.setattr(formats, "write", full)
+    with pytest.raises(StoreError, match=r"No space left.*run the same export again"):
+        street.export()
+    monkeypatch.undo()
+    assert len(street.files()) == 3
+    assert not any("partial" in file for file in street.files())
+    assert street.export().reused == 2
+
+
+def test_workers_make_the_same_files(street):
+    one = street.export()
+    other = Street(street.out.parent / "threads").export(workers=3)
+    assert [(t.path, t.sha256) for t in one.tiles] == [(t.path, t.sha256) for t in other.tiles]
+
+
+def test_one_file_and_another_format_replace_what_was_there(street):
+    street.export()
+    result = street.export(tile_size_m=0)
+    assert street.files() == ["component_0/map.ply", "tiles.json"]
+    assert (result.recomputed, result.reused) == (1, 0)
+
+
+def test_progress_ends_at_one(street):
+    seen = []
+    street.export(progress=lambda fraction, text: seen.append((fraction, text)))
+    fractions = [f for f, _ in seen]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert "of" in seen[-1][1]
+
+
+def test_folders_of_others_are_left_alone(street):
+    street.export()
+    with pytest.raises(ConfigError, match="another map"):
+        street.export(map_id="elsewhere")
+    (street.out / "tiles.json").write_text("{")
+    with pytest.raises(InputError, match="manifest"):
+        street.export()
+    (street.out / "tiles.json").unlink()
+    with pytest.raises(ConfigError, match="holds files"):
+        street.export()
+    assert len(street.files()) > 1
+    file = street.out.parent / "file"
+    file.write_text("mine")
+    with pytest.raises(ConfigError, match="is a file"):
+        Street(file).export()
+    assert file.read_text() == "mine"
+
+
+def test_bad_options_are_refused_before_anything_is_written(street):
+    with pytest.raises(ConfigError, match="choose one of"):
+        street.export(format="obj")
+    with pytest.raises(ConfigError, match="worker"):
+        street.export(workers=0)
+    assert not street.out.exists()
+    (street.out.parent / "file").write_text("mine")
+    with pytest.raises(StoreError, match="cannot write the export"):
+        Street(street.out.parent / "file" / "out").export()
