@@ -1,0 +1,111 @@
+"""Reading one capture: Gaussians, cameras, and everything said about them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from gsmap import formats
+from gsmap.errors import ConfigError
+from gsmap.ingest.find import Found, find_captures
+from gsmap.ingest.synthesise import synthesise_cameras
+from gsmap.ingest.validate import validate
+from gsmap.types import Cameras, Gaussians
+from gsmap.types.scene import SCALE_POLICIES
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One capture, read and checked, ready for the store.
+
+    Args:
+        gaussians, cameras: in the capture's own frame; ``cameras.synthesised`` where the source had none.
+        name: from the file or folder, or as given.
+        source: the file it was read from.
+        captured_at: ISO 8601 with zone, or None.
+        scale_policy: ``auto``, ``known`` or ``unknown``.
+        antialiased: trained with the 2D Mip filter.
+        notes: what a person should know.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    name: str
+    source: str = ""
+    captured_at: str | None = None
+    scale_policy: str = "auto"
+    antialiased: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def read_captures(
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    *,
+    cameras: str | os.PathLike[str] | None = None,
+    name: str | None = None,
+    captured_at: str | datetime | None = None,
+    scale_policy: str = "auto",
+    progress: Progress | None = None,
+) -> list[Capture]:
+    """Read every capture in files and folders. For many large ones loop over `find_captures` and `read_capture`.
+
+    Args:
+        cameras, name: for a single capture only.
+        captured_at: ISO 8601; UTC where it has no zone.
+
+    Raises:
+        NotFoundError: no such file or folder.
+        InputError: what cannot be read or makes no capture; see `gsmap.ingest.validate`.
+        ConfigError: options that make no sense together.
+    """
+    found = find_captures([paths] if isinstance(paths, (str, os.PathLike)) else paths)
+    if len(found) > 1 and (cameras is not None or name is not None):
+        raise ConfigError(f"cameras and name are for one capture, but {len(found)} were found: ingest them one by one")
+    out = []
+    for i, one in enumerate(found):
+        if progress:
+            progress(i / len(found), one.name)
+        out.append(read_capture(one, cameras=cameras, name=name, captured_at=captured_at, scale_policy=scale_policy))
+    return out
+
+
+def read_capture(
+    found: Found,
+    *,
+    cameras: str | os.PathLike[str] | None = None,
+    name: str | None = None,
+    captured_at: str | datetime | None = None,
+    scale_policy: str = "auto",
+) -> Capture:
+    """Read and check one capture that `find_captures` found; see `read_captures`."""
+    if scale_policy not in SCALE_POLICIES:
+        raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
+    when = _iso(captured_at)
+    gaussians = formats.read(found.path)
+    about = formats.info(found.path)
+    notes = list(about.notes) + ([found.note] if found.note else [])
+    where = str(found.path)
+    notes += validate(gaussians, where=where)
+    source = Path(cameras) if cameras is not None else found.cameras
+    if source is None:
+        views = synthesise_cameras(gaussians)
+        notes.append(f"no cameras were found beside it: {len(views)} were synthesised in its free space")
+    else:
+        views = formats.read_cameras(source)
+        notes += validate(gaussians, views, where=f"{where} with {source}")
+    return Capture(gaussians, views, name or found.name, where, when, scale_policy, about.antialiased, tuple(notes))
+
+
+def _iso(when: str | datetime | None) -> str | None:
+    if when is None:
+        return None
+    try:
+        parsed = datetime.fromisoformat(when) if isinstance(when, str) else when
+    except ValueError as error:
+        raise ConfigError(f"captured-at must be ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}") from error
+    return (parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)).isoformat()

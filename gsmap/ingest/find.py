@@ -1,0 +1,134 @@
+"""Where the captures are: files, folders of files, and the output folders of trainers."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmap import formats
+from gsmap.errors import InputError, NotFoundError
+from gsmap.formats import colmap
+
+MAX_DEPTH = 5
+# What a trainer calls every one of its files, so the folder tells more.
+_GENERIC = re.compile(r"(point_cloud|splat|scene|gaussians|model|output|export|meta)([_-]?\d+)?", re.IGNORECASE)
+_GENERIC_FOLDER = re.compile(r"(iteration_\d+|point_cloud|ply|exports?|splat|outputs?|results?)", re.IGNORECASE)
+_PICKLED = (".pt", ".pth", ".ckpt")
+
+
+@dataclass(frozen=True)
+class Found:
+    """One capture on disk.
+
+    Args:
+        path: the file of Gaussians.
+        cameras: the file or folder of its cameras, or None.
+        name: from the file, or from the folder where the file is called as every other.
+        note: why cameras that lie near were not taken; else empty.
+    """
+
+    path: Path
+    cameras: Path | None
+    name: str
+    note: str = ""
+
+
+def find_captures(paths: Iterable[str | os.PathLike[str]]) -> list[Found]:
+    """All captures in files and folders, in the order given; a folder's in the order of their names.
+
+    A folder is the output of gaussian-splatting (its last iteration is taken), of gsplat (the last ``.ply``), or of
+    nerfstudio, or it holds files and folders of captures.
+
+    Raises:
+        NotFoundError: no such file or folder.
+        InputError: an unknown suffix, or a folder without captures.
+    """
+    out: list[Found] = []
+    for path in map(Path, paths):
+        if not path.exists():
+            raise NotFoundError(f"no such file or folder: {path}")
+        if not path.is_dir():
+            out.append(_file(path, alone=len(_splats(path.parent)) <= 1))
+            continue
+        found = _folder(path.resolve() if path.name in ("", "..") else path, MAX_DEPTH)
+        if not found:
+            raise InputError(f"{path} holds no captures: {_why_none(path)}")
+        out.extend(found)
+    return out
+
+
+def _folder(folder: Path, depth: int) -> list[Found]:
+    trained = _last(folder.glob("point_cloud/iteration_*/point_cloud.*")) or _last(folder.glob("ply/point_cloud_*.*"))
+    if trained is not None:
+        return [_file(trained, alone=True)]
+    files = _splats(folder)
+    out = [_file(path, alone=len(files) == 1) for path in files]
+    if depth > 0:
+        for child in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
+            out.extend(_folder(child, depth - 1))
+    return out
+
+
+def _splats(folder: Path) -> list[Path]:
+    """Files with a suffix that can be read; not the SfM points that trainers leave as ``input.ply``."""
+    return sorted(p for p in folder.iterdir() if p.is_file() and _readable(p) and p.name != "input.ply")
+
+
+def _readable(path: Path) -> bool:
+    return formats.suffix_of(path) is not None and not path.name.startswith(".")
+
+
+def _last(paths: Iterable[Path]) -> Path | None:
+    """The one with the highest number in its path's last two parts (``iteration_30000``)."""
+    numbered = [(int(m[-1]), p) for p in paths if _readable(p) and (m := re.findall(r"\d+", "/".join(p.parts[-2:])))]
+    return max(numbered, default=(0, None))[1]
+
+
+def _file(path: Path, *, alone: bool) -> Found:
+    suffix = formats.suffix_of(path)
+    if suffix is None:
+        if path.suffix.lower() in _PICKLED:
+            raise InputError(f"{path} is a pickled checkpoint, which can run code: export a .ply and ingest that")
+        raise InputError(
+            f"{path} has the unknown suffix {path.suffix!r}: gsmap can read {', '.join(formats.known('read'))}"
+        )
+    stem = path.name[: -len(suffix)]
+    name, folder = stem, path.resolve().parent
+    while _GENERIC.fullmatch(name) or _GENERIC_FOLDER.fullmatch(name):
+        if not folder.name:
+            name = stem
+            break
+        name, folder = folder.name, folder.parent
+    own = path.with_name(f"{stem}.cameras.json")
+    if own.is_file():
+        return Found(path, own, name)
+    shared = _shared_cameras(path)
+    if shared is None or alone:
+        return Found(path, shared, name)
+    note = f"{shared.name} was not taken: several captures lie beside it (call it {own.name}, or pass --cameras)"
+    return Found(path, None, name, note)
+
+
+def _shared_cameras(path: Path) -> Path | None:
+    """Cameras beside the file; above it only in gaussian-splatting's ``point_cloud/iteration_N``."""
+    folder = path.resolve().parent
+    places = [folder]
+    if re.fullmatch(r"iteration_\d+", folder.name) and folder.parent.name == "point_cloud":
+        places.append(folder.parent.parent)
+    for place in places:
+        for name in ("cameras.json", "transforms.json"):
+            if (place / name).is_file():
+                return place / name
+        model = colmap.find_model(place)
+        if model is not None:
+            return model
+    return None
+
+
+def _why_none(folder: Path) -> str:
+    if any(p.suffix in _PICKLED for p in folder.rglob("*")):
+        return "its checkpoints are pickles, which can run code; export a .ply and ingest that"
+    return f"no file of it ends with {', '.join(formats.known('read'))}"
