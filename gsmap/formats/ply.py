@@ -7,6 +7,7 @@ abort the process on a malformed header, or allocate whatever it claims.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,16 +127,26 @@ def info(path: str | os.PathLike[str]) -> Info:
     return Info(antialiased, tuple(notes))
 
 
-def write(path: str | os.PathLike[str], gaussians: Gaussians, *, antialiased: bool = False) -> None:
+def write(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    antialiased: bool = False,
+    extra: Mapping[str, np.ndarray] | None = None,
+) -> None:
     """Write the INRIA layout (float32, little endian, normals of zero, quaternions as they are).
 
     Args:
         antialiased: note in a comment that it was trained with the 2D Mip filter.
+        extra: further float properties by name, (N,) each, such as the index of the capture each came from.
     """
+    extra = dict(extra or {})
     k = gaussians.sh.shape[1]
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    inria = len(names)
+    names += list(extra)
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += ["comment SplatRenderMode: mip"] if antialiased else []
     lines += [f"element vertex {len(gaussians)}", *(f"property float {n}" for n in names), "end_header", ""]
@@ -146,10 +157,12 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, antialiased: bo
             rows = np.zeros((len(g), len(names)), "<f4")
             rows[:, 0:3] = g.means
             rows[:, 6:9] = g.sh[:, 0]
-            rows[:, 9:-8] = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)
-            rows[:, -8] = g.logit_opacities
-            rows[:, -7:-4] = g.log_scales
-            rows[:, -4:] = g.quats
+            rows[:, 9 : inria - 8] = g.sh[:, 1:].transpose(0, 2, 1).reshape(len(g), -1)
+            rows[:, inria - 8] = g.logit_opacities
+            rows[:, inria - 7 : inria - 4] = g.log_scales
+            rows[:, inria - 4 : inria] = g.quats
+            for column, values in enumerate(extra.values(), start=inria):
+                rows[:, column] = values[start : start + len(g)]
             file.write(rows.data)
 
 

@@ -217,3 +217,17 @@ def test_real_capture(shared_data):
     assert len(g) == 152_000
     assert g.sh_degree == 1
     assert np.isfinite(g.means).all()
+
+
+def test_further_properties_ride_along_and_are_skipped_when_read(tmp_path):
+    n = 5
+    gaussians = Gaussians(
+        np.zeros((n, 3)), np.tile([1, 0, 0, 0], (n, 1)), np.zeros((n, 3)), np.arange(n), np.ones((n, 4, 3))
+    )
+    write(tmp_path / "a.ply", gaussians, extra={"scene": np.arange(n) % 2})
+    back = read(tmp_path / "a.ply")
+    np.testing.assert_array_equal(back.logit_opacities, gaussians.logit_opacities)
+    content = (tmp_path / "a.ply").read_bytes()
+    header, body = content.split(b"end_header\n")
+    assert header.endswith(b"property float scene\n")
+    np.testing.assert_array_equal(np.frombuffer(body, "<f4").reshape(n, -1)[:, -1], np.arange(n) % 2)
