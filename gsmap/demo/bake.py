@@ -16,6 +16,7 @@ from gsmap.demo.surfaces import Surfaces
 
 _LEVELS = 4
 _LIGHT_STEP_M = 0.15
+_TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,6 @@ def _rays_tensor(origins: np.ndarray, directions: np.ndarray):
 def bake(
     surfaces: Surfaces,
     *,
-    seed: int = 0,
     texel_m: float = 0.008,
     progress: Callable[[float, str], None] | None = None,
 ) -> Skin:
@@ -109,7 +109,7 @@ def bake(
     report(0.0, "painting surfaces")
     albedo = [_paint(surfaces, q, texel_m) for q in range(len(corners))]
     report(0.5, "lighting surfaces")
-    grids, light = _light(surfaces, corners, sizes, np.stack([a.mean((0, 1)) for a in albedo]), seed)
+    grids, light = _light(surfaces, corners, sizes, np.stack([a.mean((0, 1)) for a in albedo]))
     report(0.8, "baking colours")
     ends = np.cumsum([g[0] * g[1] for g in grids])
     images = []
@@ -125,12 +125,13 @@ def _paint(surfaces: Surfaces, q: int, texel_m: float) -> np.ndarray:
     (width, height), (u0, v0) = surfaces.sizes_m[q], surfaces.origins_m[q]
     w, h = max(1, round(width / texel_m)), max(1, round(height / texel_m))
     u, v = np.meshgrid((np.arange(w) + 0.5) * (width / w), (np.arange(h) + 0.5) * (height / h))
-    return surfaces.materials[q](u.astype(np.float32) + u0, v.astype(np.float32) + v0, (width, height)).astype(np.float32)
+    return surfaces.materials[q](u.astype(np.float32) + u0, v.astype(np.float32) + v0, (width, height)).astype(
+        np.float32
+    )
 
 
-def _light(surfaces: Surfaces, corners, sizes, mean_albedo, seed: int):
+def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
     """Irradiance on a coarse grid of every quad: the grids' (nu, nv) and all values (P, 3), normalised in exposure."""
-    rng = np.random.default_rng([seed, 4])
     scene = _ray_scene(corners)
     grids = np.clip(np.ceil(sizes / _LIGHT_STEP_M).astype(int) + 1, 2, 64)
     points, normals, owner = [], [], []
@@ -143,7 +144,7 @@ def _light(surfaces: Surfaces, corners, sizes, mean_albedo, seed: int):
         owner.append(np.full(len(points[-1]), q))
     points, normals, owner = np.concatenate(points), np.concatenate(normals), np.concatenate(owner)
     points = points + 0.004 * normals
-    light = _direct(scene, surfaces.lamps, points, normals, rng)
+    light = _direct(scene, surfaces.lamps, points, normals)
 
     # One bounce: what cosine-distributed rays meet, with that quad's mean colour and mean light.
     starts = np.concatenate([[0], np.cumsum(grids.prod(1))[:-1]])
@@ -151,7 +152,7 @@ def _light(surfaces: Surfaces, corners, sizes, mean_albedo, seed: int):
     radiosity += 1.2 * mean_albedo * np.array(surfaces.glows)[:, None]
     bounce = np.zeros_like(light)
     rays = 24
-    directions = _hemisphere(rays, rng)
+    directions = _hemisphere(rays)
     tangent = np.cross(normals, np.where(np.abs(normals[:, 2:]) > 0.9, [1.0, 0, 0], [0, 0, 1.0]))
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     bitangent = np.cross(normals, tangent)
@@ -165,17 +166,14 @@ def _light(surfaces: Surfaces, corners, sizes, mean_albedo, seed: int):
     return grids, (total * (0.85 / np.median(total[total.mean(1) > 0.1]))).astype(np.float32)
 
 
-def _direct(scene, lamps, points, normals, rng) -> np.ndarray:
+def _direct(scene, lamps, points, normals) -> np.ndarray:
     """Light straight from the lamps, each a small ball sampled 4 times for soft shadows."""
-    import open3d as o3d
 
     light = np.zeros((len(points), 3))
     for position, colour, radius in lamps:
         near = np.flatnonzero(np.linalg.norm(points - position, axis=1) < 8.0)
-        for _ in range(4):
-            jitter = rng.normal(size=3)
-            target = position + radius * jitter / np.linalg.norm(jitter)
-            way = target - points[near]
+        for corner in _TETRAHEDRON:
+            way = position + radius * corner - points[near]
             distance = np.linalg.norm(way, axis=1)
             cosine = (way * normals[near]).sum(1) / distance
             lit = np.flatnonzero(cosine > 0)
@@ -186,10 +184,10 @@ def _direct(scene, lamps, points, normals, rng) -> np.ndarray:
     return light
 
 
-def _hemisphere(count: int, rng) -> np.ndarray:
+def _hemisphere(count: int) -> np.ndarray:
     """Cosine-distributed directions around +z, stratified (a sunflower)."""
     k = np.arange(count) + 0.5
-    r, phi = np.sqrt(k / count), k * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
+    r, phi = np.sqrt(k / count), k * np.pi * (3 - np.sqrt(5))
     return np.stack([r * np.cos(phi), r * np.sin(phi), np.sqrt(1 - r * r)], axis=1)
 
 

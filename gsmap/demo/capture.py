@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -33,7 +34,9 @@ class Frames:
         shape = self.images.shape
         sizes = self.cameras.sizes_px
         if len(shape) != 4 or shape[3] != 3 or len(self.cameras) != shape[0] or (sizes != [shape[2], shape[1]]).any():
-            raise InputError(f"frames need images (C, H, W, 3) of their cameras' sizes, got {shape} for {self.cameras!r}")
+            raise InputError(
+                f"frames need images (C, H, W, 3) of their cameras' sizes, got {shape} for {self.cameras!r}"
+            )
         if self.depths_m is not None and self.depths_m.shape != shape[:3]:
             raise InputError(f"depth has shape {self.depths_m.shape}, the images {shape}")
 
@@ -46,7 +49,7 @@ class Frames:
 
 
 def default_routes(place: Place, count: int) -> list[tuple[int, ...]]:
-    """Routes of ``count`` captures, two neighbouring rooms each; three captures of three rooms share one room a pair."""
+    """Routes of ``count`` captures, two neighbouring rooms each; three share one room a pair."""
     pairs = sorted({tuple(sorted((d.a, d.b))) for d in place.doors}, key=lambda p: (p[1] - p[0], p))
     return [pairs[i % len(pairs)] for i in range(count)]
 
@@ -57,9 +60,11 @@ def walk(place: Place, route: Sequence[int], num_frames: int, seed: int = 0) -> 
     Raises:
         ConfigError: two rooms of the route that follow each other share no doorway, or too few frames.
     """
-    for a, b in zip(route[:-1], route[1:], strict=True):
+    for a, b in itertools.pairwise(route):
         if place.door_between(a, b) is None:
-            raise ConfigError(f"rooms {a} and {b} of this place share no doorway: a walk cannot go from one to the other")
+            raise ConfigError(
+                f"rooms {a} and {b} of this place share no doorway: a walk cannot go from one to the other"
+            )
     passages = len(route) - 1
     per_passage = 4 if num_frames >= 16 * len(route) else 1
     if num_frames < 4 * len(route) + per_passage * passages:
@@ -148,7 +153,9 @@ def film(
         colour = _look(place, pose, fine, 0.5 / focal).reshape(height, 2, width, 2, 3).mean((1, 3))
         images[i] = np.round(255 * np.clip(gain * colour**gamma, 0, 1))
         distance, *_ = place.skin.cast(np.broadcast_to(pose[:3, 3], centre.shape), centre @ pose[:3, :3].T)
-        depths[i] = np.where(np.isfinite(distance), distance, 0).reshape(height, width)  # Rays have unit z: this is depth.
+        depths[i] = np.where(np.isfinite(distance), distance, 0).reshape(
+            height, width
+        )  # Rays have unit z: this is depth.
         if progress:
             progress((i + 1) / count, f"filming {name} {i + 1}/{count}")
     return Frames(images, cameras, depths)

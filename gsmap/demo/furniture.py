@@ -27,7 +27,9 @@ def timber(rng) -> np.ndarray:
 
 def palette(rng, count: int = 5) -> np.ndarray:
     hue = rng.uniform()
-    return np.stack([colour(rng, (hue + 0.31 * k, hue + 0.31 * k + 0.12), (0.25, 0.9), (0.2, 0.95)) for k in range(count)])
+    return np.stack(
+        [colour(rng, (hue + 0.31 * k, hue + 0.31 * k + 0.12), (0.25, 0.9), (0.2, 0.95)) for k in range(count)]
+    )
 
 
 def _seed(rng) -> int:
@@ -121,14 +123,28 @@ def _ornaments(s: Surfaces, rng, w, d, z) -> None:
         kind, y = rng.integers(5), d * rng.uniform(0.35, 0.65)
         if kind == 0:
             r, h = rng.uniform(0.04, 0.08), rng.uniform(0.15, 0.32)
-            s.lathe(x, y, z, [(r * 0.7, 0), (r, h * 0.35), (r * 0.35, h * 0.75), (r * 0.6, h)], _plain(rng, saturation=(0.4, 0.9)))
+            s.lathe(
+                x,
+                y,
+                z,
+                [(r * 0.7, 0), (r, h * 0.35), (r * 0.35, h * 0.75), (r * 0.6, h)],
+                _plain(rng, saturation=(0.4, 0.9)),
+            )
         elif kind == 1:
             size = rng.uniform(0.16, 0.26)
             frame = tx.picture(palette(rng), _seed(rng), int(rng.integers(4)))
             s.box(x, y - 0.08, z, size, 0.03, size * 1.25, tx.plain(np.full(3, 0.1)), front=frame)
         elif kind == 2:
             for k in range(int(rng.integers(2, 5))):
-                s.box(x + rng.uniform(-0.01, 0.01), y, z + 0.03 * k, 0.2, 0.15, 0.03, tx.plain(colour(rng, saturation=(0.3, 0.9)), _seed(rng)))
+                s.box(
+                    x + rng.uniform(-0.01, 0.01),
+                    y,
+                    z + 0.03 * k,
+                    0.2,
+                    0.15,
+                    0.03,
+                    tx.plain(colour(rng, saturation=(0.3, 0.9)), _seed(rng)),
+                )
         elif kind == 3:
             r = rng.uniform(0.07, 0.11)
             s.lathe(x, y, z, [(r * 0.5, 0), (r, r * 0.9), (r * 0.9, r * 0.9), (0, 0.03)], _plain(rng))
@@ -169,14 +185,24 @@ def sofa(s: Surfaces, rng, w, d) -> None:
         x = -w / 2 + 0.2 + (k + 0.5) * (w - 0.4) / seats
         s.box(x, d / 2 + 0.1, 0.4, (w - 0.42) / seats, d - 0.25, 0.12, cloth)
         if rng.random() < 0.75:
-            s.at(x + rng.uniform(-0.1, 0.1), 0.36, 0.52, rng.uniform(-0.4, 0.4)).box(0, 0, 0, 0.4, 0.14, 0.36, _cloth(rng))
+            s.at(x + rng.uniform(-0.1, 0.1), 0.36, 0.52, rng.uniform(-0.4, 0.4)).box(
+                0, 0, 0, 0.4, 0.14, 0.36, _cloth(rng)
+            )
 
 
 def sideboard(s: Surfaces, rng, w, d) -> None:
     tone = timber(rng)
     s.box(0, d / 2, 0.08, w, d, 0.42, _wood(rng, tone))
     for k in range(3):
-        s.box(-w / 2 + (k + 0.5) * w / 3, d + 0.008, 0.11, w / 3 - 0.03, 0.016, 0.35, _wood(rng, tone * rng.uniform(0.5, 1.4)))
+        s.box(
+            -w / 2 + (k + 0.5) * w / 3,
+            d + 0.008,
+            0.11,
+            w / 3 - 0.03,
+            0.016,
+            0.35,
+            _wood(rng, tone * rng.uniform(0.5, 1.4)),
+        )
     screen = tx.picture(palette(rng), _seed(rng), int(rng.integers(2)))
     s.box(0, 0.16, 0.56, 0.62 * w, 0.05, 0.36 * w, tx.plain(np.full(3, 0.02)), front=screen)
     s.box(0, 0.16, 0.5, 0.3, 0.14, 0.06, tx.plain(np.full(3, 0.03)))
@@ -189,7 +215,13 @@ def kitchen_row(s: Surfaces, rng, w, d) -> None:
     units = max(2, round(w / 0.6))
     s.box(0, d / 2, 0.1, w, d - 0.04, 0.76, tx.plain(fronts * 0.6))
     s.box(0, d / 2, 0.86, w, d + 0.02, 0.04, tx.marble(stone, stone * 0.25, _seed(rng)))
-    back = tx.tiles(colour(rng, saturation=(0.05, 0.4), value=(0.6, 0.95)), colour(rng), _seed(rng), rng.uniform(0.1, 0.16), int(rng.integers(3)))
+    back = tx.tiles(
+        colour(rng, saturation=(0.05, 0.4), value=(0.6, 0.95)),
+        colour(rng),
+        _seed(rng),
+        rng.uniform(0.1, 0.16),
+        int(rng.integers(3)),
+    )
     s.box(0, 0.01, 0.9, w, 0.02, 0.55, back)
     oven, sink = rng.permutation(units)[:2]
     for k in range(units):
@@ -199,7 +231,13 @@ def kitchen_row(s: Surfaces, rng, w, d) -> None:
         s.box(x, d + 0.02, 0.76, uw * 0.6, 0.03, 0.02, tx.plain(np.full(3, 0.55)))
         if k == oven:
             s.box(x, d / 2, 0.90, uw * 0.85, d * 0.8, 0.012, tx.tiles(np.full(3, 0.02), np.full(3, 0.3), 3, 0.2, 2))
-            s.lathe(x + 0.1, d / 2, 0.912, [(0.1, 0), (0.1, 0.14), (0.02, 0.16), (0, 0.16)], _plain(rng, saturation=(0.3, 0.9)))
+            s.lathe(
+                x + 0.1,
+                d / 2,
+                0.912,
+                [(0.1, 0), (0.1, 0.14), (0.02, 0.16), (0, 0.16)],
+                _plain(rng, saturation=(0.3, 0.9)),
+            )
         elif k == sink:
             s.box(x, d / 2, 0.90, uw * 0.75, d * 0.6, 0.006, tx.plain(np.full(3, 0.25)))
             s.lathe(x, 0.1, 0.9, [(0.02, 0), (0.015, 0.3), (0.0, 0.3)], tx.plain(np.full(3, 0.6)), 6)
@@ -235,7 +273,13 @@ def dining_table(s: Surfaces, rng, w, d) -> None:
     s.lathe(rng.uniform(-0.2, 0.2), 0, 0.75, [(0.07, 0), (0.15, 0.08), (0.14, 0.08), (0, 0.04)], _plain(rng))
     for _ in range(4):
         r = 0.11
-        s.lathe(rng.uniform(-tw / 2.6, tw / 2.6), rng.choice([-1, 1]) * td * 0.3, 0.75, [(r * 0.6, 0), (r, 0.02), (0, 0.012)], _plain(rng, value=(0.6, 0.95)))
+        s.lathe(
+            rng.uniform(-tw / 2.6, tw / 2.6),
+            rng.choice([-1, 1]) * td * 0.3,
+            0.75,
+            [(r * 0.6, 0), (r, 0.02), (0, 0.012)],
+            _plain(rng, value=(0.6, 0.95)),
+        )
 
 
 def coffee_table(s: Surfaces, rng, w, d) -> None:
@@ -244,7 +288,9 @@ def coffee_table(s: Surfaces, rng, w, d) -> None:
         s.box(x, d / 2, 0, 0.05, d - 0.06, 0.36, _wood(rng))
     for _ in range(3):
         cover = tx.picture(palette(rng), _seed(rng), int(rng.integers(4)))
-        s.at(rng.uniform(-w / 3, w / 3), d * rng.uniform(0.3, 0.7), 0.4, rng.uniform(-1, 1)).box(0, 0, 0, 0.21, 0.28, 0.015, cover)
+        s.at(rng.uniform(-w / 3, w / 3), d * rng.uniform(0.3, 0.7), 0.4, rng.uniform(-1, 1)).box(
+            0, 0, 0, 0.21, 0.28, 0.015, cover
+        )
     _ornaments(s, rng, w, d, 0.4)
 
 
@@ -278,7 +324,16 @@ def floor_lamp(s: Surfaces, rng, w, d) -> None:
 
 def bathtub(s: Surfaces, rng, w, d) -> None:
     white = tx.plain(np.full(3, 0.75), _seed(rng))
-    s.box(0, d / 2, 0, w, d, 0.55, tx.tiles(colour(rng, saturation=(0.1, 0.5)), colour(rng), _seed(rng), 0.12, 2), top=white)
+    s.box(
+        0,
+        d / 2,
+        0,
+        w,
+        d,
+        0.55,
+        tx.tiles(colour(rng, saturation=(0.1, 0.5)), colour(rng), _seed(rng), 0.12, 2),
+        top=white,
+    )
     s.box(0, d / 2, 0.552, w - 0.2, d - 0.2, 0.004, tx.plain(np.array([0.3, 0.45, 0.5]), _seed(rng)))
     s.box(0.3 * w, d / 2, 0.555, 0.3, 0.24, 0.05, _cloth(rng))
 

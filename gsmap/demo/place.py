@@ -111,12 +111,12 @@ def make_place(
     built = [_build_room(surfaces, room, i, doors) for i, room in enumerate(plan)]
     for door in doors:
         _build_door_lining(surfaces, door, seed)
-    skin = bake(surfaces, seed=seed, texel_m=texel_m, progress=progress)
+    skin = bake(surfaces, texel_m=texel_m, progress=progress)
     return Place(seed, tuple(built), tuple(doors), skin)
 
 
 def _plan(rng: np.random.Generator, count: int) -> tuple[list[Room], list[Door]]:
-    """Cut a rectangle into rooms: one cut across, one of the halves cut along, then the largest room again and again."""
+    """Cut a rectangle into rooms: one cut across, one half cut along, then the largest room again and again."""
     stretch = np.sqrt(count / 3)
     width, depth = rng.uniform(7.2, 8.4) * stretch, rng.uniform(5.6, 6.6) * stretch
     x, y = rng.uniform(0.42, 0.5) * width, rng.uniform(0.44, 0.56) * depth
@@ -133,7 +133,11 @@ def _plan(rng: np.random.Generator, count: int) -> tuple[list[Room], list[Door]]
             rects += [[x0, y0, x1, m], [x0, m, x1, y1]]
     kinds = ["living room", *rng.permutation(["kitchen", "bedroom", "study"]), "bathroom"]
     rooms = [
-        Room(str(kinds[i % len(kinds)]), np.array(r) + 0.5 * _WALL_M * np.array([1, 1, -1, -1]), int(rng.integers(1 << 30)))
+        Room(
+            str(kinds[i % len(kinds)]),
+            np.array(r) + 0.5 * _WALL_M * np.array([1, 1, -1, -1]),
+            int(rng.integers(1 << 30)),
+        )
         for i, r in enumerate(rects)
     ]
     doors = []
@@ -217,8 +221,20 @@ def _build_shell(s: Surfaces, rng: np.random.Generator, room: Room, spans) -> No
     pale, deep = colour(rng, saturation=(0.08, 0.55), value=(0.6, 0.95)), colour(rng, value=(0.3, 0.7))
     floors = [
         tx.planks(timber(rng), seed, rng.uniform(0.1, 0.2), bool(rng.integers(2))),
-        tx.tiles(colour(rng, saturation=(0.05, 0.4), value=(0.4, 0.9)), colour(rng, value=(0.2, 0.6)), seed, rng.uniform(0.2, 0.45), int(rng.integers(3))),
-        tx.fabric(colour(rng, value=(0.3, 0.6)), colour(rng, value=(0.2, 0.5)), seed, int(rng.integers(4)), rng.uniform(0.3, 0.6)),
+        tx.tiles(
+            colour(rng, saturation=(0.05, 0.4), value=(0.4, 0.9)),
+            colour(rng, value=(0.2, 0.6)),
+            seed,
+            rng.uniform(0.2, 0.45),
+            int(rng.integers(3)),
+        ),
+        tx.fabric(
+            colour(rng, value=(0.3, 0.6)),
+            colour(rng, value=(0.2, 0.5)),
+            seed,
+            int(rng.integers(4)),
+            rng.uniform(0.3, 0.6),
+        ),
     ]
     liked = {"bathroom": 1, "kitchen": int(rng.integers(2)), "bedroom": int(rng.choice([0, 2]))}
     s.rectangle([0, 0, 0], [w, 0, 0], [0, d, 0], floors[liked.get(room.kind, 0)])
@@ -233,7 +249,9 @@ def _build_shell(s: Surfaces, rng: np.random.Generator, room: Room, spans) -> No
     panel_m = rng.uniform(0.8, 1.15) if rng.random() < 0.5 or room.kind == "bathroom" else 0.0
     lower = tx.wood(timber(rng), seed + 4, True)
     if room.kind in ("bathroom", "kitchen"):
-        lower = tx.tiles(colour(rng, saturation=(0.1, 0.5), value=(0.5, 0.9)), deep, seed + 4, 0.15, int(rng.integers(3)))
+        lower = tx.tiles(
+            colour(rng, saturation=(0.1, 0.5), value=(0.5, 0.9)), deep, seed + 4, 0.15, int(rng.integers(3))
+        )
     trim = tx.wood(timber(rng), seed + 5)
     for wall, (x, y, yaw, length) in enumerate(_walls(room.size_m)):
         f = s.at(x, y, 0, yaw)
@@ -246,7 +264,9 @@ def _build_shell(s: Surfaces, rng: np.random.Generator, room: Room, spans) -> No
             f.rectangle([x1, 0, panel_m], [x0 - x1, 0, 0], [0, 0, CEILING_M - panel_m], upper[wall], (-x1, 7.0 * wall))
             f.box((x0 + x1) / 2, 0.008, 0, x1 - x0, 0.016, 0.09, trim)
         for x0, x1 in cuts:
-            f.rectangle([x1, 0, _DOOR_HEIGHT_M], [x0 - x1, 0, 0], [0, 0, CEILING_M - _DOOR_HEIGHT_M], upper[wall], (-x1, 3.0))
+            f.rectangle(
+                [x1, 0, _DOOR_HEIGHT_M], [x0 - x1, 0, 0], [0, 0, CEILING_M - _DOOR_HEIGHT_M], upper[wall], (-x1, 3.0)
+            )
             f.box((x0 + x1) / 2, 0.015, _DOOR_HEIGHT_M, x1 - x0 + 0.16, 0.03, 0.08, trim)
             for edge in (x0 - 0.04, x1 + 0.04):
                 f.box(edge, 0.015, 0, 0.08, 0.03, _DOOR_HEIGHT_M, trim)
@@ -258,11 +278,23 @@ def _build_shell(s: Surfaces, rng: np.random.Generator, room: Room, spans) -> No
 
 
 def _pendant(s: Surfaces, rng: np.random.Generator) -> None:
-    drop, radius, warm = rng.uniform(0.3, 0.45), rng.uniform(0.16, 0.28), colour(rng, (0.07, 0.14), (0.08, 0.3), (0.95, 1.0))
+    drop, radius, warm = (
+        rng.uniform(0.3, 0.45),
+        rng.uniform(0.16, 0.28),
+        colour(rng, (0.07, 0.14), (0.08, 0.3), (0.95, 1.0)),
+    )
     s.lathe(0, 0, CEILING_M - drop, [(0.006, 0), (0.006, drop)], tx.plain(np.full(3, 0.05)), 5)
     tint = colour(rng, value=(0.5, 0.95))
     profile = [(radius, 0), (radius * rng.uniform(0.3, 0.9), 0.2)]
-    s.lathe(0, 0, CEILING_M - drop - 0.1, profile, tx.fabric(tint, warm, int(rng.integers(99)), int(rng.integers(4)), 0.07), 14, glow=0.5)
+    s.lathe(
+        0,
+        0,
+        CEILING_M - drop - 0.1,
+        profile,
+        tx.fabric(tint, warm, int(rng.integers(99)), int(rng.integers(4)), 0.07),
+        14,
+        glow=0.5,
+    )
     s.lamp(0, 0, CEILING_M - drop - 0.14, warm * 3.6, 0.14)
 
 
@@ -299,7 +331,9 @@ def _place_windows(s: Surfaces, rng, room: Room, taken, outside) -> None:
         if at is None:
             continue
         f = s.at(x, y, 0, yaw).at(at, 0, z)
-        f.rectangle([width / 2, 0.012, 0], [-width, 0, 0], [0, 0, height], tx.outdoors(int(rng.integers(1 << 20))), glow=1.0)
+        f.rectangle(
+            [width / 2, 0.012, 0], [-width, 0, 0], [0, 0, height], tx.outdoors(int(rng.integers(1 << 20))), glow=1.0
+        )
         for k in range(3):
             f.box((k - 1) * width / 2, 0.02, 0, 0.05, 0.04, height, frame)
         for zz in (-0.05, height):
@@ -328,7 +362,11 @@ def _place_furniture(s: Surfaces, rng, room: Room, spans, taken) -> np.ndarray:
             x, y, yaw, length = _walls(room.size_m)[wall]
             if not piece.against_wall:
                 x, y, yaw = rng.uniform(0.35, 0.65) * w, rng.uniform(0.35, 0.65) * d, rng.integers(2) * np.pi / 2
-                f, rect, at = s.at(x, y, 0, yaw).at(0, -depth / 2), _footprint(x, y, yaw, 0, width, depth, -depth / 2), 0.0
+                f, rect, at = (
+                    s.at(x, y, 0, yaw).at(0, -depth / 2),
+                    _footprint(x, y, yaw, 0, width, depth, -depth / 2),
+                    0.0,
+                )
             elif length > width + 0.1:
                 at = rng.uniform(-(length - width) / 2, (length - width) / 2)
                 gap = 0.03 if not piece.tall else 0.02

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -67,7 +68,7 @@ class Surfaces:
         angles = np.linspace(0, 2 * np.pi, sides + 1)
         ring = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
         base = np.array([x, y, z])
-        for (r0, h0), (r1, h1) in zip(profile[:-1], profile[1:], strict=True):
+        for (r0, h0), (r1, h1) in itertools.pairwise(profile):
             low, high = base + r0 * ring + [0, 0, h0], base + r1 * ring + [0, 0, h1]
             step = 2 * np.pi / sides * max(r0, r1)
             for k in range(sides):

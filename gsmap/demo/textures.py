@@ -1,7 +1,7 @@
 """Procedural materials: what every surface of a made place looks like.
 
 A material maps positions on a surface to linear-light albedo: ``material(u_m, v_m, size_m) -> (..., 3) in [0, 1]`` with
-``u_m, v_m`` metres from the surface's corner and ``size_m`` its extent. Nothing here has state: the same seed paints the
+``u_m, v_m`` metres from the surface's corner and ``size_m`` its extent. Nothing here has state: one seed paints the
 same texel on every machine, because the noise is an integer hash and not a generator.
 """
 
@@ -78,7 +78,9 @@ def wallpaper(ground: np.ndarray, figure: np.ndarray, seed: int, motif: int, pit
         else:
             s = s + 0.5 * (np.floor(t) % 2)
             p, q = s % 1 - 0.5, t % 1 - 0.5
-            mask = (np.abs(p) < 0.32 * np.sqrt(np.clip(0.25 - q * q, 0, 1)) * (1 + 0.6 * np.sin(9 * q))).astype(np.float32)
+            mask = (np.abs(p) < 0.32 * np.sqrt(np.clip(0.25 - q * q, 0, 1)) * (1 + 0.6 * np.sin(9 * q))).astype(
+                np.float32
+            )
         fade = np.clip(0.75 + 0.9 * _fractal(u, v, 1.1, seed, 2), 0, 1)
         mask = (mask * fade)[..., None]
         colour = np.asarray(ground, np.float32) * (1 - mask) + np.asarray(figure, np.float32) * mask
@@ -200,7 +202,9 @@ def picture(palette: np.ndarray, seed: int, style: int) -> Material:
     """A framed print: a landscape, overlapping shapes, a grid, or a portrait-like figure."""
     palette = np.asarray(palette, np.float32)
     rng = np.random.default_rng(seed)
-    shapes = [(rng.uniform(0, 1), rng.uniform(0, 1), rng.uniform(0.08, 0.35), rng.integers(len(palette))) for _ in range(9)]
+    shapes = [
+        (rng.uniform(0, 1), rng.uniform(0, 1), rng.uniform(0.08, 0.35), rng.integers(len(palette))) for _ in range(9)
+    ]
     round_ones = rng.random(9) < 0.5
 
     def paint(u, v, size):
