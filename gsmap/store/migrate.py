@@ -1,0 +1,105 @@
+"""Running the migrations of ``migrations/`` (in the wheel ``gsmap/migrations``)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqlalchemy import Engine, inspect, text
+
+import gsmap
+from gsmap.errors import CorruptError, SchemaVersionError, StoreError
+from gsmap.store import schema, sqlite
+from gsmap.store.catalog import Catalog, explained
+
+
+def version(engine: Engine, folder: Path) -> str | None:
+    """The migration a database is at; None where it has never seen one."""
+    with explained(folder), engine.connect() as connection:
+        if not inspect(connection).has_table("alembic_version"):
+            return None
+        return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+
+
+def require_current(engine: Engine, folder: Path) -> None:
+    """Refuse a database of another schema.
+
+    Raises:
+        SchemaVersionError: newer (get a newer gsmap) or older (``gsmap migrate``).
+        CorruptError: no schema at all.
+    """
+    found = version(engine, folder)
+    if found is None:
+        raise CorruptError(f"{folder}: its catalog holds no gsmap tables; restore it from a backup")
+    if found > schema.HEAD:
+        raise SchemaVersionError(
+            f"{folder} was written by a newer gsmap (schema {found}, this gsmap {gsmap.__version__} knows up to "
+            f"{schema.HEAD}): upgrade gsmap"
+        )
+    if found < schema.HEAD:
+        raise SchemaVersionError(
+            f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}"
+        )
+
+
+def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str | None]:
+    """Bring the tables to a revision in one transaction; returns the version before and after.
+
+    An existing SQLite catalog is first copied to ``map.sqlite.VERSION.bak``.
+
+    Raises:
+        SchemaVersionError: the database is newer than this gsmap.
+    """
+    before = version(catalog.engine, catalog.folder)
+    if before is not None and before > schema.HEAD:
+        require_current(catalog.engine, catalog.folder)
+    if before == schema.HEAD and revision == "head":
+        return before, before
+    with catalog.lock():
+        if before is not None and catalog.is_sqlite:
+            sqlite.backup(catalog.engine, catalog.folder / f"{sqlite.FILE}.{before}.bak")
+        with explained(catalog.folder), catalog.engine.connect() as connection:
+            if catalog.is_sqlite:
+                # Batch migrations rebuild tables, which foreign keys would forbid; checked before the commit.
+                connection.connection.driver_connection.execute("PRAGMA foreign_keys = OFF")
+            try:
+                with connection.execution_options(gsmap_write=True).begin():
+                    _run(connection, revision)
+                    if catalog.is_sqlite and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
+                        raise StoreError(f"{catalog.folder}: the migration would break references; nothing was changed")
+            finally:
+                if catalog.is_sqlite:
+                    connection.connection.driver_connection.execute("PRAGMA foreign_keys = ON")
+    return before, version(catalog.engine, catalog.folder)
+
+
+def config():
+    """Alembic's configuration, without a file."""
+    from alembic.config import Config
+
+    out = Config()
+    out.set_main_option("script_location", str(folder()).replace("%", "%%"))
+    return out
+
+
+def folder() -> Path:
+    """Where the migrations lie: inside the installed package, or beside it in a checkout."""
+    package = Path(gsmap.__file__).parent
+    for place in (package / "migrations", package.parent / "migrations"):
+        if (place / "env.py").is_file():
+            return place
+    raise StoreError(f"{package} was installed without its migrations: install gsmap again")
+
+
+def _run(connection, revision: str) -> None:
+    from alembic import command
+
+    settings = config()
+    settings.attributes["connection"] = connection
+    down = revision != "head" and revision < (_current(connection) or "")
+    (command.downgrade if down else command.upgrade)(settings, revision)
+
+
+def _current(connection) -> str | None:
+    from alembic.runtime.migration import MigrationContext
+
+    return MigrationContext.configure(connection).get_current_revision()

@@ -1,0 +1,298 @@
+"""Scenes: their rows, their arrays, and where in space each chunk lies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from sqlalchemy import Connection, Row, insert, select, text, update
+
+from gsmap.errors import InputError, NotFoundError, StoreError
+from gsmap.store.arrays import CHUNK_ROWS, Arrays, digest
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.groups import has_group, manifest, publish
+from gsmap.store.morton import chunk_boxes, morton_order
+from gsmap.store.schema import CHUNK_BOXES, scenes
+from gsmap.types import Cameras, Gaussians, Scene
+
+KIND = "scenes"
+Progress = Callable[[float, str], None]
+
+_GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+_SIGMAS = 3.0
+
+
+def scene_id(gaussians: Gaussians, cameras: Cameras) -> str:
+    """32 hex digits of content: the same Gaussians and cameras have the same id in every map."""
+    arrays = [getattr(gaussians, name) for name in _GAUSSIANS]
+    views = [cameras.T_frame_camera, cameras.intrinsics_px, cameras.sizes_px]
+    return digest(*arrays, *views, text="\n".join(cameras.names))
+
+
+class Scenes:
+    """The scenes of a map. A *ref* is a scene's name, its id, or the beginning of its id where only one begins so."""
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
+        self._catalog = catalog
+        self._arrays = arrays
+
+    def add(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        *,
+        name: str,
+        scale_policy: str = "auto",
+        captured_at: str | None = None,
+        source: str = "",
+        antialiased: bool = False,
+        notes: tuple[str, ...] = (),
+        rename: bool = True,
+        progress: Progress | None = None,
+    ) -> tuple[Scene, bool]:
+        """Add a scene; durable when it returns.
+
+        Args:
+            gaussians, cameras: in the scene's own frame; validated before (`gsmap.ingest.validate`).
+            rename: where another scene has the name, take ``name-2`` and so on; else refuse.
+
+        Returns:
+            The scene, and whether it is new. Content that the map has already changes nothing (False); content that
+            was removed comes back under the new name (True).
+
+        Raises:
+            InputError: no Gaussians, or the name is taken and ``rename`` is off.
+        """
+        if not len(gaussians):
+            raise InputError(f"scene {name!r} has no Gaussians")
+        new_id = scene_id(gaussians, cameras)
+        with self._catalog.read() as connection:
+            row = _by_id(connection, new_id)
+            stored = has_group(connection, new_id)
+        if row is not None and row.removed_at is None:
+            return _scene(row), False
+        fields = {
+            "name": name,
+            "num_gaussians": len(gaussians),
+            "sh_degree": gaussians.sh_degree,
+            "num_cameras": len(cameras),
+            "bounds": np.stack([gaussians.means.min(0), gaussians.means.max(0)]).astype(np.float64).tolist(),
+            "scale_policy": scale_policy,
+            "captured_at": captured_at,
+            "source": source,
+            "cameras_synthesised": int(cameras.synthesised),
+            "antialiased": int(antialiased),
+            "notes": list(notes),
+        }
+        if stored:  # removed, but not yet pruned
+            with self._catalog.write() as connection:
+                if has_group(connection, new_id):
+                    return self._enter(connection, new_id, fields, rename), True
+        if progress:
+            progress(0.1, f"sorting {name}")
+        ordered = gaussians[morton_order(gaussians.means)]
+        boxes = chunk_boxes(ordered, CHUNK_ROWS, sigmas=_SIGMAS)
+        if progress:
+            progress(0.4, f"writing {name}")
+        with self._arrays.stage(_to_arrays(ordered, cameras)) as staged, self._catalog.write() as connection:
+            row = _by_id(connection, new_id)
+            if row is not None and row.removed_at is None:  # another process was faster
+                return _scene(row), False
+            scene = self._enter(connection, new_id, fields, rename)
+            if not has_group(connection, new_id):
+                publish(connection, self._arrays, staged, KIND, new_id)
+                _put_boxes(connection, _by_id(connection, new_id).number, boxes)
+            connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))
+        return scene, True
+
+    def list(self, *, removed: bool = False) -> list[Scene]:
+        """The living scenes (or the removed ones) in the order they came."""
+        condition = scenes.c.removed_at.is_not(None) if removed else scenes.c.removed_at.is_(None)
+        with self._catalog.read() as connection:
+            return [_scene(r) for r in connection.execute(select(scenes).where(condition).order_by(scenes.c.number))]
+
+    def get(self, ref: str) -> Scene:
+        """One scene by name, id or the beginning of its id; a removed one by its id only.
+
+        Raises:
+            NotFoundError: none, or several begin so.
+        """
+        with self._catalog.read() as connection:
+            return _scene(_find(connection, ref))
+
+    def notes(self, ref: str) -> tuple[str, ...]:
+        """What a person should know about how it was ingested."""
+        with self._catalog.read() as connection:
+            return tuple(_find(connection, ref).notes)
+
+    def removed_at(self, ref: str) -> str | None:
+        """When it was removed; None while it lives."""
+        with self._catalog.read() as connection:
+            return _find(connection, ref).removed_at
+
+    def gaussians(self, ref: str, bounds: np.ndarray | None = None) -> Gaussians:
+        """Read a scene's Gaussians (Morton order).
+
+        Args:
+            bounds: (2, 3) lowest and highest corner in the scene's frame: only Gaussians within three standard
+                deviations (the largest) of it are returned, and only the chunks that touch it are read.
+
+        Raises:
+            CorruptError: bytes on disk are missing or differ.
+            NotFoundError: no such scene, or its bytes were pruned.
+        """
+        with self._catalog.read() as connection:
+            row = _find(connection, ref)
+            files = _manifest(connection, row)
+            chunks = None if bounds is None else _touching(connection, row.number, np.asarray(bounds, np.float64))
+        rows = None if chunks is None else _ranges(chunks, row.num_gaussians)
+        out = Gaussians(**self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows))
+        if bounds is None:
+            return out
+        low, high = np.asarray(bounds, np.float64)
+        reach = _SIGMAS * np.exp(out.log_scales.max(1, initial=-np.inf, keepdims=True))
+        return out[((out.means >= low - reach) & (out.means <= high + reach)).all(1)]
+
+    def cameras(self, ref: str) -> Cameras:
+        """Read a scene's cameras.
+
+        Raises:
+            CorruptError, NotFoundError: as `gaussians`.
+        """
+        with self._catalog.read() as connection:
+            row = _find(connection, ref)
+            files = _manifest(connection, row)
+        names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
+        pose, intrinsics, sizes, text_bytes = self._arrays.read(KIND, row.group_id, files, only=names).values()
+        image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
+        return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
+
+    def remove(self, ref: str) -> Scene:
+        """Leave a tombstone: gone from lists and from the next revision, its bytes kept until they are pruned."""
+        with self._catalog.write() as connection:
+            row = _find(connection, ref)
+            if row.removed_at is not None:
+                raise NotFoundError(f"scene {ref} was removed on {row.removed_at}")
+            connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
+        return _scene(row)
+
+    def _enter(self, connection: Connection, new_id: str, fields: dict, rename: bool) -> Scene:
+        """The row of a new or returning scene, under a name that is free."""
+        taken = set(connection.execute(select(scenes.c.name).where(scenes.c.removed_at.is_(None))).scalars())
+        name, number = fields["name"], 2
+        while fields["name"] in taken:
+            if not rename:
+                raise InputError(f"another scene is called {name!r}: choose another name, or remove that one first")
+            fields = fields | {"name": f"{name}-{number}"}
+            number += 1
+        fields = fields | {"ingested_at": now(), "removed_at": None}
+        if _by_id(connection, new_id) is None:
+            connection.execute(insert(scenes), fields | {"id": new_id})
+        else:
+            connection.execute(update(scenes).where(scenes.c.id == new_id).values(**fields))
+        return _scene(_by_id(connection, new_id))
+
+
+def living_ids(connection: Connection) -> set[str]:
+    return set(connection.execute(select(scenes.c.id).where(scenes.c.removed_at.is_(None))).scalars())
+
+
+def resolve(connection: Connection, ref: str) -> str:
+    """The id that a ref means; see `Scenes.get`."""
+    return _find(connection, ref).id
+
+
+def _find(connection: Connection, ref: str) -> Row:
+    living = scenes.c.removed_at.is_(None)
+    row = connection.execute(select(scenes).where(scenes.c.name == ref, living)).first() or _by_id(connection, ref)
+    if row is not None:
+        return row
+    rows = []
+    if ref and all(c in "0123456789abcdef" for c in ref):
+        rows = connection.execute(select(scenes).where(scenes.c.id.startswith(ref), living).limit(3)).all()
+    if len(rows) == 1:
+        return rows[0]
+    if rows:
+        several = ", ".join(r.name for r in rows)
+        raise NotFoundError(f"{ref!r} is the beginning of several scene ids ({several}): add digits")
+    raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes shows what there is")
+
+
+def _by_id(connection: Connection, wanted: str) -> Row | None:
+    return connection.execute(select(scenes).where(scenes.c.id == wanted)).first()
+
+
+def _manifest(connection: Connection, row: Row):
+    if row.group_id is None:
+        raise NotFoundError(f"scene {row.name!r} was removed and its arrays were pruned: ingest it again")
+    return manifest(connection, row.group_id)
+
+
+def _scene(row: Row) -> Scene:
+    return Scene(
+        id=row.id,
+        name=row.name,
+        num_gaussians=row.num_gaussians,
+        sh_degree=row.sh_degree,
+        num_cameras=row.num_cameras,
+        bounds=np.array(row.bounds),
+        scale_policy=row.scale_policy,
+        captured_at=row.captured_at,
+        ingested_at=row.ingested_at,
+        source=row.source,
+        cameras_synthesised=bool(row.cameras_synthesised),
+        antialiased=bool(row.antialiased),
+    )
+
+
+def _to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:
+    for name in cameras.names:
+        if "\n" in name:
+            raise InputError(f"camera name {name!r} has a line break")
+    return {name: getattr(gaussians, name) for name in _GAUSSIANS} | {
+        "cameras.T_frame_camera": cameras.T_frame_camera,
+        "cameras.intrinsics_px": cameras.intrinsics_px,
+        "cameras.sizes_px": cameras.sizes_px,
+        "cameras.names": np.frombuffer("\n".join(cameras.names).encode(), np.uint8),
+    }
+
+
+def _put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
+    if number >= 1 << 24:
+        raise StoreError("a map holds at most 16 million scenes")  # the R*Tree's floats count no further
+    connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
+    rows = [
+        {"s": number, "chunk": i}
+        | {f"{axis}{side}": float(box[side, k]) for side in (0, 1) for k, axis in enumerate("xyz")}
+        for i, box in enumerate(boxes)
+    ]
+    connection.execute(
+        text(
+            f"INSERT INTO {CHUNK_BOXES} (s0, s1, x0, x1, y0, y1, z0, z1, chunk) "
+            "VALUES (:s, :s, :x0, :x1, :y0, :y1, :z0, :z1, :chunk)"
+        ),
+        rows,
+    )
+
+
+def _touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:
+    if bounds.shape != (2, 3):
+        raise InputError(f"bounds must be (2, 3): lowest and highest corner, got shape {bounds.shape}")
+    query = text(
+        f"SELECT chunk FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s AND x1 >= :x0 AND x0 <= :x1 "
+        "AND y1 >= :y0 AND y0 <= :y1 AND z1 >= :z0 AND z0 <= :z1 ORDER BY chunk"
+    )
+    box = {f"{axis}{side}": float(bounds[side, k]) for side in (0, 1) for k, axis in enumerate("xyz")}
+    return list(connection.execute(query, {"s": number, **box}).scalars())
+
+
+def _ranges(chunks: list[int], count: int) -> list[tuple[int, int]]:
+    """Row ranges of chunks, neighbours joined."""
+    out: list[tuple[int, int]] = []
+    for chunk in chunks:
+        start, stop = chunk * CHUNK_ROWS, min(count, (chunk + 1) * CHUNK_ROWS)
+        if out and out[-1][1] == start:
+            out[-1] = (out[-1][0], stop)
+        else:
+            out.append((start, stop))
+    return out

@@ -1,0 +1,240 @@
+"""The catalog's tables. A change here needs a migration in ``migrations/versions`` and a new `HEAD`."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from sqlalchemy import (
+    REAL,
+    BigInteger,
+    CheckConstraint,
+    Column,
+    Double,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    Table,
+    Text,
+    text,
+)
+from sqlalchemy.types import TypeDecorator
+
+HEAD = "0001"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "ck": "ck_%(table_name)s_%(constraint_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+Bytes = BigInteger().with_variant(Integer(), "sqlite")
+Real = Double().with_variant(REAL(), "sqlite")  # STRICT tables know REAL; elsewhere REAL would be single precision
+
+
+class Json(TypeDecorator[Any]):
+    """JSON in a text column: the same on every database, floats to the last bit, infinity allowed."""
+
+    impl = Text
+    cache_ok = True
+
+    def process_bind_param(self, value: Any, dialect: Any) -> str | None:
+        return None if value is None else json.dumps(value, separators=(",", ":"))
+
+    def process_result_value(self, value: str | None, dialect: Any) -> Any:
+        return None if value is None else json.loads(value)
+
+
+def _table(name: str, *parts: Any) -> Table:
+    return Table(name, metadata, *parts, sqlite_strict=True)
+
+
+def _scene(name: str, **options: Any) -> Column[str]:
+    return Column(name, Text, ForeignKey("scenes.id"), nullable=False, **options)
+
+
+about = _table(
+    "about",
+    Column("id", Text, primary_key=True),  # of the map, random
+    Column("created_at", Text, nullable=False),
+    Column("gsmap_version", Text, nullable=False),
+)
+
+# An immutable folder of arrays, and the digest of each of its files.
+groups = _table(
+    "groups",
+    Column("id", Text, primary_key=True),  # digest of the content
+    Column("kind", Text, nullable=False),  # scenes, graphs
+    Column("created_at", Text, nullable=False),
+)
+files = _table(
+    "files",
+    Column("group_id", Text, ForeignKey("groups.id"), primary_key=True),
+    Column("path", Text, primary_key=True),  # relative to the group
+    Column("size_bytes", Bytes, nullable=False),
+    Column("sha256", Text, nullable=False),
+)
+
+scenes = _table(
+    "scenes",
+    Column("number", Integer, primary_key=True),
+    Column("id", Text, nullable=False, unique=True),  # digest of Gaussians and cameras
+    Column("name", Text, nullable=False),
+    Column("num_gaussians", Integer, nullable=False),
+    Column("sh_degree", Integer, nullable=False),
+    Column("num_cameras", Integer, nullable=False),
+    Column("bounds", Json, nullable=False),
+    Column("scale_policy", Text, nullable=False),
+    Column("captured_at", Text),
+    Column("ingested_at", Text, nullable=False),
+    Column("source", Text, nullable=False),
+    Column("cameras_synthesised", Integer, nullable=False),
+    Column("antialiased", Integer, nullable=False),
+    Column("notes", Json, nullable=False),
+    Column("group_id", Text, ForeignKey("groups.id")),  # null once pruned
+    Column("removed_at", Text),  # the tombstone
+    CheckConstraint("scale_policy in ('auto', 'known', 'unknown')", name="scale_policy"),
+)
+Index(
+    "uq_scenes_living_name",
+    scenes.c.name,
+    unique=True,
+    sqlite_where=text("removed_at IS NULL"),
+    postgresql_where=text("removed_at IS NULL"),
+)
+
+# `chunk_boxes` is an R*Tree on SQLite and a plain table elsewhere, so the migration makes it:
+# id, s0 = s1 = scene number, x0 x1 y0 y1 z0 z1, chunk.
+CHUNK_BOXES = "chunk_boxes"
+
+graphs = _table(
+    "graphs",
+    Column("key", Text, primary_key=True),  # digest of scene and method
+    _scene("scene", index=True),
+    Column("method", Text, nullable=False),
+    Column("num_nodes", Integer, nullable=False),
+    Column("about", Json, nullable=False),  # up, unit_m, notes, layers
+    Column("group_id", Text, ForeignKey("groups.id"), nullable=False),
+    Column("created_at", Text, nullable=False),
+)
+
+registrations = _table(
+    "registrations",
+    Column("number", Integer, primary_key=True),
+    _scene("target"),
+    _scene("source"),
+    Column("pair", Text, nullable=False, index=True),  # both ids, sorted: the pair in either direction
+    Column("key", Text, nullable=False, index=True),
+    Column("status", Text, nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("S_target_source", Json),
+    Column("information", Json),
+    Column("num_inliers", Integer, nullable=False),
+    Column("num_correspondences", Integer, nullable=False),
+    Column("overlap", Real, nullable=False),
+    Column("method", Text, nullable=False),
+    Column("exact", Integer, nullable=False),
+    Column("seconds", Json, nullable=False),
+    Column("evidence", Json, nullable=False),
+    Column("created_at", Text, nullable=False),
+    CheckConstraint("status in ('accepted', 'rejected', 'no_match')", name="status"),
+)
+verdicts = _table(
+    "verdicts",
+    Column("number", Integer, primary_key=True),
+    Column("pair", Text, nullable=False, index=True),
+    Column("verdict", Text, nullable=False),
+    Column("registration", Integer, ForeignKey("registrations.number"), nullable=False),
+    Column("note", Text, nullable=False),
+    Column("created_at", Text, nullable=False),
+    CheckConstraint("verdict in ('confirm', 'reject', 'withdraw')", name="verdict"),
+)
+
+revisions = _table(
+    "revisions",
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("parameters", Json, nullable=False),
+    Column("undecided", Json, nullable=False),
+    Column("note", Text, nullable=False),
+    Column("created_at", Text, nullable=False),
+    Column("dropped_at", Text),  # prune may reclaim what only this revision names
+)
+poses = _table(
+    "poses",
+    Column("revision", Integer, ForeignKey("revisions.number"), primary_key=True),
+    _scene("scene", primary_key=True),
+    Column("S_map_scene", Json),
+    Column("component", Integer, nullable=False),
+    Column("status", Text, nullable=False),
+    Column("covariance", Json),
+)
+edges = _table(
+    "edges",
+    Column("revision", Integer, ForeignKey("revisions.number"), primary_key=True),
+    _scene("target", primary_key=True),
+    _scene("source", primary_key=True),
+    Column("used", Json),  # true, false or "tentative"; null: only a residual or reason is known
+    Column("residual", Real),
+    Column("reason", Text),
+)
+
+priors = _table(
+    "priors",
+    Column("number", Integer, primary_key=True),
+    _scene("scene", index=True),
+    Column("S_map_scene", Json, nullable=False),
+    Column("sigmas", Json, nullable=False),
+    Column("created_at", Text, nullable=False),
+    Column("removed_at", Text),
+)
+
+models = _table(
+    "models",
+    Column("number", Integer, primary_key=True),
+    Column("name", Text, nullable=False),
+    Column("kind", Text, nullable=False),
+    Column("path", Text, nullable=False),  # relative to the map where it was copied
+    Column("copied", Integer, nullable=False),
+    Column("sha256", Text, nullable=False),
+    Column("size_bytes", Bytes, nullable=False),
+    Column("options", Json, nullable=False),
+    Column("created_at", Text, nullable=False),
+    Column("removed_at", Text),
+)
+Index(
+    "uq_models_living_name",
+    models.c.name,
+    unique=True,
+    sqlite_where=text("removed_at IS NULL"),
+    postgresql_where=text("removed_at IS NULL"),
+)
+
+exports = _table(
+    "exports",
+    Column("number", Integer, primary_key=True),
+    Column("target", Text, nullable=False, index=True),  # the folder or file it was written to
+    Column("revision", Integer, ForeignKey("revisions.number")),
+    Column("settings", Json, nullable=False),
+    Column("created_at", Text, nullable=False),
+)
+tiles = _table(
+    "tiles",
+    Column("number", Integer, primary_key=True),
+    Column("export", Integer, ForeignKey("exports.number"), nullable=False),
+    Column("key", Text, nullable=False, index=True),
+    Column("component", Integer, nullable=False),
+    Column("bounds", Json, nullable=False),
+    Column("poses", Json, nullable=False),  # S_map_scene by scene id
+    Column("num_gaussians", Integer, nullable=False),
+    Column("method", Text, nullable=False),
+    Column("truncated", Integer, nullable=False),
+    Column("path", Text, nullable=False),  # relative to the target
+    Column("sha256", Text, nullable=False),
+    Column("created_at", Text, nullable=False),
+    Column("removed_at", Text),
+)

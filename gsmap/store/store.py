@@ -1,0 +1,166 @@
+"""The only door to a map's disk."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from sqlalchemy import insert, select
+
+import gsmap
+from gsmap.errors import ConfigError, NotFoundError, StoreError
+from gsmap.store import catalog as _catalog
+from gsmap.store import migrate, schema, sqlite
+from gsmap.store.arrays import Arrays
+from gsmap.store.catalog import Catalog
+from gsmap.store.scenes import Scenes
+
+
+class Store:
+    """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
+
+    One attribute per noun: ``scenes``. Every method that changes something is one transaction, durable when it
+    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
+    processes open their own.
+
+    Example::
+
+        with Store.create("site.gsmap") as store:
+            scene, is_new = store.scenes.add(gaussians, cameras, name="monday")
+    """
+
+    def __init__(self, folder: Path, catalog: Catalog) -> None:
+        self.folder = folder
+        self.arrays = Arrays(folder / "arrays")
+        self.catalog = catalog
+        self.scenes = Scenes(catalog, self.arrays)
+
+    @classmethod
+    def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
+        """Make an empty map and open it for writing; it appears whole or not at all.
+
+        Args:
+            path: a folder that does not exist or is empty.
+            catalog_url: an SQLAlchemy URL (an empty PostgreSQL database, for many writers) to use instead of
+                ``map.sqlite``. It is remembered in ``catalog.url`` without its password, which the driver then takes
+                from its usual places (``PGPASSWORD``, ``~/.pgpass``).
+
+        Raises:
+            StoreError: the folder is not empty, or cannot be written.
+            NotFoundError: the folder it should lie in does not exist.
+        """
+        folder = Path(path).absolute()
+        if folder.is_dir() and any(folder.iterdir()):
+            is_map = "is a map already" if _is_map(folder) else "is not empty"
+            raise StoreError(f"{path} {is_map}: open it, or choose another name")
+        if folder.exists() and not folder.is_dir():
+            raise StoreError(f"{path} is a file: a map is a folder; choose another name")
+        if not folder.parent.is_dir():
+            raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist")
+        staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
+        try:
+            with _catalog.explained(folder):
+                staged.mkdir()
+                (staged / "arrays").mkdir()
+                _make_catalog(staged, catalog_url)
+                os.rename(staged, folder)
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+        return cls.open(path, "w")
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str], mode: str = "w", *, catalog_url: str | None = None) -> Store:
+        """Open a map.
+
+        Args:
+            mode: ``r`` to read only (works on a read-only disk), ``w`` to change it too.
+            catalog_url: in place of the remembered one.
+
+        Raises:
+            NotFoundError: no such folder.
+            StoreError: not a map, or not writable.
+            SchemaVersionError: written by a newer gsmap, or an older one (``gsmap migrate``).
+        """
+        store = cls._connect(path, mode, catalog_url)
+        try:
+            migrate.require_current(store.catalog.engine, store.folder)
+        except BaseException:
+            store.close()
+            raise
+        return store
+
+    @classmethod
+    def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
+        """Bring an older map to this gsmap's schema; returns the version before and after."""
+        store = cls._connect(path, "w", None)
+        with store:
+            return migrate.upgrade(store.catalog)
+
+    @classmethod
+    def _connect(cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None) -> Store:
+        if mode not in ("r", "w"):
+            raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
+        folder = Path(path)
+        if not folder.exists():
+            raise NotFoundError(f"no map at {path}: make one with gsmap init {path}")
+        if not _is_map(folder):
+            what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
+            raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
+        if mode == "w" and not os.access(folder, os.W_OK):
+            raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
+        with _catalog.explained(folder):
+            if catalog_url is not None:
+                engine = _catalog.url_engine(catalog_url)
+            else:
+                engine = _catalog.open_engine(folder, writable=mode == "w")
+        return cls(folder, Catalog(folder, engine, writable=mode == "w"))
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Everything inside is committed together at the end, or not at all. Keep it short: other writers wait."""
+        with self.catalog.write():
+            yield
+
+    @property
+    def id(self) -> str:
+        """The map's own random id."""
+        with self.catalog.read() as connection:
+            return connection.execute(select(schema.about.c.id)).scalar_one()
+
+    def close(self) -> None:
+        self.catalog.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Store({str(self.folder)!r}, mode={'w' if self.catalog.writable else 'r'!r})"
+
+
+def _is_map(folder: Path) -> bool:
+    has_catalog = (folder / sqlite.FILE).is_file() or (folder / _catalog.URL_FILE).is_file()
+    return has_catalog and (folder / "arrays").is_dir()
+
+
+def _make_catalog(folder: Path, url: str | None) -> None:
+    if url is None:
+        sqlite.create_file(folder / sqlite.FILE)
+        engine = sqlite.engine(folder / sqlite.FILE, writable=True)
+    else:
+        engine = _catalog.url_engine(url)
+        if migrate.version(engine, folder) is not None:
+            raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
+        (folder / _catalog.URL_FILE).write_text(_catalog.url_without_password(url) + "\n")
+    made = Catalog(folder, engine, writable=True)
+    migrate.upgrade(made)
+    with made.write() as connection:
+        row = {"id": uuid.uuid4().hex, "created_at": _catalog.now(), "gsmap_version": gsmap.__version__}
+        connection.execute(insert(schema.about), row)
+    made.close()
