@@ -143,6 +143,4 @@ def _left_factor(omega: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
     first = (growth * _NODES * np.sinc(theta * _NODES / np.pi)).sum(1)
     second = (growth * 0.5 * (_NODES * np.sinc(theta * _NODES / (2 * np.pi))) ** 2).sum(1)
     k = skew(omega)
-    return (
-        identity[:, None, None] * np.eye(3) + first[:, None, None] * k + second[:, None, None] * (k @ k)
-    )
+    return identity[:, None, None] * np.eye(3) + first[:, None, None] * k + second[:, None, None] * (k @ k)
