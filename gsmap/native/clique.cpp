@@ -1,7 +1,7 @@
 // Consistency graphs of point correspondences, and their maximum clique.
 //
 // Graphs are symmetric bit matrices: row i holds ceil(n / 64) words of 64 bits, bit j set where i and j agree. Everything
-// is single-threaded and deterministic: limits count search nodes, never time.
+// is single-threaded and deterministic: the limit counts steps of work (words of bits touched), never time.
 #include "clique.h"
 
 #include <nanobind/ndarray.h>
@@ -121,18 +121,19 @@ std::vector<int> grow(const BitGraph &g, int first) {
 // Tomita et al. 2010).
 struct Search {
     const BitGraph &g;
-    long long limit, &nodes;
+    long long limit, &steps;
     std::vector<int> current, best;
     std::size_t bound;  // cliques must be larger than this to count
     bool stopped = false;
     std::vector<std::vector<Word>> classes;
 
-    Search(const BitGraph &g_, std::size_t bound_, long long limit_, long long &nodes_)
-        : g(g_), limit(limit_), nodes(nodes_), bound(bound_) {}
+    Search(const BitGraph &g_, std::size_t bound_, long long limit_, long long &steps_)
+        : g(g_), limit(limit_), steps(steps_), bound(bound_) {}
 
     // Tries to move `v` into a class <= keep by evicting its only neighbour there into another such class.
     bool recolour(int v, int keep) {
         for (int k = 1; k <= keep; ++k) {
+            steps += g.words;
             int neighbour = -1, hits = 0;
             for (int w = 0; w < g.words && hits < 2; ++w)
                 if (Word both = classes[k][w] & g.row(v)[w]) hits += popcount(both), neighbour = w * 64 + lowest(both);
@@ -140,6 +141,7 @@ struct Search {
             if (hits > 1) continue;
             for (int other = k + 1; other <= keep; ++other) {
                 bool free = true;
+                steps += g.words;
                 for (int w = 0; w < g.words && free; ++w) free = !(classes[other][w] & g.row(neighbour)[w]);
                 if (!free) continue;
                 unset(classes[k].data(), neighbour);
@@ -167,6 +169,7 @@ struct Search {
                     unset(available.data(), v);
                     for (int x = w; x < g.words; ++x) available[x] &= ~g.row(v)[x];
                     --remaining;
+                    steps += g.words;
                     set(classes[k].data(), v);
                     if (k <= keep) continue;
                     if (keep >= 2) {
@@ -182,7 +185,7 @@ struct Search {
     }
 
     void expand(std::vector<Word> &candidates) {
-        if (++nodes > limit) {
+        if (steps > limit) {
             stopped = true;
             return;
         }
@@ -207,7 +210,7 @@ struct Search {
 
 }  // namespace
 
-// Maximum clique of a graph given as bit rows. Returns (members ascending, exact, search nodes).
+// Maximum clique of a graph given as bit rows. Returns (members ascending, exact, steps).
 static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *bits, int n, int words,
                                                                     long long limit) {
     if (n == 0) return {{}, true, 0};
@@ -219,18 +222,18 @@ static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *
 
     // Start from good cliques: grown from the vertices of the densest cores, spread over the order.
     std::vector<int> best{order.back()};
-    int starts = std::min(n, 24);
     std::vector<char> covered(n, 0);
-    for (int k = n - 1, done = 0; k >= 0 && done < starts; --k) {
+    long long steps = 0;
+    for (int k = n - 1, done = 0; k >= 0 && done < 24 && (done < 3 || steps < limit / 8); --k) {
         if (covered[order[k]] || core[order[k]] < int(best.size())) continue;
         auto clique = grow(g, order[k]);
         for (int v : clique) covered[v] = 1;
         ++done;
+        steps += (long long)core[order[k]] * core[order[k]];
         if (clique.size() > best.size()) best = clique;
     }
 
     bool exact = true;
-    long long nodes = 0;
     std::vector<int> rank(n);
     for (int k = 0; k < n; ++k) rank[order[k]] = k;
     // Dense cores last removed hold the large cliques: search them first, so the bound rises early.
@@ -242,6 +245,7 @@ static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *
             if (rank[u] > k && core[u] >= int(best.size())) members.push_back(u);
         });
         if (members.size() < best.size()) continue;
+        steps += (long long)members.size() * members.size();
         BitGraph raw = induced(g.bits.data(), g.words, members);
         std::vector<int> inner, inner_core;
         degeneracy(raw, inner, inner_core);
@@ -249,7 +253,7 @@ static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *
         std::reverse(inner.begin(), inner.end());
         BitGraph sub = induced(raw.bits.data(), raw.words, inner);
         std::size_t bound = best.size() - 1;
-        Search search(sub, bound, limit, nodes);
+        Search search(sub, bound, limit, steps);
         std::vector<Word> all(sub.words, 0);
         for (int i = 0; i < sub.n; ++i) set(all.data(), i);
         search.expand(all);
@@ -263,7 +267,7 @@ static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *
         }
     }
     std::sort(best.begin(), best.end());
-    return {best, exact, nodes};
+    return {best, exact, steps};
 }
 
 using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
@@ -343,13 +347,13 @@ void bind_clique(nb::module_ &m) {
         nb::arg("height_slope"), "Bit rows (n, ceil(n / 64)) of the graph in which correspondences agree.");
     m.def(
         "maximum_clique",
-        [](Bits bits, long long node_limit) {
+        [](Bits bits, long long step_limit) {
             std::size_t n = bits.shape(0), words = bits.shape(1);
             if (words != (n + 63) / 64) throw std::invalid_argument("bit rows must hold ceil(n / 64) words");
             std::tuple<std::vector<int>, bool, long long> found;
             {
                 nb::gil_scoped_release release;
-                found = maximum_clique(bits.data(), int(n), int(words), node_limit);
+                found = maximum_clique(bits.data(), int(n), int(words), step_limit);
             }
             auto &members = std::get<0>(found);
             auto *out = new std::int32_t[members.size() + 1];
@@ -358,5 +362,5 @@ void bind_clique(nb::module_ &m) {
             return nb::make_tuple(nb::ndarray<nb::numpy, std::int32_t, nb::ndim<1>>(out, {members.size()}, owner),
                                   std::get<1>(found), std::get<2>(found));
         },
-        nb::arg("bits"), nb::arg("node_limit"), "Largest clique: (members, exact, search nodes).");
+        nb::arg("bits"), nb::arg("step_limit"), "Largest clique: (members, exact, steps of work).");
 }

@@ -15,24 +15,24 @@ class Clique:
 
     Args:
         members: indices of the correspondences, ascending.
-        exact: proved largest; False when the search stopped at its node limit with the best found so far.
-        num_search_nodes: branch-and-bound nodes visited.
+        exact: proved largest; False when the search stopped at its limit with the best found so far.
+        steps: work done (words of bits touched).
     """
 
     members: np.ndarray
     exact: bool
-    num_search_nodes: int
+    steps: int
 
     def __len__(self) -> int:
         return len(self.members)
 
 
-def maximum_clique(rows: np.ndarray, node_limit: int = 20_000) -> Clique:
+def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000) -> Clique:
     """Maximum clique of a graph given as symmetric bit rows (`consistency_graph`).
 
     Exact branch and bound over a degeneracy order, bounded by greedy colouring with recolouring (San Segundo et al.
-    2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts search nodes, not seconds, so the
-    answer is the same on every machine.
+    2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts steps of work (about a nanosecond
+    each), not seconds, so the answer is the same on every machine.
 
     Raises:
         InputError: rows that are not (M, ceil(M / 64)) uint64.
@@ -42,5 +42,5 @@ def maximum_clique(rows: np.ndarray, node_limit: int = 20_000) -> Clique:
     rows = np.ascontiguousarray(rows)
     if rows.dtype != np.uint64 or rows.ndim != 2 or rows.shape[1] != -(-len(rows) // 64):
         raise InputError(f"a graph needs (M, ceil(M / 64)) uint64 bit rows, got {rows.shape} {rows.dtype}")
-    members, exact, nodes = _native.maximum_clique(rows, int(node_limit))
-    return Clique(members.astype(np.int64), bool(exact), int(nodes))
+    members, exact, steps = _native.maximum_clique(rows, int(step_limit))
+    return Clique(members.astype(np.int64), bool(exact), int(steps))

@@ -21,7 +21,7 @@ class Params:
 
     min_similarity: float = 0.5
     top_k: int = 1
-    max_correspondences: int = 3000
+    max_correspondences: int = 1200
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,186 @@
+"""Poses that a pair of scene graphs suggests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gsmap.register import consistency, correspondences, scale
+from gsmap.register.clique import maximum_clique
+from gsmap.register.correspondences import Correspondences
+from gsmap.register.pose import fit_pose
+from gsmap.register.significance import agreeing, log10_nfa
+from gsmap.types import NodeLayer, SceneGraph, Sim3
+
+
+@dataclass(frozen=True)
+class Params:
+    """Args:
+    landmarks, objects: how nodes of each kind are paired.
+    consistency: how pairs are tested against each other; its sigma is that of landmarks.
+    objects_sigma_m: the same for objects, whose centres are less well defined.
+    scale: the vote, where the scale is not known.
+    num_scales: scales tried of those voted for, over all pairs of layers.
+    step_limit: of a clique search, about a nanosecond each.
+    min_inliers: fewer agreeing correspondences propose nothing.
+    """
+
+    landmarks: correspondences.Params = field(default_factory=correspondences.Params)
+    objects: correspondences.Params = field(default_factory=lambda: correspondences.Params(top_k=5))
+    consistency: consistency.Params = field(default_factory=consistency.Params)
+    objects_sigma_m: float = 0.05
+    scale: scale.Params = field(default_factory=scale.Params)
+    num_scales: int = 6
+    step_limit: int = 5_000_000
+    min_inliers: int = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A pose to be refined and judged.
+
+    Args:
+        method: which evidence suggested it (``landmarks``, ``objects``, ``dense``).
+        S_target_source: the pose, in the scenes' own units.
+        with_scale: the scale was estimated; otherwise it is exactly 1.
+        num_inliers, num_correspondences, exact: of the clique.
+        log_nfa: log10 of the number of false alarms; NaN where nothing was counted.
+        runner_up: size of the best clique that disagrees, as a share of this one; NaN where none was sought.
+        flaw: why the pose cannot be used, or empty.
+    """
+
+    method: str
+    S_target_source: Sim3
+    with_scale: bool
+    num_inliers: int
+    num_correspondences: int = 0
+    exact: bool = True
+    log_nfa: float = float("nan")
+    runner_up: float = float("nan")
+    flaw: str = ""
+
+
+def propose(
+    target: SceneGraph,
+    source: SceneGraph,
+    kind: str,
+    params: Params | None = None,
+    *,
+    with_scale: bool = False,
+) -> list[Proposal]:
+    """The best pose by one kind of node and, where a rival comes near it, the rival; best first.
+
+    Candidates, consistency graph, maximum clique, closed-form pose. With an unknown scale every pair of the kind's
+    layers (each made under another guess of the metre) votes, and the scales most voted for are tried.
+    """
+    params = params or Params()
+    fields = [
+        _Field(a, b, target, source, kind, params, with_scale) for a, b in _layers(target, source, kind, with_scale)
+    ]
+    fields = [f for f in fields if len(f.matches) >= params.min_inliers]
+    if with_scale:
+        votes = [(score, i, s) for i, f in enumerate(fields) for s, score in scale.vote_scales(f.matches, params.scale)]
+        trials = [(i, s) for _, i, s in sorted(votes, reverse=True)[: params.num_scales]]
+    else:
+        trials = [(i, 1.0) for i in range(len(fields))]
+    found = [(p, i, s) for i, s in trials if (p := fields[i].solve(fields[i].matches, s)) is not None]
+    if not found:
+        return []
+    best, i, s = min(found, key=lambda f: (f[0].log_nfa, -f[0].num_inliers))
+    # The rival: the best clique once everything that agrees with this pose, within a metre, is out of the way.
+    rival = fields[i].solve(fields[i].disagreeing(best.S_target_source), s)
+    share = rival.num_inliers / best.num_inliers if rival else 0.0
+    best = replace(best, runner_up=share)
+    if rival is None or share < 0.6:
+        return [best]
+    return [best, replace(rival, runner_up=1.0 / share)]
+
+
+def _layers(target: SceneGraph, source: SceneGraph, kind: str, with_scale: bool) -> list[tuple[NodeLayer, NodeLayer]]:
+    """Pairs of layers of one kind that may be compared: the metric ones, or all guesses of the metre."""
+
+    def of(graph: SceneGraph) -> list[NodeLayer]:
+        guesses = [layer for name, layer in graph.layers.items() if name.startswith(f"{kind}:")]
+        plain = [graph.layers[kind]] if kind in graph.layers else []
+        return (guesses or plain) if with_scale else plain
+
+    pairs = [(a, b) for a in of(target) for b in of(source) if a.method == b.method and len(a) and len(b)]
+    if not with_scale:
+        return pairs
+    # Guesses come in fixed steps, so several pairs stand for one relative scale: keep the one with most nodes.
+    chosen: dict[float, tuple[NodeLayer, NodeLayer]] = {}
+    for a, b in sorted(pairs, key=lambda pair: -min(len(pair[0]), len(pair[1]))):
+        chosen.setdefault(round(float(np.log(a.unit_m / b.unit_m)), 3), (a, b))
+    return list(chosen.values())
+
+
+class _Field:
+    """Two layers, their candidate correspondences, and how a clique of those becomes a proposal."""
+
+    def __init__(
+        self,
+        a: NodeLayer,
+        b: NodeLayer,
+        target: SceneGraph,
+        source: SceneGraph,
+        kind: str,
+        params: Params,
+        with_scale: bool,
+    ) -> None:
+        self.a, self.b, self.kind, self.params, self.with_scale = a, b, kind, params, with_scale
+        sigma = params.objects_sigma_m if kind == "objects" else params.consistency.sigma_m
+        self.test = replace(params.consistency, sigma_m=sigma)
+        self.radius_m = max(4.0 * np.sqrt(2.0) * sigma, 0.15)
+        self.source_points = b.positions * b.unit_m
+        up = target.up is not None and source.up is not None
+        self.source_heights = self.source_points @ source.up if up else None
+        matching = params.objects if kind == "objects" else params.landmarks
+        self.matches = correspondences.correspondences(
+            a, b, matching, units_m=(a.unit_m, b.unit_m), ups=(target.up, source.up)
+        )
+
+    def solve(self, among: Correspondences, at_scale: float) -> Proposal | None:
+        """The pose of the largest clique among some of the correspondences."""
+        if len(among) < self.params.min_inliers:
+            return None
+        sigma = self.test.sigma_m
+        rows = consistency.consistency_graph(among, self.test, scale=at_scale)
+        clique = maximum_clique(rows, self.params.step_limit)
+        if len(clique) < self.params.min_inliers:
+            return None
+        members = among[clique.members]
+        fit = fit_pose(members.target, members.source, with_scale=self.with_scale, sigma_m=sigma)
+        pose = fit.S_target_source
+        inliers = among[agreeing(among, pose, self.radius_m)]
+        if not fit.flaw and len(inliers) > len(clique):
+            pose = fit_pose(inliers.target, inliers.source, with_scale=self.with_scale, sigma_m=sigma).S_target_source
+        nfa = log10_nfa(
+            self.a,
+            self.b,
+            self.source_points,
+            self.matches,
+            pose,
+            radius_m=self.radius_m,
+            source_heights=self.source_heights,
+        )
+        return Proposal(
+            self.kind,
+            self._in_scene_units(pose),
+            self.with_scale,
+            len(clique),
+            len(self.matches),
+            clique.exact,
+            nfa,
+            flaw=fit.flaw,
+        )
+
+    def disagreeing(self, S_target_source: Sim3, beyond_m: float = 1.0) -> Correspondences:
+        """The correspondences that a pose leaves farther apart than this."""
+        moved = S_target_source.apply(self.matches.source / self.b.unit_m) * self.a.unit_m
+        return self.matches[np.linalg.norm(moved - self.matches.target, axis=1) > beyond_m]
+
+    def _in_scene_units(self, pose: Sim3) -> Sim3:
+        """A pose between metres as one between the scenes' own units."""
+        own = pose.scale * self.b.unit_m / self.a.unit_m if self.with_scale else 1.0
+        return Sim3(pose.rotation, pose.translation / self.a.unit_m, own)

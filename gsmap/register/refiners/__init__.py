@@ -1,0 +1,1 @@
+"""Ways to sharpen a pose once it is nearly right."""

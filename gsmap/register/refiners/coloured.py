@@ -1,0 +1,89 @@
+"""Point-to-plane and colour together, over six or seven degrees of freedom: the refiner for unknown scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.rotations import retract
+from gsmap.register.covariance import point_to_plane_jacobian
+from gsmap.register.surface import Surface
+from gsmap.types import Sim3
+
+
+@dataclass(frozen=True)
+class Params:
+    """Args (metres):
+    radii_m: correspondence distances, coarse to fine.
+    iterations: Gauss-Newton steps at each.
+    colour_weight: metres of distance that one standard deviation of local colour counts for; 0 leaves colour out.
+    max_points: source cells that take part at each radius.
+    """
+
+    radii_m: tuple[float, ...] = (0.4, 0.15, 0.06)
+    iterations: int = 10
+    colour_weight: float = 0.01
+    max_points: tuple[int, ...] = (3000, 6000, 20_000)
+
+
+def refine(
+    target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
+) -> Sim3:
+    """Similarity (or rigid) pose that lays the source's cells on the target's planes and colours (both in metres).
+
+    Iteratively reweighted Gauss-Newton (Geman-McClure over the radius) on the point-to-plane distance and, as in
+    Park et al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane. The source's
+    exposure (gain and offset) is fitted along, so a change of it costs nothing.
+    """
+    params = params or Params()
+    pose = start
+    anchors = target.coarse[0]
+    if len(source) < 10 or len(target) < 10:
+        return start
+    lightness_t, gradients = target.lightness, target.lightness_gradients
+    for radius, count in zip(params.radii_m, params.max_points, strict=True):
+        chosen = source.sample(count)
+        points, light = source.coarse[0][chosen], source.lightness[chosen]
+        for _ in range(params.iterations):
+            moved = pose.apply(points)
+            distance, row = target.nearest(moved, radius)
+            hit = np.flatnonzero(np.isfinite(distance))
+            if len(hit) < 10:
+                return pose
+            row, offset = row[hit], moved[hit] - anchors[row[hit]]
+            normals = target.normals[row]
+            plane = (normals * offset).sum(1)
+            weights = 1.0 / (1.0 + (plane / (0.3 * radius)) ** 2) ** 2
+            jacobian = point_to_plane_jacobian(pose, points[hit], normals)
+            system = (jacobian * weights[:, None]).T @ jacobian
+            gradient = (jacobian * weights[:, None]).T @ plane
+            if params.colour_weight > 0:
+                expected = lightness_t[row] + (gradients[row] * offset).sum(1)
+                gain, bias = _exposure(expected, light[hit])
+                colour = expected - gain * light[hit] - bias
+                spread = 1.4826 * np.median(np.abs(colour)) + 1e-6
+                factor = params.colour_weight / spread
+                tint = weights / (1.0 + (colour / (2 * spread)) ** 2) ** 2
+                jacobian = point_to_plane_jacobian(pose, points[hit], gradients[row]) * factor
+                system += (jacobian * tint[:, None]).T @ jacobian
+                gradient += (jacobian * tint[:, None]).T @ (colour * factor)
+            dim = 7 if with_scale else 6
+            step = np.zeros(7)
+            # About the centroid of the pairs rotation, translation and scale hardly mix.
+            step[:dim] = -np.linalg.solve(system[:dim, :dim] + 1e-9 * np.trace(system) * np.eye(dim), gradient[:dim])
+            pose = retract(pose, step if with_scale else step[:6])
+            if (
+                np.abs(step[:3]).max() < 1e-5
+                and np.linalg.norm(pose.apply(points[hit]) - moved[hit], axis=1).max() < 1e-4
+            ):
+                break
+    return pose
+
+
+def _exposure(target: np.ndarray, source: np.ndarray) -> tuple[float, float]:
+    """Gain and offset that map the source's lightness to the target's, by medians."""
+    spread_t = np.median(np.abs(target - np.median(target)))
+    spread_s = np.median(np.abs(source - np.median(source)))
+    gain = float(np.clip(spread_t / max(spread_s, 1e-6), 0.5, 2.0))
+    return gain, float(np.median(target) - gain * np.median(source))

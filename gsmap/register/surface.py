@@ -1,0 +1,126 @@
+"""The surface points of a scene, as registration aligns and compares them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from gsmap.types import Gaussians
+
+_SH_C0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class Params:
+    """Which Gaussians are surface, and how finely they are sampled (metres).
+
+    Args:
+        min_opacity, max_scale_m: a surface Gaussian is opaque and not huge; floaters and sky are the rest.
+        max_scale_quantile: of the opaque Gaussians at least this share is surface, however coarse the scene is.
+        resolution_m: points are averaged over cells of this size before they are aligned.
+    """
+
+    min_opacity: float = 0.5
+    max_scale_m: float = 0.08
+    max_scale_quantile: float = 0.7
+    resolution_m: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Centres of a scene's surface Gaussians, in metres.
+
+    Args:
+        points: (N, 3) float64 in the scene's frame, scaled to metres.
+        colours: (N, 3) float32 view-independent colour.
+        resolution_m: cell size of the aligned cloud.
+    """
+
+    points: np.ndarray
+    colours: np.ndarray
+    resolution_m: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, unit_m: float = 1.0, params: Params | None = None) -> Surface:
+        """The surface of a scene whose unit is ``unit_m`` metres."""
+        params = params or Params()
+        largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
+        opaque = gaussians.logit_opacities > np.log(params.min_opacity / (1 - params.min_opacity))
+        limit = np.log(params.max_scale_m)
+        if opaque.any():
+            limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))
+        keep = opaque & (largest <= limit)
+        colours = np.clip(gaussians.sh[keep, 0] * _SH_C0 + 0.5, 0.0, 1.0)
+        return cls(gaussians.means[keep].astype(np.float64) * unit_m, colours, params.resolution_m)
+
+    def scaled(self, factor: float) -> Surface:
+        """The same surface in a unit ``factor`` times smaller."""
+        return self if factor == 1.0 else Surface(self.points * factor, self.colours, self.resolution_m)
+
+    @cached_property
+    def coarse(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cell means (M, 3) of points and of colours at the aligned cloud's resolution, in a fixed order."""
+        cells = np.floor(self.points / self.resolution_m).astype(np.int64)
+        cells -= cells.min(0) if len(cells) else 0
+        size = cells.max(0, initial=0) + 1
+        keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+        _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        values = np.concatenate([self.points, self.colours], axis=1)
+        sums = np.stack([np.bincount(inverse, values[:, k], len(counts)) for k in range(6)], 1)
+        means = sums / counts[:, None]
+        return means[:, :3], means[:, 3:].astype(np.float32)
+
+    def sample(self, count: int) -> np.ndarray:
+        """Rows of at most ``count`` cell means, evenly strided (cells come in spatial order)."""
+        total = len(self.coarse[0])
+        return np.arange(total) if total <= count else np.linspace(0, total - 1, count).astype(np.int64)
+
+    @cached_property
+    def cloud(self) -> tuple[Any, Any]:
+        """The cell means with covariances and normals, and their search tree, as small_gicp keeps them."""
+        import small_gicp
+
+        cloud = small_gicp.PointCloud(self.coarse[0])
+        tree = small_gicp.KdTree(cloud, num_threads=1)
+        small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=20, num_threads=1)
+        return cloud, tree
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(M, 3) unit normals at the cell means; signs mean nothing."""
+        return self.cloud[0].normals()[:, :3]
+
+    @property
+    def lightness(self) -> np.ndarray:
+        """(M,) float64 lightness of the cell means, 0 to 1."""
+        return self.coarse[1].astype(np.float64) @ [0.299, 0.587, 0.114]
+
+    @cached_property
+    def lightness_gradients(self) -> np.ndarray:
+        """(M, 3) change of lightness per metre within the tangent plane of each cell mean."""
+        from scipy.spatial import cKDTree
+
+        points, light, normals = self.coarse[0], self.lightness, self.normals
+        _, near = cKDTree(points).query(points, k=min(10, len(points)))
+        offset = points[near] - points[:, None]
+        offset -= (offset * normals[:, None]).sum(2, keepdims=True) * normals[:, None]
+        difference = light[near] - light[:, None]
+        # The normal is added to the normal equations: the gradient has no part along it.
+        system = offset.transpose(0, 2, 1) @ offset + self.resolution_m**2 * normals[:, :, None] * normals[:, None]
+        system += 0.1 * self.resolution_m**2 * np.eye(3)
+        return np.linalg.solve(system, (offset * difference[..., None]).sum(1)[..., None])[..., 0]
+
+    def nearest(self, points: np.ndarray, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Distance to and row of the nearest cell mean of each point; inf and 0 where none lies within the radius."""
+        if not len(self) or not len(points):
+            return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
+        rows, squares = self.cloud[1].batch_nearest_neighbor_search(np.ascontiguousarray(points), num_threads=1)
+        rows, squares = np.asarray(rows), np.asarray(squares)
+        hit = squares <= radius_m**2
+        return np.where(hit, np.sqrt(squares), np.inf), np.where(hit, rows, 0).astype(np.int64)

@@ -1,0 +1,101 @@
+"""Accept a pose, or say why not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.register.agreement import Agreement
+from gsmap.register.propose import Proposal
+
+
+@dataclass(frozen=True)
+class Params:
+    """Bars a pose must clear; a wrong edge costs a map more than ten right ones missed.
+
+    Args:
+        max_log_nfa, max_runner_up: a clique is significant when fewer false alarms than this (log10) are expected and
+            no disagreeing clique comes nearer than this share of it.
+        min_coinciding: source cells that must coincide with the target's surface.
+        max_contradiction: share of points in front of what the other scene's cameras saw.
+        min_colour_correlation, min_colour_t: local colours of coinciding surfaces must agree this well, this surely.
+        changed_contradiction, changed_colour_correlation: places change, so more contradiction is borne where colours
+            agree this well.
+        strong_overlap, strong_contradiction, strong_colour_correlation, strong_colour_t: what the surfaces must show to
+            carry a pose whose clique is not significant, or that came from no clique.
+        min_seen: fewer points than this judged by cameras is no judgement.
+        max_rotation_sigma_deg, max_translation_sigma_m, max_scale_sigma: a pose known less well (standard deviation in
+            the least known direction, at the overlap's centroid) is not an edge.
+    """
+
+    max_log_nfa: float = -2.0
+    max_runner_up: float = 0.7
+    min_coinciding: int = 300
+    max_contradiction: float = 0.08
+    min_colour_correlation: float = 0.10
+    min_colour_t: float = 2.5
+    changed_contradiction: float = 0.15
+    changed_colour_correlation: float = 0.35
+    strong_overlap: float = 0.05
+    strong_contradiction: float = 0.06
+    strong_colour_correlation: float = 0.18
+    strong_colour_t: float = 3.0
+    min_seen: int = 100
+    max_rotation_sigma_deg: float = 1.0
+    max_translation_sigma_m: float = 0.05
+    max_scale_sigma: float = 0.01
+
+
+def is_significant(proposal: Proposal, params: Params | None = None) -> bool:
+    """The correspondences alone rule out chance, and no rival pose comes near."""
+    params = params or Params()
+    return bool(proposal.log_nfa < params.max_log_nfa and proposal.runner_up <= params.max_runner_up)
+
+
+def judge(
+    proposal: Proposal,
+    agreement: Agreement,
+    sigmas: tuple[float, float, float] | None,
+    params: Params | None = None,
+) -> str:
+    """Empty when the pose is accepted, else the reason why not.
+
+    Args:
+        agreement: what the surfaces say under the refined pose.
+        sigmas: standard deviations (rad, metres, log scale) of the least known directions; None without overlap.
+    """
+    params = params or Params()
+    if proposal.flaw:
+        return proposal.flaw
+    if agreement.num_coinciding < params.min_coinciding or sigmas is None:
+        return f"too little surface coincides ({agreement.num_coinciding} cells)"
+    if agreement.colour_correlation < params.min_colour_correlation or agreement.colour_t < params.min_colour_t:
+        return f"colours disagree where surfaces coincide (correlation {agreement.colour_correlation:.2f})"
+    asked = agreement.num_seen >= params.min_seen and np.isfinite(agreement.contradiction)
+    if asked:
+        changed = agreement.colour_correlation >= params.changed_colour_correlation
+        limit = params.changed_contradiction if changed else params.max_contradiction
+        if agreement.contradiction > limit:
+            return f"{agreement.contradiction:.0%} of the points seen contradict what cameras saw"
+    degrees = np.degrees(sigmas[0])
+    if (
+        degrees > params.max_rotation_sigma_deg
+        or sigmas[1] > params.max_translation_sigma_m
+        or sigmas[2] > params.max_scale_sigma
+    ):
+        return (
+            f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * sigmas[1]:.0f} cm, {sigmas[2]:.1%} in scale"
+        )
+    if is_significant(proposal, params):
+        return ""
+    strong = (
+        asked
+        and agreement.overlap >= params.strong_overlap
+        and agreement.contradiction <= params.strong_contradiction
+        and agreement.colour_correlation >= params.strong_colour_correlation
+        and agreement.colour_t >= params.strong_colour_t
+    )
+    if strong:
+        return ""
+    return "not significant: chance could explain the match, and the surfaces do not confirm it strongly enough"
