@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-import numpy as np
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, delete, insert, select
 
 from gsmap.store.arrays import Arrays, Staged, StoredFile
 from gsmap.store.catalog import now
@@ -17,9 +14,11 @@ def has_group(connection: Connection, group_id: str) -> bool:
 
 
 def publish(connection: Connection, arrays: Arrays, staged: Staged, kind: str, group_id: str) -> None:
-    """Move a staged group into place and name it, inside a write transaction."""
+    """Move a staged group into place and name it, inside a write transaction; it replaces a damaged one."""
     arrays.publish(staged, kind, group_id)
-    connection.execute(insert(groups), {"id": group_id, "kind": kind, "created_at": now()})
+    if not has_group(connection, group_id):
+        connection.execute(insert(groups), {"id": group_id, "kind": kind, "created_at": now()})
+    connection.execute(delete(files).where(files.c.group_id == group_id))
     rows = [
         {"group_id": group_id, "path": f.path, "size_bytes": f.size_bytes, "sha256": f.sha256} for f in staged.files
     ]
@@ -30,8 +29,3 @@ def manifest(connection: Connection, group_id: str) -> tuple[StoredFile, ...]:
     """The files a group must have, with their digests."""
     rows = connection.execute(select(files).where(files.c.group_id == group_id).order_by(files.c.path))
     return tuple(StoredFile(r.path, r.size_bytes, r.sha256) for r in rows)
-
-
-def layered(layers: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Flat names ``layer.array`` of nested arrays."""
-    return {f"{layer}.{name}": array for layer, named in layers.items() for name, array in named.items()}

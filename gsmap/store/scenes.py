@@ -9,7 +9,7 @@ from sqlalchemy import Connection, Row, insert, select, text, update
 
 from gsmap.errors import InputError, NotFoundError, StoreError
 from gsmap.store.arrays import CHUNK_ROWS, Arrays, digest
-from gsmap.store.catalog import Catalog, now
+from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.groups import has_group, manifest, publish
 from gsmap.store.morton import chunk_boxes, morton_order
 from gsmap.store.schema import CHUNK_BOXES, scenes
@@ -57,8 +57,8 @@ class Scenes:
             rename: where another scene has the name, take ``name-2`` and so on; else refuse.
 
         Returns:
-            The scene, and whether it is new. Content that the map has already changes nothing (False); content that
-            was removed comes back under the new name (True).
+            The scene, and whether anything was written. Content that the map has already changes nothing (False);
+            content that was removed comes back under the new name, and content whose bytes were damaged is mended.
 
         Raises:
             InputError: no Gaussians, or the name is taken and ``rename`` is off.
@@ -68,8 +68,9 @@ class Scenes:
         new_id = scene_id(gaussians, cameras)
         with self._catalog.read() as connection:
             row = _by_id(connection, new_id)
-            stored = has_group(connection, new_id)
-        if row is not None and row.removed_at is None:
+            files = manifest(connection, new_id)
+        stored = bool(files) and not self._arrays.problems(KIND, new_id, files)
+        if row is not None and row.removed_at is None and stored:
             return _scene(row), False
         fields = {
             "name": name,
@@ -94,14 +95,17 @@ class Scenes:
         boxes = chunk_boxes(ordered, CHUNK_ROWS, sigmas=_SIGMAS)
         if progress:
             progress(0.4, f"writing {name}")
-        with self._arrays.stage(_to_arrays(ordered, cameras)) as staged, self._catalog.write() as connection:
+        staging = self._arrays.stage(_to_arrays(ordered, cameras))
+        with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
             row = _by_id(connection, new_id)
-            if row is not None and row.removed_at is None:  # another process was faster
-                return _scene(row), False
-            scene = self._enter(connection, new_id, fields, rename)
-            if not has_group(connection, new_id):
-                publish(connection, self._arrays, staged, KIND, new_id)
-                _put_boxes(connection, _by_id(connection, new_id).number, boxes)
+            if row is not None and row.removed_at is None:
+                if manifest(connection, new_id) != files:  # another process was faster
+                    return _scene(row), False
+                scene = _scene(row)  # its bytes are damaged
+            else:
+                scene = self._enter(connection, new_id, fields, rename)
+            publish(connection, self._arrays, staged, KIND, new_id)
+            _put_boxes(connection, _by_id(connection, new_id).number, boxes)
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))
         return scene, True
 

@@ -14,18 +14,25 @@ from sqlalchemy import insert, select
 import gsmap
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import catalog as _catalog
-from gsmap.store import migrate, schema, sqlite
+from gsmap.store import integrity, migrate, schema, sqlite
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
+from gsmap.store.exports import Exports
+from gsmap.store.graphs import Graphs
+from gsmap.store.integrity import Check, Progress, Pruned
+from gsmap.store.models import Models
+from gsmap.store.priors import Priors
+from gsmap.store.registrations import Registrations
+from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
 
 
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
-    One attribute per noun: ``scenes``. Every method that changes something is one transaction, durable when it
-    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
-    processes open their own.
+    One attribute per noun: ``scenes``, ``graphs``, ``registrations``, ``revisions``, ``priors``, ``models`` and
+    ``exports``. Every method that changes something is one transaction, durable when it returns; `transaction` makes
+    several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes open their own.
 
     Example::
 
@@ -38,6 +45,12 @@ class Store:
         self.arrays = Arrays(folder / "arrays")
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
+        self.graphs = Graphs(catalog, self.arrays)
+        self.registrations = Registrations(catalog)
+        self.revisions = Revisions(catalog)
+        self.priors = Priors(catalog)
+        self.models = Models(catalog)
+        self.exports = Exports(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
@@ -130,6 +143,14 @@ class Store:
         """The map's own random id."""
         with self.catalog.read() as connection:
             return connection.execute(select(schema.about.c.id)).scalar_one()
+
+    def check(self, progress: Progress | None = None) -> Check:
+        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`."""
+        return integrity.check(self.catalog, self.arrays, progress)
+
+    def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
+        """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
+        return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def close(self) -> None:
         self.catalog.close()

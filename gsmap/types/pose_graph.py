@@ -16,7 +16,9 @@ class Edge:
     Args:
         target, source: scene ids.
         S_target_source: measured pose.
-        information: (7, 7) over [rot_rad, trans, log_scale] on the source side (see `Registration`).
+        information: (7, 7) SPD over xi = [rot_rad, trans, log_scale] applied on the source side,
+            ``S = S_hat * Exp(xi)`` with the exact Sim(3) exponential (`gsmap.geometry.similarities`), translation in
+            the source's unit; a rigid edge carries a stiff scale row.
         confirmed: a person vouches for it: it joins components by itself and is never voted out.
         strong: the pairwise verdict alone may attach a scene or a small component.
     """
@@ -31,17 +33,25 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Outside knowledge of one scene's pose (GPS, survey, anchor).
+    """Outside knowledge of one scene's pose (GPS, survey, anchor, a known scale, gravity).
+
+    The three parts are independent, so that any of them may be unknown: rotation ``Log(R_hat^T R)``, translation
+    ``R_hat^T (t - t_hat) / s_hat`` and ``log(s / s_hat)``. With an identity rotation in ``S_map_scene`` the
+    translation's axes are the map's: a GPS position of the scene's origin is ``sigmas = [inf] * 3 + [x, y, z, inf]``.
 
     Args:
         scene: scene id.
         S_map_scene: expected pose.
         sigmas: (7,) standard deviations [rot_rad (3), trans_m (3), log_scale], inf where nothing is known.
+        up: (3,) direction against gravity in the scene's frame, if it is known; +z of the map should look that way.
+        up_sigma_rad: standard deviation of that direction.
     """
 
     scene: str
     S_map_scene: Sim3
     sigmas: np.ndarray
+    up: np.ndarray | None = None
+    up_sigma_rad: float = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +60,9 @@ class ScenePose:
 
     Args:
         scene: scene id.
-        S_map_scene: None where nothing ties the scene to its component's gauge (cannot happen for a gauge scene).
-        component: index of its island; islands share no frame.
-        status: ``placed``, ``tentative`` (only edges in no agreeing cycle), or ``isolated``.
+        S_map_scene: the pose in the frame of its component; an isolated scene is its own frame.
+        component: index of its island, largest first; islands share no frame.
+        status: ``placed``, ``tentative`` (placed by edges in no agreeing cycle), or ``isolated``.
         covariance: (7, 7) marginal over [rot_rad, trans, log_scale] on the scene side, or None.
     """
 
@@ -72,8 +82,8 @@ class PoseGraph:
         used: by (target, source): True, False or ``"tentative"``.
         residuals: by (target, source): chi-square of the edge under the answer (7 dof), where it could be computed.
         reasons: by (target, source): why an edge was not used, or why it is tentative.
-        undecided: pairs of scene ids whose edges nothing could decide.
-        parameters: what it was computed with.
+        undecided: (target, source) of the edges that nothing could decide.
+        parameters: what it was computed with, and how (``method`` ``batch`` or ``incremental``, ``batch_scenes``).
     """
 
     poses: dict[str, ScenePose]

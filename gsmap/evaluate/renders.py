@@ -1,0 +1,127 @@
+"""How well Gaussians reproduce pictures: a capture's own photographs, or renders of the capture itself."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import InputError, NotFoundError
+from gsmap.evaluate.images import psnr, ssim
+from gsmap.types import Cameras, Gaussians
+
+_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """Figures per picture, in the order of ``names``; a table's figure is their plain mean."""
+
+    names: tuple[str, ...]
+    psnr_db: np.ndarray
+    ssim: np.ndarray
+    lpips: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def means(self) -> dict[str, float]:
+        """``{"psnr_db", "ssim", "lpips", "num_images"}``; lpips only where it was measured."""
+        out: dict[str, float] = {"num_images": len(self.names)}
+        if self.names:
+            out |= {"psnr_db": float(self.psnr_db.mean()), "ssim": float(self.ssim.mean())}
+        if len(self.lpips):
+            out["lpips"] = float(self.lpips.mean())
+        return out
+
+
+def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:
+    """Pictures of a folder (and those below it) by the index of the camera that has their name; suffixes may differ.
+
+    Raises:
+        NotFoundError: no such folder, or no picture in it has the name of a camera.
+        InputError: two pictures answer to one camera.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise NotFoundError(f"no folder of images at {folder}")
+    index = {_stem(name): i for i, name in enumerate(cameras.names)}
+    found: dict[int, Path] = {}
+    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES):
+        at = index.get(_stem(path.relative_to(folder)), index.get(path.stem))
+        if at is None:
+            continue
+        if at in found:
+            raise InputError(f"camera {cameras.names[at]} has two images: {found[at]} and {path}")
+        found[at] = path
+    if not found:
+        raise NotFoundError(f"no image in {folder} is named like a camera (such as {', '.join(cameras.names[:3])})")
+    return found
+
+
+def read_image(path: str | os.PathLike[str]) -> np.ndarray:
+    """A picture as (H, W, 3) float32 in [0, 1]."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"), dtype=np.float32) / 255
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError(f"{path} is not an image that can be read: {error}") from error
+
+
+def compare_renders(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    images: Mapping[int, np.ndarray | Path],
+    *,
+    lpips: Callable[[np.ndarray, np.ndarray], float] | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> Likeness:
+    """Render the Gaussians at cameras and compare with pictures.
+
+    Args:
+        gaussians, cameras: in one frame.
+        images: by camera index, (H, W, 3) in [0, 1] or paths; a picture of another size than its camera's is rendered
+            at its own size, if the shape agrees.
+        lpips: such as `gsmap.evaluate.images.Lpips`.
+
+    Raises:
+        InputError: a picture whose shape is not its camera's.
+    """
+    from gsmap.render import render
+
+    figures = []
+    for done, (at, image) in enumerate(sorted(images.items())):
+        if isinstance(image, str | os.PathLike):
+            image = read_image(image)
+        camera = _at_size(cameras[at], image.shape[1], image.shape[0])
+        rendered = render(gaussians, camera).colour[0]
+        figures.append((psnr(rendered, image), ssim(rendered, image), lpips(rendered, image) if lpips else 0.0))
+        if progress is not None:
+            progress((done + 1) / len(images), f"image {done + 1} of {len(images)}")
+    table = np.array(figures).reshape(-1, 3)
+    names = tuple(cameras.names[at] for at in sorted(images))
+    return Likeness(names, table[:, 0], table[:, 1], table[:, 2] if lpips else np.zeros(0))
+
+
+def _at_size(camera: Cameras, width: int, height: int) -> Cameras:
+    """The camera with its picture resampled to a size."""
+    old = camera.sizes_px[0]
+    ratio = np.array([width, height]) / old
+    if abs(old[0] * ratio[1] - width) > 2:
+        raise InputError(
+            f"image of camera {camera.names[0]} is {width} x {height}, its camera says {old[0]} x {old[1]}: "
+            "the shapes differ"
+        )
+    return Cameras(
+        camera.T_frame_camera,
+        camera.intrinsics_px * np.concatenate([ratio, ratio]),
+        np.array([[width, height]]),
+        camera.names,
+    )
+
+
+def _stem(name: str | os.PathLike[str]) -> str:
+    path = Path(name)
+    return str(path.with_suffix("")) if path.suffix.lower() in _SUFFIXES else str(path)

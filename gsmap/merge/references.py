@@ -1,0 +1,112 @@
+"""What the merged map must look like: renders of each capture, alone, from its own cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.merge.changes import overruled_pixels
+from gsmap.merge.parts import Part, inside
+from gsmap.render import render
+from gsmap.types import Cameras, Gaussians
+
+_MIN_SEEN = 0.02  # share of a picture that must show the tile
+
+
+@dataclass(frozen=True, eq=False)
+class References:
+    """V pictures to reproduce.
+
+    Args:
+        cameras: V cameras, map frame.
+        images: V pictures (H, W, 3) uint8.
+        weights: V maps (H, W) uint8, 255 where the picture is to be believed and 0 where it says nothing: where the
+            capture saw nothing, and outside the tile.
+        part: (V,) which part each was rendered from.
+        share: (V,) how much of each picture counts, in [0, 1].
+    """
+
+    cameras: Cameras
+    images: list[np.ndarray]
+    weights: list[np.ndarray]
+    part: np.ndarray
+    share: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+def render_references(
+    parts: list[Part],
+    bounds: np.ndarray | None,
+    longest_side_px: int,
+    later: list[list[Gaussians]] | None,
+    progress: Callable[[float, str], None],
+) -> References:
+    """Render each part from its own cameras; keep the views that show enough of the tile.
+
+    A camera of one capture says nothing about what that capture never saw: pixels count as far as the capture itself
+    covers them, and, for a tile, where the surface seen lies inside it. ``later`` (see `gsmap.merge.changes`) holds
+    for each part what stands there by now.
+    """
+    todo = [(i, c) for i, part in enumerate(parts) if part.cameras is not None for c in range(len(part.cameras))]
+    cameras, images, weights, kept, shares = [], [], [], [], []
+    for done, (i, c) in enumerate(todo):
+        camera = parts[i].cameras[c].resized(longest_side_px)
+        progress(done / len(todo), "rendering the captures")
+        seen = render(parts[i].gaussians, camera)
+        weight = seen.alpha[0] * inside_pixels(camera, seen.depth[0], bounds)
+        if later is not None and later[i]:
+            weight = weight * ~overruled_pixels(camera, seen.depth[0], later[i])
+        share = float(weight.mean())
+        if share < _MIN_SEEN:
+            continue
+        cameras.append(camera)
+        images.append(np.round(np.clip(seen.colour[0], 0, 1) * 255).astype(np.uint8))
+        weights.append(np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8))
+        kept.append(i)
+        shares.append(share)
+    return References(_joined(cameras), images, weights, np.array(kept, dtype=np.int64), np.array(shares))
+
+
+def order_of_views(share: np.ndarray, steps: int, seed: int) -> np.ndarray:
+    """(steps,) which view to use at each step: each in proportion to what it shows, spread evenly over time."""
+    rng = np.random.default_rng(seed)
+    times, views = [], []
+    for view, rate in enumerate(share / share.sum()):
+        count = int(np.ceil(steps * rate)) + 1
+        # Every view takes its turn once per 1/rate steps, at a phase of its own each time.
+        times.append((np.arange(count) + rng.random(count)) / rate)
+        views.append(np.full(count, view))
+    return np.concatenate(views)[np.argsort(np.concatenate(times), kind="stable")][:steps]
+
+
+def inside_pixels(camera: Cameras, depth: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
+    """(H, W) bool, whether the surface seen in each pixel of a depth map lies in the bounds."""
+    if bounds is None:
+        return np.ones(depth.shape, dtype=bool)
+    return inside(surface_points(camera, depth).reshape(-1, 3), bounds).reshape(depth.shape) & (depth > 0)
+
+
+def surface_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:
+    """(H, W, 3) points of a depth map of one camera, in the camera's frame's parent."""
+    height, width = depth.shape
+    fx, fy, cx, cy = camera.intrinsics_px[0]
+    x = (np.arange(width) + 0.5 - cx) / fx
+    y = (np.arange(height) + 0.5 - cy) / fy
+    rays = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones(depth.shape)], axis=-1)
+    T = camera.T_frame_camera[0]
+    return (rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3]
+
+
+def _joined(cameras: list[Cameras]) -> Cameras:
+    if not cameras:
+        return Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2)))
+    return Cameras(
+        np.concatenate([c.T_frame_camera for c in cameras]),
+        np.concatenate([c.intrinsics_px for c in cameras]),
+        np.concatenate([c.sizes_px for c in cameras]),
+        tuple(str(i) for i in range(len(cameras))),
+    )

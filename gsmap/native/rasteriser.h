@@ -1,0 +1,84 @@
+// What the parts of the rasteriser share. Plain data only: it crosses between code compiled for different instruction
+// sets. The pipeline of one view: project -> sort by depth -> bin into tiles -> blend; backwards: blend -> project.
+#pragma once
+#include <cstdint>
+
+namespace gsmap {
+
+constexpr int kTile = 32;        // pixels; larger tiles make fewer intersections, smaller ones cull better
+constexpr int kBlock = 8;        // pixels; Gaussians are culled exactly against 8x8 blocks inside a tile
+constexpr int kChunk = 1024;     // Gaussians per task of the projection
+constexpr int kRound = 256;      // Gaussians of a tile that are worked on together, in L1
+constexpr float kMinAlpha = 1.f / 255.f, kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
+constexpr float kNear = 0.01f, kDilation = 0.3f;
+
+struct Scene {
+    const float *means, *quats, *log_scales, *logit_opacities, *sh;
+    int64_t n;
+    int k;  // SH coefficients per channel: 1, 4, 9 or 16
+};
+
+struct SceneGradient {
+    float *means, *quats, *log_scales, *logit_opacities, *sh;  // added to
+    float *mean2d;  // (n, 2) in pixels, set for visible Gaussians; may be null
+};
+
+struct Camera {
+    double R[9], t[3];  // world to camera
+    double fx, fy, cx, cy;
+    int width, height;
+};
+
+// A visible Gaussian on the image. The exponent is log2(alpha) = log2_opacity - u^2 - w^2 with
+// u = l11 dx + l12 dy, w = l22 dy: the Cholesky factor of the conic, which does not cancel for thin Gaussians.
+struct alignas(64) Record {
+    float x, y, l11, l12, l22, log2_opacity, r, g, b, depth;
+    uint32_t id;                 // row in the scene
+    uint32_t slot;               // first of its intersections' slots
+    uint16_t tx0, ty0, tx1, ty1;  // tiles touched, half open
+    float unused[2];
+
+    __attribute__((always_inline)) uint32_t tiles() const { return uint32_t(tx1 - tx0) * uint32_t(ty1 - ty0); }
+};
+static_assert(sizeof(Record) == 64, "a record is one cache line");
+enum Field { X, Y, L11, L12, L22, LOG2_OPACITY, R, G, B, DEPTH, ID, SLOT, TX, TY, kFields = 16 };
+
+// Sums over one Gaussian's pixels in one tile; g is dL / d ln(alpha).
+enum Moment { M_G, M_U, M_W, M_UU, M_UW, M_WW, M_R, M_GREEN, M_B, M_DEPTH, kMoments = 16 };
+
+struct Image {  // any of them may be null, except alpha
+    float *colour, *depth, *alpha;
+    int32_t *dominant_id;
+    float *max_weight;  // (n,) per Gaussian of the scene: largest blending weight, raised only
+    float background[3];
+};
+
+struct ImageGradient {
+    const float *colour, *depth, *alpha;  // gradients, null for zero
+};
+
+struct TileWork {
+    const Record *records;
+    const uint32_t *list;  // records of this tile, nearest first
+    int64_t count;
+    int tx, ty, tiles_x;
+    int width, height;
+};
+
+// One set of these per instruction set.
+struct Kernels {
+    const char *name;
+    // Projects Gaussians [begin, end), end - begin <= kChunk; writes the visible ones to out, returns how many.
+    int (*project)(const Scene &, const Camera &, int64_t begin, int64_t end, Record *out);
+    // Returns how many (Gaussian, pixel) pairs were evaluated.
+    int64_t (*blend)(const TileWork &, const Image &);
+    // Writes one slot of kMoments floats for every intersection of the tile.
+    void (*blend_backward)(const TileWork &, const Image &, const ImageGradient &, float *slots);
+    // From the slots of `count` records to gradients; adds dL/dT_camera_world (rows of R, then t) to pose unless null.
+    void (*project_backward)(const Scene &, const Camera &, const Record *, int count, const float *slots,
+                             const SceneGradient &, double *pose);
+};
+extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
+extern const Kernels *kernels_baseline;
+
+}  // namespace gsmap

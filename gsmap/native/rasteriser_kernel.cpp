@@ -1,0 +1,13 @@
+// Compiled once per instruction set: GSMAP_ISA is the namespace and name, the compiler's flags choose the vectors.
+#include "rasteriser_blend.h"
+#include "rasteriser_blend_backward.h"
+#include "rasteriser_project_backward.h"
+
+#define GSMAP_STRING_(x) #x
+#define GSMAP_STRING(x) GSMAP_STRING_(x)
+#define GSMAP_JOIN_(a, b) a##b
+#define GSMAP_JOIN(a, b) GSMAP_JOIN_(a, b)
+
+static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend,
+                                     GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward};
+const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;

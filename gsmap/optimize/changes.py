@@ -1,0 +1,76 @@
+"""What moved between two answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.rotations import angle_between
+from gsmap.types import PoseGraph, Sim3
+
+
+@dataclass(frozen=True)
+class Change:
+    """How one scene differs between two answers.
+
+    Args:
+        scene: scene id.
+        kind: ``added``, ``removed``, ``moved`` or ``same`` (pose and component both as before).
+        rotation_deg: angle turned; NaN where the scene is in only one of the two.
+        translation_m: how far the scene's centroid went, in map units; NaN as above.
+        scale_ratio: new scale by old; NaN as above.
+        components: its component before and after, None where it is absent.
+        statuses: its status before and after, None where it is absent.
+    """
+
+    scene: str
+    kind: str
+    rotation_deg: float
+    translation_m: float
+    scale_ratio: float
+    components: tuple[int | None, int | None]
+    statuses: tuple[str | None, str | None]
+
+
+def diff(before: PoseGraph, after: PoseGraph, centroids: Mapping[str, np.ndarray] | None = None) -> dict[str, Change]:
+    """What moved by how much, by scene id, in the order of ``after`` and then what was removed.
+
+    Args:
+        centroids: (3,) middle of each scene in its own frame; the origin where it is not given. A rotation about the
+            middle of a scene moves it little, the same about a far origin moves it a lot: measure where the scene is.
+    """
+    centroids = centroids or {}
+    out = {}
+    for scene in [*after.poses, *(s for s in before.poses if s not in after.poses)]:
+        old, new = before.poses.get(scene), after.poses.get(scene)
+        rotation = translation = ratio = float("nan")
+        kind = "added" if old is None else "removed"
+        if old is not None and new is not None:
+            rotation, translation, ratio = motion(old.S_map_scene, new.S_map_scene, centroids.get(scene))
+            same = rotation == 0 and translation == 0 and ratio == 1 and old.component == new.component
+            kind = "same" if same else "moved"
+        out[scene] = Change(
+            scene,
+            kind,
+            rotation,
+            translation,
+            ratio,
+            (old.component if old else None, new.component if new else None),
+            (old.status if old else None, new.status if new else None),
+        )
+    return out
+
+
+def motion(old: Sim3, new: Sim3, centroid: np.ndarray | None = None) -> tuple[float, float, float]:
+    """Rotation in degrees, way of the centroid in map units, and scale ratio, from one pose to another."""
+    middle = np.zeros(3) if centroid is None else np.asarray(centroid, dtype=np.float64)
+    turned = np.degrees(angle_between(old.rotation, new.rotation))
+    return float(turned), float(np.linalg.norm(new.apply(middle) - old.apply(middle))), new.scale / old.scale
+
+
+def moved(old: Sim3, new: Sim3, threshold_m: float, corners: np.ndarray) -> bool:
+    """Whether any of the points (N, 3), such as the corners of a scene's box, went further than the threshold."""
+    corners = np.asarray(corners, dtype=np.float64).reshape(-1, 3)
+    return bool(np.linalg.norm(new.apply(corners) - old.apply(corners), axis=1).max(initial=0) > threshold_m)

@@ -1,0 +1,107 @@
+"""The frame a component is given in: where its anchor scene stays, or where its priors put it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.geometry.similarities import Similarities, exp
+from gsmap.geometry.umeyama import umeyama
+from gsmap.optimize.clean import open_gauge
+from gsmap.optimize.priors import UP, PriorTerms
+from gsmap.types import PoseGraph, Sim3
+
+
+def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGraph | None) -> int:
+    """The scene that holds the component's frame: its first one from the largest island it had before.
+
+    Scenes come in the caller's order (oldest first), so a component that swallows another keeps its own frame, and
+    re-optimising moves nothing that need not move.
+    """
+    if previous is None:
+        return int(scenes[0])
+    known = [s for s in scenes.tolist() if scene_ids[s] in previous.poses]
+    if not known:
+        return int(scenes[0])
+    islands = [previous.poses[scene_ids[s]].component for s in known]
+    counts = {island: islands.count(island) for island in islands}
+    surviving = min(counts, key=lambda island: (-counts[island], island))
+    return int(known[islands.index(surviving)])
+
+
+def onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3) -> Similarities:
+    """Move a component as one so that its anchor has the given pose."""
+    rows = np.full(len(scenes), anchor)
+    move = Similarities.stack([pose] * len(scenes)) @ poses[rows].inverse()
+    return poses.replaced(scenes, (move @ poses[scenes]).orthonormalised())
+
+
+def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int) -> Similarities:
+    """Move a component as one to where its priors want it; what they leave open stays as it is.
+
+    A closed-form guess from full poses, positions or up directions, then Gauss-Newton over the component's own degrees
+    of freedom.
+    """
+    if not len(priors):
+        return poses
+    poses = _guess(poses, scenes, priors, dim)
+    for _ in range(20):
+        held = open_gauge(poses, scenes, anchor, priors, dim)
+        r, J = priors.linearised(poses)
+        carry = (poses[priors.scenes].inverse() @ poses[np.full(len(priors), anchor)]).adjoint()
+        moved = (J @ carry)[:, :, :dim]
+        H = np.einsum("pij,pik->jk", moved, moved) + held.T @ held
+        step = -np.linalg.lstsq(H, np.einsum("pij,pi->j", moved, r), rcond=1e-14)[0]
+        start = poses[np.array([anchor])]
+        target = (start @ exp(step[None])).orthonormalised().item(0)
+        poses = onto_anchor(poses, scenes, anchor, target)
+        if np.abs(step).max() < 1e-10:
+            break
+    return poses
+
+
+def _guess(poses: Similarities, scenes: np.ndarray, priors: PriorTerms, dim: int) -> Similarities:
+    knows = priors.root_weights > 0
+    full = np.flatnonzero(knows[:, :6].all(1))
+    if len(full):
+        best = full[np.argmax(priors.root_weights[full, :3].sum(1))]
+        pose = priors.expected.item(best)
+        scene = int(priors.scenes[best])
+        if dim == 6 or not knows[best, 6]:
+            pose = Sim3(pose.rotation, pose.translation, float(np.exp(poses.log_scales[scene])))
+        return onto_anchor(poses, scenes, scene, pose)
+    placed = np.flatnonzero(knows[:, 3:6].all(1))
+    rows = priors.scenes[placed]
+    if len(np.unique(rows)) >= 3:
+        try:
+            S = umeyama(priors.expected.translations[placed], poses.translations[rows], with_scale=dim == 7)
+        except InputError:  # all at one place: they say nothing about orientation
+            S = Sim3.identity()
+        return _moved(poses, scenes, S)
+    upright = np.flatnonzero(knows[:, 7:].all(1))
+    if len(upright):
+        ups = np.einsum("pij,pj->pi", poses.rotations[priors.scenes[upright]], priors.ups[upright])
+        poses = _moved(poses, scenes, Sim3(_turn(ups.mean(0)), np.zeros(3)))
+    if len(placed):
+        shift = (priors.expected.translations[placed] - poses.translations[rows]).mean(0)
+        poses = _moved(poses, scenes, Sim3(np.eye(3), shift))
+    return poses
+
+
+def _moved(poses: Similarities, scenes: np.ndarray, S: Sim3) -> Similarities:
+    move = Similarities.stack([S] * len(scenes))
+    return poses.replaced(scenes, (move @ poses[scenes]).orthonormalised())
+
+
+def _turn(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation that takes ``up`` to the map's up."""
+    from scipy.spatial.transform import Rotation
+
+    length = np.linalg.norm(up)
+    if length < 1e-9:
+        return np.eye(3)
+    axis = np.cross(up / length, UP)
+    sine, cosine = np.linalg.norm(axis), float(up @ UP / length)
+    if sine < 1e-12:
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()

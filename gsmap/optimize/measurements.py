@@ -1,0 +1,161 @@
+"""Edges and priors as arrays, every value checked before any solver sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.geometry.similarities import Similarities
+from gsmap.types import Edge, Prior
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """E edges between N scenes.
+
+    Args:
+        scene_ids: N ids, in the caller's order.
+        targets, sources: (E,) rows of ``scene_ids``.
+        measured: E measured ``S_target_source``.
+        information: (E, D, D); D is 6 where every edge is rigid (a stiff scale row says nothing then), else 7.
+        confirmed, strong: (E,) bool.
+    """
+
+    scene_ids: tuple[str, ...]
+    targets: np.ndarray
+    sources: np.ndarray
+    measured: Similarities
+    information: np.ndarray
+    confirmed: np.ndarray
+    strong: np.ndarray
+
+    @property
+    def num_scenes(self) -> int:
+        return len(self.scene_ids)
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+    @property
+    def dim(self) -> int:
+        return self.information.shape[1]
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """(E, D, D)."""
+        return np.linalg.inv(self.information)
+
+    @cached_property
+    def keys(self) -> list[tuple[str, str]]:
+        """(target, source) ids by edge."""
+        ids = self.scene_ids
+        return [(ids[a], ids[b]) for a, b in zip(self.targets.tolist(), self.sources.tolist(), strict=True)]
+
+    def __getitem__(self, rows: np.ndarray) -> Measurements:
+        """Some of the edges, between the same scenes."""
+        return Measurements(
+            self.scene_ids,
+            self.targets[rows],
+            self.sources[rows],
+            self.measured[rows],
+            self.information[rows],
+            self.confirmed[rows],
+            self.strong[rows],
+        )
+
+
+def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool | None = None) -> Measurements:
+    """Check the edges and stack them.
+
+    Args:
+        rigid: force the 6 (True) or 7 (False) dimensional form; None chooses 6 where every edge has scale 1.
+
+    Raises:
+        InputError: names the first edge that is unusable, and why: a scene that is missing, a self-edge, the same
+            (target, source) twice, an information matrix of the wrong shape, not finite, not symmetric or not SPD.
+    """
+    ids = tuple(scene_ids)
+    row = {scene: k for k, scene in enumerate(ids)}
+    if len(row) != len(ids):
+        twice = next(s for k, s in enumerate(ids) if row[s] != k)
+        raise InputError(f"scene {twice!r} is listed twice: pass every scene once")
+    seen: set[tuple[str, str]] = set()
+    for edge in edges:
+        for scene in (edge.target, edge.source):
+            if scene not in row:
+                raise InputError(f"edge {_name(edge)} names scene {scene!r}, which is not in the map")
+        if edge.target == edge.source:
+            raise InputError(f"edge {_name(edge)} ties a scene to itself: remove it")
+        if (edge.target, edge.source) in seen:
+            raise InputError(f"edge {_name(edge)} is given twice: pass one measurement for a target and source")
+        seen.add((edge.target, edge.source))
+        if np.shape(edge.information) != (7, 7):
+            raise InputError(f"edge {_name(edge)} needs a (7, 7) information matrix, got {np.shape(edge.information)}")
+    targets = np.array([row[e.target] for e in edges], dtype=np.int64)
+    sources = np.array([row[e.source] for e in edges], dtype=np.int64)
+    information = np.array([e.information for e in edges], dtype=np.float64).reshape(-1, 7, 7)
+    _check_information(edges, information)
+    measured = Similarities.stack([e.S_target_source for e in edges])
+    information = (information + information.transpose(0, 2, 1)) / 2
+    if rigid if rigid is not None else not measured.log_scales.any():
+        # With both scales known the log-scale residual is zero: its row and column drop out of the chi-square.
+        information = information[:, :6, :6]
+    return Measurements(
+        ids,
+        targets,
+        sources,
+        measured,
+        np.ascontiguousarray(information),
+        np.array([e.confirmed for e in edges], dtype=bool),
+        np.array([e.strong for e in edges], dtype=bool),
+    )
+
+
+def check_priors(scene_ids: Sequence[str], priors: Sequence[Prior]) -> None:
+    """Raise `InputError` naming the first prior that is unusable."""
+    known = set(scene_ids)
+    for prior in priors:
+        sigmas = np.asarray(prior.sigmas, dtype=np.float64)
+        if prior.scene not in known:
+            raise InputError(f"prior names scene {prior.scene!r}, which is not in the map")
+        if sigmas.shape != (7,) or np.isnan(sigmas).any() or (sigmas <= 0).any():
+            raise InputError(
+                f"prior of scene {prior.scene!r} needs 7 positive sigmas, inf where unknown; got {sigmas.tolist()}"
+            )
+        if prior.up is not None:
+            up = np.asarray(prior.up, dtype=np.float64)
+            usable = up.shape == (3,) and np.isfinite(up).all() and np.linalg.norm(up) > 1e-9
+            if not usable or not (np.isfinite(prior.up_sigma_rad) and prior.up_sigma_rad > 0):
+                raise InputError(f"prior of scene {prior.scene!r} needs a finite up direction and a positive sigma")
+
+
+def _check_information(edges: Sequence[Edge], information: np.ndarray) -> None:
+    """gtsam's noise models accept NaN, singular and non-SPD matrices silently, so none may reach it."""
+    if not len(information):
+        return
+    finite = np.isfinite(information).all((1, 2))
+    if not finite.all():
+        raise InputError(f"edge {_name(edges[int(np.argmin(finite))])} has NaN or infinity in its information matrix")
+    size = np.abs(information).max((1, 2))
+    skewed = np.abs(information - information.transpose(0, 2, 1)).max((1, 2)) > 1e-6 * size
+    if skewed.any():
+        raise InputError(f"edge {_name(edges[int(np.argmax(skewed))])} has an information matrix that is not symmetric")
+    # Scale to a unit diagonal first: a stiff scale row beside soft ones is well posed, however large the ratio.
+    diagonal = np.einsum("eii->ei", information)
+    bad = (diagonal <= 0).any(1)
+    if not bad.any():
+        root = np.sqrt(diagonal)
+        bad = np.linalg.eigvalsh(information / root[:, :, None] / root[:, None, :])[:, 0] < 1e-9
+    if bad.any():
+        raise InputError(
+            f"edge {_name(edges[int(np.argmax(bad))])} has an information matrix that is not positive definite: "
+            "every direction needs some certainty"
+        )
+
+
+def _name(edge: Edge) -> str:
+    return f"{edge.target}:{edge.source}"

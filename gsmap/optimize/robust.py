@@ -1,0 +1,206 @@
+"""Poses from edges that may be wrong: spread along a tree, chordal relaxation, Gauss-Newton with annealed weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+from gsmap.geometry.similarities import Similarities, commutator, exp
+from gsmap.optimize.blocks import BlockSystem
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.priors import PriorTerms
+
+
+def islands(edges: Measurements, rows: np.ndarray) -> np.ndarray:
+    """(N,) island of each scene, tied by the edges at ``rows``; islands are numbered by their first scene."""
+    n = edges.num_scenes
+    graph = sp.coo_matrix((np.ones(len(rows)), (edges.targets[rows], edges.sources[rows])), shape=(n, n))
+    labels = connected_components(graph, directed=False)[1]
+    _, first = np.unique(labels, return_index=True)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[labels]
+
+
+def roots(labels: np.ndarray) -> np.ndarray:
+    """First scene of each island."""
+    return np.unique(labels, return_index=True)[1]
+
+
+def spread(edges: Measurements, rows: np.ndarray, cost: np.ndarray, poses: Similarities) -> Similarities:
+    """Poses by following the cheapest spanning forest of the edges at ``rows`` from each island's first scene.
+
+    Args:
+        cost: (len(rows),) positive; a lower one is trusted more.
+        poses: where the first scene of each island stays.
+    """
+    n = edges.num_scenes
+    order = np.lexsort((rows, cost))
+    rank = np.empty(len(rows))
+    rank[order] = np.arange(1, len(rows) + 1)
+    # Where two scenes are tied twice, only the better edge may enter the tree: sparse matrices would add them.
+    low = np.minimum(edges.targets[rows], edges.sources[rows])
+    high = np.maximum(edges.targets[rows], edges.sources[rows])
+    _, best = np.unique((low * n + high)[order], return_index=True)
+    best = order[best]
+    tree = minimum_spanning_tree(sp.coo_matrix((rank[best], (low[best], high[best])), shape=(n, n)).tocsr()).tocoo()
+    edge_of = rows[order[tree.data.astype(np.int64) - 1]]
+    link = sp.coo_matrix((edge_of + 1.0, (tree.row, tree.col)), shape=(n, n)).tocsr()
+    link = link + link.T
+    out = Similarities(poses.rotations.copy(), poses.translations.copy(), poses.log_scales.copy())
+    depth = np.full(n, -1)
+    parent = np.full(n, -1)
+    for root in roots(islands(edges, rows)):
+        found, before = breadth_first_order(link, root, directed=False)
+        parent[found] = before[found]
+        depth[root] = 0
+        for scene in found[1:]:
+            depth[scene] = depth[before[scene]] + 1
+    for level in range(1, depth.max(initial=0) + 1):
+        scenes = np.flatnonzero(depth == level)
+        edge = np.asarray(link[scenes, parent[scenes]]).ravel().astype(np.int64) - 1
+        step = edges.measured[edge]
+        backward = edges.targets[edge] == scenes
+        step = step.replaced(backward, step[backward].inverse())
+        placed = out[parent[scenes]] @ step
+        out = out.replaced(scenes, placed.orthonormalised())
+    return out
+
+
+def residuals(edges: Measurements, poses: Similarities) -> np.ndarray:
+    """(E, D) ``Log(S_target_source^-1 S_map_target^-1 S_map_source)`` on the source side."""
+    predicted = poses[edges.targets].inverse() @ poses[edges.sources]
+    return (edges.measured.inverse() @ predicted).log()[:, : edges.dim]
+
+
+def chi_squares(edges: Measurements, poses: Similarities) -> np.ndarray:
+    """(E,) chi-square of every edge under ``poses``, with D degrees of freedom."""
+    r = residuals(edges, poses)
+    return np.einsum("ed,edf,ef->e", r, edges.information, r)
+
+
+def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Similarities:
+    """Least-squares poses without a starting guess; fixed scenes keep theirs.
+
+    Rotations by the chordal relaxation (Martinec and Pajdla 2007; Carlone et al. 2015, sec. III-B): solve
+    ``R_source^T = R_target_source^T R_target^T`` over all edges as if the entries were free, then project to SO(3).
+    Log scales and then translations are linear once the rotations are known.
+    """
+    n, a, b = edges.num_scenes, edges.targets, edges.sources
+    touched = np.zeros(n, dtype=bool)
+    touched[a] = touched[b] = True
+    still = fixed | ~touched
+    covariance = edges.covariance
+    weight_r = 3 / np.einsum("eii->e", covariance[:, :3, :3])
+    weight_t = 3 / np.einsum("eii->e", covariance[:, 3:6, 3:6])
+
+    def solve(A: np.ndarray, B: np.ndarray, weight: np.ndarray, r: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """x over all scenes, from 0 at the unknown ones and ``known`` at the fixed ones."""
+        start = np.where(still[:, None, None], known, 0.0)
+        system = BlockSystem(a, b, still, A.shape[2])
+        W = weight[:, None, None] * np.eye(A.shape[1])
+        return start + system.solve(A, B, W, A @ start[a] + B @ start[b] + r)
+
+    eye = np.tile(np.eye(3), (len(edges), 1, 1))
+    backward = edges.measured.rotations.transpose(0, 2, 1)
+    transposed = solve(-backward, eye, weight_r, np.zeros((len(edges), 3, 3)), poses.rotations.transpose(0, 2, 1))
+    u, _, vt = np.linalg.svd(transposed.transpose(0, 2, 1))
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    rotations = np.where(still[:, None, None], poses.rotations, u @ vt)
+
+    one = np.ones((len(edges), 1, 1))
+    log_scales = poses.log_scales
+    if edges.dim == 7:
+        r = -edges.measured.log_scales[:, None, None]
+        log_scales = solve(-one, one, 1 / covariance[:, 6, 6], r, poses.log_scales[:, None, None])[:, 0, 0]
+    moved = np.einsum("eij,ej->ei", rotations[a], edges.measured.translations) * np.exp(log_scales[a])[:, None]
+    weight_t = weight_t * np.exp(-2 * log_scales[b])
+    translations = solve(-one, one, weight_t, -moved[:, None, :], poses.translations[:, None, :])[:, 0, :]
+    return Similarities(rotations, translations, log_scales)
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Gauss-Newton over a fixed set of edges.
+
+    Args:
+        edges: what to fit.
+        fixed: (N,) scenes that stay where they are.
+        priors: terms on single scenes, never weighted down.
+        anchors: free scenes whose step is damped, so that what the priors leave open stays put.
+    """
+
+    edges: Measurements
+    fixed: np.ndarray
+    priors: PriorTerms
+    anchors: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        touched = np.zeros(self.edges.num_scenes, dtype=bool)
+        touched[self.edges.targets] = touched[self.edges.sources] = True
+        system = BlockSystem(self.edges.targets, self.edges.sources, self.fixed | ~touched, self.edges.dim)
+        object.__setattr__(self, "system", system)
+
+    def step(self, poses: Similarities, weights: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """(N, D) Gauss-Newton step from residuals ``r`` and a weight per edge."""
+        edges, d = self.edges, self.edges.dim
+        full = np.zeros((len(edges), 7))
+        full[:, :d] = r
+        ad = commutator(full)
+        # Inverse right Jacobian of the exponential, to second order (exact up to the fourth).
+        inverse_right = np.eye(7) + ad / 2 + ad @ ad / 12
+        B = inverse_right[:, :d, :d]
+        back = (poses[edges.sources].inverse() @ poses[edges.targets]).adjoint()
+        A = -(inverse_right @ back)[:, :d, :d]
+        scenes, hessians, gradients = self.priors.normal(poses, d)
+        if len(self.anchors):
+            scenes = np.concatenate([scenes, self.anchors])
+            hessians = np.concatenate([hessians, np.tile(np.eye(d), (len(self.anchors), 1, 1))])
+            gradients = np.concatenate([gradients, np.zeros((len(self.anchors), d))])
+        W = edges.information * weights[:, None, None]
+        return self.system.solve(A, B, W, r[:, :, None], (scenes, hessians, gradients[:, :, None]))[:, :, 0]
+
+    def fit(self, poses: Similarities, max_steps: int = 20, tolerance: float = 1e-6) -> Similarities:
+        """Least squares from a good guess, with step halving; stops when the cost gains less than ``tolerance``."""
+        cost = self._cost(poses)
+        ones = np.ones(len(self.edges))
+        for _ in range(max_steps):
+            step = self.step(poses, ones, residuals(self.edges, poses))
+            for _ in range(4):
+                trial = (poses @ exp(step)).orthonormalised()
+                trial_cost = self._cost(trial)
+                if trial_cost <= cost:
+                    break
+                step = step / 2
+            else:
+                return poses
+            gain, cost, poses = cost - trial_cost, trial_cost, trial
+            if gain <= tolerance * cost + 1e-9:
+                break
+        return poses
+
+    def anneal(self, poses: Similarities, gate: float, widest: float, trusted: np.ndarray) -> Similarities:
+        """Iteratively reweighted least squares with Geman-McClure weights, from wide to the width of the gate.
+
+        ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by 4 (graduated non-convexity, Yang et al.
+        2020, with a start that the vote makes narrow). ``trusted`` edges keep weight 1.
+        """
+        c = gate * max(1.0, widest)
+        while True:
+            for _ in range(3 if c <= gate else 2):
+                r = residuals(self.edges, poses)
+                chi = np.einsum("ed,edf,ef->e", r, self.edges.information, r)
+                weights = np.where(trusted, 1.0, (c / (c + chi)) ** 2)
+                step = self.step(poses, weights, r)
+                poses = (poses @ exp(step)).orthonormalised()
+                if np.abs(step).max(initial=0) < 1e-6:
+                    break
+            if c <= gate:
+                return poses
+            c = max(gate, c / 4)
+
+    def _cost(self, poses: Similarities) -> float:
+        return float(chi_squares(self.edges, poses).sum() + self.priors.cost(poses))

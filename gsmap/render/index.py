@@ -1,0 +1,98 @@
+"""Boxes of chunks of Gaussians, so that a camera that sees a corner of a site touches only that corner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.types import Gaussians
+
+MAX_SIGMAS = 3.3290429  # sqrt(2 ln 255): nothing is drawn farther out
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkIndex:
+    """Bounding boxes of consecutive runs of Gaussians; tight where the Gaussians are in Morton order.
+
+    Args:
+        starts: (M + 1,) int64 first Gaussian of each chunk, and the number of Gaussians.
+        low, high: (M, 3) float64 box of the chunk's centres.
+        radius: (M,) float64 largest scale in the chunk (one standard deviation).
+    """
+
+    starts: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    radius: np.ndarray
+
+    @classmethod
+    def build(cls, gaussians: Gaussians, chunk: int = 4096) -> ChunkIndex:
+        """Boxes of runs of ``chunk`` Gaussians, in the order they are stored.
+
+        Sort scattered Gaussians along a Morton curve first (`morton_order`); scenes from the store are.
+        """
+        n = len(gaussians)
+        starts = np.append(np.arange(0, n, chunk, dtype=np.int64), n)
+        if n == 0:
+            return cls(starts, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        first = starts[:-1]
+        with np.errstate(over="ignore"):
+            radius = np.exp(np.fmax.reduceat(gaussians.log_scales.max(1).astype(np.float64), first))
+        return cls(
+            starts,
+            np.fmin.reduceat(gaussians.means, first, axis=0).astype(np.float64),
+            np.fmax.reduceat(gaussians.means, first, axis=0).astype(np.float64),
+            radius,
+        )
+
+    def __post_init__(self) -> None:
+        m = len(self.starts) - 1
+        if self.low.shape != (m, 3) or self.high.shape != (m, 3) or self.radius.shape != (m,):
+            raise InputError(
+                f"ChunkIndex of {m} chunks has boxes {self.low.shape}, {self.high.shape}, {self.radius.shape}"
+            )
+
+    @property
+    def num_gaussians(self) -> int:
+        return int(self.starts[-1])
+
+    def visible_ranges(self, pose: np.ndarray, intrinsics_px: np.ndarray, width: int, height: int) -> np.ndarray:
+        """(R, 2) int64 ranges of Gaussians that a camera may see; never leaves out one that it draws.
+
+        Args:
+            pose: (3, 4) or (4, 4) frame-to-camera.
+            intrinsics_px: ``fx fy cx cy``.
+        """
+        rotation, translation = pose[:3, :3], pose[:3, 3]
+        center = rotation @ ((self.low + self.high).T / 2) + translation[:, None]
+        half = (self.high - self.low) / 2
+        fx, fy, cx, cy = intrinsics_px
+        # Each side of the frustum is a half-space n . x >= 0 in camera space; a box is outside when even its nearest
+        # corner, grown by what a Gaussian on it can cover, is. A Gaussian reaches MAX_SIGMAS standard deviations, but
+        # its footprint is that of the projection linearised at its centre, which overshoots the true outline towards
+        # the image's border: there, dilation and the skewed Jacobian together stay below the factor used here.
+        # Linearised at u = x/z, a sphere of radius r spans (r/z) sqrt(1 + u^2) on the plane z = 1. Outside the plane
+        # of the border u_b that is a distance (u - u_b) z <= r sqrt(1 + u_c^2) with u_c the clamp of the Jacobian.
+        visible = np.ones(len(half), bool)
+        reach = MAX_SIGMAS * self.radius
+        nearest_z = center[2] + half @ np.abs(rotation[2])
+        visible &= nearest_z > 0.01
+        margin = 3.0  # pixels: sqrt(0.3) dilation times MAX_SIGMAS, and rounding
+        for axis, focal, principal, size in ((0, fx, cx, width), (1, fy, cy, height)):
+            clamp = max(principal / focal, (size - principal) / focal) + 0.15 * size / focal
+            grow = reach * np.sqrt(1 + clamp**2)
+            for sign, border in ((1.0, -(principal + margin) / focal), (-1.0, (size - principal + margin) / focal)):
+                normal = np.zeros(3)
+                normal[axis], normal[2] = sign, -sign * border
+                distance = normal @ center + half @ np.abs(normal @ rotation) + grow
+                visible &= distance > 0
+        chunks = np.flatnonzero(visible)
+        if len(chunks) == 0:
+            return np.zeros((0, 2), np.int64)
+        # Neighbouring chunks become one range.
+        breaks = np.flatnonzero(np.diff(chunks) > 1)
+        first = chunks[np.append(0, breaks + 1)]
+        last = chunks[np.append(breaks, len(chunks) - 1)]
+        return np.ascontiguousarray(np.stack([self.starts[first], self.starts[last + 1]], axis=1))

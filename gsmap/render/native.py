@@ -1,0 +1,87 @@
+"""The CPU kernel as numpy calls: allocation, argument checks, one view at a time."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from gsmap._native import View, num_threads, use_instruction_set
+from gsmap._native import set_num_threads as _set_num_threads
+from gsmap.errors import InputError
+from gsmap.render.index import ChunkIndex
+from gsmap.types import Gaussians
+
+__all__ = ["View", "allocate", "arrays_of", "forward", "num_threads", "set_num_threads", "use_instruction_set"]
+
+
+def set_num_threads(count: int | None = None) -> None:
+    """How many threads render; None is every core this process may use, or OMP_NUM_THREADS where that is set."""
+    if count is None:
+        try:
+            count = int(os.environ.get("OMP_NUM_THREADS", ""))
+        except ValueError:
+            affinity = getattr(os, "sched_getaffinity", None)
+            count = len(affinity(0)) if affinity else os.cpu_count() or 1
+    if count < 1:
+        raise InputError(f"the number of threads must be at least 1, got {count}")
+    _set_num_threads(count)
+
+
+def arrays_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
+    """The five arrays in the kernel's order."""
+    return gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh
+
+
+def allocate(
+    views: int, height: int, width: int, num_gaussians: int, depth: bool, dominant_id: bool, max_weight: bool
+) -> dict[str, np.ndarray | None]:
+    """Output arrays of `Rendered` by field name."""
+    shape = (views, height, width)
+    return {
+        "colour": np.empty((*shape, 3), np.float32),
+        "alpha": np.empty(shape, np.float32),
+        "depth": np.empty(shape, np.float32) if depth else None,
+        "dominant_id": np.empty(shape, np.int32) if dominant_id else None,
+        "max_weight": np.zeros(num_gaussians, np.float32) if max_weight else None,
+    }
+
+
+def forward(
+    view: Any,
+    arrays: tuple[np.ndarray, ...],
+    T_camera_frame: np.ndarray,
+    intrinsics_px: np.ndarray,
+    background: np.ndarray,
+    images: dict[str, np.ndarray | None],
+    i: int,
+    index: ChunkIndex | None,
+) -> None:
+    """Render view ``i`` into ``images``; ``view`` keeps what its backward pass needs."""
+    height, width = images["alpha"].shape[1:]
+    pose = np.ascontiguousarray(T_camera_frame[:3], dtype=np.float64)
+    ranges = None
+    if index is not None:
+        if index.num_gaussians != len(arrays[0]):
+            raise InputError(
+                f"the index is of {index.num_gaussians} Gaussians, rendered are {len(arrays[0])}: rebuild it"
+            )
+        ranges = index.visible_ranges(pose, intrinsics_px, width, height)
+    view.forward(
+        *arrays,
+        pose=pose,
+        intrinsics=np.ascontiguousarray(intrinsics_px, dtype=np.float64),
+        width=width,
+        height=height,
+        ranges=ranges,
+        background=background,
+        colour=images["colour"][i],
+        depth=None if images["depth"] is None else images["depth"][i],
+        alpha=images["alpha"][i],
+        dominant_id=None if images["dominant_id"] is None else images["dominant_id"][i],
+        max_weight=images["max_weight"],
+    )
+
+
+set_num_threads()

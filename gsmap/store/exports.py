@@ -1,0 +1,126 @@
+"""What was exported where, and with which poses, so that only what changed is made again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Row, func, insert, select, update
+
+from gsmap.errors import NotFoundError
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.matrices import from_array, from_pose, plain, to_array, to_pose
+from gsmap.store.schema import exports, tiles
+from gsmap.types import Tile
+
+
+@dataclass(frozen=True)
+class Export:
+    """One run of an export.
+
+    Args:
+        number: unique in the map, growing.
+        target: absolute path of the folder or file.
+        revision: the poses it was made with.
+        settings: tile size, merger, format and the like, as given to `Exports.begin`.
+        num_tiles: tiles it made (clean ones are not made again).
+    """
+
+    number: int
+    target: str
+    revision: int | None
+    created_at: str
+    num_tiles: int
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+class Exports:
+    """The exports of a map. A tile belongs to a target; the newest one of a path is the one on disk."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+
+    def begin(
+        self, target: str | os.PathLike[str], *, revision: int | None, settings: Mapping[str, Any] | None = None
+    ) -> int:
+        """Note that an export begins; returns its number."""
+        row = {"target": _target(target), "revision": revision, "settings": plain(dict(settings or {}))}
+        with self._catalog.write() as connection:
+            query = insert(exports).returning(exports.c.number)
+            return connection.execute(query, row | {"created_at": now()}).scalar_one()
+
+    def add_tile(self, export: int, tile: Tile) -> None:
+        """Note a tile that was just written (so that an interrupted export goes on where it stopped)."""
+        row = {
+            "export": export,
+            "key": tile.key,
+            "component": int(tile.component),
+            "bounds": from_array(tile.bounds),
+            "poses": {scene: from_pose(pose) for scene, pose in tile.poses.items()},
+            "num_gaussians": int(tile.num_gaussians),
+            "method": tile.method,
+            "truncated": int(tile.truncated),
+            "path": tile.path,
+            "sha256": tile.sha256,
+            "created_at": now(),
+        }
+        with self._catalog.write() as connection:
+            if connection.execute(select(exports.c.number).where(exports.c.number == export)).first() is None:
+                raise NotFoundError(f"no export {export}: begin one first")
+            connection.execute(insert(tiles), row)
+
+    def forget(self, target: str | os.PathLike[str], paths: Iterable[str]) -> None:
+        """Note that tiles (by path) are no longer part of a target; their rows stay as history."""
+        ours = select(exports.c.number).where(exports.c.target == _target(target))
+        gone = tiles.c.export.in_(ours) & tiles.c.path.in_(list(paths)) & tiles.c.removed_at.is_(None)
+        with self._catalog.write() as connection:
+            connection.execute(update(tiles).where(gone).values(removed_at=now()))
+
+    def tiles(self, target: str | os.PathLike[str]) -> list[Tile]:
+        """The tiles that a target should hold now, by path."""
+        query = (
+            select(tiles)
+            .join(exports, exports.c.number == tiles.c.export)
+            .where(exports.c.target == _target(target), tiles.c.removed_at.is_(None))
+            .order_by(tiles.c.number)
+        )
+        with self._catalog.read() as connection:
+            newest = {row.path: row for row in connection.execute(query)}
+        return [_tile(newest[path]) for path in sorted(newest)]
+
+    def targets(self) -> list[str]:
+        """Every target that holds tiles."""
+        query = select(exports.c.target).join(tiles).where(tiles.c.removed_at.is_(None)).distinct()
+        with self._catalog.read() as connection:
+            return sorted(connection.execute(query).scalars())
+
+    def list(self) -> list[Export]:
+        """All exports, oldest first."""
+        count = func.count(tiles.c.number).label("num_tiles")
+        query = select(exports, count).outerjoin(tiles).group_by(exports.c.number).order_by(exports.c.number)
+        with self._catalog.read() as connection:
+            return [
+                Export(r.number, r.target, r.revision, r.created_at, r.num_tiles, r.settings)
+                for r in connection.execute(query)
+            ]
+
+
+def _target(path: str | os.PathLike[str]) -> str:
+    return str(Path(path).resolve())
+
+
+def _tile(row: Row) -> Tile:
+    return Tile(
+        key=row.key,
+        component=row.component,
+        bounds=to_array(row.bounds),
+        poses={scene: to_pose(pose) for scene, pose in row.poses.items()},
+        num_gaussians=row.num_gaussians,
+        method=row.method,
+        truncated=bool(row.truncated),
+        path=row.path,
+        sha256=row.sha256,
+    )

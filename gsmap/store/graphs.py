@@ -1,0 +1,117 @@
+"""Scene graphs, kept under what they were made from: scene and method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from sqlalchemy import Row, delete, insert, select
+
+from gsmap.store.arrays import Arrays, digest
+from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.groups import has_group, manifest, publish
+from gsmap.store.scenes import resolve
+from gsmap.store.schema import graphs, scenes
+from gsmap.types import NodeLayer, SceneGraph
+
+KIND = "graphs"
+_ARRAYS = tuple(f.name for f in fields(NodeLayer) if f.name != "method")
+
+
+@dataclass(frozen=True)
+class StoredGraph:
+    """What the catalog knows of a graph without reading it.
+
+    Args:
+        key: digest of scene and method; registrations are keyed by it.
+        scene: scene id.
+        method: as given to `Graphs.save`.
+        layers: number of nodes by layer.
+    """
+
+    key: str
+    scene: str
+    method: str
+    layers: dict[str, int]
+    created_at: str
+
+    @property
+    def num_nodes(self) -> int:
+        return sum(self.layers.values())
+
+
+def graph_key(scene_id: str, method: str) -> str:
+    """The digest a graph is kept under."""
+    return digest(text=f"{scene_id}\n{method}")
+
+
+class Graphs:
+    """The scene graphs of a map; ``method`` is any text that decides the result (a digest of segmenter, ...)."""
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
+        self._catalog = catalog
+        self._arrays = arrays
+
+    def save(self, graph: SceneGraph, method: str) -> StoredGraph:
+        """Keep a graph; the same again changes nothing, another one under the same key takes its place."""
+        key = graph_key(graph.scene_id, method)
+        arrays = {f"{layer}.{name}": getattr(nodes, name) for layer, nodes in graph.layers.items() for name in _ARRAYS}
+        about = {
+            "up": None if graph.up is None else np.asarray(graph.up, np.float64).tolist(),
+            "unit_m": float(graph.unit_m),
+            "notes": list(graph.notes),
+            "layers": {name: {"method": nodes.method, "count": len(nodes)} for name, nodes in graph.layers.items()},
+        }
+        group_id = digest(*arrays.values(), text=f"{key}{about}")
+        row = {"key": key, "scene": graph.scene_id, "method": method, "num_nodes": graph.num_nodes, "about": about}
+        staging = self._arrays.stage(arrays)
+        with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
+            old = connection.execute(select(graphs).where(graphs.c.key == key)).first()
+            if old is not None and old.group_id == group_id:
+                return _stored(old)
+            resolve(connection, graph.scene_id)
+            if not has_group(connection, group_id):
+                publish(connection, self._arrays, staged, KIND, group_id)
+            connection.execute(delete(graphs).where(graphs.c.key == key))
+            connection.execute(insert(graphs), row | {"group_id": group_id, "created_at": now()})
+            return _stored(connection.execute(select(graphs).where(graphs.c.key == key)).one())
+
+    def find(self, ref: str, method: str) -> StoredGraph | None:
+        """The graph of a scene by a method, if it was made."""
+        with self._catalog.read() as connection:
+            key = graph_key(resolve(connection, ref), method)
+            row = connection.execute(select(graphs).where(graphs.c.key == key)).first()
+        return None if row is None else _stored(row)
+
+    def load(self, ref: str, method: str | None = None) -> SceneGraph | None:
+        """Read the graph of a scene by a method, or the newest one; None where there is none.
+
+        Raises:
+            CorruptError: bytes on disk are missing or differ.
+        """
+        with self._catalog.read() as connection:
+            query = (
+                select(graphs).where(graphs.c.scene == resolve(connection, ref)).order_by(graphs.c.created_at.desc())
+            )
+            row = connection.execute(query if method is None else query.where(graphs.c.method == method)).first()
+            if row is None:
+                return None
+            files = manifest(connection, row.group_id)
+        arrays = self._arrays.read(KIND, row.group_id, files)
+        layers = {
+            name: NodeLayer(**{a: arrays[f"{name}.{a}"] for a in _ARRAYS}, method=layer["method"])
+            for name, layer in row.about["layers"].items()
+        }
+        up = None if row.about["up"] is None else np.array(row.about["up"])
+        return SceneGraph(row.scene, layers, up, row.about["unit_m"], tuple(row.about["notes"]))
+
+    def list(self) -> list[StoredGraph]:
+        """The graphs of all living scenes, oldest first."""
+        query = select(graphs).join(scenes, scenes.c.id == graphs.c.scene).where(scenes.c.removed_at.is_(None))
+        with self._catalog.read() as connection:
+            return [_stored(row) for row in connection.execute(query.order_by(graphs.c.created_at))]
+
+
+def _stored(row: Row) -> StoredGraph:
+    counts = {name: layer["count"] for name, layer in row.about["layers"].items()}
+    return StoredGraph(row.key, row.scene, row.method, counts, row.created_at)

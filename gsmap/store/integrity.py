@@ -1,0 +1,167 @@
+"""`check` reads every byte; `prune` reclaims what nothing names."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sqlalchemy import Connection, delete, not_, select, text, update
+
+from gsmap.store import sqlite
+from gsmap.store.arrays import CHUNK_ROWS, Arrays
+from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.groups import manifest
+from gsmap.store.models import FOLDER
+from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Check:
+    """What `check` found.
+
+    Args:
+        problems: one line each; empty for a sound map.
+        orphans: folders that no row names (a crash left them; `prune` removes them); no harm.
+        num_groups, num_bytes: what was read.
+    """
+
+    problems: tuple[str, ...]
+    orphans: tuple[str, ...]
+    num_groups: int
+    num_bytes: int
+
+    @property
+    def ok(self) -> bool:
+        return not self.problems
+
+
+@dataclass
+class Pruned:
+    """What `prune` reclaimed (or would).
+
+    Args:
+        scenes: names of removed scenes whose arrays were dropped.
+        revisions: numbers that can no longer be exported in full.
+        num_graphs, num_orphans, num_bytes: graphs, folders without a row, and bytes on disk.
+    """
+
+    scenes: list[str] = field(default_factory=list)
+    revisions: list[int] = field(default_factory=list)
+    num_graphs: int = 0
+    num_orphans: int = 0
+    num_bytes: int = 0
+
+
+def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) -> Check:
+    """Read every byte of the map and compare it with what was written; see `Check`."""
+    with catalog.read() as connection:
+        named = {row.id: row.kind for row in connection.execute(select(groups).order_by(groups.c.id))}
+        manifests = {group: manifest(connection, group) for group in named}
+        problems = _row_problems(connection, catalog.folder)
+    if catalog.is_sqlite:
+        with explained(catalog.folder):
+            problems += sqlite.integrity_problems(catalog.engine)
+    for i, (group, kind) in enumerate(named.items()):
+        if progress:
+            progress(i / len(named), f"{kind}/{group[:12]}")
+        problems += arrays.problems(kind, group, manifests[group])
+    orphans = tuple(f"{kind}/{name}" for kind, name in arrays.groups() if named.get(name) != kind)
+    num_bytes = sum(f.size_bytes for files in manifests.values() for f in files)
+    if progress:
+        progress(1.0, "checked")
+    return Check(tuple(problems), orphans, len(named), num_bytes)
+
+
+def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
+    """Reclaim the arrays of removed scenes that no kept revision names, their graphs, and what crashes left.
+
+    Args:
+        keep_revisions: keep only this many of the newest; older ones stay listed but lose their claim. None: all.
+        dry_run: only say what would go.
+    """
+    out = Pruned()
+    doomed: list[tuple[str, str]] = []
+    with catalog.lock():
+        with contextlib.ExitStack() as stack:
+            connection = stack.enter_context(catalog.read() if dry_run else catalog.write())
+            kept, out.revisions = _revisions_to_keep(connection, keep_revisions)
+            named = select(poses.c.scene).where(poses.c.revision.in_(kept))
+            gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
+            of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
+            dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None))).all()
+            keys = list(connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars())
+            out.scenes, out.num_graphs = [row.name for row in dead], len(keys)
+            claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
+            claimed |= set(
+                connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars()
+            )
+            doomed = [(g.kind, g.id) for g in connection.execute(select(groups)) if g.id not in claimed]
+            known = {(g.kind, g.id) for g in connection.execute(select(groups))}
+            orphans = [group for group in arrays.groups() if group not in known]
+            out.num_orphans = len(orphans)
+            out.num_bytes = sum(arrays.size_bytes(*group) for group in [*doomed, *orphans])
+            if not dry_run:
+                ids = [group for _, group in doomed]
+                connection.execute(
+                    update(revisions).where(revisions.c.number.in_(out.revisions)).values(dropped_at=now())
+                )
+                connection.execute(delete(graphs).where(graphs.c.key.in_(keys)))
+                connection.execute(update(scenes).where(scenes.c.group_id.in_(ids)).values(group_id=None))
+                for row in dead:
+                    boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
+                    connection.execute(boxes, {"s": row.number})
+                connection.execute(delete(files).where(files.c.group_id.in_(ids)))
+                connection.execute(delete(groups).where(groups.c.id.in_(ids)))
+        # The rows are gone for good: a crash from here on leaves orphans for the next prune.
+        if not dry_run:
+            with explained(catalog.folder):
+                for group in [*doomed, *orphans]:
+                    arrays.drop(*group)
+                out.num_bytes += arrays.drop_leftovers()
+                out.num_bytes += _drop_models(catalog)
+    return out
+
+
+def _row_problems(connection: Connection, folder: Path) -> list[str]:
+    out = []
+    for row in connection.execute(select(scenes).where(scenes.c.removed_at.is_(None))):
+        if row.group_id is None:
+            out.append(f"scene {row.name} has no arrays")
+        query = text(f"SELECT count(*) FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
+        boxes = connection.execute(query, {"s": row.number}).scalar_one()
+        if boxes != -(-row.num_gaussians // CHUNK_ROWS):
+            out.append(f"scene {row.name} has {boxes} chunk boxes, not one for every {CHUNK_ROWS} Gaussians")
+    for row in connection.execute(select(models).where(models.c.removed_at.is_(None))):
+        path = folder / row.path if row.copied else Path(row.path)
+        if not path.is_file():
+            out.append(f"model {row.name} is missing: {path}")
+            continue
+        with open(path, "rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != row.sha256:
+                out.append(f"model {row.name} differs from what was added: {path}")
+    return out
+
+
+def _revisions_to_keep(connection: Connection, keep: int | None) -> tuple[list[int], list[int]]:
+    """Numbers to keep, and numbers to drop now."""
+    query = select(revisions.c.number).where(revisions.c.dropped_at.is_(None)).order_by(revisions.c.number)
+    numbers = list(connection.execute(query).scalars())
+    cut = 0 if keep is None else max(0, len(numbers) - max(keep, 0))
+    return numbers[cut:], numbers[:cut]
+
+
+def _drop_models(catalog: Catalog) -> int:
+    """Copies of models that no row names any more."""
+    with catalog.read() as connection:
+        standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
+    freed = 0
+    for path in (catalog.folder / FOLDER).glob("*"):
+        if f"{FOLDER}/{path.name}" not in standing:
+            freed += path.stat().st_size
+            path.unlink()
+    return freed

@@ -1,0 +1,40 @@
+"""Poses and matrices as JSON and back, to the last bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsmap.types import Sim3
+
+
+def from_pose(pose: Sim3 | None) -> dict[str, Any] | None:
+    if pose is None:
+        return None
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "scale": pose.scale}
+
+
+def to_pose(value: dict[str, Any] | None) -> Sim3 | None:
+    return None if value is None else Sim3(value["rotation"], value["translation"], value["scale"])
+
+
+def from_array(array: np.ndarray | None) -> list[Any] | None:
+    return None if array is None else np.asarray(array, np.float64).tolist()
+
+
+def to_array(value: list[Any] | None) -> np.ndarray | None:
+    return None if value is None else np.array(value, np.float64)
+
+
+def plain(value: Any) -> Any:
+    """Parameters as JSON can hold them: numpy scalars and arrays become numbers and lists, the unknown becomes text."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

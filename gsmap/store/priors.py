@@ -1,0 +1,53 @@
+"""Outside knowledge of scene poses: at most one standing prior for each scene, the earlier ones kept."""
+
+from __future__ import annotations
+
+import numpy as np
+from sqlalchemy import insert, select, update
+
+from gsmap.errors import InputError, NotFoundError
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
+from gsmap.store.scenes import living_ids, resolve
+from gsmap.store.schema import priors
+from gsmap.types import Prior
+
+
+class Priors:
+    """The priors of a map."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+
+    def set(self, prior: Prior) -> None:
+        """Give a scene a prior, in place of the one it had."""
+        sigmas = np.asarray(prior.sigmas, np.float64)
+        if sigmas.shape != (7,) or not (sigmas > 0).all():
+            raise InputError(f"a prior needs 7 positive sigmas (inf where nothing is known), got {sigmas.tolist()}")
+        with self._catalog.write() as connection:
+            scene = resolve(connection, prior.scene)
+            self._retire(connection, scene)
+            row = {"scene": scene, "S_map_scene": from_pose(prior.S_map_scene), "sigmas": from_array(sigmas)}
+            connection.execute(insert(priors), row | {"created_at": now()})
+
+    def list(self) -> list[Prior]:
+        """The standing priors of living scenes, oldest first."""
+        query = select(priors).where(priors.c.removed_at.is_(None)).order_by(priors.c.number)
+        with self._catalog.read() as connection:
+            alive = living_ids(connection)
+            rows = [row for row in connection.execute(query) if row.scene in alive]
+        return [Prior(row.scene, to_pose(row.S_map_scene), to_array(row.sigmas)) for row in rows]
+
+    def remove(self, ref: str) -> None:
+        """Take a scene's prior back.
+
+        Raises:
+            NotFoundError: it has none.
+        """
+        with self._catalog.write() as connection:
+            if not self._retire(connection, resolve(connection, ref)):
+                raise NotFoundError(f"scene {ref!r} has no prior")
+
+    def _retire(self, connection, scene: str) -> int:
+        standing = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
+        return connection.execute(update(priors).where(standing).values(removed_at=now())).rowcount

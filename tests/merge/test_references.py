@@ -1,0 +1,99 @@
+import numpy as np
+from made_walls import cameras_facing, texture, two_parts, wall
+
+from gsmap.merge import Part
+from gsmap.merge.changes import drop_what_is_gone, what_came_later
+from gsmap.merge.exposure import apply_gain, balance_exposure
+from gsmap.merge.references import order_of_views, render_references, surface_points
+from gsmap.render import render
+from gsmap.types import Gaussians
+
+
+def quiet(fraction, text):
+    pass
+
+
+def test_surface_points_lie_on_the_wall():
+    camera = cameras_facing([0.2])
+    seen = render(wall(0, -1.5, 1.5), camera)
+    points = surface_points(camera, seen.depth[0])[seen.alpha[0] > 0.95]
+    assert len(points) > 500
+    assert np.abs(points[:, 2]).max() < 0.03
+    assert points[:, 0].min() < 0 < points[:, 0].max()
+
+
+def test_references_count_only_what_was_seen_of_the_tile():
+    parts = two_parts()
+    whole = render_references(parts, None, 64, None, quiet)
+    assert len(whole) == 14
+    tile = np.array([[0.6, -2, -2], [2, 2, 2]])
+    views = render_references(parts, tile, 64, None, quiet)
+    # Only capture b reaches there, and only some of its cameras look that way.
+    assert set(views.part.tolist()) == {1}
+    assert 0 < len(views) < 7
+    assert all(w.max() == 255 and w.min() == 0 for w in views.weights)
+
+
+def test_views_take_turns_in_proportion_to_what_they_show():
+    order = order_of_views(np.array([0.1, 0.2, 0.4]), 700, seed=0)
+    np.testing.assert_allclose(np.bincount(order), [100, 200, 400], atol=2)
+    first = np.bincount(order[:70], minlength=3)
+    np.testing.assert_allclose(first, [10, 20, 40], atol=3)
+    np.testing.assert_array_equal(order, order_of_views(np.array([0.1, 0.2, 0.4]), 700, seed=0))
+
+
+def test_a_gain_multiplies_every_colour():
+    g = wall(0, -1, 1)
+    gain = np.array([1.2, 0.9, 1.05])
+    camera = cameras_facing([0.0])
+    np.testing.assert_allclose(
+        render(apply_gain(g, gain), camera).colour, render(g, camera).colour * gain.astype(np.float32), atol=1e-5
+    )
+
+
+def test_exposure_is_balanced_where_captures_meet():
+    a, b = two_parts()
+    gain = np.array([1.25, 1.1, 0.9])
+    brighter = Part(apply_gain(b.gaussians, gain), b.cameras, "b")
+    _, log_gains = balance_exposure([a, brighter])
+    np.testing.assert_allclose(log_gains[1] - log_gains[0], -np.log(gain), atol=0.02)
+    np.testing.assert_allclose(log_gains.sum(0), 0, atol=1e-9)
+    parts, log_gains = balance_exposure([a, b])
+    assert parts[0] is a
+    assert not log_gains.any()
+
+
+def test_captures_that_do_not_meet_keep_their_exposure():
+    a = Part(wall(0, -3, -2), cameras_facing([-2.5]), "a")
+    b = Part(apply_gain(wall(1, 2, 3), np.full(3, 1.5)), cameras_facing([2.5]), "b")
+    assert not balance_exposure([a, b])[1].any()
+
+
+def test_what_a_later_capture_looked_through_is_gone():
+    box = wall(5, -0.2, 0.2, z=-0.5, colour=lambda x, y: 1 - texture(x, y), half_height=0.15)
+    before = Gaussians.concatenate([wall(0, -1.5, 1.5), box])
+    cameras = cameras_facing(np.linspace(-0.6, 0.6, 7))
+    old = Part(before, cameras, "old", "2026-01-01T00:00:00+00:00")
+    new = Part(wall(1, -1.5, 1.5), cameras, "new", "2026-02-01T00:00:00+00:00")
+    kept, lost = drop_what_is_gone([old, new])
+    assert lost == [len(box), 0]
+    assert kept[0].gaussians.means[:, 2].min() > -0.1
+    # The other way round the box is new, and stays; so it does where nobody knows the time.
+    assert drop_what_is_gone([Part(before, cameras, "x", new.captured_at), old])[1][0] == 0
+    assert drop_what_is_gone([Part(before, cameras, "x"), new])[1] == [0, 0]
+
+
+def test_what_came_later_is_not_asked_away_by_older_pictures():
+    box = wall(5, -0.2, 0.2, z=-0.5, colour=lambda x, y: 1 - texture(x, y), half_height=0.15)
+    cameras = cameras_facing(np.linspace(-0.6, 0.6, 7))
+    old = Part(wall(1, -1.5, 1.5), cameras, "old", "2026-01-01T00:00:00+00:00")
+    new = Part(Gaussians.concatenate([wall(0, -1.5, 1.5), box]), cameras, "new", "2026-02-01T00:00:00+00:00")
+    later = what_came_later([old, new])
+    assert [len(x) for x in later] == [1, 0]
+    plain = render_references([old, new], None, 64, None, quiet)
+    views = render_references([old, new], None, 64, later, quiet)
+    middle = 3  # looks straight at the box
+    assert plain.weights[middle][24, 32] > 250
+    assert views.weights[middle][24, 32] == 0
+    assert views.weights[middle][24, 4] > 250
+    np.testing.assert_array_equal(views.weights[middle + 7], plain.weights[middle + 7])

@@ -1,0 +1,87 @@
+"""Made worlds for the optimiser's tests: scenes in a flat cloud, edges between neighbours, some of them wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from gsmap.geometry import similarities
+from gsmap.geometry.similarities import Similarities
+from gsmap.geometry.umeyama import umeyama
+from gsmap.types import Edge, PoseGraph
+
+ROT_RAD, TRANS_M, STIFF = np.radians(0.5), 0.05, 1e10
+
+
+@dataclass
+class World:
+    ids: list[str]
+    edges: list[Edge]
+    truth: Similarities
+    wrong: np.ndarray
+
+    @property
+    def wrong_keys(self) -> set[tuple[str, str]]:
+        return {(e.target, e.source) for e, bad in zip(self.edges, self.wrong, strict=True) if bad}
+
+    def ate(self, answer: PoseGraph, status: tuple[str, ...] = ("placed",)) -> float:
+        """RMSE in metres of the placed scenes of the largest component, after rigid alignment."""
+        rows = [
+            k for k, s in enumerate(self.ids) if answer.poses[s].component == 0 and answer.poses[s].status in status
+        ]
+        found = np.array([answer.poses[self.ids[k]].S_map_scene.translation for k in rows])
+        S = umeyama(self.truth.translations[rows], found)
+        return float(np.sqrt(((S.apply(found) - self.truth.translations[rows]) ** 2).sum(1).mean()))
+
+
+def information(rot_rad: float = ROT_RAD, trans_m: float = TRANS_M, log_scale: float | None = None) -> np.ndarray:
+    return np.diag([rot_rad**-2] * 3 + [trans_m**-2] * 3 + [STIFF if log_scale is None else log_scale**-2])
+
+
+def poses_at(positions: np.ndarray, seed: int = 0) -> Similarities:
+    n = len(positions)
+    return Similarities(Rotation.random(n, random_state=seed).as_matrix(), np.asarray(positions, float), np.zeros(n))
+
+
+def true_edges(truth: Similarities, pairs: np.ndarray, rng: np.random.Generator, ids: list[str]) -> list[Edge]:
+    """Noisy measurements of the pairs (K, 2): target, source."""
+    pairs = np.asarray(pairs).reshape(-1, 2)
+    noise = np.c_[
+        rng.normal(0, ROT_RAD, (len(pairs), 3)), rng.normal(0, TRANS_M, (len(pairs), 3)), np.zeros(len(pairs))
+    ]
+    measured = truth[pairs[:, 0]].inverse() @ truth[pairs[:, 1]] @ similarities.exp(noise)
+    return [Edge(ids[a], ids[b], measured.item(k), information()) for k, (a, b) in enumerate(pairs)]
+
+
+def near_pairs(positions: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` random ones of the shortest pairs."""
+    k = min(len(positions), 25)
+    near = cKDTree(positions).query(positions, k=k)[1]
+    pairs = np.unique(np.sort(np.stack([np.repeat(near[:, 0], k - 1), near[:, 1:].ravel()], 1), axis=1), axis=0)
+    length = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
+    pairs = pairs[np.argsort(length)[: int(1.5 * count)]]
+    return pairs[np.sort(rng.permutation(len(pairs))[:count])]
+
+
+def city(count: int, wrong_share: float, seed: int = 0, edges_per_scene: int = 5) -> World:
+    """Scenes 3 m apart on a floor; ``wrong_share`` of the edges tie random scenes by random poses."""
+    rng = np.random.default_rng(seed)
+    side = 3.0 * np.sqrt(count)
+    positions = np.c_[rng.uniform(0, side, (count, 2)), rng.uniform(0, 3, count)]
+    truth = poses_at(positions, seed)
+    ids = [f"s{k:05d}" for k in range(count)]
+    num_wrong = round(wrong_share * edges_per_scene * count)
+    pairs = near_pairs(positions, edges_per_scene * count - num_wrong, rng)
+    edges = true_edges(truth, pairs, rng, ids)
+    taken = set(map(tuple, pairs.tolist()))
+    while len(edges) < edges_per_scene * count:
+        a, b = sorted(rng.integers(0, count, 2).tolist())
+        if a == b or (a, b) in taken:
+            continue
+        taken.add((a, b))
+        off = poses_at(rng.normal(0, 3, (1, 3)), int(rng.integers(1 << 30)))
+        edges.append(Edge(ids[a], ids[b], off.item(0), information()))
+    return World(ids, edges, truth, np.arange(len(edges)) >= len(pairs))

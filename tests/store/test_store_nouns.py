@@ -1,0 +1,332 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
+from gsmap.store import Store, graph_key
+from gsmap.types import NodeLayer, PoseGraph, Prior, Registration, SceneGraph, ScenePose, Sim3, Tile
+
+
+def pose(seed: int = 0, scale: float = 1.0) -> Sim3:
+    return Sim3(Rotation.random(random_state=seed).as_matrix(), np.random.default_rng(seed).normal(size=3), scale)
+
+
+def assert_pose(a: Sim3, b: Sim3) -> None:
+    assert (a.rotation == b.rotation).all()
+    assert (a.translation == b.translation).all()
+    assert a.scale == b.scale
+
+
+def layer(m: int = 7, method: str = "m1") -> NodeLayer:
+    r = np.random.default_rng(m)
+    return NodeLayer(
+        r.normal(size=(m, 3)),
+        r.normal(size=(m, 16)),
+        r.integers(0, 9, m),
+        r.uniform(size=m),
+        r.normal(size=(m, 2, 3)),
+        r.normal(size=(m, 8)),
+        r.integers(0, 9, m),
+        method,
+    )
+
+
+def registration(target: str, source: str, **more: object) -> Registration:
+    fields = {
+        "status": "accepted",
+        "S_target_source": pose(1, 1.25),
+        "information": np.diag(np.arange(1.0, 8)) / 3,
+        "num_inliers": 12,
+        "num_correspondences": 99,
+        "overlap": 0.1 + 0.2,
+        "method": "landmarks",
+        "exact": False,
+        "seconds": {"match": 0.5, "refine": 0.25, "verdict": 1e-3},
+        "evidence": {"logNFA": np.float32(-7.5), "runner_up": 0.3},
+    }
+    return Registration(target, source, **(fields | more))
+
+
+# -- scene graphs
+
+
+def test_graph_round_trip(store, two_scenes):
+    up = np.array([0, 0.6, 0.8])
+    graph = SceneGraph(two_scenes[0].id, {"objects": layer(5), "landmarks": layer(0, "m2")}, up, 0.4, ("few nodes",))
+    kept = store.graphs.save(graph, "method-1")
+    assert kept.key == graph_key(two_scenes[0].id, "method-1")
+    assert kept.layers == {"objects": 5, "landmarks": 0}
+    back = store.graphs.load("scene0", "method-1")
+    assert (back.scene_id, back.unit_m, back.notes) == (two_scenes[0].id, 0.4, ("few nodes",))
+    np.testing.assert_array_equal(back.up, up)
+    assert list(back.layers) == ["objects", "landmarks"]
+    for name, nodes in graph.layers.items():
+        assert back.layers[name].method == nodes.method
+        for array in ("positions", "embeddings", "types", "weights", "extents", "features", "num_views"):
+            a, b = getattr(nodes, array), getattr(back.layers[name], array)
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+
+
+def test_graphs_by_method(store, two_scenes):
+    scene = two_scenes[0].id
+    assert store.graphs.find("scene0", "a") is None
+    assert store.graphs.load("scene0") is None
+    first = store.graphs.save(SceneGraph(scene, {"objects": layer(3)}), "a")
+    store.graphs.save(SceneGraph(scene, {"objects": layer(4)}), "b")
+    assert store.graphs.save(SceneGraph(scene, {"objects": layer(3)}), "a") == first  # nothing happened
+    assert store.graphs.find("scene0", "a").num_nodes == 3
+    assert store.graphs.load("scene0").num_nodes == 4  # the newest
+    assert [g.method for g in store.graphs.list()] == ["a", "b"]
+    store.graphs.save(SceneGraph(scene, {"objects": layer(9)}), "a")
+    assert store.graphs.load("scene0", "a").num_nodes == 9
+    assert len(store.graphs.list()) == 2
+    store.prune()  # the replaced graph's bytes go
+    assert store.check().ok
+    assert store.graphs.load("scene0", "a").num_nodes == 9
+    with pytest.raises(NotFoundError):
+        store.graphs.save(SceneGraph("unknown", {}), "a")
+
+
+def test_empty_graph(store, two_scenes):
+    store.graphs.save(SceneGraph(two_scenes[0].id), "a")
+    assert store.graphs.load("scene0", "a").layers == {}
+
+
+# -- registrations
+
+
+def test_registration_round_trip(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    r = registration(a, b)
+    store.registrations.save(r, "key")
+    back = store.registrations.get("scene1", "scene0")
+    assert back.key == "key"
+    assert back.verdict is None
+    got = back.registration
+    assert_pose(got.S_target_source, r.S_target_source)
+    np.testing.assert_array_equal(got.information, r.information)
+    for name in ("target", "source", "status", "reason", "num_inliers", "num_correspondences", "overlap", "method"):
+        assert getattr(got, name) == getattr(r, name)
+    assert got.exact is False
+    assert got.seconds == r.seconds
+    assert got.evidence == {"logNFA": -7.5, "runner_up": 0.3}
+    none = registration(a, b, status="no_match", S_target_source=None, information=None, reason="not enough nodes")
+    assert store.registrations.save(none).registration.S_target_source is None
+
+
+def test_history_and_current(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    assert store.registrations.get(a, b) is None
+    assert store.registrations.find("k1") is None
+    store.registrations.save(registration(a, b, num_inliers=1), "k1")
+    store.registrations.save(registration(b, a, num_inliers=2), "k2")  # the other direction is the same pair
+    assert [r.registration.num_inliers for r in store.registrations.history(a, b)] == [1, 2]
+    assert [r.registration.num_inliers for r in store.registrations.current()] == [2]
+    assert store.registrations.get(a, b).registration.target == b
+    assert store.registrations.find("k1").registration.num_inliers == 1
+    store.scenes.remove("scene0")
+    assert store.registrations.current() == []
+    with pytest.raises(InputError, match="same scene"):
+        store.registrations.get(b, b)
+
+
+def test_verdicts(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    with pytest.raises(NotFoundError, match="never registered"):
+        store.registrations.judge("scene0", "scene1", "confirm")
+    first = store.registrations.save(registration(a, b, num_inliers=1))
+    assert store.registrations.judge("scene0", "scene1", "confirm", "looked at it").verdict == "confirm"
+    store.registrations.save(registration(a, b, num_inliers=2))
+    for found in (store.registrations.get(a, b), *store.registrations.current()):
+        assert (found.number, found.verdict) == (first.number, "confirm")  # a person's pose stays
+    assert store.registrations.judge("scene1", "scene0", "reject").verdict == "reject"
+    assert store.registrations.current()[0].registration.num_inliers == 2
+    assert store.registrations.judge("scene0", "scene1", "withdraw").verdict is None
+    assert [v.verdict for v in store.registrations.verdicts(a, b)] == ["confirm", "reject", "withdraw"]
+    assert store.registrations.verdicts(a, b)[0].note == "looked at it"
+    with pytest.raises(ConfigError, match="verdict"):
+        store.registrations.judge(a, b, "maybe")
+    store.registrations.save(registration(a, b, status="no_match", S_target_source=None, reason="look alike"))
+    with pytest.raises(InputError, match="look alike"):
+        store.registrations.judge(a, b, "confirm")
+
+
+# -- revisions and priors
+
+
+def graph_of(scenes, shift: float = 0.0) -> PoseGraph:
+    a, b = (s.id for s in scenes)
+    covariance = np.diag(np.arange(1.0, 8)) / 7
+    placed = {
+        a: ScenePose(a, Sim3(np.eye(3), [shift, 0, 0]), 0, "placed", covariance),
+        b: ScenePose(b, None, 1, "isolated"),
+    }
+    pair = (a, b)
+    parameters = {"chi2": 12.02, "seed": np.int64(3), "robust": "gnc"}
+    return PoseGraph(placed, {pair: "tentative"}, {pair: np.float64(2.5)}, {pair: "no cycle"}, (pair,), parameters)
+
+
+def test_revisions(store, two_scenes):
+    assert store.revisions.current() is None
+    assert store.revisions.get() is None
+    assert store.revisions.save(graph_of(two_scenes)) == 1
+    assert store.revisions.save(graph_of(two_scenes, 0.5), note="new scene") == 2
+    a, b = (s.id for s in two_scenes)
+    for number, shift in ((1, 0.0), (2, 0.5), (None, 0.5)):
+        got = store.revisions.get(number)
+        assert got.poses[a].S_map_scene.translation[0] == shift
+        np.testing.assert_array_equal(got.poses[a].covariance, np.diag(np.arange(1.0, 8)) / 7)
+        assert got.poses[b].S_map_scene is None
+        assert (got.poses[b].status, got.poses[b].component) == ("isolated", 1)
+        assert got.used == {(a, b): "tentative"}
+        assert got.residuals == {(a, b): 2.5}
+        assert got.reasons == {(a, b): "no cycle"}
+        assert got.undecided == ((a, b),)
+        assert got.parameters == {"chi2": 12.02, "seed": 3, "robust": "gnc"}
+    first, second = store.revisions.list()
+    assert (first.number, first.num_scenes, first.num_placed, first.num_components) == (1, 2, 1, 2)
+    assert second.note == "new scene"
+    with pytest.raises(NotFoundError, match="revision 3"):
+        store.revisions.get(3)
+
+
+@pytest.mark.parametrize("used", [True, False, "tentative"])
+def test_used_keeps_its_kind(store, two_scenes, used):
+    a, b = (s.id for s in two_scenes)
+    store.revisions.save(PoseGraph({}, {(a, b): used}))
+    assert store.revisions.get().used[(a, b)] is used or used == "tentative"
+
+
+def test_a_revision_of_unknown_scenes_leaves_nothing(store):
+    with pytest.raises(StoreError):
+        store.revisions.save(PoseGraph({"x": ScenePose("x", None, 0, "isolated")}))
+    assert store.revisions.list() == []
+
+
+def test_priors(store, two_scenes):
+    sigmas = np.array([0.1, 0.1, np.inf, 1, 1, 1, np.inf])
+    store.priors.set(Prior("scene0", pose(3), sigmas))
+    store.priors.set(Prior("scene0", pose(4), sigmas))
+    (got,) = store.priors.list()
+    assert got.scene == two_scenes[0].id
+    assert_pose(got.S_map_scene, pose(4))
+    np.testing.assert_array_equal(got.sigmas, sigmas)
+    store.priors.remove("scene0")
+    assert store.priors.list() == []
+    with pytest.raises(NotFoundError, match="no prior"):
+        store.priors.remove("scene0")
+    for bad in (np.zeros(7), np.ones(6), np.full(7, np.nan)):
+        with pytest.raises(InputError, match="sigmas"):
+            store.priors.set(Prior("scene0", pose(), bad))
+
+
+# -- models
+
+
+def test_models(store, tmp_path):
+    file = tmp_path / "net.onnx"
+    file.write_bytes(b"first")
+    kept = store.models.add("clip", file, kind="clip", options={"size_px": np.int64(224), "mean": (0.5, 0.5)})
+    assert kept.path.read_bytes() == b"first"
+    assert kept.path.is_relative_to(store.folder)
+    assert store.models.get("clip").options == {"size_px": 224, "mean": [0.5, 0.5]}
+    file.write_bytes(b"second")
+    store.models.add("clip", file, kind="clip")
+    linked = store.models.add("sam", file, kind="sam_encoder", copy=False)
+    assert linked.path == file
+    assert store.models.get("clip").path.read_bytes() == b"second"
+    assert len(list((store.folder / "models").iterdir())) == 2
+    assert store.check().ok
+    store.prune()
+    assert len(list((store.folder / "models").iterdir())) == 1
+    file.write_bytes(b"third!")
+    assert "model sam differs" in store.check().problems[0]
+    store.models.remove("sam")
+    assert store.check().ok
+    with pytest.raises(NotFoundError, match="no model is called"):
+        store.models.get("sam")
+    with pytest.raises(NotFoundError, match="no model file"):
+        store.models.add("x", tmp_path / "none", kind="clip")
+
+
+# -- exports
+
+
+def tile(path: str, scenes, shift: float = 0.0) -> Tile:
+    poses = {s.id: Sim3(np.eye(3), [shift, 0, 0]) for s in scenes}
+    return Tile("key", 0, np.array([[0, 0, 0], [1, 2, 3.0]]), poses, 42, "tto", True, path, "ab" * 32)
+
+
+def test_exports_keep_the_newest_tile_of_a_path(store, two_scenes, tmp_path):
+    revision = store.revisions.save(graph_of(two_scenes))
+    first = store.exports.begin(tmp_path / "out", revision=revision, settings={"tile_size_m": 10})
+    store.exports.add_tile(first, tile("0/a.ply", two_scenes))
+    store.exports.add_tile(first, tile("0/b.ply", two_scenes))
+    second = store.exports.begin(tmp_path / "out" / ".." / "out", revision=None)
+    store.exports.add_tile(second, tile("0/b.ply", two_scenes, 0.25))
+    other = store.exports.begin(tmp_path / "other", revision=None)
+    store.exports.add_tile(other, tile("0/a.ply", two_scenes, 9.0))
+    a, b = store.exports.tiles(tmp_path / "out")
+    assert (a.path, b.path) == ("0/a.ply", "0/b.ply")
+    assert b.poses[two_scenes[0].id].translation[0] == 0.25
+    np.testing.assert_array_equal(a.bounds, [[0, 0, 0], [1, 2, 3]])
+    assert (a.key, a.num_gaussians, a.method, a.truncated, a.sha256) == ("key", 42, "tto", True, "ab" * 32)
+    store.exports.forget(tmp_path / "out", ["0/a.ply"])
+    assert [t.path for t in store.exports.tiles(tmp_path / "out")] == ["0/b.ply"]
+    assert [t.path for t in store.exports.tiles(tmp_path / "other")] == ["0/a.ply"]
+    assert store.exports.targets() == sorted([str(tmp_path / "out"), str(tmp_path / "other")])
+    assert [(e.number, e.revision, e.num_tiles) for e in store.exports.list()] == [
+        (1, 1, 2),
+        (2, None, 1),
+        (3, None, 1),
+    ]
+    assert store.exports.list()[0].settings == {"tile_size_m": 10}
+    with pytest.raises(NotFoundError):
+        store.exports.add_tile(99, tile("x", two_scenes))
+
+
+def test_several_changes_in_one_transaction(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    with pytest.raises(RuntimeError), store.transaction():
+        store.registrations.save(registration(a, b))
+        store.revisions.save(graph_of(two_scenes))
+        assert store.revisions.current() == 1  # seen from inside
+        raise RuntimeError
+    assert store.registrations.current() == []
+    assert store.revisions.current() is None
+
+
+# -- prune
+
+
+def test_prune_keeps_what_a_revision_names(tmp_path):
+    with Store.create(tmp_path / "m") as store:
+        scenes = [store.scenes.add(make_gaussians(seed=i), make_cameras(), name=f"scene{i}")[0] for i in range(3)]
+        store.graphs.save(SceneGraph(scenes[0].id, {"objects": layer()}), "a")
+        store.graphs.save(SceneGraph(scenes[2].id, {"objects": layer()}), "a")
+        store.revisions.save(graph_of(scenes[:2]))
+        store.scenes.remove("scene0")
+        store.scenes.remove("scene2")
+        would = store.prune(dry_run=True)
+        assert (would.scenes, would.num_graphs) == (["scene2"], 1)
+        assert len(store.scenes.gaussians(scenes[2].id)) == 500
+        done = store.prune()
+        assert (done.scenes, done.num_graphs, done.num_bytes) == (["scene2"], 1, would.num_bytes)
+        assert done.num_bytes > 10_000
+        assert len(store.scenes.gaussians(scenes[0].id)) == 500  # revision 1 can still be exported
+        with pytest.raises(NotFoundError, match="pruned"):
+            store.scenes.gaussians(scenes[2].id)
+        assert store.check().ok
+
+        store.revisions.save(PoseGraph({scenes[1].id: ScenePose(scenes[1].id, pose(), 0, "placed")}))
+        assert store.prune().scenes == []
+        dropped = store.prune(keep_revisions=1)
+        assert (dropped.scenes, dropped.revisions) == (["scene0"], [1])
+        assert [bool(r.dropped_at) for r in store.revisions.list()] == [True, False]
+        assert store.revisions.get(1).poses[scenes[0].id].status == "placed"  # the record itself stays
+        assert store.prune().num_bytes == 0
+        assert store.check().ok
+        assert len(store.scenes.gaussians("scene1")) == 500
+        assert len(list((tmp_path / "m" / "arrays" / "scenes").iterdir())) == 1

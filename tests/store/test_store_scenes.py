@@ -1,0 +1,243 @@
+import numpy as np
+import pytest
+from sqlalchemy import text
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.errors import CorruptError, InputError, NotFoundError
+from gsmap.store import Store, scene_id
+from gsmap.store.arrays import CHUNK_ROWS
+from gsmap.store.morton import chunk_boxes, morton_order
+from gsmap.types import Gaussians
+
+NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
+
+def rows(g: Gaussians) -> np.ndarray:
+    """Gaussians as rows in an order of their own, to compare sets."""
+    table = np.concatenate([getattr(g, n).reshape(len(g), -1) for n in NAMES], axis=1)
+    return table[np.lexsort(table.T)]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [1, 500, CHUNK_ROWS, 2 * CHUNK_ROWS + 17])
+def test_what_goes_in_comes_out(store, n, degree):
+    g, c = make_gaussians(n, degree=degree), make_cameras()
+    scene, is_new = store.scenes.add(
+        g, c, name="a", captured_at="2026-01-02T03:04:05+00:00", source="a.ply", antialiased=True, notes=("hm",)
+    )
+    assert is_new
+    assert (scene.num_gaussians, scene.sh_degree, scene.num_cameras) == (n, degree, 3)
+    np.testing.assert_array_equal(rows(store.scenes.gaussians("a")), rows(g))
+    cameras = store.scenes.cameras("a")
+    np.testing.assert_array_equal(cameras.T_frame_camera, c.T_frame_camera)
+    np.testing.assert_array_equal(cameras.intrinsics_px, c.intrinsics_px)
+    assert cameras.names == c.names
+    again = store.scenes.get("a")
+    assert (again.captured_at, again.source, again.antialiased) == ("2026-01-02T03:04:05+00:00", "a.ply", True)
+    np.testing.assert_array_equal(again.bounds, [g.means.min(0), g.means.max(0)])
+    assert store.scenes.notes("a") == ("hm",)
+
+
+def test_same_content_twice_changes_nothing(store):
+    first, _ = store.scenes.add(make_gaussians(), make_cameras(), name="a")
+    before = {p: p.stat().st_mtime_ns for p in (store.folder / "arrays").rglob("*")}
+    again, is_new = store.scenes.add(make_gaussians(), make_cameras(), name="other")
+    assert not is_new
+    assert (again.id, again.name) == (first.id, "a")
+    assert {p: p.stat().st_mtime_ns for p in (store.folder / "arrays").rglob("*")} == before
+    assert len(store.scenes.list()) == 1
+
+
+def test_id_depends_on_all_content(store):
+    g, c = make_gaussians(), make_cameras()
+    ids = {scene_id(g, c), scene_id(g, c[:2]), scene_id(g[:-1], c)}
+    for name in NAMES:
+        changed = {n: getattr(g, n).copy() for n in NAMES}
+        changed[name].flat[-1] += 1
+        ids.add(scene_id(Gaussians(**changed), c))
+    assert len(ids) == 8
+
+
+def test_refs(store, two_scenes):
+    a, b = two_scenes
+    assert store.scenes.get("scene0").id == a.id
+    assert store.scenes.get(b.id).name == "scene1"
+    assert store.scenes.get(b.id[:12]).name == "scene1"
+    for ref in ("nothing", "", "zzz", "%", "_"):
+        with pytest.raises(NotFoundError, match="no scene is called"):
+            store.scenes.get(ref)
+
+
+def test_a_beginning_of_several_ids_is_refused(store):
+    for i in range(20):  # of 20 ids two begin with the same of 16 digits
+        store.scenes.add(make_gaussians(2, seed=i), make_cameras(), name=f"scene {i}")
+    firsts = [s.id[0] for s in store.scenes.list()]
+    twice = next(d for d in firsts if firsts.count(d) > 1)
+    with pytest.raises(NotFoundError, match="several scene ids"):
+        store.scenes.get(twice)
+
+
+def test_names_stay_unique(store):
+    for i in range(3):
+        store.scenes.add(make_gaussians(seed=i), make_cameras(), name="a")
+    assert [s.name for s in store.scenes.list()] == ["a", "a-2", "a-3"]
+    with pytest.raises(InputError, match="another name"):
+        store.scenes.add(make_gaussians(seed=9), make_cameras(), name="a", rename=False)
+    assert len(store.scenes.list()) == 3
+
+
+def test_remove_leaves_a_tombstone_and_frees_the_name(store, two_scenes):
+    a, b = two_scenes
+    store.scenes.remove("scene0")
+    assert [s.name for s in store.scenes.list()] == ["scene1"]
+    assert [s.name for s in store.scenes.list(removed=True)] == ["scene0"]
+    with pytest.raises(NotFoundError):
+        store.scenes.get("scene0")
+    assert store.scenes.removed_at(a.id)
+    assert len(store.scenes.gaussians(a.id)) == 500  # history can still be exported
+    with pytest.raises(NotFoundError, match="was removed"):
+        store.scenes.remove(a.id)
+    c, is_new = store.scenes.add(make_gaussians(seed=7), make_cameras(), name="scene0")
+    assert is_new
+    assert c.name == "scene0"
+
+
+def test_removed_content_comes_back(store):
+    a, _ = store.scenes.add(make_gaussians(), make_cameras(), name="a")
+    for prune in (False, True):
+        store.scenes.remove(a.id)
+        if prune:
+            store.prune()
+        back, is_new = store.scenes.add(make_gaussians(), make_cameras(), name="back")
+        assert is_new
+        assert (back.id, back.name) == (a.id, "back")
+        assert len(store.scenes.gaussians("back")) == 500
+        assert store.check().ok
+
+
+def test_bounds_read_exactly_what_reaches_in(store):
+    g = make_gaussians(5 * CHUNK_ROWS)
+    store.scenes.add(g, make_cameras(), name="a")
+    low, high = np.array([-1.0, 0, 2]), np.array([0.5, 1, 3])
+    reach = 3 * g.scales.max(1, keepdims=True).astype(np.float64)
+    expected = g[((g.means >= low - reach) & (g.means <= high + reach)).all(1)]
+    found = store.scenes.gaussians("a", np.array([low, high]))
+    assert len(found) > 100
+    # The chunk boxes are tighter than the sphere around a Gaussian, so only ones that cannot touch may be missing.
+    inside = expected[((expected.means >= low) & (expected.means <= high)).all(1)]
+    kept = {tuple(m) for m in found.means.tolist()}
+    assert {tuple(m) for m in inside.means.tolist()} <= kept <= {tuple(m) for m in expected.means.tolist()}
+    assert len(store.scenes.gaussians("a", np.array([[90.0] * 3, [91.0] * 3]))) == 0
+    with pytest.raises(InputError, match=r"\(2, 3\)"):
+        store.scenes.gaussians("a", np.zeros((3, 2)))
+
+
+def test_bounds_read_few_chunks(store, monkeypatch):
+    store.scenes.add(make_gaussians(8 * CHUNK_ROWS), make_cameras(), name="a")
+    asked = []
+    real = store.arrays.read
+    monkeypatch.setattr(store.arrays, "read", lambda *a, **k: asked.append(k["rows"]) or real(*a, **k))
+    store.scenes.gaussians("a", np.array([[-5.0] * 3, [-4.5] * 3]))
+    assert sum(stop - start for start, stop in asked[0]) <= 2 * CHUNK_ROWS
+
+
+def test_scenes_do_not_mix_in_the_tree(store):
+    store.scenes.add(make_gaussians(3 * CHUNK_ROWS, seed=1), make_cameras(), name="a")
+    store.scenes.add(make_gaussians(2 * CHUNK_ROWS, seed=2), make_cameras(), name="b")
+    whole = np.array([[-99.0] * 3, [99.0] * 3])
+    assert len(store.scenes.gaussians("a", whole)) == 3 * CHUNK_ROWS
+    assert len(store.scenes.gaussians("b", whole)) == 2 * CHUNK_ROWS
+    with store.catalog.read() as connection:
+        plan = str(connection.execute(text("EXPLAIN QUERY PLAN SELECT chunk FROM chunk_boxes WHERE s0 = 1")).all())
+    assert "VIRTUAL TABLE INDEX" in plan
+
+
+def test_morton_order_keeps_neighbours_together():
+    points = np.random.default_rng(0).uniform(size=(40_000, 3)).astype(np.float32)
+    order = morton_order(points)
+    assert sorted(order) == list(range(len(points)))
+    g = make_gaussians(40_000)
+    boxes = chunk_boxes(g[morton_order(g.means)], 1000)
+    plain = chunk_boxes(g, 1000)
+    volume = np.prod(boxes[:, 1] - boxes[:, 0], axis=1).mean() / np.prod(plain[:, 1] - plain[:, 0], axis=1).mean()
+    assert volume < 0.25
+    np.testing.assert_array_equal(morton_order(np.zeros((5, 3), np.float32)), np.arange(5))
+
+
+def test_morton_order_is_the_bit_interleaving():
+    grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+
+    def interleave(p: list[int]) -> int:
+        return sum(((v >> bit) & 1) << (3 * bit + axis) for axis, v in enumerate(p) for bit in range(2))
+
+    expected = np.argsort([interleave(p) for p in grid.tolist()])
+    np.testing.assert_array_equal(morton_order(grid.astype(np.float32)), expected)
+
+
+def test_chunk_boxes_hold_three_sigmas():
+    g = make_gaussians(50)
+    from gsmap.geometry.rotations import quats_to_matrices
+
+    for i, (low, high) in enumerate(chunk_boxes(g, 1)):
+        half = quats_to_matrices(g.quats[i]) * g.scales[i]
+        reach = 3 * np.sqrt(np.diag(half @ half.T))
+        np.testing.assert_allclose(low, g.means[i] - reach, atol=1e-5)
+        np.testing.assert_allclose(high, g.means[i] + reach, atol=1e-5)
+
+
+def test_no_gaussians_and_odd_camera_names(store):
+    with pytest.raises(InputError, match="no Gaussians"):
+        store.scenes.add(Gaussians.empty(), make_cameras(), name="a")
+    c = make_cameras(2)
+    odd = type(c)(c.T_frame_camera, c.intrinsics_px, c.sizes_px, ("a\nb", "c"))
+    with pytest.raises(InputError, match="line break"):
+        store.scenes.add(make_gaussians(), odd, name="a")
+    assert not store.scenes.list()
+    assert not store.arrays.groups()
+
+
+def test_damage_is_found_on_reading_and_mended_by_ingesting_again(store):
+    g, c = make_gaussians(), make_cameras()
+    scene, _ = store.scenes.add(g, c, name="a")
+    means = store.folder / "arrays" / "scenes" / scene.id / "means"
+    file = next(p for p in means.rglob("*") if p.is_file() and "json" not in p.name)
+    for harm in (
+        lambda: file.unlink(),
+        lambda: file.write_bytes(file.read_bytes()[:-9]),
+        lambda: file.write_bytes(bytes([file.read_bytes()[0]]) + file.read_bytes()[1:-30] + bytes(30)),
+    ):
+        harm()
+        with pytest.raises(CorruptError, match="ingest the scene again"):
+            store.scenes.gaussians("a")
+        assert not store.check().ok
+        mended, written = store.scenes.add(g, c, name="a")
+        assert written
+        assert mended.id == scene.id
+        assert len(store.scenes.gaussians("a")) == 500
+        assert store.check().ok
+
+
+def test_reads_while_another_writes(tmp_path):
+    with Store.create(tmp_path / "m") as writer, Store.open(tmp_path / "m", "r") as reader:
+        writer.scenes.add(make_gaussians(), make_cameras(), name="a")
+        with writer.transaction():
+            writer.scenes.remove("a")
+            assert [s.name for s in reader.scenes.list()] == ["a"]
+        assert reader.scenes.list() == []
+
+
+def test_a_failed_transaction_leaves_nothing(store, two_scenes):
+    with pytest.raises(RuntimeError), store.transaction():
+        store.scenes.remove("scene0")
+        store.scenes.remove("scene1")
+        raise RuntimeError
+    assert len(store.scenes.list()) == 2
+
+
+def test_real_capture(store, shared_data):
+    from gsmap.ingest import read_captures
+
+    (capture,) = read_captures(shared_data / "kitchen_splats" / "k0.ply")
+    scene, _ = store.scenes.add(capture.gaussians, capture.cameras, name=capture.name, source=capture.source)
+    np.testing.assert_array_equal(rows(store.scenes.gaussians("k0")), rows(capture.gaussians))
+    assert scene.name == "k0"
