@@ -18,7 +18,13 @@ from gsmap.types import Cameras, Gaussians
 
 # Suffix -> module of this package. The longest suffix wins, so `.compressed.ply` goes before `.ply`.
 MODULES: dict[str, str] = {
+    ".compressed.ply": "compressed_ply",
+    ".glb": "glb",
     ".ply": "ply",
+    ".sog": "sog",
+    ".splat": "splat",
+    ".spz": "spz",
+    "tileset.json": "tiles3d",
 }
 
 

@@ -1,0 +1,277 @@
+"""Binary glTF 2.0 (``.glb``) with the ratified ``KHR_gaussian_splatting``, uncompressed.
+
+Scales are linear, opacities in [0, 1], quaternions xyzw, and the axes left-up-front; colours are as trained (sRGB).
+A file is written with an identity transform and everything, SH included, turned into glTF's axes, so that viewers
+agree whether or not they turn SH with a node.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.formats.axes import GLTF, PLY, change_axes
+from gsmap.formats.ply import SH_C0
+from gsmap.formats.quantise import opacity_bytes, require_writable
+from gsmap.geometry.transforms import transform_gaussians
+from gsmap.types import Gaussians, Sim3
+
+EXTENSION = "KHR_gaussian_splatting"
+_MAX_JSON_BYTES = 16 << 20
+_MAX_NODES = 10_000
+_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_ARRAY_BUFFER = 34962
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+def read(path: str | os.PathLike[str]) -> Gaussians:
+    """Read all splats of the file's scene into one set, in the axes of a ``.ply``; node transforms are applied.
+
+    Raises:
+        InputError: not a GLB, damaged, without splats, of a draft of the extension, compressed, or with buffers
+            outside the file.
+    """
+    return change_axes(read_world(path), PLY, GLTF)
+
+
+def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a ``.glb``, in the order given, with point colours for viewers that know no splats."""
+    require_writable(path, gaussians)
+    write_world(path, change_axes(gaussians, GLTF, PLY))
+
+
+def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -> Gaussians:
+    """The splats of a GLB in glTF's own world, y up, or in the frame that ``matrix`` (4, 4) takes that world to."""
+    gltf, binary = _read_container(path)
+    outer = np.eye(4) if matrix is None else matrix
+    try:
+        parts = [_read_primitive(path, gltf, binary, *item) for item in _primitives(path, gltf, outer)]
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is not valid glTF: {type(error).__name__} {error}") from error
+    if not parts:
+        raise InputError(f"{path} holds no Gaussian splats ({EXTENSION}): a mesh or a point cloud?")
+    return Gaussians.concatenate(parts)
+
+
+def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.ndarray | None = None) -> None:
+    """Write Gaussians as they are; ``matrix`` (4, 4) takes them to glTF's world, as the transform of their node."""
+    g = gaussians
+    degree_of = np.repeat(np.arange(4), [1, 3, 5, 7])
+    unit = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-30)
+    unit[~unit.any(1), 0] = 1
+    arrays: dict[str, np.ndarray] = {
+        "POSITION": g.means,
+        "COLOR_0": _point_colours(g),
+        f"{EXTENSION}:ROTATION": unit[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": g.scales,
+        f"{EXTENSION}:OPACITY": g.opacities,
+    }
+    for k in range(g.sh.shape[1]):
+        degree = degree_of[k]
+        arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = g.sh[:, k]
+
+    views, accessors, length = [], [], 0
+    for name, values in arrays.items():
+        width = values.shape[1] if values.ndim == 2 else 1
+        accessor = {
+            "bufferView": len(views),
+            "componentType": 5121 if values.dtype == np.uint8 else 5126,
+            "count": len(g),
+            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width],
+        }
+        if values.dtype == np.uint8:
+            accessor["normalized"] = True
+        if name == "POSITION":  # the one attribute whose bounds glTF asks for
+            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        size = len(g) * width * values.itemsize
+        views.append({"buffer": 0, "byteOffset": length, "byteLength": size, "target": _ARRAY_BUFFER})
+        accessors.append(accessor)
+        length += size  # every attribute is a multiple of 4 bytes
+    splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    splatting |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    primitive = {"attributes": {name: i for i, name in enumerate(arrays)}, "mode": 0}
+    node: dict[str, Any] = {"mesh": 0}
+    if matrix is not None:
+        node["matrix"] = np.asarray(matrix, float).T.ravel().tolist()
+    gltf = {
+        "asset": {"version": "2.0", "generator": "gsmap"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [primitive | {"extensions": {EXTENSION: splatting}}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": length}],
+    }
+    text = json.dumps(gltf, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + length
+    if total >= 2**32:
+        raise InputError(f"{path}: {len(g)} Gaussians do not fit a GLB of 4 GiB; write 3D Tiles instead")
+    with open(path, "wb") as file:
+        file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), _JSON) + text)
+        file.write(struct.pack("<II", length, _BIN))
+        for values in arrays.values():
+            file.write(np.ascontiguousarray(values).data)
+
+
+def _point_colours(g: Gaussians) -> np.ndarray:
+    """(N, 4) uint8 linear RGB and opacity, for viewers that draw the Gaussians as points."""
+    srgb = np.clip(g.sh[:, 0] * SH_C0 + 0.5, 0, 1)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    rgb = np.round(linear * 255).astype(np.uint8)
+    return np.concatenate([rgb, opacity_bytes(g.logit_opacities)[:, None]], axis=1)
+
+
+def _read_container(path: str | os.PathLike[str]) -> tuple[dict[str, Any], np.ndarray]:
+    """The JSON and the bytes of the binary chunk, mapped from the file."""
+    size = Path(path).stat().st_size
+    with open(path, "rb") as file:
+        head = file.read(20)
+        if len(head) < 20 or head[:4] != b"glTF":
+            raise InputError(f"{path} is not a GLB file: it {'is empty' if not head else 'has no glTF header'}")
+        version, total, json_bytes, kind = struct.unpack_from("<IIII", head, 4)
+        if version != 2 or kind != _JSON:
+            raise InputError(f"{path}: GLB version {version} with first chunk {kind:#x}; gsmap reads version 2")
+        if total > size or 20 + json_bytes > total or json_bytes > _MAX_JSON_BYTES:
+            raise InputError(
+                f"{path}: its header promises {total:,} bytes with {json_bytes:,} of JSON, the file has {size:,}: "
+                "truncated or damaged"
+            )
+        try:
+            gltf = json.loads(file.read(json_bytes))
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: its JSON cannot be read: {error}") from error
+        if not isinstance(gltf, dict):
+            raise InputError(f"{path} is not valid glTF: its JSON is not an object")
+        tail = file.read(8)
+    offset = 20 + json_bytes + 8
+    if len(tail) < 8 or offset >= size:
+        return gltf, np.empty(0, np.uint8)
+    length, kind = struct.unpack("<II", tail)
+    if kind != _BIN or offset + length > size:
+        raise InputError(
+            f"{path}: its binary chunk is {length:,} bytes, {size - offset:,} follow: truncated or damaged"
+        )
+    return gltf, np.memmap(path, np.uint8, "r", offset, (length,)) if length else np.empty(0, np.uint8)
+
+
+def _primitives(
+    path: str | os.PathLike[str], gltf: dict[str, Any], outer: np.ndarray
+) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Every splat primitive of the default scene with the matrix (4, 4) from its node to the outermost frame."""
+    nodes = gltf.get("nodes", [])
+    scenes = gltf.get("scenes", [])
+    roots = scenes[gltf.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
+    todo = [(int(i), outer) for i in roots]
+    seen = 0
+    while todo:
+        index, parent = todo.pop()
+        seen += 1
+        if seen > _MAX_NODES or index < 0:
+            raise InputError(f"{path}: more than {_MAX_NODES} nodes, or nodes in a circle")
+        node = nodes[index]
+        world = parent @ _node_matrix(path, node)
+        todo += [(int(child), world) for child in node.get("children", [])]
+        if "mesh" in node:
+            for primitive in gltf["meshes"][node["mesh"]]["primitives"]:
+                if EXTENSION in primitive.get("extensions", {}):
+                    yield primitive, world
+
+
+def _node_matrix(path: str | os.PathLike[str], node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    if "rotation" in node or "scale" in node:
+        from gsmap.geometry.rotations import quats_to_matrices
+
+        x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+        matrix[:3, :3] = quats_to_matrices(np.array([w, x, y, z])) * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _read_primitive(path, gltf: dict[str, Any], binary: np.ndarray, primitive: dict[str, Any], world) -> Gaussians:
+    splatting = primitive["extensions"][EXTENSION]
+    attributes = primitive["attributes"]
+    nested = splatting.get("extensions", {})
+    if nested:
+        raise InputError(f"{path} is compressed or extended by {', '.join(nested)}: convert it to plain {EXTENSION}")
+    if splatting.get("kernel") != "ellipse" or splatting.get("colorSpace") != "srgb_rec709_display":
+        raise InputError(
+            f"{path}: kernel {splatting.get('kernel')!r} and colour space {splatting.get('colorSpace')!r}; gsmap reads "
+            f"'ellipse' and 'srgb_rec709_display' of the ratified {EXTENSION}"
+        )
+    count = int(gltf["accessors"][attributes["POSITION"]]["count"])
+
+    def values(name: str, width: int) -> np.ndarray:
+        if name not in attributes:
+            raise InputError(f"{path} lacks the attribute {name}: not a file of the ratified {EXTENSION}")
+        return _accessor(path, gltf, binary, attributes[name], count, width)
+
+    scales = values(f"{EXTENSION}:SCALE", 3)
+    if (scales < 0).any():
+        raise InputError(f"{path} has negative scales: an early draft of {EXTENSION} stored logarithms; export it anew")
+    opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0]
+    if not ((opacities >= 0) & (opacities <= 1)).all():
+        raise InputError(f"{path} has opacities outside [0, 1]: a draft of {EXTENSION}? export it anew")
+    degree = 0
+    while degree < 3 and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
+        degree += 1
+    sh = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}", 3) for d in range(degree + 1) for n in range(2 * d + 1)]
+    tiny = np.finfo(np.float32).tiny
+    # float32 rounds what is nearly opaque to 1: keep its logit finite.
+    bounded = np.clip(opacities.astype(np.float64), tiny, 1 - 2.0**-25)
+    local = Gaussians(
+        values("POSITION", 3),
+        values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        np.log(np.maximum(scales, tiny)),
+        np.log(bounded) - np.log1p(-bounded),
+        np.stack(sh, axis=1),
+    )
+    if np.array_equal(world, np.eye(4)):
+        return local
+    try:
+        return transform_gaussians(local, Sim3.from_matrix(world))
+    except InputError as error:
+        raise InputError(f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}") from error
+
+
+def _accessor(path, gltf: dict[str, Any], binary: np.ndarray, index: int, count: int, width: int) -> np.ndarray:
+    """(count, width) float32 of one accessor, its place in the file checked before anything is allocated."""
+    accessor = gltf["accessors"][index]
+    kind, stored = _COMPONENTS.get(accessor["componentType"]), _WIDTHS.get(accessor["type"])
+    if "sparse" in accessor or "bufferView" not in accessor or kind is None or stored != width:
+        raise InputError(f"{path}: accessor {index} is sparse or of a kind that splats do not have")
+    if accessor["count"] != count:
+        raise InputError(f"{path}: accessor {index} has {accessor['count']} values for {count} Gaussians")
+    view = gltf["bufferViews"][accessor["bufferView"]]
+    if view["buffer"] != 0 or "uri" in gltf["buffers"][0]:
+        raise InputError(f"{path}: its data lies outside the file; gsmap reads self-contained .glb only")
+    item = np.dtype(kind)
+    stride = int(view.get("byteStride", item.itemsize * width))
+    start, begin, length = int(accessor.get("byteOffset", 0)), int(view.get("byteOffset", 0)), int(view["byteLength"])
+    needed = start + stride * (count - 1) + item.itemsize * width
+    if not count > 0 or min(start, begin) < 0 or not item.itemsize * width <= stride <= 252:
+        raise InputError(f"{path}: accessor {index} has impossible count, offset or stride")
+    if needed > length or begin + length > len(binary):
+        raise InputError(
+            f"{path} is damaged: accessor {index} needs {needed:,} bytes of {length:,} in its view, {len(binary):,} in all"
+        )
+    raw = np.ndarray((count, width), item, binary, begin + start, (stride, item.itemsize))
+    out = raw.astype(np.float32)
+    if accessor.get("normalized"):
+        out = np.maximum(out / np.iinfo(item).max, -1)
+    return out

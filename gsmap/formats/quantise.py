@@ -1,0 +1,79 @@
+"""What the compressed formats share: bytes for opacities, three numbers for a quaternion, limits for what is read."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.types import Gaussians
+
+# Real splats compress 2 to 10 times; what claims far more than that is a bomb.
+_FREE_BYTES = 256 << 20
+_MAX_RATIO = 32
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def check_size(path: str | os.PathLike[str], expanded: int, compressed: int) -> None:
+    """Refuse to expand ``compressed`` bytes to more than 256 MiB and more than 32 times as many.
+
+    Raises:
+        InputError: a decompression bomb, or a header that lies.
+    """
+    if expanded > max(_FREE_BYTES, _MAX_RATIO * compressed):
+        raise InputError(
+            f"{path}: its header promises {expanded / 2**20:,.0f} MiB out of {compressed / 2**20:.1f} MiB compressed; "
+            "no real splat compresses that well, so the file is damaged or hostile"
+        )
+
+
+def require_writable(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Refuse what a format without room for it cannot hold: nothing at all, NaN, or infinite positions and colours.
+
+    Infinite logits and scales of minus infinity are fine: they have an opacity and a size.
+    """
+    if len(gaussians) == 0:
+        raise InputError(f"{path}: there are no Gaussians to write")
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        values = getattr(gaussians, name)
+        total = values.sum(dtype=np.float64)
+        if not np.isfinite(total):
+            bad = ~np.isfinite(values) if name in ("means", "quats", "sh") else np.isnan(values)
+            if bad.any():
+                row = int(bad.reshape(len(values), -1).any(1).argmax())
+                raise InputError(f"{path}: {name} of Gaussian {row} is not finite: remove it before writing")
+
+
+def opacity_bytes(logits: np.ndarray) -> np.ndarray:
+    """Opacities as uint8, 0 to 255."""
+    with np.errstate(over="ignore"):
+        return np.round(255.0 / (1.0 + np.exp(-logits))).astype(np.uint8)
+
+
+def logits_of_bytes(values: np.ndarray) -> np.ndarray:
+    """Logits float32 of opacities stored as uint8; 0 and 255 stand for the middle of their half-wide bins."""
+    opacity = np.clip(np.arange(256), 0.25, 254.75) / 255.0
+    return np.log(opacity / (1.0 - opacity)).astype(np.float32)[values]
+
+
+def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The index (N,) of the largest component of normalised quaternions (N, 4), and the other three (N, 3) in order.
+
+    The sign is chosen so that the largest is positive; a zero quaternion is the one with only component 0.
+    """
+    q = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
+    largest = np.abs(q).argmax(1)
+    rows = np.arange(len(q))
+    q *= np.where(q[rows, largest] < 0, -1, 1).astype(q.dtype)[:, None]
+    return largest, np.take_along_axis(q, _OTHERS[largest], axis=1)
+
+
+def from_smallest_three(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
+    """Unit quaternions (N, 4) float32 from the index of the largest component and the other three."""
+    squared = (three * three).sum(1)
+    q = np.empty((len(three), 4), np.float32)
+    np.put_along_axis(q, _OTHERS[largest], three.astype(np.float32), axis=1)
+    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(0.0, 1.0 - squared))
+    return q / np.linalg.norm(q, axis=1, keepdims=True)

@@ -1,0 +1,239 @@
+"""A 3D Tiles 1.1 tileset: ``tileset.json`` beside a folder of GLB files, coarse tiles replaced by finer ones.
+
+The root tile's frame is the frame of the Gaussians. 3D Tiles turns glTF from y up to z up, so every GLB carries the
+inverse of that turn on its node: what is stored is in the root's frame as it is, and viewers agree whether or not they
+turn SH with a node. The root's ``transform`` alone places the map in a viewer's world, by default so that
+right-down-front, the axes of a trained ``.ply``, stands upright.
+
+For a map too large for memory, `write_content` each tile as it is made and `write_tileset` at the end; `write` does
+both for one set of Gaussians, with an octree and levels of detail.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from gsmap.errors import ConfigError, InputError
+from gsmap.formats import glb
+from gsmap.formats.quantise import require_writable
+from gsmap.geometry.voxels import covariances, merge_groups, voxel_labels
+from gsmap.types import Gaussians
+
+CONTENT_FOLDER = "tiles"
+_MAX_JSON_BYTES = 64 << 20
+_MAX_DEPTH = 64
+_MAX_TILES = 100_000
+_SIGMAS = 3.0
+_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # right-down-front to z up
+
+
+@dataclass(frozen=True, eq=False)
+class TileNode:
+    """One tile of a tileset.
+
+    Args:
+        box: (2, 3) lowest and highest corner of what it and its children draw, root frame.
+        error_m: how far, in the frame's unit, what it draws may be from the originals; 0 for the originals.
+        uri: its GLB, relative to ``tileset.json``, with ``/``; None where only its children draw.
+        children: finer tiles that replace it.
+    """
+
+    box: np.ndarray
+    error_m: float
+    uri: str | None = None
+    children: tuple[TileNode, ...] = ()
+
+
+def read(path: str | os.PathLike[str]) -> Gaussians:
+    """Read the finest level of a tileset, in the frame of its root tile (the root's own transform is left out).
+
+    Raises:
+        InputError: not a tileset, implicit tiling, content that is not splats in GLB, or that lies outside the
+            tileset's folder.
+    """
+    path = Path(path)
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise InputError(f"{path} is larger than the {_MAX_JSON_BYTES >> 20} MiB of JSON that gsmap reads")
+    try:
+        tileset = json.loads(path.read_bytes())
+        contents = list(_finest(path, tileset["root"]))
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is not a 3D Tiles tileset: {type(error).__name__} {error}") from error
+    if not contents:
+        raise InputError(f"{path} has no tiles with content")
+    return Gaussians.concatenate(
+        [glb.read_world(_inside(path, uri), matrix @ _Y_UP_TO_Z_UP) for uri, matrix in contents]
+    )
+
+
+def write(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    max_per_tile: int = 100_000,
+    transform: np.ndarray | None = None,
+) -> None:
+    """Write a tileset of an octree: the leaves hold the originals, every tile above about ``max_per_tile`` of them.
+
+    What is coarse is merged voxel by voxel with its moments kept, never dropped. Content files are named by their
+    digest, so an older ``tileset.json`` in the same folder stays whole until it is replaced.
+
+    Args:
+        max_per_tile: Gaussians in one file.
+        transform: (4, 4) from the Gaussians' frame to the viewer's world; upright for right-down-front if None.
+    """
+    path = Path(path)
+    if max_per_tile < 1:
+        raise ConfigError(f"max_per_tile must be at least 1, got {max_per_tile}")
+    require_writable(path, gaussians)
+    low, high = gaussians.means.min(0).astype(np.float64), gaussians.means.max(0).astype(np.float64)
+    side = float(max((high - low).max(), 1e-6))
+    root, _ = _octree(path, gaussians, (low + high) / 2, side, max_per_tile, "0")
+    write_tileset(path, root, transform=transform)
+
+
+def write_content(path: str | os.PathLike[str], gaussians: Gaussians) -> np.ndarray:
+    """Write one tile's GLB; returns the box (2, 3) of its Gaussians, widened by three standard deviations."""
+    require_writable(path, gaussians)
+    glb.write_world(path, gaussians, np.linalg.inv(_Y_UP_TO_Z_UP))
+    return box_of(gaussians)
+
+
+def write_tileset(path: str | os.PathLike[str], root: TileNode, *, transform: np.ndarray | None = None) -> None:
+    """Write ``tileset.json``; write it last, when the content that it names is there.
+
+    Args:
+        transform: (4, 4) from the root's frame to the viewer's world; upright for right-down-front if None.
+    """
+    tile = _tile_json(root) | {"refine": "REPLACE"}
+    tile["transform"] = (_UPRIGHT if transform is None else np.asarray(transform, float)).T.ravel().tolist()
+    diagonal = float(np.linalg.norm(root.box[1] - root.box[0]))
+    tileset = {
+        "asset": {"version": "1.1", "generator": "gsmap"},
+        "geometricError": max(diagonal, root.error_m),  # of drawing nothing at all
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {"3DTILES_content_gltf": {"extensionsUsed": [glb.EXTENSION]}},
+        "root": tile,
+    }
+    Path(path).write_text(json.dumps(tileset, indent=1))
+
+
+def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
+    """At most about ``max_count`` Gaussians that look alike from afar, and the voxel size that merged them (0: none).
+
+    Moments and transmittance are kept; see `gsmap.geometry.voxels.merge_groups`.
+    """
+    if len(gaussians) <= max_count:
+        return gaussians, 0.0
+    extent = np.ptp(gaussians.means.astype(np.float64), axis=0)
+    low, high = float(extent.max()) / 2**20, float(extent.max()) * 2
+    labels = voxel_labels(gaussians.means, high)
+    for _ in range(12):  # the size is found to a few per cent
+        middle = float(np.sqrt(low * high))
+        tried = voxel_labels(gaussians.means, middle)
+        if tried.max() + 1 > max_count:
+            low = middle
+        else:
+            high, labels = middle, tried
+    return merge_groups(gaussians, labels)[0], high
+
+
+def box_of(gaussians: Gaussians) -> np.ndarray:
+    """(2, 3) float64 box of the Gaussians, each widened by three standard deviations along the axes."""
+    reach = _SIGMAS * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
+    return np.stack([(gaussians.means - reach).min(0), (gaussians.means + reach).max(0)])
+
+
+def _octree(
+    path: Path, gaussians: Gaussians, center: np.ndarray, side: float, max_per_tile: int, name: str
+) -> tuple[TileNode, Gaussians]:
+    """The tile of a cube, written with all below it; and what it draws, from which its parent's level is made."""
+    children, levels = [], []
+    if len(gaussians) > max_per_tile and len(name) < _MAX_DEPTH // 2:
+        octant = ((gaussians.means >= center) @ [1, 2, 4]).astype(int)
+        for i in np.unique(octant):
+            sub_center = center + side / 4 * np.where([i & 1, i & 2, i & 4], 1, -1)
+            node, level = _octree(path, gaussians[octant == i], sub_center, side / 2, max_per_tile, f"{name}{i}")
+            children.append(node)
+            levels.append(level)
+    if not children:
+        return TileNode(box_of(gaussians), 0.0, _place(path, gaussians, name)), gaussians
+    level, voxel = coarser(Gaussians.concatenate(levels), max_per_tile)
+    below = max(child.error_m for child in children)
+    boxes = np.stack([box_of(level), *(child.box for child in children)])
+    box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+    return TileNode(box, max(voxel, below), _place(path, level, name), tuple(children)), level
+
+
+def _place(path: Path, gaussians: Gaussians, name: str) -> str:
+    """Write one GLB into the content folder under a name with its digest; returns its uri."""
+    folder = path.parent / CONTENT_FOLDER
+    folder.mkdir(exist_ok=True)
+    staged = folder / f".{os.getpid()}.{name}.glb"
+    try:
+        write_content(staged, gaussians)
+        with open(staged, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        uri = f"{CONTENT_FOLDER}/{name}-{digest[:12]}.glb"
+        os.replace(staged, path.parent / uri)
+    finally:
+        staged.unlink(missing_ok=True)
+    return uri
+
+
+def _tile_json(node: TileNode) -> dict[str, Any]:
+    center, half = (node.box[0] + node.box[1]) / 2, (node.box[1] - node.box[0]) / 2
+    box = [*center.tolist(), half[0], 0, 0, 0, half[1], 0, 0, 0, half[2]]
+    tile: dict[str, Any] = {"boundingVolume": {"box": [float(v) for v in box]}, "geometricError": float(node.error_m)}
+    if node.uri is not None:
+        tile["content"] = {"uri": node.uri}
+    if node.children:
+        tile["children"] = [_tile_json(child) for child in node.children]
+    return tile
+
+
+def _finest(path: Path, root: dict[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
+    """Uri and matrix of the content that is drawn when every tile is refined."""
+    todo = [(root, np.eye(4), "REPLACE", 0)]
+    seen = 0
+    while todo:
+        tile, matrix, refine, depth = todo.pop()
+        seen += 1
+        if depth > _MAX_DEPTH or seen > _MAX_TILES:
+            raise InputError(f"{path}: more than {_MAX_TILES} tiles, or nested deeper than {_MAX_DEPTH}")
+        if "implicitTiling" in tile:
+            raise InputError(f"{path} uses implicit tiling, which gsmap does not read")
+        if tile is not root and "transform" in tile:
+            matrix = matrix @ np.array(tile["transform"], np.float64).reshape(4, 4).T
+        refine = str(tile.get("refine", refine)).upper()
+        children = tile.get("children", [])
+        if not children or refine == "ADD":
+            for content in tile.get("contents", [tile["content"]] if "content" in tile else []):
+                yield content["uri"], matrix
+        todo += [(child, matrix, refine, depth + 1) for child in reversed(children)]
+
+
+def _inside(path: Path, uri: str) -> Path:
+    """The file of a relative uri within the tileset's folder, links followed."""
+    name = PurePosixPath(unquote(str(uri)))
+    folder = path.parent.resolve()
+    file = (folder / name).resolve()
+    if name.is_absolute() or ":" in str(name) or "\\" in str(name) or not file.is_relative_to(folder):
+        raise InputError(f"{path}: content {uri!r} lies outside the tileset's folder; gsmap will not follow it")
+    if file.suffix.lower() != ".glb":
+        raise InputError(f"{path}: content {uri!r} is not a .glb; gsmap reads tilesets of splats in GLB")
+    if not file.is_file():
+        raise InputError(f"{path}: content {uri!r} is missing")
+    return file
