@@ -268,7 +268,7 @@ def _accessor(path, gltf: dict[str, Any], binary: np.ndarray, index: int, count:
         raise InputError(f"{path}: accessor {index} has impossible count, offset or stride")
     if needed > length or begin + length > len(binary):
         raise InputError(
-            f"{path} is damaged: accessor {index} needs {needed:,} bytes of {length:,} in its view, {len(binary):,} in all"
+            f"{path} is damaged: accessor {index} needs {needed:,} bytes of {length:,}, {len(binary):,} in all"
         )
     raw = np.ndarray((count, width), item, binary, begin + start, (stride, item.itemsize))
     out = raw.astype(np.float32)

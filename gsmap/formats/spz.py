@@ -116,7 +116,7 @@ def write(
     fields = (_MAGIC, version, len(g), header.degree, header.fractional_bits, header.flags)
     with open(path, "wb") as file:
         if version == 3:
-            squeeze = zlib.compressobj(wbits=31, level=6)
+            squeeze = zlib.compressobj(wbits=31, level=3)
             file.write(squeeze.compress(struct.pack("<4sIIBBBB", *fields, 0)))
             for stream in streams:
                 file.write(squeeze.compress(stream))
@@ -124,7 +124,7 @@ def write(
         else:
             from numcodecs import zstd
 
-            packed = [bytes(zstd.compress(stream, 12)) for stream in streams]
+            packed = [bytes(zstd.compress(stream, 3)) for stream in streams]
             file.write(struct.pack("<4sIIBBBBI12x", *fields, len(packed), 32))
             for stream, squeezed in zip(streams, packed, strict=True):
                 file.write(struct.pack("<QQ", len(squeezed), stream.nbytes))
