@@ -18,9 +18,12 @@ struct Scene {
     int k;  // SH coefficients per channel: 1, 4, 9 or 16
 };
 
-struct SceneGradient {
-    float *means, *quats, *log_scales, *logit_opacities, *sh;  // added to
-    float *mean2d;  // (n, 2) in pixels, set for visible Gaussians; may be null
+struct SceneGradient {  // added to
+    float *means, *quats, *log_scales, *logit_opacities, *sh;
+    float *mean2d;          // (n, 2) in pixels; may be null
+    uint8_t *touched;       // (n,) set to 1 where something was added; may be null
+    const uint8_t *frozen;  // (n,) not 0: leave out; may be null; always of the whole scene
+    int64_t first;          // the scene's row that row 0 of the arrays above belongs to
 };
 
 struct Camera {
@@ -65,6 +68,19 @@ struct TileWork {
     int width, height;
 };
 
+// One attribute of N Gaussians under Adam: values, first and second moments, all (N, cols).
+struct AdamArrays {
+    float *value, *m, *v;
+    int cols;
+    float rate, rate_rest;  // learning rates of the first three columns and of the others
+};
+
+struct AdamStep {
+    float beta1, beta2, epsilon;
+    const float *corrections;  // by number of updates t: 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t)
+    uint32_t *updates;         // (N,) how often each Gaussian was updated
+};
+
 // One set of these per instruction set.
 struct Kernels {
     const char *name;
@@ -77,6 +93,15 @@ struct Kernels {
     // From the slots of `count` records to gradients; adds dL/dT_camera_world (rows of R, then t) to pose unless null.
     void (*project_backward)(const Scene &, const Camera &, const Record *, int count, const float *slots,
                              const SceneGradient &, double *pose);
+    // One Adam update of rows [begin, begin + n) that are touched; clears their gradients, not `touched`.
+    void (*adam)(const AdamArrays &, const AdamStep &, int64_t begin, int n, const uint8_t *touched, float *gradient);
+    // One row of pixels of weight * sum mask |a - b|: adds its gradient to g, returns the sum. mask may be null.
+    float (*l1)(const float *a, const float *b, const float *mask, int pixels, float weight, float *g);
+    // out[i] = sum_j kBlurTaps[j] rows[j][i], 11 rows, null for zeros; n values, which may overlap (a blur along a row).
+    void (*blur)(const float *const *rows, float *out, int n);
+    // Sum of the structural similarity over n values from blurred a, b, aa, bb, ab; overwrites the first three with the
+    // derivatives of that sum with respect to blurred a, aa and ab, times mask[i] (or 1).
+    float (*ssim)(float *a, const float *b, float *aa, const float *bb, float *ab, const float *mask, int n);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

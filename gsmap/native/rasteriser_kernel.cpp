@@ -1,4 +1,5 @@
 // Compiled once per instruction set: GSMAP_ISA is the namespace and name, the compiler's flags choose the vectors.
+#include "fit_kernel.h"
 #include "rasteriser_blend.h"
 #include "rasteriser_blend_backward.h"
 #include "rasteriser_project_backward.h"
@@ -9,5 +10,6 @@
 #define GSMAP_JOIN(a, b) GSMAP_JOIN_(a, b)
 
 static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend,
-                                     GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward};
+                                     GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
+                                     GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::blur, GSMAP_ISA::ssim};
 const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;

@@ -102,75 +102,83 @@ INLINE void group_backward(const Scene &scene, const View &view, const V *mean, 
     }
 }
 
+// Sums a Gaussian's slots over its tiles; false where they are all zero: hidden, nothing to add.
+INLINE bool sum_slots(const Record &record, const float *slots, float *moments) {
+    V sum[kMoments / W] = {};
+    const float *slot = slots + int64_t(record.slot) * kMoments;
+    for (uint32_t s = record.tiles(); s; s--, slot += kMoments)
+        for (int i = 0; i < kMoments / W; i++) sum[i] += load(slot + i * W);
+    bool some = false;
+    for (int i = 0; i < kMoments / W; i++) {
+        some |= any(gt(abs(sum[i]), V{}));
+        store(moments + i * W, sum[i]);
+    }
+    return some;
+}
+
+// Up to W Gaussians whose moments are not zero.
+struct Group {
+    int rows = 0;
+    const Record *record[W];
+    alignas(64) float moments[W][kMoments];
+};
+
+void finish_group(const Scene &scene, const View &view, Group &group, const SceneGradient &gradient, V *pose) {
+    const int rows = group.rows, k3 = 3 * scene.k;
+    for (int l = rows; l < W; l++) {  // repeat the last one with zero weight
+        group.record[l] = group.record[rows - 1];
+        for (int i = 0; i < kMoments; i++) group.moments[l][i] = 0.f;
+    }
+    group.rows = 0;
+    const float *mean[W], *quat[W], *scale[W], *sh[W], *record[W], *moment[W];
+    alignas(64) float logit[W];
+    int64_t id[W];
+    for (int l = 0; l < W; l++) {
+        id[l] = group.record[l]->id;
+        mean[l] = scene.means + 3 * id[l], quat[l] = scene.quats + 4 * id[l], scale[l] = scene.log_scales + 3 * id[l];
+        sh[l] = scene.sh + k3 * id[l], logit[l] = scene.logit_opacities[id[l]];
+        record[l] = &group.record[l]->x, moment[l] = group.moments[l];
+    }
+    V means[3], quats[4], log_scales[3], coefficients[48], fields[kFields], moments[kMoments], mean2d[2];
+    load_rows(mean, 3, means);
+    load_rows(quat, 4, quats);
+    load_rows(scale, 3, log_scales);
+    load_rows(sh, k3, coefficients);
+    load_rows(record, kFields, fields);
+    load_rows(moment, kMoments, moments);
+    GroupGradient g;
+    group_backward(scene, view, means, quats, log_scales, load(logit), coefficients, fields, moments, g, mean2d);
+    if (pose) {
+        for (int i = 0; i < 9; i++) pose[i] += g.Rc[i];
+        for (int i = 0; i < 3; i++) pose[9 + i] += g.tc[i];
+    }
+    const auto add = [&](float *array, V *values, int cols) {
+        float *row[W];
+        for (int l = 0; l < rows; l++) row[l] = array + cols * (id[l] - gradient.first);
+        add_to_rows(values, cols, row, rows);
+    };
+    add(gradient.means, g.mean, 3);
+    add(gradient.quats, g.quat, 4);
+    add(gradient.log_scales, g.log_scale, 3);
+    add(gradient.logit_opacities, &g.logit, 1);
+    add(gradient.sh, g.sh, k3);
+    if (gradient.mean2d) add(gradient.mean2d, mean2d, 2);
+    if (gradient.touched)
+        for (int l = 0; l < rows; l++) gradient.touched[id[l] - gradient.first] = 1;
+}
+
 void project_backward(const Scene &scene, const Camera &camera, const Record *records, int count, const float *slots,
                       const SceneGradient &gradient, double *pose) {
     const View view(camera);
-    const int k3 = 3 * scene.k;
-    int32_t live[W];
-    int pending = 0;
-    alignas(64) float moments[W][kMoments];
     V pose_sum[12] = {};
-
-    for (int next = 0; next < count || pending; next++) {
-        if (next < count) {
-            const Record &r = records[next];
-            V sum[kMoments / W] = {};
-            const float *slot = slots + int64_t(r.slot) * kMoments;
-            for (uint32_t s = r.tiles(); s; s--, slot += kMoments)
-                for (int i = 0; i < kMoments / W; i++) sum[i] += load(slot + i * W);
-            M some = gt(abs(sum[0]), V{});
-            for (int i = 1; i < kMoments / W; i++) some = (M)(some | gt(abs(sum[i]), V{}));
-            if (!any(some)) continue;  // hidden: nothing to add
-            for (int i = 0; i < kMoments / W; i++) store(&moments[pending][i * W], sum[i]);
-            live[pending++] = next;
-        }
-        if (pending < W && next + 1 < count) continue;
-        if (!pending) break;
-
-        const int rows = pending;
-        for (int l = rows; l < W; l++) {  // repeat the last one with zero weight
-            live[l] = live[rows - 1];
-            for (int i = 0; i < kMoments; i++) moments[l][i] = 0.f;
-        }
-        pending = 0;
-        const float *mean[W], *quat[W], *scale[W], *sh[W], *rec[W], *mom[W];
-        alignas(64) float logit[W];
-        int64_t id[W];
-        for (int l = 0; l < W; l++) {
-            id[l] = records[live[l]].id;
-            mean[l] = scene.means + 3 * id[l], quat[l] = scene.quats + 4 * id[l], scale[l] = scene.log_scales + 3 * id[l];
-            sh[l] = scene.sh + k3 * id[l], logit[l] = scene.logit_opacities[id[l]];
-            rec[l] = &records[live[l]].x, mom[l] = moments[l];
-        }
-        V vm[3], vq[4], vs[3], vsh[48], vr[kFields], vmom[kMoments], mean2d[2];
-        load_rows(mean, 3, vm);
-        load_rows(quat, 4, vq);
-        load_rows(scale, 3, vs);
-        load_rows(sh, k3, vsh);
-        load_rows(rec, kFields, vr);
-        load_rows(mom, kMoments, vmom);
-        GroupGradient g;
-        group_backward(scene, view, vm, vq, vs, load(logit), vsh, vr, vmom, g, mean2d);
-        if (pose) {
-            for (int i = 0; i < 9; i++) pose_sum[i] += g.Rc[i];
-            for (int i = 0; i < 3; i++) pose_sum[9 + i] += g.tc[i];
-        }
-        float *row[W];
-        for (int l = 0; l < rows; l++) row[l] = gradient.means + 3 * id[l];
-        add_to_rows(g.mean, 3, row, rows);
-        for (int l = 0; l < rows; l++) row[l] = gradient.quats + 4 * id[l];
-        add_to_rows(g.quat, 4, row, rows);
-        for (int l = 0; l < rows; l++) row[l] = gradient.log_scales + 3 * id[l];
-        add_to_rows(g.log_scale, 3, row, rows);
-        for (int l = 0; l < rows; l++) row[l] = gradient.logit_opacities + id[l];
-        add_to_rows(&g.logit, 1, row, rows);
-        for (int l = 0; l < rows; l++) row[l] = gradient.sh + k3 * id[l];
-        add_to_rows(g.sh, k3, row, rows);
-        if (gradient.mean2d) {
-            for (int l = 0; l < rows; l++) row[l] = gradient.mean2d + 2 * id[l];
-            add_to_rows(mean2d, 2, row, rows);
-        }
+    Group group;
+    for (int i = 0; i < count; i++) {
+        if (gradient.frozen && gradient.frozen[records[i].id]) continue;
+        if (!sum_slots(records[i], slots, group.moments[group.rows])) continue;
+        group.record[group.rows++] = &records[i];
+        if (group.rows == W) finish_group(scene, view, group, gradient, pose ? pose_sum : nullptr);
     }
+    if (group.rows) finish_group(scene, view, group, gradient, pose ? pose_sum : nullptr);
     if (pose)
         for (int i = 0; i < 12; i++)
             for (int l = 0; l < W; l++) pose[i] += double(pose_sum[i][l]);

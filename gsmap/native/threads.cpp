@@ -13,16 +13,16 @@ namespace gsmap {
 namespace {
 
 struct Job {
-    const std::function<void(int64_t, int)> *body;
+    const std::function<void(int64_t)> *body;
     int64_t tasks;
     std::atomic<int64_t> next{0};
     std::atomic<bool> failed{false};
     std::exception_ptr error;
 
-    void work(int worker) {
+    void work() {
         for (int64_t t; !failed && (t = next++) < tasks;) {
             try {
-                (*body)(t, worker);
+                (*body)(t);
             } catch (...) {
                 if (!failed.exchange(true)) error = std::current_exception();
             }
@@ -33,7 +33,7 @@ struct Job {
 class Pool {
   public:
     explicit Pool(int extra) {
-        for (int i = 0; i < extra; i++) threads_.emplace_back([this, i] { loop(i + 1); });
+        for (int i = 0; i < extra; i++) threads_.emplace_back([this] { loop(); });
     }
     ~Pool() {
         {
@@ -51,7 +51,7 @@ class Pool {
             busy_ = static_cast<int>(threads_.size());
         }
         wake_.notify_all();
-        job.work(0);
+        job.work();
         std::unique_lock<std::mutex> lock(mutex_);
         done_.wait(lock, [this] { return busy_ == 0; });
         job_ = nullptr;
@@ -59,7 +59,7 @@ class Pool {
     const int pid = getpid();  // threads do not survive a fork; the child makes its own pool
 
   private:
-    void loop(int worker) {
+    void loop() {
         uint64_t seen = 0;
         std::unique_lock<std::mutex> lock(mutex_);
         for (;;) {
@@ -68,7 +68,7 @@ class Pool {
             seen = generation_;
             Job *job = job_;
             lock.unlock();
-            job->work(worker);
+            job->work();
             lock.lock();
             if (--busy_ == 0) done_.notify_one();
         }
@@ -92,7 +92,7 @@ int pool_size = 0;
 int num_threads() { return wanted; }
 void set_num_threads(int n) { wanted = n < 1 ? 1 : n; }
 
-void parallel_for(int64_t tasks, const std::function<void(int64_t, int)> &body) {
+void parallel_for(int64_t tasks, const std::function<void(int64_t)> &body) {
     Job job;
     job.body = &body;
     job.tasks = tasks;
@@ -108,7 +108,7 @@ void parallel_for(int64_t tasks, const std::function<void(int64_t, int)> &body) 
         }
         pool->run(job);
     } else {
-        job.work(0);
+        job.work();
     }
     if (job.error) std::rethrow_exception(job.error);
 }

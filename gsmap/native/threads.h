@@ -9,8 +9,8 @@ namespace gsmap {
 int num_threads();
 void set_num_threads(int n);
 
-// Calls body(task, worker) for every task in [0, tasks); worker < num_threads() tells which thread runs it, for scratch.
-// Tasks are handed out as threads become free: a result must not depend on which worker ran what.
-void parallel_for(int64_t tasks, const std::function<void(int64_t task, int worker)> &body);
+// Calls body(task) for every task in [0, tasks). Tasks are handed out as threads become free: a result must not depend
+// on which thread ran what. Scratch belongs in thread_local variables. A call from inside a body runs alone.
+void parallel_for(int64_t tasks, const std::function<void(int64_t task)> &body);
 
 }  // namespace gsmap

@@ -5,13 +5,23 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from gsmap.render.fit import Fitter, LearningRates
 from gsmap.render.index import ChunkIndex
 from gsmap.render.rendering import Rendered, num_threads, render, set_num_threads
 
 if TYPE_CHECKING:
     from gsmap.render.autograd import GaussianTensors
 
-__all__ = ["ChunkIndex", "GaussianTensors", "Rendered", "num_threads", "render", "set_num_threads"]
+__all__ = [
+    "ChunkIndex",
+    "Fitter",
+    "GaussianTensors",
+    "LearningRates",
+    "Rendered",
+    "num_threads",
+    "render",
+    "set_num_threads",
+]
 
 
 def __getattr__(name: str) -> Any:

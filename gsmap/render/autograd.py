@@ -118,7 +118,7 @@ class _Render(torch.autograd.Function):
             for name in ("colour", "alpha", "depth", "dominant_id", "max_weight")
         )
         if keep:
-            ctx.views = views
+            ctx.views, ctx.background = views, background
             ctx.save_for_backward(*tensors, pose, out[0], out[1], *(out[2:3] if depth else ()))
         ctx.mark_non_differentiable(*(t for t in out[3:] if t is not None))
         return out
@@ -135,6 +135,7 @@ class _Render(torch.autograd.Function):
             for i, view in enumerate(ctx.views):
                 view.backward(
                     *arrays,
+                    background=ctx.background,
                     colour=colour[i].numpy(),
                     depth=None if depth is None else depth[i],
                     alpha=alpha[i].numpy(),
@@ -146,7 +147,6 @@ class _Render(torch.autograd.Function):
                     g_log_scales=out[2],
                     g_logit_opacities=out[3],
                     g_sh=out[4],
-                    g_mean2d=None,
                     g_pose=None if g_pose is None else g_pose[i, :3],
                 )
         pose_gradient = None if g_pose is None else torch.from_numpy(g_pose).to(pose)
