@@ -10,12 +10,12 @@ from sqlalchemy import Row, delete, insert, select
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.groups import has_group, manifest, publish
+from gsmap.store.matrices import from_array, plain, to_array
 from gsmap.store.scenes import resolve
 from gsmap.store.schema import graphs, scenes
 from gsmap.types import NodeLayer, SceneGraph
 
 KIND = "graphs"
-_ARRAYS = tuple(f.name for f in fields(NodeLayer) if f.name != "method")
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,18 @@ class Graphs:
     def save(self, graph: SceneGraph, method: str) -> StoredGraph:
         """Keep a graph; the same again changes nothing, another one under the same key takes its place."""
         key = graph_key(graph.scene_id, method)
-        arrays = {f"{layer}.{name}": getattr(nodes, name) for layer, nodes in graph.layers.items() for name in _ARRAYS}
+        arrays: dict[str, np.ndarray] = {}
+        layers: dict[str, dict] = {}
+        for i, (name, nodes) in enumerate(graph.layers.items()):
+            parts = {field.name: getattr(nodes, field.name) for field in fields(nodes)}
+            arrays |= {f"{i}.{part}": value for part, value in parts.items() if isinstance(value, np.ndarray)}
+            rest = {part: value for part, value in parts.items() if not isinstance(value, np.ndarray)}
+            layers[name] = {"count": len(nodes), "rest": plain(rest)}
         about = {
-            "up": None if graph.up is None else np.asarray(graph.up, np.float64).tolist(),
+            "up": from_array(graph.up),
             "unit_m": float(graph.unit_m),
             "notes": list(graph.notes),
-            "layers": {name: {"method": nodes.method, "count": len(nodes)} for name, nodes in graph.layers.items()},
+            "layers": layers,
         }
         group_id = digest(*arrays.values(), text=f"{key}{about}")
         row = {"key": key, "scene": graph.scene_id, "method": method, "num_nodes": graph.num_nodes, "about": about}
@@ -98,12 +104,11 @@ class Graphs:
                 return None
             files = manifest(connection, row.group_id)
         arrays = self._arrays.read(KIND, row.group_id, files)
-        layers = {
-            name: NodeLayer(**{a: arrays[f"{name}.{a}"] for a in _ARRAYS}, method=layer["method"])
-            for name, layer in row.about["layers"].items()
-        }
-        up = None if row.about["up"] is None else np.array(row.about["up"])
-        return SceneGraph(row.scene, layers, up, row.about["unit_m"], tuple(row.about["notes"]))
+        layers = {}
+        for i, (name, layer) in enumerate(row.about["layers"].items()):
+            mine = {key.split(".", 1)[1]: array for key, array in arrays.items() if key.startswith(f"{i}.")}
+            layers[name] = NodeLayer(**mine, **layer["rest"])
+        return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
 
     def list(self) -> list[StoredGraph]:
         """The graphs of all living scenes, oldest first."""

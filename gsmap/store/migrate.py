@@ -95,7 +95,7 @@ def _run(connection, revision: str) -> None:
 
     settings = config()
     settings.attributes["connection"] = connection
-    down = revision != "head" and revision < (_current(connection) or "")
+    down = revision == "base" or (revision != "head" and revision < (_current(connection) or ""))
     (command.downgrade if down else command.upgrade)(settings, revision)
 
 

@@ -27,7 +27,13 @@ class Priors:
         with self._catalog.write() as connection:
             scene = resolve(connection, prior.scene)
             self._retire(connection, scene)
-            row = {"scene": scene, "S_map_scene": from_pose(prior.S_map_scene), "sigmas": from_array(sigmas)}
+            row = {
+                "scene": scene,
+                "S_map_scene": from_pose(prior.S_map_scene),
+                "sigmas": from_array(sigmas),
+                "up": from_array(prior.up),
+                "up_sigma_rad": float(prior.up_sigma_rad),
+            }
             connection.execute(insert(priors), row | {"created_at": now()})
 
     def list(self) -> list[Prior]:
@@ -36,7 +42,10 @@ class Priors:
         with self._catalog.read() as connection:
             alive = living_ids(connection)
             rows = [row for row in connection.execute(query) if row.scene in alive]
-        return [Prior(row.scene, to_pose(row.S_map_scene), to_array(row.sigmas)) for row in rows]
+        return [
+            Prior(row.scene, to_pose(row.S_map_scene), to_array(row.sigmas), to_array(row.up), row.up_sigma_rad)
+            for row in rows
+        ]
 
     def remove(self, ref: str) -> None:
         """Take a scene's prior back.

@@ -189,6 +189,8 @@ priors = _table(
     _scene("scene", index=True),
     Column("S_map_scene", Json, nullable=False),
     Column("sigmas", Json, nullable=False),
+    Column("up", Json),
+    Column("up_sigma_rad", Real, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
 )

@@ -158,6 +158,8 @@ def upgrade() -> None:
         sa.Column("scene", sa.Text, nullable=False),
         sa.Column("S_map_scene", JSON, nullable=False),
         sa.Column("sigmas", JSON, nullable=False),
+        sa.Column("up", JSON, nullable=True),
+        sa.Column("up_sigma_rad", REAL, nullable=False),
         sa.Column("created_at", sa.Text, nullable=False),
         sa.Column("removed_at", sa.Text, nullable=True),
         sa.ForeignKeyConstraint(["scene"], ["scenes.id"], name=op.f("fk_priors_scene_scenes")),

@@ -87,7 +87,7 @@ def test_names_stay_unique(store):
 
 
 def test_remove_leaves_a_tombstone_and_frees_the_name(store, two_scenes):
-    a, b = two_scenes
+    a = two_scenes[0]
     store.scenes.remove("scene0")
     assert [s.name for s in store.scenes.list()] == ["scene1"]
     assert [s.name for s in store.scenes.list(removed=True)] == ["scene0"]
@@ -227,10 +227,14 @@ def test_reads_while_another_writes(tmp_path):
 
 
 def test_a_failed_transaction_leaves_nothing(store, two_scenes):
-    with pytest.raises(RuntimeError), store.transaction():
-        store.scenes.remove("scene0")
-        store.scenes.remove("scene1")
-        raise RuntimeError
+    def change() -> None:
+        with store.transaction():
+            store.scenes.remove("scene0")
+            store.scenes.remove("scene1")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        change()
     assert len(store.scenes.list()) == 2
 
 

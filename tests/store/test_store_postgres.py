@@ -1,0 +1,76 @@
+"""The same store with its catalog in a real PostgreSQL server."""
+
+import numpy as np
+import pytest
+from store_samples import make_cameras, make_gaussians
+from test_store_nouns import graph_of, layer, registration, tile
+
+from gsmap.errors import ConfigError, StoreError
+from gsmap.store import Store, schema
+from gsmap.store.arrays import CHUNK_ROWS
+from gsmap.types import Prior, SceneGraph, Sim3
+
+
+def test_the_whole_store_on_postgres(tmp_path, postgres_database):
+    with Store.create(tmp_path / "m", catalog_url=postgres_database) as store:
+        made = store.id
+    assert not (tmp_path / "m" / "map.sqlite").exists()
+    with Store.open(tmp_path / "m") as store:
+        assert store.id == made
+        g = make_gaussians(3 * CHUNK_ROWS)
+        a, is_new = store.scenes.add(g, make_cameras(), name="a")
+        assert is_new
+        assert not store.scenes.add(g, make_cameras(), name="again")[1]
+        b, _ = store.scenes.add(make_gaussians(seed=2), make_cameras(), name="a")
+        assert b.name == "a-2"
+        box = np.array([[-5.0] * 3, [-4.0] * 3])
+        inside = ((g.means >= box[0]) & (g.means <= box[1])).all(1).sum()
+        assert inside <= len(store.scenes.gaussians("a", box)) < CHUNK_ROWS
+        store.graphs.save(SceneGraph(a.id, {"objects": layer()}), "method")
+        assert store.graphs.load("a").num_nodes == 7
+        saved = store.registrations.save(registration(a.id, b.id), "k")
+        assert store.registrations.judge("a", "a-2", "confirm").number == saved.number
+        np.testing.assert_array_equal(
+            store.registrations.current()[0].registration.information, np.diag(np.arange(1.0, 8)) / 3
+        )
+        assert store.registrations.get("a", "a-2").registration.overlap == 0.1 + 0.2  # all of a double
+        assert store.revisions.save(graph_of([a, b])) == 1
+        assert store.revisions.get().residuals == {(a.id, b.id): 2.5}
+        store.priors.set(Prior("a", Sim3.identity(), np.full(7, np.inf)))
+        assert np.isinf(store.priors.list()[0].sigmas).all()
+        export = store.exports.begin(tmp_path / "out", revision=1)
+        store.exports.add_tile(export, tile("a.ply", [a, b]))
+        assert store.exports.tiles(tmp_path / "out")[0].num_gaussians == 42
+        store.scenes.remove("a-2")
+        assert store.prune().scenes == []
+        assert store.prune(keep_revisions=0).scenes == ["a-2"]
+        assert store.check().ok
+    with pytest.raises(StoreError, match="holds a map already"):
+        Store.create(tmp_path / "other", catalog_url=postgres_database)
+    assert not (tmp_path / "other").exists()
+
+
+def test_migrated_tables_are_the_schema_on_postgres(tmp_path, postgres_database):
+    from alembic.autogenerate import compare_metadata
+    from alembic.runtime.migration import MigrationContext
+
+    with Store.create(tmp_path / "m", catalog_url=postgres_database) as store, store.catalog.read() as connection:
+        options = {"compare_type": True, "include_name": lambda name, kind, _: name != schema.CHUNK_BOXES}
+        assert compare_metadata(MigrationContext.configure(connection, opts=options), schema.metadata) == []
+
+
+def test_the_password_stays_out_of_the_map(tmp_path, postgres_database):
+    url = postgres_database.replace("gsmap@", "gsmap:secret@")
+    with Store.create(tmp_path / "m", catalog_url=url):
+        pass
+    assert not [p for p in (tmp_path / "m").rglob("*") if p.is_file() and b"secret" in p.read_bytes()]
+
+
+def test_a_server_that_is_not_there(tmp_path):
+    pytest.importorskip("psycopg")
+    with pytest.raises(StoreError):
+        Store.create(tmp_path / "m", catalog_url=f"postgresql+psycopg://nobody@/none?host={tmp_path}")
+    for url in ("nonsense", "nonsense://x"):
+        with pytest.raises(ConfigError, match="database URL"):
+            Store.create(tmp_path / "m", catalog_url=url)
+    assert list(tmp_path.iterdir()) == []
