@@ -6,8 +6,8 @@ colour, so a point looks the same from everywhere: what a static, diffuse scene 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,6 +29,8 @@ class Skin:
         offsets: per level, (Q,) where each quad's texels start.
         widths, heights: per level, (Q,) texels along u and v.
         texel_m: edge of a texel of the finest level.
+        leaves: (Q,) the door whose leaf a quad belongs to, -1 for all that stays.
+        shut: the doors that are shut; the leaves of others are not there.
     """
 
     corners: np.ndarray
@@ -37,20 +39,25 @@ class Skin:
     widths: tuple[np.ndarray, ...]
     heights: tuple[np.ndarray, ...]
     texel_m: float
+    leaves: np.ndarray
+    shut: frozenset[int] = frozenset()
+
+    def with_shut(self, doors: Iterable[int]) -> Skin:
+        """The same skin with these doors shut and all others open."""
+        return replace(self, shut=frozenset(doors))
 
     @cached_property
-    def vertices(self) -> np.ndarray:
-        """(4Q, 3) float32 vertices of the triangle mesh, four per quad."""
-        return self.corners.reshape(-1, 3).astype(np.float32)
+    def present(self) -> np.ndarray:
+        """Indices of the quads that are there: all but the leaves of open doors."""
+        return np.flatnonzero((self.leaves < 0) | np.isin(self.leaves, list(self.shut)))
 
-    @cached_property
-    def triangles(self) -> np.ndarray:
-        """(2Q, 3) uint32 vertex indices; triangles 2q and 2q + 1 make quad q."""
-        return _triangles(len(self.corners))
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """(4n, 3) float32 vertices and (2n, 3) uint32 triangles of the n quads that are there."""
+        return self.corners[self.present].reshape(-1, 3).astype(np.float32), _triangles(len(self.present))
 
     @cached_property
     def _rays(self):
-        return _ray_scene(self.corners)
+        return _ray_scene(self.corners[self.present])
 
     def cast(self, origins: np.ndarray, directions: np.ndarray):
         """First hits of rays (n, 3): distance in units of the direction (inf for none), quad index, and its (s, t)."""
@@ -61,7 +68,7 @@ class Skin:
         b1, b2 = hit["primitive_uvs"].numpy().T
         first = primitive % 2 == 0  # (p00, p10, p11), the other is (p00, p11, p01)
         s, t = np.where(first, b1 + b2, b1), np.where(first, b2, b1 + b2)
-        return hit["t_hit"].numpy(), primitive // 2, s, t
+        return hit["t_hit"].numpy(), self.present[primitive // 2], s, t
 
     def colour(self, quad: np.ndarray, s: np.ndarray, t: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
         """(n, 3) float32 display colours in [0, 1] at (s, t) of quads, averaged over about ``footprint_m``."""
@@ -109,6 +116,7 @@ def bake(
     report(0.0, "painting surfaces")
     albedo = [_paint(surfaces, q, texel_m) for q in range(len(corners))]
     report(0.5, "lighting surfaces")
+    leaves = np.array(surfaces.leaves)
     grids, light = _light(surfaces, corners, sizes, np.stack([a.mean((0, 1)) for a in albedo]))
     report(0.8, "baking colours")
     ends = np.cumsum([g[0] * g[1] for g in grids])
@@ -117,7 +125,7 @@ def bake(
         nu, nv = grids[q]
         lit = _enlarge(light[ends[q] - nu * nv : ends[q]].reshape(nv, nu, 3), *paint.shape[:2])
         images.append(_display(paint * (lit + 1.6 * surfaces.glows[q])))
-    return _pack(corners, images, texel_m)
+    return Skin(corners, *_pack(images), texel_m, leaves)
 
 
 def _paint(surfaces: Surfaces, q: int, texel_m: float) -> np.ndarray:
@@ -132,7 +140,8 @@ def _paint(surfaces: Surfaces, q: int, texel_m: float) -> np.ndarray:
 
 def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
     """Irradiance on a coarse grid of every quad: the grids' (nu, nv) and all values (P, 3), normalised in exposure."""
-    scene = _ray_scene(corners)
+    standing = np.flatnonzero(np.array(surfaces.leaves) < 0)  # Doors stand open while the lamps shine.
+    scene = _ray_scene(corners[standing])
     grids = np.clip(np.ceil(sizes / _LIGHT_STEP_M).astype(int) + 1, 2, 64)
     points, normals, owner = [], [], []
     for q, (nu, nv) in enumerate(grids):
@@ -160,7 +169,7 @@ def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
         hit = scene.cast_rays(_rays_tensor(points, x * tangent + y * bitangent + z * normals))
         primitive = hit["primitive_ids"].numpy()
         found = primitive != 0xFFFFFFFF
-        bounce[found] += radiosity[primitive[found] // 2] / rays
+        bounce[found] += radiosity[standing[primitive[found] // 2]] / rays
     total = light + 1.5 * bounce + 0.04
     # A point inside other furniture is dark for a reason; expose for the ones that are not.
     return grids, (total * (0.85 / np.median(total[total.mean(1) > 0.1]))).astype(np.float32)
@@ -206,7 +215,8 @@ def _display(linear: np.ndarray) -> np.ndarray:
     return (1.0 - np.exp(-1.15 * linear)) ** np.float32(1 / 2.2)
 
 
-def _pack(corners: np.ndarray, images: list[np.ndarray], texel_m: float) -> Skin:
+def _pack(images: list[np.ndarray]):
+    """Texels, offsets, widths and heights of each level of detail of all images, see `Skin`."""
     texels, offsets, widths, heights = [], [], [], []
     for level in range(_LEVELS):
         if level:
@@ -217,7 +227,7 @@ def _pack(corners: np.ndarray, images: list[np.ndarray], texel_m: float) -> Skin
         offsets.append(np.concatenate([[0], np.cumsum(areas)[:-1]]))
         flat = np.concatenate([i.reshape(-1, 3) for i in images])
         texels.append(np.clip(np.round(flat * 255), 0, 255).astype(np.uint8))
-    return Skin(corners, tuple(texels), tuple(offsets), tuple(widths), tuple(heights), texel_m)
+    return tuple(texels), tuple(offsets), tuple(widths), tuple(heights)
 
 
 def _half(image: np.ndarray) -> np.ndarray:

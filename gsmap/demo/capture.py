@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.demo.bake import Skin
 from gsmap.demo.place import Place, Room
 from gsmap.errors import ConfigError, InputError
 from gsmap.types import Cameras
@@ -52,6 +53,12 @@ def default_routes(place: Place, count: int) -> list[tuple[int, ...]]:
     """Routes of ``count`` captures, two neighbouring rooms each; three share one room a pair."""
     pairs = sorted({tuple(sorted((d.a, d.b))) for d in place.doors}, key=lambda p: (p[1] - p[0], p))
     return [pairs[i % len(pairs)] for i in range(count)]
+
+
+def unused_doors(place: Place, route: Sequence[int]) -> list[int]:
+    """The doors a route does not pass, which whoever walks it leaves shut."""
+    passed = {frozenset(pair) for pair in itertools.pairwise(route)}
+    return [i for i, door in enumerate(place.doors) if frozenset((door.a, door.b)) not in passed]
 
 
 def walk(place: Place, route: Sequence[int], num_frames: int, seed: int = 0) -> np.ndarray:
@@ -128,6 +135,7 @@ def film(
     poses: np.ndarray,
     *,
     size_px: tuple[int, int] = (320, 240),
+    shut: Iterable[int] = (),
     gain: float = 1.0,
     gamma: float = 1.0,
     name: str = "frame",
@@ -135,7 +143,7 @@ def film(
 ) -> Frames:
     """Render colour (2 x 2 supersampled) and depth frames of a place from camera-to-place poses (C, 4, 4).
 
-    ``gain`` and ``gamma`` imitate a camera's exposure: colours become ``clip(gain * colour ** gamma)``.
+    ``shut`` names the doors (indices) that are closed meanwhile. ``gain`` and ``gamma`` imitate a camera's exposure: colours become ``clip(gain * colour ** gamma)``.
     """
     width, height = size_px
     focal = _FOCAL * width
@@ -148,11 +156,12 @@ def film(
     )
     images = np.empty((count, height, width, 3), np.uint8)
     depths = np.empty((count, height, width), np.float32)
+    skin = place.skin.with_shut(shut)
     fine, centre = _pixel_rays(size_px, focal, 2), _pixel_rays(size_px, focal, 1)
     for i, pose in enumerate(poses):
-        colour = _look(place, pose, fine, 0.5 / focal).reshape(height, 2, width, 2, 3).mean((1, 3))
+        colour = _look(skin, pose, fine, 0.5 / focal).reshape(height, 2, width, 2, 3).mean((1, 3))
         images[i] = np.round(255 * np.clip(gain * colour**gamma, 0, 1))
-        distance, *_ = place.skin.cast(np.broadcast_to(pose[:3, 3], centre.shape), centre @ pose[:3, :3].T)
+        distance, *_ = skin.cast(np.broadcast_to(pose[:3, 3], centre.shape), centre @ pose[:3, :3].T)
         depths[i] = np.where(np.isfinite(distance), distance, 0).reshape(
             height, width
         )  # Rays have unit z: this is depth.
@@ -170,10 +179,10 @@ def _pixel_rays(size_px: tuple[int, int], focal: float, samples: int) -> np.ndar
     return np.stack([xx, yy, np.ones_like(xx)], axis=-1).reshape(-1, 3)
 
 
-def _look(place: Place, pose: np.ndarray, rays: np.ndarray, pixel: float) -> np.ndarray:
+def _look(skin: Skin, pose: np.ndarray, rays: np.ndarray, pixel: float) -> np.ndarray:
     """(n, 3) colours seen along camera-frame rays of unit depth; black where there is nothing."""
-    distance, quad, s, t = place.skin.cast(np.broadcast_to(pose[:3, 3], rays.shape), rays @ pose[:3, :3].T)
+    distance, quad, s, t = skin.cast(np.broadcast_to(pose[:3, 3], rays.shape), rays @ pose[:3, :3].T)
     hit = np.isfinite(distance)
     out = np.zeros((len(rays), 3), np.float32)
-    out[hit] = place.skin.colour(quad[hit], s[hit], t[hit], pixel * distance[hit])
+    out[hit] = skin.colour(quad[hit], s[hit], t[hit], pixel * distance[hit])
     return out

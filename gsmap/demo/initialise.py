@@ -27,9 +27,10 @@ def from_depth(frames: Frames, count: int, seed: int = 0) -> Gaussians:
     points, colours, normals, detail = _back_project(frames)
     if len(points) < 100:
         raise InputError(f"only {len(points)} pixels have a usable depth: check the depth's unit and the poses")
-    points, colours, normals, detail = _average_in_cells(points, colours, normals, detail, count)
+    points, colours, normals, detail, hits = _average_in_cells(points, colours, normals, detail, count)
     rng = np.random.default_rng([seed, 6])
-    weight = 0.02 + detail
+    # What few pixels show, from afar or in passing, needs few Gaussians: the loss counts pixels too.
+    weight = (0.02 + detail) * np.minimum(1.0, hits / np.median(hits))
     # Exponential races: drawing without replacement with probability in proportion to the weight.
     chosen = np.sort(np.argsort(rng.exponential(size=len(points)) / weight, kind="stable")[:count])
     means = points[chosen]
@@ -118,7 +119,7 @@ def _average_in_cells(points, colours, normals, detail, count):
 
     normal = mean(normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return mean(points), mean(colours), normal, mean(detail[:, None])[:, 0]
+    return mean(points), mean(colours), normal, mean(detail[:, None])[:, 0], total
 
 
 def _cells(points: np.ndarray, cell: float) -> tuple[np.ndarray, int]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.demo.capture import Frames, default_routes, film, walk
+from gsmap.demo.capture import Frames, default_routes, film, unused_doors, walk
 from gsmap.demo.initialise import from_depth
 from gsmap.demo.place import Place, make_place
 from gsmap.errors import ConfigError
@@ -49,6 +49,7 @@ def make_captures(
     twin: bool = False,
     routes: Sequence[Sequence[int]] | None = None,
     scales: Sequence[float] | None = None,
+    shut_doors: bool = True,
     vary_exposure: bool = False,
     place: Place | None = None,
     progress: Progress | None = None,
@@ -64,6 +65,8 @@ def make_captures(
         routes: rooms each capture walks through; by default two neighbouring ones, so that three captures of three
             rooms pairwise share one room.
         scales: units per metre of each capture's frame; by default all are metric.
+        shut_doors: shut the doors a capture's route does not pass, so that captures see only the rooms they walk
+            through; with open doors they glimpse most of the rooms next to those, too.
         vary_exposure: give each capture its own exposure (gain 0.85 to 1.15, gamma 0.9 to 1.15).
         place: a place already built, instead of the one of ``seed``.
 
@@ -89,7 +92,9 @@ def make_captures(
             report(0.05 + 0.95 * (start + fraction) / num_captures, text)
 
         poses = walk(place, route, num_frames, seed=i)
-        frames = film(place, poses, size_px=size_px, gain=gain, gamma=gamma, name=name, progress=_part(step, 0.0, 0.3))
+        shut = unused_doors(place, route) if shut_doors else ()
+        look = {"size_px": size_px, "shut": shut, "gain": gain, "gamma": gamma, "name": name}
+        frames = film(place, poses, **look, progress=_part(step, 0.0, 0.3))
         gaussians = fit_frames(frames, steps=steps, num_gaussians=num_gaussians, seed=i, progress=_part(step, 0.3, 1.0))
         out.append(put_in_own_frame(gaussians, frames, name, rng, scale))
     report(1.0, "captures made")

@@ -109,8 +109,8 @@ def make_place(
         plan, doors = _with_twin(plan, doors, seed)
     surfaces = Surfaces()
     built = [_build_room(surfaces, room, i, doors) for i, room in enumerate(plan)]
-    for door in doors:
-        _build_door_lining(surfaces, door, seed)
+    for index, door in enumerate(doors):
+        _build_door(surfaces, door, index, seed)
     skin = bake(surfaces, texel_m=texel_m, progress=progress)
     return Place(seed, tuple(built), tuple(doors), skin)
 
@@ -298,8 +298,8 @@ def _pendant(s: Surfaces, rng: np.random.Generator) -> None:
     s.lamp(0, 0, CEILING_M - drop - 0.14, warm * 3.6, 0.14)
 
 
-def _build_door_lining(surfaces: Surfaces, door: Door, seed: int) -> None:
-    """The inside of a doorway's frame and its threshold."""
+def _build_door(surfaces: Surfaces, door: Door, index: int, seed: int) -> None:
+    """The inside of a doorway's frame, its threshold, and the leaf that is there while the door is shut."""
     rng = np.random.default_rng([seed, 3])
     lining = tx.wood(timber(rng), seed)
     s = surfaces.at(door.xy[0], door.xy[1], 0, 0.0 if door.along_x else np.pi / 2)
@@ -308,6 +308,13 @@ def _build_door_lining(surfaces: Surfaces, door: Door, seed: int) -> None:
     s.rectangle([-w, t, h], [2 * w, 0, 0], [0, -2 * t, 0], lining)
     s.rectangle([-w, t, 0], [0, -2 * t, 0], [0, 0, h], lining)
     s.rectangle([w, -t, 0], [0, 2 * t, 0], [0, 0, h], lining)
+    s.leaf = index
+    tone = timber(rng)
+    s.box(0, 0, 0.005, 2 * w, 0.04, h - 0.005, tx.wood(tone, seed + 1, True))
+    for z, height in ((0.15, 0.7), (1.05, 0.85)):
+        for x in (-w / 2, w / 2):
+            s.box(x, 0, z, 0.6 * w, 0.055, height, tx.wood(tone * 0.7, seed + 2, True))
+    s.lathe(0.82 * w, 0, 1.0, [(0, 0), (0.05, 0.03), (0.05, 0.06), (0, 0.09)], tx.plain(np.full(3, 0.6)), 8)
 
 
 def _free_spot(rng, taken: list[tuple[float, float]], length: float, width: float, tries: int = 30) -> float | None:

@@ -15,7 +15,8 @@ class Surfaces:
     """Collects quads. `at` gives a view with a moved local frame that adds to the same lists.
 
     Every quad has corners p00, p10, p11, p01 (u runs along p00-p10, v along p00-p01, the normal is u x v), its size in
-    metres, the place of its corner in the material's plane, a material, and how brightly it glows by itself.
+    metres, the place of its corner in the material's plane, a material, how brightly it glows by itself, and the index
+    of the door whose leaf it belongs to (-1: none), for a leaf is there only while its door is shut.
     """
 
     corners: list[np.ndarray] = field(default_factory=list)
@@ -24,14 +25,16 @@ class Surfaces:
     materials: list[Material] = field(default_factory=list)
     glows: list[float] = field(default_factory=list)
     lamps: list[tuple[np.ndarray, np.ndarray, float]] = field(default_factory=list)
+    leaves: list[int] = field(default_factory=list)
     T_place_local: np.ndarray = field(default_factory=lambda: np.eye(4))
+    leaf: int = -1
 
     def at(self, x: float, y: float, z: float = 0.0, yaw_rad: float = 0.0) -> Surfaces:
         """The same collection seen from a local frame at (x, y, z), turned about the vertical."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         T = np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, z], [0, 0, 0, 1]])
-        shared = (self.corners, self.sizes_m, self.origins_m, self.materials, self.glows, self.lamps)
-        return Surfaces(*shared, self.T_place_local @ T)
+        shared = (self.corners, self.sizes_m, self.origins_m, self.materials, self.glows, self.lamps, self.leaves)
+        return Surfaces(*shared, self.T_place_local @ T, self.leaf)
 
     def quad(self, corners, material: Material, origin_m=(0.0, 0.0), glow: float = 0.0, size_m=None) -> None:
         """Add one quad of local corners p00, p10, p11, p01."""
@@ -44,6 +47,7 @@ class Surfaces:
         self.origins_m.append(origin_m)
         self.materials.append(material)
         self.glows.append(glow)
+        self.leaves.append(self.leaf)
 
     def rectangle(self, corner, edge_u, edge_v, material: Material, origin_m=(0.0, 0.0), glow: float = 0.0) -> None:
         """Add a parallelogram by its corner and two edges."""

@@ -37,7 +37,8 @@ def test_untrained_gaussians_lie_on_the_surfaces(place, captures):
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(place.skin.vertices), o3d.core.Tensor(place.skin.triangles))
+    vertices, triangles = place.skin.with_shut(range(len(place.doors))).mesh()
+    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
     for capture in captures:
         distance = scene.compute_distance(o3d.core.Tensor(_in_place(capture).astype(np.float32))).numpy()
         assert np.median(distance) < 0.005
@@ -57,7 +58,7 @@ def test_captures_overlap_pairwise(captures):
     points = [_in_place(c) for c in captures]
     for a, b in [(0, 1), (0, 2), (1, 2)]:
         shared = [(cKDTree(points[i]).query(points[j])[0] < 0.15).mean() for i, j in [(a, b), (b, a)]]
-        assert min(shared) > 0.3
+        assert 0.3 < min(shared) < 0.75
 
 
 def test_same_seed_same_captures(place, captures):

@@ -45,6 +45,17 @@ def test_depth_and_texture_coordinates_agree_with_the_hit_point(place):
         np.testing.assert_allclose(at, point[:3], atol=2e-2 if not np.allclose(p10 - p00, p11 - p01) else 1e-4)
 
 
+def test_a_shut_door_stops_the_eye_and_an_open_one_does_not(place):
+    door = place.doors[0]
+    across = np.array([[0.0, 1.0, 0.0] if door.along_x else [1.0, 0.0, 0.0]])
+    eye = np.array([[*door.xy, 1.4]]) - 0.5 * across
+    through, *_ = place.skin.cast(eye, across)
+    stopped, *_ = place.skin.with_shut([0]).cast(eye, across)
+    other, *_ = place.skin.with_shut([1]).cast(eye, across)
+    assert stopped[0] == pytest.approx(0.48, abs=1e-4)  # The leaf is 4 cm thick.
+    assert through[0] == other[0] > 0.6
+
+
 def test_a_wall_seen_head_on_has_constant_depth(place):
     room = place.rooms[0]
     up = np.array([0, 0, 1.0])
