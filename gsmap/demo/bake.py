@@ -124,7 +124,8 @@ def bake(
     for q, paint in enumerate(albedo):
         nu, nv = grids[q]
         lit = _enlarge(light[ends[q] - nu * nv : ends[q]].reshape(nv, nu, 3), *paint.shape[:2])
-        images.append(_display(paint * (lit + 1.6 * surfaces.glows[q])))
+        glow = surfaces.glows[q]
+        images.append(_display(paint * (lit * (1 - glow) + 1.1 * glow)))
     return Skin(corners, *_pack(images), texel_m, leaves)
 
 

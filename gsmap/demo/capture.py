@@ -143,7 +143,8 @@ def film(
 ) -> Frames:
     """Render colour (2 x 2 supersampled) and depth frames of a place from camera-to-place poses (C, 4, 4).
 
-    ``shut`` names the doors (indices) that are closed meanwhile. ``gain`` and ``gamma`` imitate a camera's exposure: colours become ``clip(gain * colour ** gamma)``.
+    ``shut`` names the doors (indices) that are closed meanwhile. ``gain`` and ``gamma`` imitate a camera's exposure:
+    colours become ``clip(gain * colour ** gamma)``.
     """
     width, height = size_px
     focal = _FOCAL * width

@@ -10,6 +10,8 @@ from gsmap.geometry.rotations import matrices_to_quats
 from gsmap.types import Gaussians
 
 _SH0 = 0.28209479177387814
+_EVEN = 0.01  # Weight of a blank surface against one of that contrast per pixel.
+_REACH = 0.6
 
 
 def from_depth(frames: Frames, count: int, seed: int = 0) -> Gaussians:
@@ -28,20 +30,19 @@ def from_depth(frames: Frames, count: int, seed: int = 0) -> Gaussians:
     if len(points) < 100:
         raise InputError(f"only {len(points)} pixels have a usable depth: check the depth's unit and the poses")
     points, colours, normals, detail, hits = _average_in_cells(points, colours, normals, detail, count)
-    rng = np.random.default_rng([seed, 6])
     # What few pixels show, from afar or in passing, needs few Gaussians: the loss counts pixels too.
-    weight = (0.02 + detail) * np.minimum(1.0, hits / np.median(hits))
-    # Exponential races: drawing without replacement with probability in proportion to the weight.
-    chosen = np.sort(np.argsort(rng.exponential(size=len(points)) / weight, kind="stable")[:count])
+    weight = (_EVEN + detail) * np.minimum(1.0, hits / np.median(hits))
+    chosen = _draw_evenly(weight, count, seed)
     means = points[chosen]
     tree = cKDTree(means)
     owner = tree.query(points)[1]
     total = np.bincount(owner, minlength=len(means))[:, None]
     mean_colours = np.stack([np.bincount(owner, colours[:, k], len(means)) for k in range(3)], axis=1) / total
-    # Three neighbours set the reach; a lone speck must not become a beach ball.
-    reach = tree.query(means, k=min(4, len(means)))[0][:, 1:].mean(1)
+    # On a plane with one Gaussian per area a, the eighth neighbour is about 1.6 sqrt(a) away: reach sets sigma to
+    # _REACH of sqrt(a), which leaves no holes. A lone speck must not become a beach ball.
+    reach = _REACH / 1.6 * tree.query(means, k=min(9, len(means)))[0][:, -1]
     reach = np.minimum(reach, 4 * np.median(reach))
-    scales = np.stack([0.6 * reach, 0.6 * reach, np.maximum(0.12 * reach, 1e-4)], axis=1)
+    scales = np.stack([reach, reach, np.maximum(0.2 * reach, 1e-4)], axis=1)
     n = len(means)
     return Gaussians(
         means,
@@ -103,14 +104,14 @@ def _central(image: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _average_in_cells(points, colours, normals, detail, count):
-    """Means over cubic cells small enough that about three times ``count`` of them are occupied."""
+    """Means over cubic cells small enough that about five times ``count`` of them are occupied."""
     extent = np.ptp(points, axis=0).max()
     low, high = extent / 4096, extent / 8
     for _ in range(12):
         cell = np.sqrt(low * high)
         inverse, occupied = _cells(points, cell)
-        low, high = (cell, high) if occupied > 3 * count else (low, cell)
-        if 2.6 * count < occupied < 3.4 * count:
+        low, high = (cell, high) if occupied > 5 * count else (low, cell)
+        if 4.4 * count < occupied < 5.6 * count:
             break
     total = np.bincount(inverse, minlength=occupied)
 
@@ -124,9 +125,21 @@ def _average_in_cells(points, colours, normals, detail, count):
 
 def _cells(points: np.ndarray, cell: float) -> tuple[np.ndarray, int]:
     key = np.floor((points - points.min(0)) / cell).astype(np.int64)
-    size = key.max(0) + 1
-    unique, inverse = np.unique((key[:, 0] * size[1] + key[:, 1]) * size[2] + key[:, 2], return_inverse=True)
+    code = np.zeros(len(key), np.int64)
+    for bit in range(int(key.max()).bit_length()):  # Z-order: neighbours in space are neighbours in the list of cells.
+        for axis in range(3):
+            code |= ((key[:, axis] >> bit) & 1) << (3 * bit + axis)
+    unique, inverse = np.unique(code, return_inverse=True)
     return inverse, len(unique)
+
+
+def _draw_evenly(weight: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Indices of ``count`` items in proportion to weight, spread evenly along their order: no clumps, no gaps."""
+    ends = np.cumsum(weight)
+    start = np.random.default_rng([seed, 6]).uniform()
+    return np.unique(
+        np.searchsorted(ends, (np.arange(count) + start) * (ends[-1] / count), side="right").clip(max=len(ends) - 1)
+    )
 
 
 def _frames_of_normals(normals: np.ndarray) -> np.ndarray:
