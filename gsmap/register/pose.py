@@ -56,8 +56,9 @@ def fit_pose(
             flaw = "correspondences are mirrored"
     if not flaw and rotation_sigma > np.radians(max_rotation_sigma_deg):
         flaw = "correspondences lie along a line"
-    # An inlier's residual has standard deviation sqrt(2) sigma per axis, 2.45 sigma over three.
-    if not flaw and rms > 3.1 * sigma_m:
+    # An inlier's residual has standard deviation sqrt(2) sigma per axis, 2.45 sigma over three. Twice that may still be
+    # a true match of poorly repeated nodes, for the surfaces to judge; more is no pose at all.
+    if not flaw and rms > 6.0 * sigma_m:
         flaw = "correspondences do not fit one pose"
     return PoseFit(pose, rms, rotation_sigma, flaw)
 

@@ -55,7 +55,10 @@ def refine(
             normals = target.normals[row]
             plane = (normals * offset).sum(1)
             weights = 1.0 / (1.0 + (plane / (0.3 * radius)) ** 2) ** 2
-            jacobian = point_to_plane_jacobian(pose, points[hit], normals)
+            # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
+            centre = points[hit].mean(0)
+            centred = pose @ Sim3(np.eye(3), centre)
+            jacobian = point_to_plane_jacobian(centred, points[hit] - centre, normals)
             system = (jacobian * weights[:, None]).T @ jacobian
             gradient = (jacobian * weights[:, None]).T @ plane
             if params.colour_weight > 0:
@@ -65,18 +68,20 @@ def refine(
                 spread = 1.4826 * np.median(np.abs(colour)) + 1e-6
                 factor = params.colour_weight / spread
                 tint = weights / (1.0 + (colour / (2 * spread)) ** 2) ** 2
-                jacobian = point_to_plane_jacobian(pose, points[hit], gradients[row]) * factor
+                jacobian = point_to_plane_jacobian(centred, points[hit] - centre, gradients[row]) * factor
                 system += (jacobian * tint[:, None]).T @ jacobian
                 gradient += (jacobian * tint[:, None]).T @ (colour * factor)
-            dim = 7 if with_scale else 6
             step = np.zeros(7)
-            # About the centroid of the pairs rotation, translation and scale hardly mix.
-            step[:dim] = -np.linalg.solve(system[:dim, :dim] + 1e-9 * np.trace(system) * np.eye(dim), gradient[:dim])
-            pose = retract(pose, step if with_scale else step[:6])
-            if (
-                np.abs(step[:3]).max() < 1e-5
-                and np.linalg.norm(pose.apply(points[hit]) - moved[hit], axis=1).max() < 1e-4
-            ):
+            dim = 7 if with_scale else 6
+            damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
+            step[:dim] = -np.linalg.solve((system + damping)[:dim, :dim], gradient[:dim])
+            # No single step goes farther than the correspondences reach.
+            step *= min(1.0, 0.1 / max(np.abs(step[:3]).max(), 1e-12), radius / max(np.abs(step[3:6]).max(), 1e-12))
+            step[6] = np.clip(step[6], -0.05, 0.05)
+            pose = retract(centred, step if with_scale else step[:6]) @ Sim3(np.eye(3), -centre)
+            if abs(np.log(pose.scale / start.scale)) > np.log(1.3):
+                return start
+            if np.linalg.norm(pose.apply(points[hit]) - moved[hit], axis=1).max() < 0.002 * radius:
                 break
     return pose
 
