@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import clean
-from gsmap.optimize.components import Walk, allowed, closes, forest, grow, joins, merge_islands
+from gsmap.optimize.components import SMALL_ISLAND, Walk, allowed, bridges, closes, forest, grow, joins, merge_islands
 from gsmap.optimize.cycles import Vote, vote
 from gsmap.optimize.gauge import anchor_of, onto_anchor, onto_priors
 from gsmap.optimize.measurements import Measurements, check_priors, measurements
@@ -23,6 +23,8 @@ from gsmap.types import Edge, PoseGraph, Prior, ScenePose, Sim3
 MAX_ROUNDS = 30
 # A person's edges contradict each other if one is off by more than this many gates after giving way to the others.
 CONTRADICTION = 10.0
+# Poses from which an accepted edge is off by more gates than this are no start for Gauss-Newton.
+DRIFTED = 4.0
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,18 @@ def solve_batch(
     report(0.05, "voting on cycles")
     votes = vote(m, params.gate_probability)
     state = _begin(m, votes, params)
+    _refine(m, terms, state, gate, params.anneal)
     for turn in range(MAX_ROUNDS):
         report(0.1 + 0.6 * turn / MAX_ROUNDS, "growing components")
-        _refine(m, terms, state, gate, params)
-        if not (_close_loops(m, state, params) or _join(m, state, params)):
+        agreed = False
+        while _close_loops(m, state, params) or _join(m, state, params, single=False):
+            agreed = True
+        if agreed:
+            _cut_weak_bridges(m, state)
+            _refine(m, terms, state, gate, 1.0)
+        elif not _join(m, state, params, single=True):
             break
-    _refine(m, terms, state, gate, params)
+    _forgive(m, state, gate)
     _check_confirmed(m, state, gate)
 
     report(0.75, "final solve")
@@ -106,7 +114,7 @@ def _begin(m: Measurements, votes: Vote, params: OptimizeParams) -> State:
     return State(poses, accepted, np.zeros(len(m), dtype=np.int64), {})
 
 
-def _refine(m: Measurements, terms: PriorTerms, state: State, gate: float, params: OptimizeParams) -> None:
+def _refine(m: Measurements, terms: PriorTerms, state: State, gate: float, widest: float) -> None:
     """Robust poses of every island from its accepted edges; edges that do not fit are let go."""
     rows = np.flatnonzero(state.accepted)
     if not len(rows):
@@ -117,13 +125,14 @@ def _refine(m: Measurements, terms: PriorTerms, state: State, gate: float, param
     fixed = np.zeros(m.num_scenes, dtype=bool)
     fixed[anchors] = True
     edges = m[rows]
-    state.poses = chordal(edges, fixed, state.poses)
+    if (chi_squares(edges, state.poses) > DRIFTED * gate).any():
+        state.poses = chordal(edges, fixed, state.poses)
     for island in np.unique(labels[terms.scenes]):
         scenes = np.flatnonzero(labels == island)
         mine = terms[labels[terms.scenes] == island]
         state.poses = onto_priors(state.poses, scenes, int(scenes[0]), mine, m.dim)
     descent = Descent(edges, fixed & ~held, terms, anchors[held[anchors]])
-    state.poses = descent.anneal(state.poses, gate, params.anneal, edges.confirmed)
+    state.poses = descent.anneal(state.poses, gate, widest, edges.confirmed)
     bad = (chi_squares(edges, state.poses) > gate) & ~edges.confirmed
     state.accepted[rows[bad]] = False
     state.failures[rows[bad]] += 1
@@ -140,8 +149,8 @@ def _close_loops(m: Measurements, state: State, params: OptimizeParams) -> bool:
     return len(fits) > 0
 
 
-def _join(m: Measurements, state: State, params: OptimizeParams) -> bool:
-    """Join islands: first where edges agree, and only when nothing agrees any more by single strong edges."""
+def _join(m: Measurements, state: State, params: OptimizeParams, *, single: bool) -> bool:
+    """Join islands where edges agree, or, with ``single``, where one strong edge attaches a small island."""
     rows = np.flatnonzero(~state.accepted & (state.failures < 2))
     if not len(rows):
         return False
@@ -149,9 +158,9 @@ def _join(m: Measurements, state: State, params: OptimizeParams) -> bool:
     sizes = np.bincount(walk.labels)
     offers = joins(m, rows, walk, params.gate_probability)
     verdicts = [allowed(join, m, sizes) for join in offers]
-    chosen = forest([j for j, v in zip(offers, verdicts, strict=True) if v == "agreed"], len(sizes))
-    if not chosen:
-        chosen = grow([j for j, v in zip(offers, verdicts, strict=True) if v == "single"], sizes)
+    wanted = "single" if single else "agreed"
+    fitting = [join for join, verdict in zip(offers, verdicts, strict=True) if verdict == wanted]
+    chosen = grow(fitting, sizes) if single else forest(fitting, len(sizes))
     state.pending = {
         int(row): verdict
         for join, verdict in zip(offers, verdicts, strict=True)
@@ -163,6 +172,38 @@ def _join(m: Measurements, state: State, params: OptimizeParams) -> bool:
     taken, state.poses = merge_islands(m, chosen, walk.labels, state.poses)
     state.accepted[taken] = True
     return True
+
+
+def _cut_weak_bridges(m: Measurements, state: State) -> None:
+    """Let go of single edges that have come to hold two firm islands together.
+
+    A scene attached by one edge may turn out to belong to an island of its own; then that edge alone would join two
+    islands, which it may not.
+    """
+    single = bridges(m, state.accepted) & ~m.confirmed
+    blocks = islands(m, np.flatnonzero(state.accepted & ~single))
+    solid = np.bincount(blocks) >= SMALL_ISLAND
+    graph = networkx.Graph()
+    rows = np.flatnonzero(single)
+    ends = np.stack([blocks[m.targets[rows]], blocks[m.sources[rows]]], axis=1)
+    graph.add_edges_from((a, b, {"row": row}) for (a, b), row in zip(ends.tolist(), rows.tolist(), strict=True))
+    for part in networkx.connected_components(graph):
+        tree = graph.subgraph(part)
+        total = sum(solid[k] for k in part)
+        if total < 2:
+            continue
+        below = {k: int(solid[k]) for k in part}
+        for child, parent in reversed([(b, a) for a, b in networkx.bfs_edges(tree, min(part))]):
+            if 0 < below[child] < total:
+                state.accepted[tree.edges[child, parent]["row"]] = False
+            below[parent] += below[child]
+
+
+def _forgive(m: Measurements, state: State, gate: float) -> None:
+    """Take back edges that failed on the way and fit now."""
+    labels = islands(m, np.flatnonzero(state.accepted))
+    inside = labels[m.targets] == labels[m.sources]
+    state.accepted |= inside & (chi_squares(m, state.poses) < gate)
 
 
 def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
@@ -241,11 +282,9 @@ def _describe(
 ) -> PoseGraph:
     chi = chi_squares(m, poses)
     together = component[m.targets] == component[m.sources]
-    bridges = _bridges(m, state.accepted)
-    firm = state.accepted & (~bridges | m.confirmed)
-    status = np.full(m.num_scenes, "isolated", dtype=object)
-    for rows, name in ((np.flatnonzero(state.accepted), "tentative"), (np.flatnonzero(firm), "placed")):
-        status[m.targets[rows]] = status[m.sources[rows]] = name
+    single = bridges(m, state.accepted)
+    firm = state.accepted & (~single | m.confirmed)
+    status = _statuses(m, component, state.accepted, firm)
 
     used: dict[tuple[str, str], bool | str] = {}
     residual: dict[tuple[str, str], float] = {}
@@ -288,16 +327,19 @@ def _describe(
     )
 
 
-def _bridges(m: Measurements, accepted: np.ndarray) -> np.ndarray:
-    """(E,) bool: accepted edges on no cycle of accepted edges."""
+def _statuses(m: Measurements, component: np.ndarray, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:
+    """(N,) ``placed`` in the largest firmly tied part of a component, ``tentative`` beside it, ``isolated`` alone."""
+    blocks = islands(m, np.flatnonzero(firm))
+    sizes = np.bincount(blocks, minlength=1)[blocks]
+    order = np.lexsort((blocks, -sizes, component))
+    leads = order[np.unique(component[order], return_index=True)[1]]
+    main = blocks == blocks[leads][component]
+    status = np.where(main & (sizes > 1), "placed", "tentative").astype(object)
+    tied = np.zeros(m.num_scenes, dtype=bool)
     rows = np.flatnonzero(accepted)
-    low, high = np.minimum(m.targets[rows], m.sources[rows]), np.maximum(m.targets[rows], m.sources[rows])
-    pairs, which, count = np.unique(low * m.num_scenes + high, return_inverse=True, return_counts=True)
-    graph = networkx.Graph(zip((pairs // m.num_scenes).tolist(), (pairs % m.num_scenes).tolist(), strict=True))
-    found = np.array([a * m.num_scenes + b for edge in networkx.bridges(graph) for a, b in (sorted(edge),)])
-    out = np.zeros(len(m), dtype=bool)
-    out[rows] = np.isin(pairs[which], found) & (count[which] == 1)
-    return out
+    tied[m.targets[rows]] = tied[m.sources[rows]] = True
+    status[~tied] = "isolated"
+    return status
 
 
 def _all_rigid(edges: Sequence[Edge], priors: Sequence[Prior], previous: PoseGraph | None) -> bool:

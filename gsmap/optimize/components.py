@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, depth_first_order, dijkstra
 from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
@@ -173,6 +173,33 @@ def allowed(join: Join, edges: Measurements, sizes: np.ndarray) -> str:
     if edges.strong[rows].any():
         return "single"
     return "the only tie to the rest, and its own verdict is not strong enough to attach by itself"
+
+
+def bridges(edges: Measurements, accepted: np.ndarray) -> np.ndarray:
+    """(E,) bool: accepted edges on no cycle of accepted edges.
+
+    Direct the edges of a depth-first tree downwards and all others, which go to an ancestor, upwards: what is then
+    strongly connected is what two edge-disjoint paths connect (Robbins 1939), and the edges between are the bridges.
+    """
+    n, rows = edges.num_scenes, np.flatnonzero(accepted)
+    ends = np.sort(np.stack([edges.targets[rows], edges.sources[rows]]), axis=0)
+    pairs, which, count = np.unique(ends[0] * n + ends[1], return_inverse=True, return_counts=True)
+    low, high = pairs // n, pairs % n
+    # One more node above the first scene of every island makes the forest a tree.
+    first = roots(islands(edges, rows))
+    a, b = np.r_[low, first], np.r_[high, np.full(len(first), n)]
+    graph = sp.coo_matrix((np.ones(len(a)), (a, b)), shape=(n + 1, n + 1)).tocsr()
+    order, parent = depth_first_order((graph + graph.T).tocsr(), n, directed=False)
+    rank = np.empty(n + 1, dtype=np.int64)
+    rank[order] = np.arange(n + 1)
+    early, late = np.where(rank[a] < rank[b], a, b), np.where(rank[a] < rank[b], b, a)
+    down = parent[late] == early
+    tail, head = np.where(down, early, late), np.where(down, late, early)
+    directed = sp.coo_matrix((np.ones(len(a)), (tail, head)), shape=(n + 1, n + 1)).tocsr()
+    blocks = connected_components(directed, directed=True, connection="strong")[1]
+    out = np.zeros(len(edges), dtype=bool)
+    out[rows] = (blocks[low] != blocks[high])[which] & (count[which] == 1)
+    return out
 
 
 def merge_islands(

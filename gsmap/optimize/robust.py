@@ -189,14 +189,16 @@ class Descent:
         2020, with a start that the vote makes narrow). ``trusted`` edges keep weight 1.
         """
         c = gate * max(1.0, widest)
+        noise = float(np.sqrt(np.median(np.einsum("eii->ei", self.edges.covariance)[:, :3])))
         while True:
-            for _ in range(3 if c <= gate else 2):
+            for _ in range(4 if c <= gate else 2):
                 r = residuals(self.edges, poses)
                 chi = np.einsum("ed,edf,ef->e", r, self.edges.information, r)
                 weights = np.where(trusted, 1.0, (c / (c + chi)) ** 2)
                 step = self.step(poses, weights, r)
                 poses = (poses @ exp(step)).orthonormalised()
-                if np.abs(step).max(initial=0) < 1e-6:
+                # Settled: the step is small beside the noise of the edges it would have to explain.
+                if np.abs(step).max(initial=0) < 1e-2 * noise:
                     break
             if c <= gate:
                 return poses
