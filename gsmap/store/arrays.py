@@ -65,7 +65,8 @@ class Arrays:
                 _write(folder, arrays)
                 yield Staged(folder, _synchronise(folder))
             finally:
-                shutil.rmtree(folder, ignore_errors=True)
+                if folder.exists():  # not published
+                    shutil.rmtree(folder, ignore_errors=True)
 
     def publish(self, staged: Staged, kind: str, name: str) -> None:
         """Move a staged group into its place; only under the writer lock, and only where no row names that place."""

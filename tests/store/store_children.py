@@ -1,0 +1,109 @@
+"""What the processes do that the crash tests start and kill."""
+
+import errno
+import itertools
+import os
+import sys
+
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.store import Store
+from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
+
+# Every event of the interpreter that changes the disk; writing itself has none, but each file is opened first.
+EVENTS = ("os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree", "os.truncate")
+
+
+def changes_disk(event: str, arguments: tuple) -> bool:
+    if event == "open":
+        _, mode, flags = arguments
+        return bool(set(mode or "") & set("wxa+")) or bool((flags or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+    return event in EVENTS
+
+
+def add(store: Store, seed: int) -> str:
+    return store.scenes.add(make_gaussians(300, seed=seed), make_cameras(), name=f"scene{seed}")[0].id
+
+
+def work(path: str, first_seed: int, pipe) -> None:
+    """Change the map until killed, telling before and after each step."""
+    store = Store.open(path)
+    for seed in itertools.count(first_seed):
+        pipe.send(("begin", "add", seed))
+        scene = add(store, seed)
+        pipe.send(("done", "add", scene))
+        pipe.send(("begin", "revise", None))
+        alive = [s.id for s in store.scenes.list()]
+        poses = {s: ScenePose(s, Sim3.identity(), 0, "placed") for s in alive}
+        pipe.send(("done", "revise", store.revisions.save(PoseGraph(poses))))
+        pipe.send(("begin", "describe", scene))
+        store.graphs.save(SceneGraph(scene), f"method {seed}")
+        pipe.send(("done", "describe", scene))
+        if seed % 2:
+            pipe.send(("begin", "remove", alive[0]))
+            store.scenes.remove(alive[0])
+            pipe.send(("done", "remove", alive[0]))
+            pipe.send(("begin", "prune", None))
+            store.prune(keep_revisions=1)
+            pipe.send(("done", "prune", None))
+
+
+def die_at(path: str, seed: int, step: int, pipe) -> None:
+    """Add a scene, and die at the given change of the disk; tells where, or that it came through."""
+    left = [step]
+
+    def hook(event: str, arguments: tuple) -> None:
+        if changes_disk(event, arguments):
+            left[0] -= 1
+            if left[0] == 0:
+                pipe.send(f"died at {event} {arguments[0]}")
+                os._exit(9)
+
+    with Store.open(path) as store:
+        sys.addaudithook(hook)
+        add(store, seed)
+        left[0] = -1
+    pipe.send("through")
+
+
+def fail_at_steps(path: str, code: int, stride: int, pipe) -> None:
+    """Add one scene after another, each failing at a later change of the disk, until one comes through."""
+    armed = [0]
+
+    def hook(event: str, arguments: tuple) -> None:
+        if armed[0] > 0 and changes_disk(event, arguments) and str(path) in str(arguments[0]):
+            armed[0] -= 1
+            if armed[0] == 0:
+                raise OSError(code, os.strerror(code))
+
+    sys.addaudithook(hook)
+    for step in itertools.count(1, stride):
+        with Store.open(path) as store:
+            before = len(store.scenes.list())
+            armed[0] = step
+            try:
+                add(store, step)
+                kind, text = "through", ""
+            except BaseException as error:
+                kind, text = type(error).__name__, str(error)
+            fired, armed[0] = armed[0] <= 0, 0
+            pipe.send((step, kind, text, len(store.scenes.list()) - before, store.check().problems))
+            if not fired:
+                return
+
+
+def write_some(path: str, worker: int, count: int, pipe) -> None:
+    """One of several writers: scenes of its own, one that all share, and revisions."""
+    try:
+        with Store.open(path) as store:
+            for i in range(count):
+                add(store, 1000 * (worker + 1) + i)
+                add(store, i)
+                scene = store.scenes.list()[0].id
+                store.revisions.save(PoseGraph({scene: ScenePose(scene, Sim3.identity(), 0, "placed")}))
+        pipe.send("done")
+    except BaseException as error:
+        pipe.send(repr(error))
+
+
+CODES = (errno.ENOSPC, errno.EIO)

@@ -1,0 +1,230 @@
+"""Killed anywhere, the map opens whole and nothing that was acknowledged is lost."""
+
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import time
+
+import pytest
+import store_children
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.errors import StoreError
+from gsmap.store import Store
+
+
+@pytest.fixture(scope="module")
+def context():
+    """Processes that start in a moment: the server has imported everything, and has no threads."""
+    made = multiprocessing.get_context("forkserver")
+    made.set_forkserver_preload(["gsmap.store", "zarr", "zarr.codecs"])
+    return made
+
+
+@pytest.fixture
+def start(context):
+    started = []
+
+    def run(target, *arguments):
+        ours, theirs = context.Pipe(duplex=False)
+        process = context.Process(target=target, args=(*arguments, theirs))
+        process.start()
+        theirs.close()
+        started.append(process)
+        return process, ours
+
+    yield run
+    for process in started:
+        if process.is_alive():
+            process.kill()
+        process.join()
+
+
+def messages(pipe) -> list:
+    out = []
+    try:
+        while pipe.poll(0):
+            out.append(pipe.recv())
+    except EOFError:
+        pass
+    return out
+
+
+def kill_at_random(tmp_path, start, kills: int, seed: int) -> None:
+    path = tmp_path / "site.gsmap"
+    Store.create(path).close()
+    rng = random.Random(seed)
+    alive: set[str] = set()
+    revisions = killed_inside = 0
+    for kill in range(kills):
+        process, pipe = start(store_children.work, str(path), 100 * kill)
+        assert pipe.poll(60)  # it has begun
+        time.sleep(rng.uniform(0, 0.4))
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        begun = None
+        for state, step, what in messages(pipe):
+            begun = (step, what) if state == "begin" else None
+            if (state, step) == ("done", "add"):
+                alive.add(what)
+            elif (state, step) == ("done", "remove"):
+                alive.discard(what)
+            elif (state, step) == ("done", "revise"):
+                revisions = what
+        killed_inside += begun is not None
+        with Store.open(path) as store:
+            found = {scene.id for scene in store.scenes.list()}
+            # Only the step under way may have happened or not.
+            if begun is not None and begun[0] == "add":
+                assert alive <= found
+                assert len(found - alive) <= 1
+            elif begun is not None and begun[0] == "remove":
+                assert alive - {begun[1]} <= found <= alive
+            else:
+                assert found == alive
+            alive = found
+            assert revisions <= (store.revisions.current() or 0) <= revisions + 1
+            revisions = store.revisions.current() or 0
+            for scene in random.Random(kill).sample(sorted(found), min(2, len(found))):
+                assert len(store.scenes.gaussians(scene)) == 300
+            if kill % 10 == 9:
+                assert store.check().problems == ()
+    assert killed_inside > kills / 3
+    with Store.open(path) as store:
+        assert store.check().problems == ()
+        store.prune()
+        report = store.check()
+        assert (report.problems, report.orphans) == ((), ())
+        assert not list(store.arrays.staging.iterdir())
+        assert all(len(store.scenes.gaussians(scene)) == 300 for scene in alive)
+
+
+def test_killed_at_fifty_random_moments(tmp_path, start):
+    kill_at_random(tmp_path, start, 50, seed=1)
+
+
+@pytest.mark.slow
+def test_killed_at_five_hundred_random_moments(tmp_path, start):
+    kill_at_random(tmp_path, start, 500, seed=2)
+
+
+def die_at_steps(tmp_path, start, stride: int) -> None:
+    path = tmp_path / "site.gsmap"
+    with Store.create(path) as store:
+        kept = store_children.add(store, 0)
+    places, step = [], 1
+    while True:
+        process, pipe = start(store_children.die_at, str(path), 1, step)
+        process.join()
+        (said,) = messages(pipe)
+        with Store.open(path) as store:
+            assert store.check().problems == ()
+            assert len(store.scenes.gaussians(kept)) == 300
+            if said == "through":
+                assert len(store.scenes.list()) == 2
+                break
+            assert [s.id for s in store.scenes.list()] == [kept]  # it was not committed yet
+            if step % 2:
+                store.prune()
+                assert store.check().orphans == ()
+        places.append(said)
+        step += stride
+    assert any("os.rename" in place for place in places) or stride > 1
+    assert len(places) > 30 / stride
+
+
+def test_killed_at_chosen_steps(tmp_path, start):
+    die_at_steps(tmp_path, start, 7)
+
+
+@pytest.mark.slow
+def test_killed_at_every_step(tmp_path, start):
+    die_at_steps(tmp_path, start, 1)
+
+
+@pytest.mark.parametrize("code", store_children.CODES)
+@pytest.mark.parametrize("stride", [10, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_failing_disk_is_one_typed_error_and_changes_nothing(tmp_path, start, code, stride):
+    path = tmp_path / "site.gsmap"
+    Store.create(path).close()
+    process, pipe = start(store_children.fail_at_steps, str(path), code, stride)
+    process.join(120)
+    said = messages(pipe)
+    for step, kind, text, added, problems in said:
+        assert problems == (), step
+        # Some failures change nothing, such as that of making a folder that is there.
+        assert added == (kind == "through"), (step, kind, text)
+        if kind != "through":
+            assert kind == "StoreError", (step, kind, text)
+            assert "\n" not in text
+            assert os.strerror(code) in text
+    assert said[-1][1] == "through"
+    assert sum(kind == "StoreError" for _, kind, *_ in said) > 60 / stride
+
+
+def test_a_full_disk(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "none", disk], capture_output=True).returncode:
+        pytest.skip("needs the right to mount a small file system")
+    try:
+        with Store.create(disk / "m") as store:
+            kept, _ = store.scenes.add(make_gaussians(2000), make_cameras(), name="a")
+            with pytest.raises(StoreError, match="No space left"):
+                store.scenes.add(make_gaussians(40_000, degree=3), make_cameras(), name="b")
+            assert [s.id for s in store.scenes.list()] == [kept.id]
+            assert store.check().problems == ()
+            (disk / "filler").write_bytes(b"x" * (os.statvfs(disk).f_bavail * os.statvfs(disk).f_frsize - 8192))
+
+            def fill() -> None:
+                for i in range(200):
+                    store.exports.begin(f"/out/{i}", revision=None, settings={"x": "y" * 4000})
+
+            with pytest.raises(StoreError, match=r"full|No space"):
+                fill()
+            assert store.check().problems == ()
+            (disk / "filler").unlink()
+            assert store.scenes.add(make_gaussians(100), make_cameras(), name="c")[1]
+            assert store.check().problems == ()
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_eight_writers(tmp_path, start):
+    path = tmp_path / "site.gsmap"
+    Store.create(path).close()
+    workers = [start(store_children.write_some, str(path), i, 4) for i in range(8)]
+    for process, pipe in workers:
+        process.join(120)
+        assert messages(pipe) == ["done"]
+    with Store.open(path) as store:
+        assert len(store.scenes.list()) == 8 * 4 + 4
+        assert [r.number for r in store.revisions.list()] == list(range(1, 33))
+        report = store.check()
+        assert (report.problems, report.orphans) == ((), ())
+
+
+def test_check_finds_a_flipped_bit_in_every_file(tmp_path):
+    rng = random.Random(4)
+    with Store.create(tmp_path / "m") as store:
+        for seed in range(2):
+            store_children.add(store, seed)
+        store.models.add("net", __file__, kind="clip")
+        assert store.check().ok
+        files = [p for folder in ("arrays", "models") for p in (store.folder / folder).rglob("*") if p.is_file()]
+        assert len(files) > 30
+        for file in files:
+            whole = file.read_bytes()
+            broken = bytearray(whole)
+            broken[rng.randrange(len(broken))] ^= 1 << rng.randrange(8)
+            file.write_bytes(broken)
+            (problem,) = store.check().problems
+            assert str(file) in problem
+            file.write_bytes(whole)
+        file.unlink()
+        assert "missing" in store.check().problems[0]
+        file.write_bytes(whole)
+        (files[0].parent / "stranger").touch()
+        assert "does not belong" in store.check().problems[0]
