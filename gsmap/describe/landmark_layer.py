@@ -9,11 +9,12 @@ import numpy as np
 from gsmap.describe.cloud import Cloud
 from gsmap.describe.cylinder import NUM_BINS, cylinder_context
 from gsmap.describe.gravity import rotation_to_z
-from gsmap.describe.landmarks import Blobs, find_blobs
+from gsmap.describe.landmarks import find_blobs
 from gsmap.describe.method import method_digest
 from gsmap.types import NodeLayer
 
-_VERSION = 1
+_VERSION = 2
+_DIM = 4 * NUM_BINS + 3
 
 
 @dataclass(frozen=True)
@@ -22,17 +23,19 @@ class LandmarkParams:
 
     Args:
         cell_m: grid of the finest octave; its blobs have a scale of 1.6 cells.
-        octaves: number of scales, doubling.
+        octaves: number of scales, doubling; those finer than the capture's Gaussians are skipped.
         lab_threshold: smallest colour contrast, L*a*b* units.
-        density_threshold: smallest excess of occupancy over a plane's.
-        max_nodes: the strongest are kept.
+        density_threshold: smallest excess of surface over a plane's.
+        max_per_octave: the strongest are kept.
+        context_cell_m: the surroundings are thinned to one point per cell of this size.
     """
 
-    cell_m: float = 0.05
-    octaves: int = 3
-    lab_threshold: float = 3.0
-    density_threshold: float = 0.8
-    max_nodes: int = 2500
+    cell_m: float = 0.025
+    octaves: int = 4
+    lab_threshold: float = 2.0
+    density_threshold: float = 0.6
+    max_per_octave: int = 1500
+    context_cell_m: float = 0.05
 
 
 def landmark_method(params: LandmarkParams) -> str:
@@ -56,7 +59,7 @@ def landmark_layer(
     """
     method = landmark_method(params)
     if up is None or len(cloud) == 0:
-        return NodeLayer.empty(method, 1 + 4 * NUM_BINS, unit_m)
+        return NodeLayer.empty(method, _DIM, unit_m)
     level = rotation_to_z(up)
     points = cloud.points @ level.T * unit_m
     blobs = find_blobs(
@@ -67,17 +70,16 @@ def landmark_layer(
         octaves=params.octaves,
         lab_threshold=params.lab_threshold,
         density_threshold=params.density_threshold,
+        max_per_octave=params.max_per_octave,
     )
-    blobs = Blobs(*(getattr(blobs, n)[: params.max_nodes] for n in ("positions", "types", "responses", "sigmas_m")))
     if len(blobs) == 0:
-        return NodeLayer.empty(method, 1 + 4 * NUM_BINS, unit_m)
-    context = cylinder_context(blobs.positions, points, cloud.lab, params.cell_m)
-    height = blobs.positions[:, 2] - np.percentile(points[:, 2], 2)
+        return NodeLayer.empty(method, _DIM, unit_m)
+    context = cylinder_context(blobs.positions, points, cloud.lab, params.context_cell_m)
     positions = blobs.positions @ level / unit_m
     half = (1.5 * blobs.sigmas_m / unit_m)[:, None]
     return NodeLayer(
         positions=positions,
-        embeddings=_embed(context, height),
+        embeddings=_embed(context),
         types=blobs.types,
         weights=blobs.responses,
         extents=np.stack([positions - half, positions + half], 1),
@@ -88,10 +90,19 @@ def landmark_layer(
     )
 
 
-def _embed(context: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Unit vectors (M, 1 + 4 * bins): occupancy, colour weighted by its square root, height above the floor."""
-    occupancy = context[..., 3]
-    colour = np.sqrt(occupancy)[..., None] * np.clip(context[..., :3], -2.5, 2.5)
-    parts = [occupancy, colour.reshape(len(context), -1)]
-    vector = np.concatenate([np.concatenate(parts, 1) / np.sqrt(NUM_BINS), 0.7 * height[:, None]], 1)
-    return vector / np.linalg.norm(vector, axis=1, keepdims=True)
+def _embed(context: np.ndarray) -> np.ndarray:
+    """Unit vectors (M, 4 * bins + 3) of contexts (M, bins, 4): occupancy, relative colour, and the mean colour.
+
+    Another exposure adds to L and stretches it (gain and gamma in the logarithm of light), so each bin's colour is
+    taken relative to the mean of the whole surrounding and divided by its spread; the mean itself is kept at less
+    weight, the lightness least. A bin counts by the root of its occupancy.
+    """
+    occupancy, colour = context[..., 3:], np.clip(context[..., :3], -2.5, 2.5)
+    total = np.maximum(occupancy.sum(1), 1e-6)
+    mean = (occupancy * colour).sum(1) / total
+    relative = colour - mean[:, None]
+    spread = np.sqrt((occupancy * relative**2).sum(1) / total) + 0.15
+    relative *= 0.7 * np.sqrt(occupancy) / spread[:, None]
+    parts = [0.75 * occupancy[..., 0], relative.reshape(len(context), -1)]
+    vector = np.concatenate([np.concatenate(parts, 1) / np.sqrt(NUM_BINS), mean * [0.3, 0.5, 0.5]], 1)
+    return vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9)

@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
+_MAX_SPACING_CELLS = 1.4  # points whose 8th neighbour is farther cannot carry an octave
 _BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
 _WINDOW = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)  # 1.2 sigma
 
@@ -47,6 +48,7 @@ def find_blobs(
     octaves: int,
     lab_threshold: float,
     density_threshold: float,
+    max_per_octave: int,
 ) -> Blobs:
     """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
 
@@ -54,27 +56,39 @@ def find_blobs(
     densely a trainer put its Gaussians matters. Colour at a scale is the normalised Gaussian convolution; the response
     is its difference between scale s and 1.8 s. Density is the surface near a point relative to that of a plane
     (``m sqrt(2 pi) s``): corners, clutter and thin things stand out. A blob's position is the mean of the cells around
-    the extremum whose response exceeds 0.6 of the peak's, weighted by it.
+    the extremum whose response exceeds 0.6 of the peak's, weighted by it. Octaves finer than the points are skipped.
 
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
-        lab_threshold: smallest response in a and b (in L 1.3 times as much, and on the finest octave 4/3 of both).
+        lab_threshold: smallest response in a and b; in L 1.3 times as much.
         density_threshold: smallest excess of surface, in planes.
+        max_per_octave: the strongest are kept.
     """
-    found = []
+    spacing_m = np.sqrt(8 / np.pi * np.median(areas))
+    thresholds = np.array([1.3 * lab_threshold, lab_threshold, lab_threshold, density_threshold])
+    found = [_empty()]
     for octave in range(octaves):
         size_m = cell_m * 2**octave
-        finest = 4 / 3 if octave == 0 else 1.0
-        thresholds = np.array([1.3 * finest * lab_threshold, *[finest * lab_threshold] * 2, density_threshold])
+        if spacing_m > _MAX_SPACING_CELLS * size_m:
+            continue
+        parts = [_empty()]
         for channel, negative, cells, ratio in _extrema(points / size_m, lab, areas / size_m**2, thresholds):
-            kind = (channel * 2 + negative) * octaves + octave
-            n = len(cells)
-            found.append((cells * size_m, np.full(n, kind), ratio, np.full(n, _SIGMA_CELLS * size_m)))
-    if not found:
-        return Blobs(np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros(0), np.zeros(0))
-    positions, types, responses, sigmas = (np.concatenate(x) for x in zip(*found, strict=True))
-    order = np.argsort(-responses, kind="stable")
-    return Blobs(positions[order], types[order].astype(np.int32), responses[order], sigmas[order])
+            kind = np.full(len(cells), (channel * 2 + negative) * octaves + octave, np.int32)
+            parts.append(Blobs(cells * size_m, kind, ratio, np.full(len(cells), _SIGMA_CELLS * size_m)))
+        found.append(_strongest(parts, max_per_octave))
+    return _strongest(found)
+
+
+def _empty() -> Blobs:
+    return Blobs(np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros(0), np.zeros(0))
+
+
+def _strongest(parts: list[Blobs], count: int | None = None) -> Blobs:
+    columns = [
+        np.concatenate([getattr(p, name) for p in parts]) for name in ("positions", "types", "responses", "sigmas_m")
+    ]
+    order = np.argsort(-columns[2], kind="stable")[:count]
+    return Blobs(*(c[order] for c in columns))
 
 
 def _extrema(points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray):

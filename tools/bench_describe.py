@@ -1,0 +1,103 @@
+"""How well landmarks of separately trained captures of one place agree, over all pairs of a folder of captures.
+
+    python tools/bench_describe.py ../shared/data/house [--json OUT] [--gain]
+
+The folder holds NAME.ply, NAME.cameras.json and truth/NAME.json (``T_scene_world``). For each ordered pair that
+overlaps (landmarks of a with surface of b within 10 cm): rep@10 is their share with a landmark of b of the same type
+within 10 cm (chance: the same at random points of b's surface), sigma the RMS distance per axis of those
+counterparts, recall@1 the share of landmarks with a counterpart within 15 cm whose most similar one is such, correct
+the number of mutual best matches within 15 cm, out of how many. ``--gain`` changes each capture's exposure (gain .85
+to 1.15, gamma .9 to 1.15).
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap import formats
+from gsmap.describe import describe
+from gsmap.describe.cloud import surface_cloud
+from gsmap.types import Gaussians, Sim3
+
+_SH_C0 = 0.28209479177387814
+
+
+def exposed(gaussians: Gaussians, gain: float, gamma: float) -> Gaussians:
+    """The capture under another exposure (view-independent colour only)."""
+    sh = gaussians.sh.copy()
+    sh[:, 0] = (gain * np.clip(_SH_C0 * sh[:, 0] + 0.5, 0, 1) ** gamma - 0.5) / _SH_C0
+    return replace(gaussians, sh=sh)
+
+
+def compare(a, b, S_a_b: Sim3, surface_a: np.ndarray, surface_b: np.ndarray) -> dict[str, float] | None:
+    """The figures of one ordered pair, or None where less than a tenth of the landmarks of a lie in the overlap."""
+    mapped, mapped_surface = S_a_b.apply(b.positions), S_a_b.apply(surface_b)
+    inside = cKDTree(mapped_surface).query(a.positions)[0] < 0.1
+    if inside.mean() < 0.1:
+        return None
+    typed = cKDTree(np.c_[mapped, b.types * 1e3])
+    distance = typed.query(np.c_[a.positions, a.types * 1e3])[0]
+    rng = np.random.default_rng(0)
+    random = mapped_surface[rng.integers(len(mapped_surface), size=inside.sum())]
+    chance = typed.query(np.c_[random, a.types[inside] * 1e3])[0] < 0.1
+    similarity = np.where(a.types[:, None] == b.types[None], a.embeddings @ b.embeddings.T, -2)
+    best, back = similarity.argmax(1), similarity.argmax(0)
+    right = np.linalg.norm(mapped[best] - a.positions, axis=1) < 0.15
+    mutual = back[best] == np.arange(len(a))
+    near = inside & (distance < 0.1)
+    return {
+        "rep@10": float(near.sum() / inside.sum()),
+        "chance": float(chance.mean()),
+        "sigma": float(np.sqrt((distance[near] ** 2).mean() / 3)) if near.any() else float("nan"),
+        "recall@1": float(right[inside & (distance < 0.15)].mean()),
+        "correct": int((right & mutual).sum()),
+        "matches": int(mutual.sum()),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--gain", action="store_true", help="change each capture's exposure")
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    scenes = {}
+    for path in sorted(options.folder.glob("*.ply")):
+        gaussians = formats.read(path)
+        cameras = formats.read_cameras(path.with_suffix(".cameras.json"))
+        if options.gain:
+            gaussians = exposed(gaussians, rng.uniform(0.85, 1.15), rng.uniform(0.9, 1.15))
+        record = json.loads((options.folder / "truth" / f"{path.stem}.json").read_text())
+        start = time.process_time()
+        graph = describe(path.stem, gaussians, cameras, scale_policy="known")
+        seconds = time.process_time() - start
+        layer = graph.layers["landmarks"]
+        print(f"{path.stem}: {len(gaussians)} Gaussians, {len(layer)} landmarks, {seconds:.1f} CPU s")
+        truth = Sim3.from_matrix(np.array(record["T_scene_world"]))
+        scenes[path.stem] = (layer, truth, surface_cloud(gaussians).points)
+    rows = []
+    for one, two in itertools.permutations(scenes, 2):
+        (a, S_a, surface_a), (b, S_b, surface_b) = scenes[one], scenes[two]
+        figures = compare(a, b, S_a @ S_b.inverse(), surface_a, surface_b)
+        if figures:
+            rows.append({"pair": f"{one}-{two}", **figures})
+    names = [k for k in rows[0] if k != "pair"] if rows else []
+    print("pair    " + "".join(f"{n:>10}" for n in names))
+    mean = {"pair": "mean", **{n: float(np.nanmean([r[n] for r in rows])) for n in names}}
+    for row in [*rows, mean]:
+        print(f"{row['pair']:8}" + "".join(f"{row[n]:10.3f}" for n in names))
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()
