@@ -14,7 +14,7 @@ from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
 
 
-def room(seed: int = 0, n: int = 20000, patches: int = 120) -> tuple[Gaussians, Cameras]:
+def room(seed: int = 0, n: int = 30000, patches: int = 120) -> tuple[Gaussians, Cameras]:
     """A 6 x 5 x 2.5 m room of flat Gaussians with coloured patches on all six sides and two boxes; 24 cameras."""
     rng = np.random.default_rng(seed)
     size = np.array([6.0, 5.0, 2.5])
