@@ -1,0 +1,57 @@
+"""TUM trajectories: one pose per line, ``timestamp tx ty tz qx qy qz qw``, as most evaluation tools read."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import InputError, NotFoundError
+from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
+from gsmap.types import Sim3
+
+
+def read_trajectory(path: str | os.PathLike[str]) -> list[tuple[float, Sim3]]:
+    """Timestamps in seconds and poses ``T_map_scene``, in file order; ``#`` starts a comment.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: a line that does not hold eight finite numbers or whose quaternion is not a rotation (named).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise NotFoundError(f"no trajectory at {path}")
+    out = []
+    with path.open(encoding="ascii", errors="replace") as lines:
+        for number, line in enumerate(lines, 1):
+            words = line.split("#", 1)[0].replace(",", " ").split()
+            if not words:
+                continue
+            try:
+                values = [float(word) for word in words]
+            except ValueError:
+                values = []
+            if len(values) != 8 or not all(math.isfinite(v) for v in values):
+                raise InputError(f"{path} line {number}: a TUM pose is 8 finite numbers: time, position, quaternion")
+            x, y, z, w = values[4:]
+            if not 0.5 < x * x + y * y + z * z + w * w < 2:
+                raise InputError(f"{path} line {number}: the quaternion {values[4:]} is not a rotation")
+            out.append((values[0], Sim3(quats_to_matrices(np.array([w, x, y, z])), np.array(values[1:4]))))
+    return out
+
+
+def write_trajectory(
+    path: str | os.PathLike[str], poses: Sequence[Sim3], timestamps_s: Sequence[float] | None = None
+) -> None:
+    """Write poses in order, at ``timestamps_s`` or at 0, 1, 2, ...; a scale is left out, as the format has none."""
+    times = range(len(poses)) if timestamps_s is None else timestamps_s
+    if len(times) != len(poses):
+        raise InputError(f"{len(poses)} poses but {len(times)} timestamps")
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for time_s, pose in zip(times, poses, strict=True):
+        w, x, y, z = matrices_to_quats(pose.rotation[None])[0].tolist()
+        lines.append(" ".join(repr(v) for v in [float(time_s), *pose.translation.tolist(), x, y, z, w]))
+    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")

@@ -1,0 +1,27 @@
+import numpy as np
+import pytest
+
+from gsmap.formats.g2o import read_graph
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize import OptimizeParams, optimize
+from gsmap.optimize.robust import chi_squares
+
+OPTIMA = {"smallGrid3D": 517.925, "parking-garage": 0.634192, "sphere2500": 675.701, "torus3D": 12117.64}
+
+
+@pytest.mark.parametrize("name", [n if n != "torus3D" else pytest.param(n, marks=pytest.mark.slow) for n in OPTIMA])
+def test_known_optimum(shared_data, name):
+    from gsmap.optimize.measurements import measurements
+
+    graph = read_graph(shared_data / "pose_graphs" / f"{name}.g2o")
+    answer = optimize(list(graph.poses), graph.edges, params=OptimizeParams(marginals=False))
+    poses = Similarities.stack([p.S_map_scene for p in answer.poses.values()])
+    cost = chi_squares(measurements(list(graph.poses), graph.edges), poses).sum() / 2
+    assert cost == pytest.approx(OPTIMA[name], rel=1e-3)
+
+
+def test_grid_without_triangles_is_found_by_longer_cycles(shared_data):
+    """Nobody vouches for the edges, and a grid has no triangles: cycles of four must do."""
+    graph = read_graph(shared_data / "pose_graphs" / "smallGrid3D.g2o", confirmed=False)
+    answer = optimize(list(graph.poses), graph.edges, params=OptimizeParams(marginals=False))
+    assert np.mean([used is True for used in answer.used.values()]) > 0.98
