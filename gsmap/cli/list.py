@@ -47,5 +47,5 @@ def command(map: MapPath, what: Annotated[What, typer.Argument(help="What to lis
 
 
 def _short(column: str, value: object) -> object:
-    """Content digests are 64 digits long; a dozen tell them apart."""
-    return value[:12] if column in {"id", "target", "source"} and isinstance(value, str) and len(value) == 64 else value
+    """Content digests are long; a dozen digits tell them apart."""
+    return value[:12] if column in {"id", "target", "source"} and isinstance(value, str) and len(value) >= 32 else value

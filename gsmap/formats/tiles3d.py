@@ -111,6 +111,11 @@ def write_content(path: str | os.PathLike[str], gaussians: Gaussians) -> np.ndar
     return box_of(gaussians)
 
 
+def read_content(path: str | os.PathLike[str]) -> Gaussians:
+    """Read one tile's GLB back, in the frame it was written in."""
+    return glb.read_world(Path(path), _Y_UP_TO_Z_UP)
+
+
 def write_tileset(path: str | os.PathLike[str], root: TileNode, *, transform: np.ndarray | None = None) -> None:
     """Write ``tileset.json``; write it last, when the content that it names is there.
 

@@ -1,0 +1,147 @@
+"""A 3D Tiles tileset over an export's tiles: coarser levels merged upwards, the finest level the tiles themselves."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.export.manifest import sync_folder
+from gsmap.formats import tiles3d
+from gsmap.formats.tiles3d import TileNode
+from gsmap.types import Gaussians, Tile
+
+FILE_NAME = "tileset.json"
+LEVELS_FOLDER = "levels"
+_MAX_PER_LEVEL = 100_000
+_Cell = tuple[int, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """A node and the file, relative to the component's folder, that holds what it draws."""
+
+    node: TileNode
+    path: Path
+
+    def gaussians(self) -> Gaussians:
+        return tiles3d.read_content(self.path)
+
+
+def write_tilesets(out: Path, tiles: Sequence[Tile], tile_size_m: float) -> list[Path]:
+    """Write ``tileset.json`` into each component's folder, with coarser levels made by merging, never by dropping.
+
+    Levels are named by what they were made from, so those whose tiles did not change are not made again. Memory is
+    bounded by eight tiles.
+
+    Args:
+        out: the export's folder; the tiles' ``.glb`` lie in it.
+        tile_size_m: edge of the grid's tiles, > 0.
+    """
+    by_component: dict[int, list[Tile]] = defaultdict(list)
+    for tile in tiles:
+        if tile.path:
+            by_component[tile.component].append(tile)
+    written = []
+    for members in by_component.values():
+        folder = (out / members[0].path).parent
+        known = _known_boxes(folder)
+        cells = {_cell(tile, tile_size_m): _leaf(folder, tile, known) for tile in members}
+        while len(cells) > 1:
+            cells = _one_level_up(folder, cells, known)
+        (root,) = cells.values()
+        staged = folder / f".{FILE_NAME}.partial"
+        tiles3d.write_tileset(staged, root.node, transform=np.eye(4))  # the map's z is up where gsmap could tell
+        with open(staged, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(staged, folder / FILE_NAME)
+        _remove_unnamed(folder, root.node)
+        sync_folder(folder)
+        written.append(folder / FILE_NAME)
+    return written
+
+
+def _cell(tile: Tile, tile_size_m: float) -> _Cell:
+    x, y, z = np.floor(tile.bounds.mean(0) / tile_size_m).astype(int).tolist()
+    return x, y, z
+
+
+def _leaf(folder: Path, tile: Tile, known: dict[str, tuple[np.ndarray, float]]) -> _Drawn:
+    path = folder / Path(tile.path).name
+    # The digest makes a changed tile another key; viewers ignore it.
+    uri = f"{path.name}?{tile.sha256[:12]}"
+    box = known[uri][0] if uri in known else tiles3d.box_of(tiles3d.read_content(path))
+    return _Drawn(TileNode(box, 0.0, uri), path)
+
+
+def _one_level_up(
+    folder: Path, cells: dict[_Cell, _Drawn], known: dict[str, tuple[np.ndarray, float]]
+) -> dict[_Cell, _Drawn]:
+    """Join every two by two by two cells, counted from the lowest one, so that each component ends in one root."""
+    low = np.min(list(cells), axis=0)
+    groups: dict[_Cell, list[_Drawn]] = defaultdict(list)
+    for cell in sorted(cells):
+        x, y, z = ((np.array(cell) - low) // 2).tolist()
+        groups[x, y, z].append(cells[cell])
+    return {
+        cell: children[0] if len(children) == 1 else _parent(folder, children, known)
+        for cell, children in groups.items()
+    }
+
+
+def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndarray, float]]) -> _Drawn:
+    names = "\n".join(str(child.node.uri) for child in children)
+    uri = f"{LEVELS_FOLDER}/{hashlib.sha256(names.encode()).hexdigest()[:24]}.glb"
+    path = folder / uri
+    if uri in known and path.exists():
+        box, error_m = known[uri]
+    else:
+        level, voxel_m = tiles3d.coarser(Gaussians.concatenate([c.gaussians() for c in children]), _MAX_PER_LEVEL)
+        path.parent.mkdir(exist_ok=True)
+        staged = path.with_name(f".{path.name}.partial")
+        boxes = np.stack([tiles3d.write_content(staged, level), *(c.node.box for c in children)])
+        os.replace(staged, path)
+        box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+        # A level must never be finer than what replaces it, or viewers would stop at it too early.
+        error_m = max(voxel_m, 1.5 * max(c.node.error_m for c in children), 1e-3)
+    return _Drawn(TileNode(box, error_m, uri, tuple(c.node for c in children)), path)
+
+
+def _known_boxes(folder: Path) -> dict[str, tuple[np.ndarray, float]]:
+    """Box and error of every content that the folder's present tileset names."""
+    known: dict[str, tuple[np.ndarray, float]] = {}
+
+    def walk(tile: dict) -> None:
+        center, axes = (
+            np.array(tile["boundingVolume"]["box"][:3]),
+            np.reshape(tile["boundingVolume"]["box"][3:], (3, 3)),
+        )
+        half = np.diag(axes)
+        known[tile["content"]["uri"]] = np.stack([center - half, center + half]), tile["geometricError"]
+        for child in tile.get("children", ()):
+            walk(child)
+
+    try:
+        walk(json.loads((folder / FILE_NAME).read_text())["root"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}  # none yet, or not ours: everything is read again
+    return known
+
+
+def _remove_unnamed(folder: Path, root: TileNode) -> None:
+    """Delete levels that no node names any more."""
+    named = set()
+    todo = [root]
+    while todo:
+        node = todo.pop()
+        named.add(node.uri)
+        todo += node.children
+    for path in (folder / LEVELS_FOLDER).glob("*"):
+        if f"{LEVELS_FOLDER}/{path.name}" not in named:
+            path.unlink()

@@ -1,0 +1,41 @@
+"""What a worker runs: one scene described, one pair registered. Each opens the map for reading and returns types."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+
+from gsmap.describe import DescribeParams, describe
+from gsmap.register import Params as RegisterParams
+from gsmap.register import SceneView, register_pair
+from gsmap.store import Store
+from gsmap.types import Registration, SceneGraph
+
+
+@lru_cache(maxsize=1)
+def _store(path: str) -> Store:
+    return Store.open(path, "r")
+
+
+@lru_cache(maxsize=4)
+def _view(path: str, scene_id: str, method: str) -> SceneView:
+    """Pairs come ordered by scene, so a few views kept save most of the reading."""
+    scenes, graphs = _store(path).scenes, _store(path).graphs
+    graph = graphs.load(scene_id, method)
+    assert graph is not None, f"scene {scene_id} was to be registered before it was described"
+    policy = scenes.get(scene_id).scale_policy
+    return SceneView(scene_id, scenes.gaussians(scene_id), scenes.cameras(scene_id), graph, policy)
+
+
+def describe_scene(path: str, scene_id: str, params: DescribeParams, models: Mapping[str, object]) -> SceneGraph:
+    """The graph of one scene of the map at ``path``."""
+    scenes = _store(path).scenes
+    policy = scenes.get(scene_id).scale_policy
+    return describe(scene_id, scenes.gaussians(scene_id), scenes.cameras(scene_id), params, models, scale_policy=policy)
+
+
+def register_scenes(
+    path: str, target: tuple[str, str], source: tuple[str, str], params: RegisterParams
+) -> Registration:
+    """The registration of one pair of the map at ``path``; target and source are (scene id, method of its graph)."""
+    return register_pair(_view(path, *target), _view(path, *source), params)
