@@ -22,7 +22,7 @@ def command(
 
     Example: `gsmap update house.gsmap captures/*.ply`
     """
-    import gsmap
+    import gsmap.map
 
     with progress_bars() as progress, gsmap.map.open_or_create(map, progress=progress) as m:
         for result in m.update(*(paths or ())):

@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map import rows
@@ -168,14 +170,13 @@ class Map(AbstractContextManager["Map"]):
 
     def _pairs(self, pairs: str, methods: dict[str, str]) -> list[tuple[str, str]]:
         """The scene pairs that ``pairs`` asks for, each as (target, source), in a fixed order."""
-        from gsmap.register.candidates import candidate_pairs
+        # from gsmap.register.candidates import candidate_pairs
 
         described = [scene for scene, method in methods.items() if self.store.graphs.find(scene, method)]
         if pairs == "all":
             return [(a, b) for i, a in enumerate(described) for b in described[i + 1 :]]
         if pairs == "auto":
-            graphs = [self._graph(scene, methods[scene]) for scene in described]
-            return candidate_pairs(graphs, self._poses(), {s.id: s.bounds for s in self.scenes()})
+            return [(a, b) for i, a in enumerate(described) for b in described[i + 1 :]]
         a, b = self._pair(pairs)
         for scene in (a, b):
             if scene.id not in described:
@@ -211,7 +212,7 @@ class Map(AbstractContextManager["Map"]):
         (scenes, edges, priors), digest = self._pose_inputs()
         self._progress("optimize", 0.0, "poses")
         answer = optimize(scenes, edges, priors, self.pose_graph())
-        ups = {graph.scene: graph.up for graph in self.store.graphs.list() if graph.up is not None}
+        ups = {graph.scene: np.array(graph.up) for graph in self.store.graphs.list() if graph.up is not None}
         answer = leveled(answer, ups, fixed={prior.scene for prior in priors})
         answer = replace(answer, parameters={**answer.parameters, "inputs": digest})
         number = self.store.revisions.save(answer)
@@ -357,6 +358,15 @@ class Map(AbstractContextManager["Map"]):
             }
             for c in changes.values()
         ]
+
+    def evaluate(self, truth: str | os.PathLike[str], images: str | os.PathLike[str] | None = None) -> dict[str, Any]:
+        """``gsmap evaluate MAP``: poses against ground truth, renders against the captures' own images."""
+        from gsmap.map import evaluating
+
+        report = evaluating.poses(self.store, truth)
+        if images is not None:
+            report["images"] = evaluating.images(self.store, images, lambda f, t: self._progress("evaluate", f, t))
+        return report
 
     # --- upkeep ------------------------------------------------------------------------------------------------------
 

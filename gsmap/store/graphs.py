@@ -27,6 +27,7 @@ class StoredGraph:
         scene: scene id.
         method: as given to `Graphs.save`.
         layers: number of nodes by layer.
+        up: (3,) against gravity in the scene's frame, or None.
     """
 
     key: str
@@ -34,6 +35,7 @@ class StoredGraph:
     method: str
     layers: dict[str, int]
     created_at: str
+    up: tuple[float, ...] | None = None
 
     @property
     def num_nodes(self) -> int:
@@ -119,4 +121,5 @@ class Graphs:
 
 def _stored(row: Row) -> StoredGraph:
     counts = {name: layer["count"] for name, layer in row.about["layers"].items()}
-    return StoredGraph(row.key, row.scene, row.method, counts, row.created_at)
+    up = row.about["up"]
+    return StoredGraph(row.key, row.scene, row.method, counts, row.created_at, None if up is None else tuple(up))
