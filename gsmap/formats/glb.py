@@ -19,7 +19,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.formats.axes import GLTF, PLY, change_axes
 from gsmap.formats.ply import SH_C0
-from gsmap.formats.quantise import opacity_bytes, require_writable
+from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, Sim3
 
@@ -28,6 +28,7 @@ _MAX_JSON_BYTES = 16 << 20
 _MAX_NODES = 10_000
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _ARRAY_BUFFER = 34962
+_LEAST_BYTES = 56  # of a Gaussian in memory, SH degree 0
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
@@ -53,7 +54,10 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
     gltf, binary = _read_container(path)
     outer = np.eye(4) if matrix is None else matrix
     try:
-        parts = [_read_primitive(path, gltf, binary, *item) for item in _primitives(path, gltf, outer)]
+        found = list(_primitives(path, gltf, outer))
+        repeated = sum(int(gltf["accessors"][p["attributes"]["POSITION"]]["count"]) for p, _ in found)
+        check_size(path, repeated * _LEAST_BYTES, len(binary))
+        parts = [_read_primitive(path, gltf, binary, *item) for item in found]
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise

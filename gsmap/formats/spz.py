@@ -229,7 +229,7 @@ def _zstd_content_size(frame: bytes) -> int | None:
 
     numcodecs leaves the rest of a buffer as it was when a frame holds less than the buffer.
     """
-    if len(frame) < 18 or frame[:4] != b"\x28\xb5\x2f\xfd":
+    if len(frame) < 6 or frame[:4] != b"\x28\xb5\x2f\xfd":
         return None
     flags = frame[4]
     single = flags >> 5 & 1

@@ -142,17 +142,19 @@ def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
     """
     if len(gaussians) <= max_count:
         return gaussians, 0.0
-    extent = np.ptp(gaussians.means.astype(np.float64), axis=0)
-    low, high = float(extent.max()) / 2**20, float(extent.max()) * 2
-    labels = voxel_labels(gaussians.means, high)
-    for _ in range(12):  # the size is found to a few per cent
-        middle = float(np.sqrt(low * high))
-        tried = voxel_labels(gaussians.means, middle)
-        if tried.max() + 1 > max_count:
-            low = middle
-        else:
-            high, labels = middle, tried
-    return merge_groups(gaussians, labels)[0], high
+    extent = max(float(np.ptp(gaussians.means.astype(np.float64), axis=0).max()), 1e-6)
+    finest, coarsest = extent / 2**20, extent * 2
+    labels, voxel = voxel_labels(gaussians.means, coarsest), coarsest
+    tried = extent / max_count**0.5
+    for _ in range(10):  # surfaces have as many voxels as the voxel size squared has room for
+        found = voxel_labels(gaussians.means, tried)
+        count = int(found.max()) + 1
+        if count <= max_count and tried < voxel:
+            labels, voxel = found, tried
+        if 0.7 * max_count <= count <= max_count:
+            break
+        tried = float(np.clip(tried * (count / (0.85 * max_count)) ** 0.5, finest, coarsest))
+    return merge_groups(gaussians, labels)[0], voxel
 
 
 def box_of(gaussians: Gaussians) -> np.ndarray:
