@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.merge.changes import overruled_pixels
 from gsmap.merge.parts import Part, inside
-from gsmap.render import render
+from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
 
 _MIN_SEEN = 0.02  # share of a picture that must show the tile
@@ -26,6 +26,8 @@ class References:
             capture saw nothing, and outside the tile.
         part: (V,) which part each was rendered from.
         share: (V,) how much of each picture counts, in [0, 1].
+        shown: per part (N_part,) float32: in how many pixels of its own views each Gaussian dominates; below 1 where
+            in none; 1 for all where there are no views.
     """
 
     cameras: Cameras
@@ -33,6 +35,7 @@ class References:
     weights: list[np.ndarray]
     part: np.ndarray
     share: np.ndarray
+    shown: list[np.ndarray]
 
     def __len__(self) -> int:
         return len(self.images)
@@ -53,10 +56,13 @@ def render_references(
     """
     todo = [(i, c) for i, part in enumerate(parts) if part.cameras is not None for c in range(len(part.cameras))]
     cameras, images, weights, kept, shares = [], [], [], [], []
+    pixels = [np.zeros(len(part.gaussians), dtype=np.int64) for part in parts]
+    largest = [np.zeros(len(part.gaussians), dtype=np.float32) for part in parts]
     for done, (i, c) in enumerate(todo):
         camera = parts[i].cameras[c].resized(longest_side_px)
         progress(done / len(todo), "rendering the captures")
-        seen = render(parts[i].gaussians, camera)
+        seen = render(parts[i].gaussians, camera, max_weight=True)
+        _count(seen, pixels[i], largest[i])
         weight = seen.alpha[0] * inside_pixels(camera, seen.depth[0], bounds)
         if later is not None and later[i]:
             weight = weight * ~overruled_pixels(camera, seen.depth[0], later[i])
@@ -68,7 +74,23 @@ def render_references(
         weights.append(np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8))
         kept.append(i)
         shares.append(share)
-    return References(_joined(cameras), images, weights, np.array(kept, dtype=np.int64), np.array(shares))
+    shown = [_shown(p, w, whole=bounds is None) for p, w in zip(pixels, largest, strict=True)]
+    return References(_joined(cameras), images, weights, np.array(kept, dtype=np.int64), np.array(shares), shown)
+
+
+def _count(seen: Rendered, pixels: np.ndarray, largest: np.ndarray) -> None:
+    dominant = seen.dominant_id[seen.dominant_id >= 0]
+    pixels += np.bincount(dominant, minlength=len(pixels))
+    np.maximum(largest, seen.max_weight, out=largest)
+
+
+def _shown(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
+    """See `References.shown`. What no view saw shows nothing of a whole capture; of a piece of one, other views may
+    have seen it, so it goes after what is seen and yet dominates nothing."""
+    if not largest.any():
+        return np.ones(len(pixels), dtype=np.float32)
+    unseen = 0.0 if whole else 0.5
+    return np.where(pixels > 0, pixels, np.where(largest > 0, 0.1 * largest, unseen)).astype(np.float32)
 
 
 def order_of_views(share: np.ndarray, steps: int, seed: int) -> np.ndarray:

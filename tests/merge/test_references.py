@@ -52,7 +52,7 @@ def test_a_gain_multiplies_every_colour():
 
 
 def test_exposure_is_balanced_where_captures_meet():
-    a, b = two_parts()
+    a, b = two_parts(grain=0.0)
     gain = np.array([1.25, 1.1, 0.9])
     brighter = Part(apply_gain(b.gaussians, gain), b.cameras, "b")
     _, log_gains = balance_exposure([a, brighter])

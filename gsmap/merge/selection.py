@@ -1,0 +1,53 @@
+"""Which Gaussians of overlapping captures to keep: one capture per place, and of it what shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.types import Gaussians
+
+
+def one_owner_per_cell(
+    gaussians: Gaussians, origin: np.ndarray, shown: np.ndarray, cell_m: float, cover_m: float
+) -> np.ndarray:
+    """(N,) which Gaussians stay when every cell of a grid belongs to the capture that shows most of it.
+
+    Two captures of one surface laid over one another blur it and stop its light twice: the ghosts of a plain union.
+    A Gaussian of another capture than its cell's owner stays only where the owner has nothing near: a place the owner
+    did not see.
+
+    Args:
+        origin: (N,) capture each Gaussian came from.
+        shown: (N,) pixels that each Gaussian dominates in its own capture's views.
+        cell_m: side of a cell.
+        cover_m: an owner's Gaussian this near covers another's.
+    """
+    from scipy.spatial import cKDTree
+
+    from gsmap.geometry.voxels import voxel_labels
+
+    captures = int(origin.max(initial=-1)) + 1
+    if captures < 2:
+        return np.ones(len(gaussians), dtype=bool)
+    cell = voxel_labels(gaussians.means, cell_m)
+    count = int(cell.max()) + 1
+    votes = np.stack([np.bincount(cell, shown * (origin == c), count) for c in range(captures)])
+    owner = votes.argmax(0)[cell]
+    stays = owner == origin
+    for c in range(captures):
+        own = stays & (origin == c)
+        others = np.flatnonzero(~stays & (owner == c) & (shown > 0))
+        if len(others) == 0 or not own.any():
+            continue
+        tree = cKDTree(gaussians.means[own])
+        distance, _ = tree.query(gaussians.means[others], distance_upper_bound=cover_m)
+        stays[others[np.isinf(distance)]] = True
+    return stays
+
+
+def most_shown(shown: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
+    """(N,) the ``count`` Gaussians of a mask that show most; ties by row."""
+    order = np.argsort(np.where(among, -shown, np.inf), kind="stable")
+    stays = np.zeros(len(shown), dtype=bool)
+    stays[order[: min(count, int(among.sum()))]] = True
+    return stays
