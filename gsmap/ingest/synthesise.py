@@ -7,39 +7,43 @@ import numpy as np
 from gsmap.types import Cameras, Gaussians
 
 _POINTS = 20_000
-_CANDIDATES = 192
+_PLACES = 256
 _GRID = 32
+_CLEARANCE = 0.03  # how far from every point a place is, in diagonals
 _PANORAMA = (16, 32)  # bins of latitude and longitude
 _ENCLOSED = 0.6  # share of directions that hit something: a room without a ceiling has more, the outside less
+_TIE = 0.02  # rooms of which nothing but bare walls is known look the same from both sides: stay inside
+_WORTH = 0.002  # share of the points that a further place must add
 _SIDE_PX = 512
 
 
 def synthesise_cameras(gaussians: Gaussians, *, num_positions: int = 16, seed: int = 0) -> Cameras:
-    """Cameras that together see the surfaces of a scene.
+    """Cameras in the free space of a scene that together see its surfaces.
 
-    Indoors (somewhere most directions hit a surface): up to ``num_positions`` places in free space, each the one that
-    sees most of what those before did not, looking along all six axes with 90 degrees. Else: a sphere around the
-    whole, looking at its middle. Same input, same cameras.
+    Up to ``num_positions`` places, each the one that sees most of what those before did not, looking along the axes
+    with 90 degrees where something is to be seen. Places are indoors (most directions hit something) where such places
+    see as much as those outside do: true of rooms, not of the hollows of an object. Same input, same cameras.
 
     Returns:
         Cameras in the scene's frame with ``synthesised=True``.
     """
     rng = np.random.default_rng(seed)
     points = _solid_points(gaussians, rng)
-    low, high = np.percentile(points, [1, 99], axis=0)
-    diagonal = float(np.linalg.norm(high - low)) or 1.0
-    candidates = _free_positions(points, low, high, diagonal, rng)
-    panoramas = [_panorama(points, position) for position in candidates]
-    inside = [i for i, (share, _) in enumerate(panoramas) if share >= _ENCLOSED]
-    poses = _look_around(points, candidates, panoramas, inside, num_positions) if len(inside) >= 4 else []
-    if not poses:
-        poses, focal_px = _orbit(low, high, diagonal), _SIDE_PX / (2 * np.tan(np.radians(30)))
+    places = _free_places(points, rng)
+    panoramas = [_panorama(points, place) for place in places]
+    share = np.array([hit for hit, _ in panoramas])
+    seen = [visible for _, visible in panoramas]
+    indoors = _best(seen, np.flatnonzero(share >= _ENCLOSED), len(points), num_positions)
+    outside = _best(seen, np.flatnonzero(share < _ENCLOSED), len(points), num_positions)
+    if _coverage(seen, indoors) >= _coverage(seen, outside) - _TIE * len(points):
+        chosen = indoors
     else:
-        focal_px = _SIDE_PX / 2  # 90 degrees
+        chosen = _best(seen, np.arange(len(places)), len(points), num_positions)
+    poses = np.array([pose for i in chosen for pose in _look_around(places[i], points[seen[i]])])
     n = len(poses)
-    intrinsics = np.tile([focal_px, focal_px, _SIDE_PX / 2, _SIDE_PX / 2], (n, 1))
-    sizes = np.full((n, 2), _SIDE_PX)
-    return Cameras(np.array(poses), intrinsics, sizes, tuple(f"synthesised_{i:03d}" for i in range(n)), True)
+    intrinsics = np.full((n, 4), _SIDE_PX / 2)  # 90 degrees
+    names = tuple(f"synthesised_{i:03d}" for i in range(n))
+    return Cameras(poses, intrinsics, np.full((n, 2), _SIDE_PX), names, synthesised=True)
 
 
 def _solid_points(gaussians: Gaussians, rng: np.random.Generator) -> np.ndarray:
@@ -53,21 +57,21 @@ def _solid_points(gaussians: Gaussians, rng: np.random.Generator) -> np.ndarray:
     return gaussians.means[solid].astype(np.float64)
 
 
-def _free_positions(
-    points: np.ndarray, low: np.ndarray, high: np.ndarray, diagonal: float, rng: np.random.Generator
-) -> np.ndarray:
-    """(M, 3) positions inside the box, away from every point, spread by farthest-point sampling."""
+def _free_places(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(M, 3) places in the box of the points, away from each, spread by farthest-point sampling."""
     from scipy.spatial import cKDTree
 
-    cells = np.stack(np.meshgrid(*[np.linspace(0, 1, _GRID)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    cells = low + (cells + rng.uniform(-0.5, 0.5, cells.shape) / _GRID).clip(0, 1) * (high - low)
-    clearance = cKDTree(points).query(cells, distance_upper_bound=0.2 * diagonal)[0].clip(max=0.2 * diagonal)
-    free = cells[clearance >= 0.03 * diagonal]
+    low, high = np.percentile(points, [1, 99], axis=0)
+    diagonal = float(np.linalg.norm(high - low)) or 1.0
+    cells = np.stack(np.meshgrid(*[np.arange(_GRID)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    cells = low + (cells + rng.uniform(size=cells.shape)) / _GRID * (high - low)
+    clearance, _ = cKDTree(points).query(cells, distance_upper_bound=0.2 * diagonal)
+    free = cells[clearance >= _CLEARANCE * diagonal]
     if len(free) < 8:
-        free = cells[np.argsort(-clearance)[:64]]
+        free = cells[np.argsort(-clearance, kind="stable")[:64]]
     chosen = [0]
     distance = np.linalg.norm(free - free[0], axis=1)
-    while len(chosen) < min(_CANDIDATES, len(free)):
+    while len(chosen) < min(_PLACES, len(free)):
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(free - free[chosen[-1]], axis=1))
     return free[chosen]
@@ -90,53 +94,40 @@ def _panorama(points: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarr
     return float(np.isfinite(nearest).mean()), visible
 
 
-def _look_around(
-    points: np.ndarray,
-    candidates: np.ndarray,
-    panoramas: list[tuple[float, np.ndarray]],
-    inside: list[int],
-    num_positions: int,
-) -> list[np.ndarray]:
-    """Views along the axes from the positions that, chosen greedily, see the most; views of nothing are left out."""
-    unseen = np.ones(len(points), bool)
-    poses = []
-    for _ in range(num_positions):
-        gain = [int(unseen[panoramas[i][1]].sum()) for i in inside]
-        best = inside[int(np.argmax(gain))]
-        if max(gain) < 0.002 * len(points):
+def _best(seen: list[np.ndarray], allowed: np.ndarray, num_points: int, count: int) -> list[int]:
+    """Up to ``count`` of the allowed places, greedily by how many points each adds; none that adds hardly any."""
+    unseen = np.ones(num_points, bool)
+    out: list[int] = []
+    while len(out) < min(count, len(allowed)):
+        gain = [int(unseen[seen[i]].sum()) for i in allowed]
+        if out and max(gain) < _WORTH * num_points:
             break
-        visible = panoramas[best][1]
-        unseen[visible] = False
-        offset = points[visible] - candidates[best]
-        ahead = np.abs(offset).max(1)
-        for axis in range(3):
-            for sign in (1, -1):
-                if (sign * offset[:, axis] >= ahead).sum() >= 0.02 * len(visible):
-                    direction = np.zeros(3)
-                    direction[axis] = sign
-                    poses.append(_look(candidates[best], candidates[best] + direction))
+        out.append(int(allowed[int(np.argmax(gain))]))
+        unseen[seen[out[-1]]] = False
+    return out
+
+
+def _coverage(seen: list[np.ndarray], places: list[int]) -> int:
+    """How many points these places see together."""
+    return len(np.unique(np.concatenate([seen[i] for i in places]))) if places else -1
+
+
+def _look_around(place: np.ndarray, visible: np.ndarray) -> list[np.ndarray]:
+    """Poses at a place along the six axes, but only where at least 2 % of the visible points lie."""
+    offset = visible - place
+    reach = np.abs(offset).max(1)
+    poses = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            if (sign * offset[:, axis] >= reach).sum() >= max(1.0, 0.02 * len(visible)):
+                poses.append(_look(place, sign * np.eye(3)[axis]))
     return poses
 
 
-def _orbit(low: np.ndarray, high: np.ndarray, diagonal: float) -> list[np.ndarray]:
-    """Views from a sphere that holds the whole box: Fibonacci points, 60 degrees of view."""
-    center, count = (low + high) / 2, 48
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    angle = k * np.pi * (1 + 5**0.5)
-    ring = np.sqrt(1 - z**2)
-    sphere = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
-    return [_look(center + 1.1 * diagonal * p, center) for p in sphere]
-
-
-def _look(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(4, 4) camera-to-frame pose with OpenCV axes, looking at ``target``; image down is one of the frame's axes."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    down = np.zeros(3)
-    down[1 if abs(forward[1]) < 0.9 else 2] = 1.0
-    right = np.cross(down, forward)
-    right /= np.linalg.norm(right)
+def _look(place: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """(4, 4) camera-to-frame pose with OpenCV axes, looking along a unit axis; image down is an axis of the frame."""
+    down = np.array([0.0, 1, 0]) if forward[1] == 0 else np.array([0.0, 0, 1])
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    pose[:3, 3] = position
+    pose[:3, :3] = np.stack([np.cross(down, forward), down, forward], 1)
+    pose[:3, 3] = place
     return pose

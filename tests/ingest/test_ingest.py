@@ -1,0 +1,215 @@
+import json
+
+import numpy as np
+import pytest
+
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.formats import cameras_json, write
+from gsmap.ingest import find_captures, read_captures, validate
+from gsmap.types import Cameras, Gaussians
+
+
+def box(n: int = 4000, seed: int = 0) -> Gaussians:
+    """The inside walls of a room of 4 x 6 x 3 around the origin."""
+    rng = np.random.default_rng(seed)
+    half = np.array([2, 3, 1.5])
+    points = rng.uniform(-half, half, size=(n, 3))
+    axis = rng.integers(0, 3, n)
+    points[np.arange(n), axis] = np.sign(points[np.arange(n), axis]) * half[axis]
+    return Gaussians(
+        points, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), -3.5), np.full(n, 2.0), rng.normal(size=(n, 1, 3))
+    )
+
+
+def looking(n: int = 4) -> Cameras:
+    pose = np.tile(np.eye(4), (n, 1, 1))
+    pose[:, 0, 3] = np.linspace(-1, 1, n)
+    return Cameras(pose, np.tile([50.0, 50, 32, 24], (n, 1)), np.tile([64, 48], (n, 1)))
+
+
+def replaced(g: Gaussians, **arrays: np.ndarray) -> Gaussians:
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    return Gaussians(**({n: getattr(g, n) for n in names} | arrays))
+
+
+# -- finding
+
+
+def test_cameras_of_its_own_name(tmp_path):
+    write(tmp_path / "monday.ply", box())
+    write(tmp_path / "tuesday.ply", box(seed=1))
+    cameras_json.write(tmp_path / "monday.cameras.json", looking(4))
+    cameras_json.write(tmp_path / "cameras.json", looking(7))
+    a, b = read_captures(tmp_path)
+    assert (a.name, len(a.cameras), a.cameras.synthesised) == ("monday", 4, False)
+    assert (b.name, b.cameras.synthesised) == ("tuesday", True)
+    assert any("cameras.json was not taken" in note for note in b.notes)
+    assert any("synthesised" in note for note in b.notes)
+    assert a.source == str(tmp_path / "monday.ply")
+
+
+def test_shared_cameras_of_a_single_file(tmp_path):
+    write(tmp_path / "monday.ply", box())
+    cameras_json.write(tmp_path / "cameras.json", looking(7))
+    (capture,) = read_captures(tmp_path / "monday.ply")
+    assert len(capture.cameras) == 7
+    assert capture.notes == ()
+
+
+def test_gaussian_splatting_output(tmp_path):
+    out = tmp_path / "kitchen"
+    for iteration, n in ((7000, 100), (30000, 300)):
+        folder = out / "point_cloud" / f"iteration_{iteration}"
+        folder.mkdir(parents=True)
+        write(folder / "point_cloud.ply", box(n))
+    (out / "input.ply").write_bytes(b"ply\n")
+    cameras_json.write(out / "cameras.json", looking())
+    last = out / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    for given in (out, last, tmp_path):
+        (capture,) = read_captures(given)
+        assert (capture.name, len(capture.gaussians), len(capture.cameras)) == ("kitchen", 300, 4)
+    (earlier,) = read_captures(out / "point_cloud" / "iteration_7000" / "point_cloud.ply")
+    assert (earlier.name, len(earlier.gaussians), len(earlier.cameras)) == ("kitchen", 100, 4)
+
+
+def test_gsplat_output(tmp_path):
+    out = tmp_path / "garden"
+    (out / "ply").mkdir(parents=True)
+    (out / "ckpts").mkdir()
+    (out / "ckpts" / "ckpt_29999_rank0.pt").touch()
+    for step, n in ((6999, 100), (29999, 300)):
+        write(out / "ply" / f"point_cloud_{step}.ply", box(n))
+    (capture,) = read_captures(out)
+    assert (capture.name, len(capture.gaussians), capture.cameras.synthesised) == ("garden", 300, True)
+
+
+def test_nerfstudio_export(tmp_path):
+    out = tmp_path / "poster"
+    out.mkdir()
+    write(out / "splat.ply", box())
+    frames = []
+    for i, pose in enumerate(looking().T_frame_camera):
+        saved = pose @ np.diag([1.0, -1, -1, 1])
+        saved[:3, 3] /= 0.5
+        frames.append({"file_path": f"{i}.png", "transform_matrix": saved.tolist()})
+    content = {"fl_x": 50, "fl_y": 50, "w": 64, "h": 48, "frames": frames}
+    (out / "transforms.json").write_text(json.dumps(content))
+    (out / "dataparser_transforms.json").write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 0.5}))
+    (capture,) = read_captures(out)
+    assert capture.name == "poster"
+    np.testing.assert_allclose(capture.cameras.T_frame_camera, looking().T_frame_camera, atol=1e-12)
+
+
+def test_colmap_beside_the_file(tmp_path):
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sparse" / "0" / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("# x\n1 1 0 0 0 0 0 0 1 a.jpg\n\n")
+    write(tmp_path / "hall.ply", box())
+    (capture,) = read_captures(tmp_path)
+    assert capture.cameras.names == ("a.jpg",)
+
+
+def test_cameras_may_lie_elsewhere(tmp_path):
+    (tmp_path / "a").mkdir()
+    write(tmp_path / "a" / "hall.ply", box())
+    cameras_json.write(tmp_path / "views.json", looking(5))
+    (capture,) = read_captures(tmp_path / "a" / "hall.ply", cameras=tmp_path / "views.json", name="the hall")
+    assert (len(capture.cameras), capture.name) == (5, "the hall")
+
+
+def test_what_is_no_capture(tmp_path):
+    with pytest.raises(NotFoundError, match="no such file"):
+        read_captures(tmp_path / "none.ply")
+    with pytest.raises(InputError, match=r"holds no captures.*\.ply"):
+        read_captures(tmp_path)
+    (tmp_path / "a.xyz").touch()
+    with pytest.raises(InputError, match=r"unknown suffix '\.xyz'.*\.ply"):
+        read_captures(tmp_path / "a.xyz")
+    (tmp_path / "ckpt_29999_rank0.pt").touch()
+    for given in (tmp_path / "ckpt_29999_rank0.pt", tmp_path):
+        with pytest.raises(InputError, match=r"export a \.ply"):
+            read_captures(given)
+
+
+def test_options(tmp_path):
+    write(tmp_path / "a.ply", box())
+    write(tmp_path / "b.ply", box())
+    for wrong in ({"name": "x"}, {"cameras": tmp_path}):
+        with pytest.raises(ConfigError, match="one capture"):
+            read_captures(tmp_path, **wrong)
+    with pytest.raises(ConfigError, match="ISO 8601"):
+        read_captures(tmp_path / "a.ply", captured_at="yesterday")
+    with pytest.raises(ConfigError, match="auto, known, unknown"):
+        read_captures(tmp_path / "a.ply", scale_policy="metres")
+    (capture,) = read_captures(tmp_path / "a.ply", captured_at="2026-05-31T14:00:00", scale_policy="known")
+    assert capture.captured_at == "2026-05-31T14:00:00+00:00"
+    assert capture.scale_policy == "known"
+    (capture,) = read_captures(tmp_path / "a.ply", captured_at="2026-05-31T14:00+02:00")
+    assert capture.captured_at == "2026-05-31T14:00:00+02:00"
+
+
+def test_house_finds_its_cameras(shared_data):
+    found = find_captures([shared_data / "house"])
+    assert [f.name for f in found] == ["c0", "c1", "c2", "c3", "c5"]
+    assert [f.cameras.name for f in found] == [f"{f.name}.cameras.json" for f in found]
+
+
+# -- validation
+
+
+def test_a_sound_capture_passes():
+    assert validate(box(), looking()) == ()
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_nan_and_infinity_are_refused_with_their_row(name, value):
+    array = getattr(box(), name).copy()
+    array.reshape(len(array), -1)[17, -1] = value
+    with pytest.raises(InputError, match=rf"a\.ply holds NaN or infinity in {name} in row 17: "):
+        validate(replaced(box(), **{name: array}), where="a.ply")
+    array.reshape(len(array), -1)[40, -1] = value
+    with pytest.raises(InputError, match=r"row 17 \(2 such rows\)"):
+        validate(replaced(box(), **{name: array}))
+
+
+def test_absurd_values_are_refused_with_their_row():
+    scales = box().log_scales.copy()
+    scales[3, 1] = np.log(1e6)
+    with pytest.raises(InputError, match=r"scale.*row 3"):
+        validate(replaced(box(), log_scales=scales))
+    scales[3, 1] = np.log(100)  # a far background is no mistake
+    validate(replaced(box(), log_scales=scales))
+    quats = box().quats.copy()
+    quats[5] = 0
+    with pytest.raises(InputError, match="zero in row 5"):
+        validate(replaced(box(), quats=quats))
+    with pytest.raises(InputError, match="no Gaussians"):
+        validate(Gaussians.empty())
+
+
+def test_large_finite_numbers_do_not_overflow_the_check():
+    means = box().means.copy()
+    means[0] = 3e38
+    means[1] = 3e38
+    validate(replaced(box(), means=means))
+
+
+def test_cameras_of_another_scene_are_refused():
+    c = looking()
+    away = c.T_frame_camera.copy()
+    away[:, 2, 3] = 50  # behind the room, looking on
+    with pytest.raises(InputError, match="none of its 4 cameras sees"):
+        validate(box(), Cameras(away, c.intrinsics_px, c.sizes_px))
+    away[1:, 2, 3] = 0
+    assert validate(box(), Cameras(away, c.intrinsics_px, c.sizes_px)) == ("1 of 4 cameras see no Gaussian",)
+    with pytest.raises(InputError, match="empty list"):
+        validate(box(), c[:0])
+
+
+def test_bad_file_is_refused_by_name(tmp_path):
+    means = box().means.copy()
+    means[9] = np.nan
+    write(tmp_path / "bad.ply", replaced(box(), means=means))
+    with pytest.raises(InputError, match=r"bad\.ply holds NaN or infinity in means in row 9"):
+        read_captures(tmp_path / "bad.ply")
