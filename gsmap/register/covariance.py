@@ -16,9 +16,9 @@ class Params:
     """Args (metres, degrees):
     radius_m: pairs farther apart than this are not counted.
     cell_m: residuals within a cell of this size are taken to share their error.
-    floor_deg, floor_m: errors that no residual shows (a trainer's bias), at the overlap's centroid.
+    floor_deg, floor_m: errors that no residual shows (a trainer's bias, a sensor's distortion), at the overlap's
+        centroid. A small overlap cannot fix angles better than ``floor_m`` over its radius, nor the scale.
     factor: on the sandwich, from measured normalised errors.
-    scale_floor: the same for the logarithm of the scale.
     """
 
     radius_m: float = 0.08
@@ -26,7 +26,6 @@ class Params:
     floor_deg: float = 0.15
     floor_m: float = 0.01
     factor: float = 2.0
-    scale_floor: float = 0.002
 
 
 # A rigid edge knows its scale: a row this stiff keeps the matrix 7 x 7 without letting the scale move.
@@ -68,7 +67,11 @@ def pose_covariance(
     np.add.at(gradient, cell.ravel(), jacobian * residual[:, None])
     inverse = np.linalg.inv(hessian)
     sandwich = inverse @ (gradient.T @ gradient) @ inverse
-    floor = np.r_[np.full(3, np.radians(params.floor_deg)), np.full(3, params.floor_m / pose.scale), params.scale_floor]
+    spread = points[hit] - points[hit].mean(0)
+    radius = float(np.sqrt((spread**2).sum(1).mean()))
+    relative = params.floor_m / max(radius * pose.scale, 1e-6)
+    turn = max(np.radians(params.floor_deg), relative)
+    floor = np.r_[np.full(3, turn), np.full(3, params.floor_m / pose.scale), relative]
     covariance = np.diag(np.r_[floor[:6], _RIGID_LOG_SCALE_SIGMA] ** 2)
     covariance[:dim, :dim] = params.factor * sandwich + np.diag(floor[:dim] ** 2)
     sigmas = (

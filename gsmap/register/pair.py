@@ -18,7 +18,6 @@ from gsmap.register.agreement import Agreement
 from gsmap.register.propose import Proposal
 from gsmap.register.refiners import coloured, gicp
 from gsmap.register.scene_view import SceneView
-from gsmap.register.surface import Surface
 from gsmap.types import Cameras, Registration, Sim3
 
 METHOD_VERSION = 1
@@ -36,13 +35,15 @@ class Params:
         fallback: ``auto`` asks the surfaces where the graphs are poor or suggest nothing sure, ``never``, ``always``.
         poor_nodes: a graph none of whose layers has this many nodes is poor.
         max_poses: poses that are refined and judged at most.
+        hopeless_log_nfa: a clique that chance explains this easily is not looked into.
     """
 
     kinds: tuple[str, ...] = ("landmarks", "objects")
     refiner: str = "coloured"
     fallback: str = "auto"
     poor_nodes: int = 500
-    max_poses: int = 4
+    max_poses: int = 3
+    hopeless_log_nfa: float = 5.0
     propose: propose.Params = field(default_factory=propose.Params)
     surface: surface.Params = field(default_factory=surface.Params)
     coloured: coloured.Params = field(default_factory=coloured.Params)
@@ -106,8 +107,9 @@ def register_pair(
     judged: list[_Judged] = []
     for proposals in (pair.graph_proposals, pair.scaled_proposals, pair.dense_proposals):
         for proposal in proposals():
+            hopeless = proposal.log_nfa > params.hopeless_log_nfa
             known = any(_same_pose(proposal, j.proposal, centre, target.graph.unit_m) for j in judged)
-            if known or len(judged) >= params.max_poses:
+            if hopeless or known or len(judged) >= params.max_poses:
                 continue
             report(0.2 + 0.7 * len(judged) / params.max_poses, f"judging a pose by {proposal.method}")
             judged.append(pair.judge(proposal))
@@ -125,7 +127,6 @@ class _Pair:
     def __init__(self, target: SceneView, source: SceneView, params: Params, clock: _Clock) -> None:
         self.target, self.source, self.params, self.clock = target, source, params, clock
         self.policies = {target.scale_policy, source.scale_policy}
-        self._surfaces: dict[tuple[str, float], Surface] = {}
 
     def graph_proposals(self) -> list[Proposal]:
         """Rigid poses by each kind of node, unless a scene's scale is unknown."""
@@ -156,7 +157,9 @@ class _Pair:
         with self.clock.step("fallback"):
             unit_m = self._target_unit_m(with_scale=False)
             found = dense.match_surfaces(
-                self._surface(self.target, unit_m), self._surface(self.source, unit_m), self.params.dense
+                self.target.surface(unit_m, self.params.surface),
+                self.source.surface(unit_m, self.params.surface),
+                self.params.dense,
             )
         if found is None:
             return []
@@ -169,12 +172,6 @@ class _Pair:
         metric = not with_scale and any(name in graph.layers for name in self.params.kinds)
         return 1.0 if metric or self.target.scale_policy == "known" else graph.unit_m
 
-    def _surface(self, view: SceneView, unit_m: float) -> Surface:
-        key = (view.id, unit_m)
-        if key not in self._surfaces:
-            self._surfaces[key] = Surface.of(view.gaussians, unit_m, self.params.surface)
-        return self._surfaces[key]
-
     def judge(self, proposal: Proposal) -> _Judged:
         """Refine a proposal and hold it against everything both scenes know."""
         params, S = self.params, proposal.S_target_source
@@ -184,7 +181,8 @@ class _Pair:
             # Both surfaces go to target metres, the source with the proposed scale, so what remains is nearly rigid.
             unit_t = self._target_unit_m(proposal.with_scale)
             unit_s = unit_t * S.scale
-            target, source = self._surface(self.target, unit_t), self._surface(self.source, unit_s)
+            target = self.target.surface(unit_t, params.surface)
+            source = self.source.surface(unit_s, params.surface)
             pose = Sim3(S.rotation, S.translation * unit_t)
             if params.refiner == "gicp" and not proposal.with_scale:
                 pose = gicp.refine(target, source, pose, params.gicp)
@@ -238,7 +236,7 @@ def _conclude(pair: _Pair, judged: list[_Judged]) -> Registration:
     target, source = pair.target.id, pair.source.id
     if not judged:
         poor = min(_most_nodes(pair.target), _most_nodes(pair.source))
-        reason = f"too few nodes agree (the poorer graph has {poor})"
+        reason = f"no pose that more nodes support than chance would (the poorer graph has {poor})"
         return Registration(target, source, "no_match", reason, seconds=pair.clock.seconds)
     accepted = [j for j in judged if not j.flaw]
     best = accepted[0] if accepted else min(judged, key=_rank)

@@ -81,13 +81,20 @@ def propose(
     fields = [f for f in fields if len(f.matches) >= params.min_inliers]
     if with_scale:
         votes = [(score, i, s) for i, f in enumerate(fields) for s, score in scale.vote_scales(f.matches, params.scale)]
-        trials = [(i, s) for _, i, s in sorted(votes, reverse=True)[: params.num_scales]]
+        votes = sorted(votes, reverse=True)[: params.num_scales]
+        trials = [(i, s) for score, i, s in votes if score > 0.5 * votes[0][0]]
     else:
         trials = [(i, 1.0) for i in range(len(fields))]
     found = [(p, i, s) for i, s in trials if (p := fields[i].solve(fields[i].matches, s)) is not None]
     if not found:
         return []
     best, i, s = min(found, key=lambda f: (f[0].log_nfa, -f[0].num_inliers))
+    if with_scale and not best.flaw:
+        # The vote is good to a percent; at the scale its own clique implies more correspondences agree.
+        s = best.S_target_source.scale * fields[i].a.unit_m / fields[i].b.unit_m
+        again = fields[i].solve(fields[i].matches, s)
+        if again is not None and again.num_inliers > best.num_inliers:
+            best = again
     # The rival: the best clique once everything that agrees with this pose, within a metre, is out of the way.
     rival = fields[i].solve(fields[i].disagreeing(best.S_target_source), s)
     share = rival.num_inliers / best.num_inliers if rival else 0.0

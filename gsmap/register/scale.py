@@ -17,13 +17,15 @@ class Params:
     bin_width: of the histogram over the logarithm of the ratio.
     min_distance_m: closer pairs say too little of the scale.
     max_correspondences: most similar candidates that vote.
+    rise_tolerance: difference of the two slopes of a pair of nodes, where gravity is known.
     num_peaks: scales that are tried.
     """
 
     max_factor: float = 1.35
     bin_width: float = 0.01
     min_distance_m: float = 1.0
-    max_correspondences: int = 700
+    max_correspondences: int = 1000
+    rise_tolerance: float = 0.06
     num_peaks: int = 3
 
 
@@ -38,25 +40,23 @@ def vote_scales(matches: Correspondences, params: Params | None = None) -> list[
     params = params or Params()
     matches = matches[np.arange(min(len(matches), params.max_correspondences))]
     i, j = np.triu_indices(len(matches), 1)
-    apart = (matches.target_ids[i] != matches.target_ids[j]) & (matches.source_ids[i] != matches.source_ids[j])
-    i, j = i[apart], j[apart]
     target, source = matches.target.astype(np.float32), matches.source.astype(np.float32)
-    dt = np.linalg.norm(target[i] - target[j], axis=1)
-    ds = np.linalg.norm(source[i] - source[j], axis=1)
-    far = (dt > params.min_distance_m) & (ds > params.min_distance_m)
-    ratio = np.log(dt[far]) - np.log(ds[far])
+    dt, ds = _lengths(target, i, j), _lengths(source, i, j)
+    use = (dt > params.min_distance_m) & (ds > params.min_distance_m)
+    use &= (matches.target_ids[i] != matches.target_ids[j]) & (matches.source_ids[i] != matches.source_ids[j])
     if matches.target_heights is not None:
-        rise_t = (matches.target_heights[i] - matches.target_heights[j])[far]
-        rise_s = (matches.source_heights[i] - matches.source_heights[j])[far]
-        level = np.abs(rise_t / dt[far] - rise_s / ds[far]) < 0.1
-        ratio = ratio[level]
-    limit = np.log(params.max_factor)
-    bins = int(np.ceil(2 * limit / params.bin_width))
-    counts, edges = np.histogram(ratio, bins, (-limit, limit))
+        # Where gravity is known a right pair of pairs also rises alike, whatever the scale.
+        rise_t, rise_s = (h.astype(np.float32) for h in (matches.target_heights, matches.source_heights))
+        use &= np.abs((rise_t[i] - rise_t[j]) * ds - (rise_s[i] - rise_s[j]) * dt) < params.rise_tolerance * dt * ds
+    ratio = np.log(dt[use]) - np.log(ds[use])
+    limit, margin = np.log(params.max_factor), 0.3
+    bins = int(np.ceil(2 * (limit + margin) / params.bin_width))
+    counts, edges = np.histogram(ratio, bins, (-limit - margin, limit + margin))
     smooth = gaussian_filter1d(counts.astype(float), 1.5)
-    background = gaussian_filter1d(counts.astype(float), 0.15 / params.bin_width)
-    score = (smooth - background) / np.sqrt(background + 1.0)
+    background = gaussian_filter1d(counts.astype(float), 0.1 / params.bin_width)
     centres = 0.5 * (edges[1:] + edges[:-1])
+    score = (smooth - background) / np.sqrt(background + 1.0)
+    score[np.abs(centres) > limit] = -np.inf
     scales: list[tuple[float, float]] = []
     for at in np.argsort(-score, kind="stable"):
         if len(scales) == params.num_peaks or score[at] <= 0:
@@ -64,3 +64,11 @@ def vote_scales(matches: Correspondences, params: Params | None = None) -> list[
         if all(abs(centres[at] - np.log(s)) > 3.5 * params.bin_width for s, _ in scales):
             scales.append((float(np.exp(centres[at])), float(score[at])))
     return scales
+
+
+def _lengths(points: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Distances between pairs of points, from their Gram matrix."""
+    points = points - points.mean(0)
+    squares = (points**2).sum(1)
+    gram = points @ points.T
+    return np.sqrt(np.maximum(squares[i] + squares[j] - 2 * gram[i, j], 0.0))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gsmap.errors import ConfigError
+from gsmap.register import surface
+from gsmap.register.surface import Surface
 from gsmap.types import Cameras, Gaussians, SceneGraph
 from gsmap.types.scene import SCALE_POLICIES
 
@@ -25,7 +27,17 @@ class SceneView:
     cameras: Cameras | None
     graph: SceneGraph
     scale_policy: str = "auto"
+    _surfaces: dict[tuple[float, surface.Params], Surface] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.scale_policy not in SCALE_POLICIES:
             raise ConfigError(f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {self.scale_policy!r}")
+
+    def surface(self, unit_m: float, params: surface.Params) -> Surface:
+        """The scene's surface in metres; the last two are kept, so a scene met by many others is prepared once."""
+        key = (unit_m, params)
+        if key not in self._surfaces:
+            while len(self._surfaces) > 1:
+                self._surfaces.pop(next(iter(self._surfaces)))
+            self._surfaces[key] = Surface.of(self.gaussians, unit_m, params)
+        return self._surfaces[key]

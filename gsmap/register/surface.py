@@ -91,30 +91,41 @@ class Surface:
         small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=20, num_threads=1)
         return cloud, tree
 
-    @property
+    @cached_property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals at the cell means; signs mean nothing."""
         return self.cloud[0].normals()[:, :3]
 
-    @property
+    @cached_property
     def lightness(self) -> np.ndarray:
         """(M,) float64 lightness of the cell means, 0 to 1."""
         return self.coarse[1].astype(np.float64) @ [0.299, 0.587, 0.114]
 
+    def lightness_gradients(self, rows: np.ndarray) -> np.ndarray:
+        """(R, 3) change of lightness per metre within the tangent plane of some cell means; each computed once."""
+        new = np.unique(rows[np.isnan(self._gradients[rows, 0])])
+        if len(new):
+            points, light = self.coarse[0], self.lightness
+            normals = self.normals[new]
+            _, near = self._tree.query(points[new], k=min(10, len(points)))
+            offset = points[near] - points[new][:, None]
+            offset -= (offset * normals[:, None]).sum(2, keepdims=True) * normals[:, None]
+            difference = light[near] - light[new][:, None]
+            # The normal is added to the normal equations: the gradient has no part along it.
+            system = offset.transpose(0, 2, 1) @ offset + self.resolution_m**2 * normals[:, :, None] * normals[:, None]
+            system += 0.1 * self.resolution_m**2 * np.eye(3)
+            self._gradients[new] = np.linalg.solve(system, (offset * difference[..., None]).sum(1)[..., None])[..., 0]
+        return self._gradients[rows]
+
     @cached_property
-    def lightness_gradients(self) -> np.ndarray:
-        """(M, 3) change of lightness per metre within the tangent plane of each cell mean."""
+    def _gradients(self) -> np.ndarray:
+        return np.full((len(self.coarse[0]), 3), np.nan)
+
+    @cached_property
+    def _tree(self) -> Any:
         from scipy.spatial import cKDTree
 
-        points, light, normals = self.coarse[0], self.lightness, self.normals
-        _, near = cKDTree(points).query(points, k=min(10, len(points)))
-        offset = points[near] - points[:, None]
-        offset -= (offset * normals[:, None]).sum(2, keepdims=True) * normals[:, None]
-        difference = light[near] - light[:, None]
-        # The normal is added to the normal equations: the gradient has no part along it.
-        system = offset.transpose(0, 2, 1) @ offset + self.resolution_m**2 * normals[:, :, None] * normals[:, None]
-        system += 0.1 * self.resolution_m**2 * np.eye(3)
-        return np.linalg.solve(system, (offset * difference[..., None]).sum(1)[..., None])[..., 0]
+        return cKDTree(self.coarse[0])
 
     def nearest(self, points: np.ndarray, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
         """Distance to and row of the nearest cell mean of each point; inf and 0 where none lies within the radius."""

@@ -42,7 +42,7 @@ class Params:
     strong_colour_correlation: float = 0.18
     strong_colour_t: float = 3.0
     min_seen: int = 100
-    max_rotation_sigma_deg: float = 1.0
+    max_rotation_sigma_deg: float = 1.5
     max_translation_sigma_m: float = 0.05
     max_scale_sigma: float = 0.01
 

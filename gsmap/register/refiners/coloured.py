@@ -17,7 +17,8 @@ class Params:
     """Args (metres):
     radii_m: correspondence distances, coarse to fine.
     iterations: Gauss-Newton steps at each.
-    colour_weight: metres of distance that one standard deviation of local colour counts for; 0 leaves colour out.
+    colour_weight: metres of distance that one standard deviation of local colour counts for, at the finest radius;
+        0 leaves colour out.
     max_points: source cells that take part at each radius.
     """
 
@@ -41,7 +42,6 @@ def refine(
     anchors = target.coarse[0]
     if len(source) < 10 or len(target) < 10:
         return start
-    lightness_t, gradients = target.lightness, target.lightness_gradients
     for radius, count in zip(params.radii_m, params.max_points, strict=True):
         chosen = source.sample(count)
         points, light = source.coarse[0][chosen], source.lightness[chosen]
@@ -61,14 +61,15 @@ def refine(
             jacobian = point_to_plane_jacobian(centred, points[hit] - centre, normals)
             system = (jacobian * weights[:, None]).T @ jacobian
             gradient = (jacobian * weights[:, None]).T @ plane
-            if params.colour_weight > 0:
-                expected = lightness_t[row] + (gradients[row] * offset).sum(1)
+            if params.colour_weight > 0 and radius == params.radii_m[-1]:
+                gradients = target.lightness_gradients(row)
+                expected = target.lightness[row] + (gradients * offset).sum(1)
                 gain, bias = _exposure(expected, light[hit])
                 colour = expected - gain * light[hit] - bias
                 spread = 1.4826 * np.median(np.abs(colour)) + 1e-6
                 factor = params.colour_weight / spread
                 tint = weights / (1.0 + (colour / (2 * spread)) ** 2) ** 2
-                jacobian = point_to_plane_jacobian(centred, points[hit] - centre, gradients[row]) * factor
+                jacobian = point_to_plane_jacobian(centred, points[hit] - centre, gradients) * factor
                 system += (jacobian * tint[:, None]).T @ jacobian
                 gradient += (jacobian * tint[:, None]).T @ (colour * factor)
             step = np.zeros(7)

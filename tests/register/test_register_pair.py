@@ -1,0 +1,189 @@
+"""Registering pairs end to end, on rooms made for the purpose: right poses accepted, everything else refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from register_worlds import splat_world
+
+from gsmap.errors import ConfigError
+from gsmap.evaluate.registration import pose_error, scene_centroid
+from gsmap.register import Params, SceneView, register_pair
+from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph, Sim3
+
+
+def _error(world, found):
+    return pose_error(found.S_target_source, world.S_target_source, scene_centroid(world.source.gaussians))
+
+
+def test_overlapping_captures_are_accepted_to_the_millimetre():
+    world = splat_world(0)
+    found = register_pair(world.target, world.source)
+    assert (found.status, found.reason) == ("accepted", "")
+    error = _error(world, found)
+    assert error.rre_deg < 0.1
+    assert error.centroid_m < 0.01
+    assert found.S_target_source.is_rigid
+    assert (found.target, found.source, found.method) == ("s0", "s1", "landmarks")
+    assert 0.1 < found.overlap < 0.8
+    assert found.evidence["log_nfa"] < -10
+    assert set(found.seconds) >= {"match", "refine", "verdict"}
+
+
+def test_the_answer_is_the_same_both_ways_and_twice():
+    world = splat_world(1)
+    there, back = register_pair(world.target, world.source), register_pair(world.source, world.target)
+    loop = there.S_target_source @ back.S_target_source
+    moved = loop.apply(world.target.gaussians.means)
+    assert np.abs(moved - world.target.gaussians.means).max() < 0.02
+    again = register_pair(world.target, world.source)
+    assert np.array_equal(again.S_target_source.matrix(), there.S_target_source.matrix())
+    assert np.array_equal(again.information, there.information)
+
+
+@pytest.mark.parametrize("scale", [0.27, 4.0])
+def test_unknown_scale_is_found(scale):
+    world = splat_world(2, scale=scale, policy="unknown")
+    found = register_pair(world.target, world.source)
+    assert found.status == "accepted"
+    error = _error(world, found)
+    assert error.rse < 0.005
+    assert error.rre_deg < 0.2
+    assert error.centroid_m < 0.02
+    # The scale is measured: its information is finite, a rigid edge's is stiff.
+    assert found.information[6, 6] < 1e8
+
+
+def test_auto_snaps_to_rigid_only_when_the_scale_is_one():
+    rigid = register_pair(*_views(splat_world(3)))
+    assert rigid.S_target_source.is_rigid
+    assert rigid.information[6, 6] > 1e8
+    scaled = splat_world(3, scale=1.4)
+    found = register_pair(*_views(scaled))
+    assert found.status == "accepted"
+    assert abs(found.scale / 1.4 - 1) < 0.005
+
+
+def _views(world):
+    return world.target, world.source
+
+
+def test_known_scale_never_scales():
+    world = splat_world(4, scale=1.4, policy="known")
+    assert register_pair(world.target, world.source).status != "accepted"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_different_places_are_never_accepted(seed):
+    world = splat_world(seed, place=(20 + seed, 40 + seed))
+    found = register_pair(world.target, world.source)
+    assert found.status != "accepted"
+    assert found.reason
+
+
+def test_look_alike_nodes_do_not_carry_a_pose_that_the_surfaces_contradict():
+    # The source shows another room, but its graph is that of the target's: a significant clique, and a wrong one.
+    right, other = splat_world(5), splat_world(5, place=(7, 8))
+    source = replace(other.source, graph=right.source.graph)
+    found = register_pair(right.target, source)
+    assert found.evidence["log_nfa"] < -10
+    assert found.status == "rejected"
+    assert "colour" in found.reason or "contradict" in found.reason
+
+
+def test_repainted_room_in_another_shape_is_contradicted_by_free_space():
+    right = splat_world(6)
+    g = right.source.gaussians
+    # A wall of points of plausible colours across what the target's cameras saw as empty.
+    inside = right.S_target_source.inverse()
+    rng = np.random.default_rng(0)
+    wall = np.c_[np.full(9000, 3.0), rng.uniform(0, 4, 9000), rng.uniform(0, 2.5, 9000)]
+    extra = Gaussians(
+        inside.apply(wall), np.tile([1.0, 0, 0, 0], (9000, 1)), np.full((9000, 3), np.log(0.02)), np.full(9000, 3.0),
+        np.zeros((9000, 1, 3)),
+    )  # fmt: skip
+    found = register_pair(right.target, replace(right.source, gaussians=Gaussians.concatenate([g, extra])))
+    assert found.evidence["contradiction"] > 0.15
+    assert found.status == "rejected"
+
+
+def test_without_cameras_the_rest_still_decides():
+    world = splat_world(7, with_cameras=False)
+    found = register_pair(world.target, world.source)
+    assert found.status == "accepted"
+    assert np.isnan(found.evidence["contradiction"])
+
+
+def test_surfaces_propose_where_graphs_are_poor():
+    world = splat_world(8, cut_m=(5.0, 1.0))
+    few = {k: _first(layer, 4) for k, layer in world.target.graph.layers.items()}
+    target = replace(world.target, graph=replace(world.target.graph, layers=few))
+    found = register_pair(target, world.source)
+    assert found.method == "dense"
+    assert found.status == "accepted"
+    assert _error(world, found).rre_deg < 0.2
+    assert "fallback" in found.seconds
+    assert register_pair(target, world.source, Params(fallback="never")).status == "no_match"
+
+
+def _first(layer: NodeLayer, n: int) -> NodeLayer:
+    names = ("positions", "embeddings", "types", "weights", "extents", "features", "num_views")
+    return NodeLayer(*(getattr(layer, k)[:n] for k in names), method=layer.method, unit_m=layer.unit_m)
+
+
+def test_scenes_with_nothing_in_them_do_not_match():
+    world = splat_world(9, points=5000)
+    empty = SceneView("e", Gaussians.empty(), None, SceneGraph("e"))
+    bare = replace(world.source, graph=SceneGraph("s1"))
+    faint = replace(world.source.gaussians, logit_opacities=np.full(len(world.source.gaussians), -6.0))
+    for source in (empty, bare, replace(world.source, gaussians=faint)):
+        for pair in ((world.target, source), (source, world.target)):
+            found = register_pair(*pair)
+            assert found.status in ("no_match", "rejected")
+            assert found.reason
+    one = replace(world.source.graph, layers={k: _first(v, 1) for k, v in world.source.graph.layers.items()})
+    assert register_pair(world.target, replace(world.source, graph=one), Params(fallback="never")).status == "no_match"
+
+
+def test_collinear_nodes_are_refused_with_that_reason():
+    world = splat_world(10)
+    layers = {}
+    line = np.linspace(0, 5, 60)[:, None] * [1.0, 0.0, 0.0] + [0.0, 2.0, 0.5]
+    for view, name in ((world.target, "t"), (world.source, "s")):
+        move = Sim3.identity() if name == "t" else world.S_target_source.inverse()
+        layers[name] = {}
+        for k, v in view.graph.layers.items():
+            known = world.target.graph.layers[k].embeddings[:60]
+            layers[name][k] = replace(_first(v, 60), positions=move.apply(line), embeddings=known, types=np.zeros(60))
+    target = replace(world.target, graph=replace(world.target.graph, layers=layers["t"]))
+    source = replace(world.source, graph=replace(world.source.graph, layers=layers["s"]))
+    found = register_pair(target, source, Params(fallback="never"))
+    assert found.status in ("rejected", "no_match")
+    assert "line" in found.reason
+
+
+def test_cameras_inside_walls_do_no_harm():
+    world = splat_world(11)
+    cameras = world.target.cameras
+    poses = cameras.T_frame_camera.copy()
+    poses[:, :3, 3] = [0.0, 0.0, 0.0]  # a corner of the room
+    buried = Cameras(poses, cameras.intrinsics_px, cameras.sizes_px)
+    found = register_pair(replace(world.target, cameras=buried), world.source)
+    assert found.status == "accepted"
+    assert _error(world, found).centroid_m < 0.01
+
+
+def test_options_that_do_not_exist_are_refused():
+    with pytest.raises(ConfigError, match="refiner"):
+        Params(refiner="magic")
+    with pytest.raises(ConfigError, match="scale policy"):
+        replace(splat_world(0, points=1000).target, scale_policy="maybe")
+
+
+def test_progress_rises_to_one():
+    seen = []
+    world = splat_world(12, points=20_000)
+    register_pair(world.target, world.source, progress=lambda fraction, text: seen.append(fraction))
+    assert seen[0] == 0.0
+    assert seen[-1] == 1.0
+    assert seen == sorted(seen)
