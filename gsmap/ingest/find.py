@@ -61,9 +61,11 @@ def find_captures(paths: Iterable[str | os.PathLike[str]]) -> list[Found]:
 
 
 def _folder(folder: Path, depth: int) -> list[Found]:
-    trained = _last(folder.glob("point_cloud/iteration_*/point_cloud.*")) or _last(folder.glob("ply/point_cloud_*.*"))
-    if trained is not None:
-        return [_file(trained, alone=True)]
+    whole = _last(folder.glob("point_cloud/iteration_*/point_cloud.*")) or _last(folder.glob("ply/point_cloud_*.*"))
+    if whole is None and (folder / "tileset.json").is_file():  # its tiles are parts of one scene
+        whole = folder / "tileset.json"
+    if whole is not None:
+        return [_file(whole, alone=True)]
     files = _splats(folder)
     out = [_file(path, alone=len(files) == 1) for path in files]
     if depth > 0:
@@ -97,7 +99,7 @@ def _file(path: Path, *, alone: bool) -> Found:
         )
     stem = path.name[: -len(suffix)]
     name, folder = stem, path.resolve().parent
-    while _GENERIC.fullmatch(name) or _GENERIC_FOLDER.fullmatch(name):
+    while not name or _GENERIC.fullmatch(name) or _GENERIC_FOLDER.fullmatch(name):
         if not folder.name:
             name = stem
             break

@@ -72,11 +72,10 @@ class Catalog:
                     yield connection
             finally:
                 self._held.connection = None
-            if self.is_sqlite:
-                sqlite.checkpoint(self.engine, self.folder / sqlite.FILE)
+            self._checkpoint(at_bytes=sqlite.CHECKPOINT_BYTES)
 
     @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
+    def lock(self, patience_s: float | None = None) -> Iterator[None]:
         """Hold the map's writer lock (again in the same thread: nothing). The kernel frees it when a process dies.
 
         Raises:
@@ -93,7 +92,8 @@ class Catalog:
         except OSError as error:
             raise StoreError(f"cannot write to {self.folder}: {error.strerror}") from error
         try:
-            deadline = time.monotonic() + self.patience_s
+            patience_s = self.patience_s if patience_s is None else patience_s
+            deadline = time.monotonic() + patience_s
             while True:
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -101,7 +101,7 @@ class Catalog:
                 except BlockingIOError:
                     if time.monotonic() > deadline:
                         raise BusyError(
-                            f"{self.folder}: others have been writing for {self.patience_s:g} s; try again later"
+                            f"{self.folder}: others have been writing for {patience_s:g} s; try again later"
                         ) from None
                     time.sleep(0.01)
             self._held.depth = 1
@@ -111,7 +111,15 @@ class Catalog:
             os.close(handle)
 
     def close(self) -> None:
+        """Leave one file at rest, unless others are still at it."""
+        if self.writable and self.is_sqlite:
+            with contextlib.suppress(GsmapError), explained(self.folder), self.lock(patience_s=0.0):
+                self._checkpoint(at_bytes=1)
         self.engine.dispose()
+
+    def _checkpoint(self, at_bytes: int) -> None:
+        if self.is_sqlite:
+            sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:

@@ -66,6 +66,7 @@ def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) ->
     if catalog.is_sqlite:
         with explained(catalog.folder):
             problems += sqlite.integrity_problems(catalog.engine)
+            problems += sqlite.digest_problems(catalog.folder / sqlite.FILE)
     for i, (group, kind) in enumerate(named.items()):
         if progress:
             progress(i / len(named), f"{kind}/{group[:12]}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,7 @@ from sqlalchemy import Connection, Engine, create_engine, event
 from gsmap.errors import StoreError
 
 FILE = "map.sqlite"
+DIGEST_FILE = "map.sqlite.sha256"
 CHECKPOINT_BYTES = 4 << 20
 
 
@@ -50,18 +54,45 @@ def create_file(file: Path) -> None:
     connection.close()
 
 
-def checkpoint(engine: Engine, file: Path) -> None:
-    """Fold a grown log into the database. Only under the writer lock: before 3.51.3 a commit meanwhile can corrupt."""
+def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
+    """Fold a log of at least this size into the database, and note the digest of the result.
+
+    Only under the writer lock: in SQLite before 3.51.3 a commit at the same time can corrupt the file.
+    """
     log = file.with_name(file.name + "-wal")
-    if log.exists() and log.stat().st_size > CHECKPOINT_BYTES:
+    if log.exists() and log.stat().st_size >= at_bytes:
         _raw(engine, "PRAGMA wal_checkpoint(TRUNCATE)")
+        _note_digest(file)
 
 
 def integrity_problems(engine: Engine) -> list[str]:
-    """What SQLite itself finds wrong with the file."""
+    """What SQLite itself finds wrong with its structure; it does not notice other bytes than those written."""
     rows = [row[0] for row in _raw(engine, "PRAGMA integrity_check")]
     out = [] if rows == ["ok"] else [str(r) for r in rows]
     return out + [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in _raw(engine, "PRAGMA foreign_key_check")]
+
+
+def digest_problems(file: Path) -> list[str]:
+    """Whether the file still has the bytes of the last `checkpoint`; nothing is known of one touched since then.
+
+    SQLite keeps no checksums, so a flipped bit in a name or a pose would go unnoticed. A disk that goes bad leaves the
+    time of the last change as it was; whatever wrote to the file since did not.
+    """
+    try:
+        noted = json.loads(file.with_name(DIGEST_FILE).read_text())
+        if not _same_stamp(file, noted):
+            return []
+        with open(file, "rb") as opened:
+            found = hashlib.file_digest(opened, "sha256").hexdigest()
+        return (
+            []
+            if found == noted["sha256"] or not _same_stamp(file, noted)
+            else [f"{file} differs from what was written"]
+        )
+    except FileNotFoundError:
+        return []
+    except (ValueError, KeyError, TypeError):
+        return [f"{file.with_name(DIGEST_FILE)} is damaged"]
 
 
 def backup(engine: Engine, target: Path) -> None:
@@ -75,6 +106,21 @@ def backup(engine: Engine, target: Path) -> None:
         connection.close()
 
 
+def _note_digest(file: Path) -> None:
+    before = file.stat()
+    with open(file, "rb") as opened:
+        sha256 = hashlib.file_digest(opened, "sha256").hexdigest()
+    note = {"sha256": sha256, "size_bytes": before.st_size, "mtime_ns": before.st_mtime_ns}
+    staged = file.with_name(f".{DIGEST_FILE}")
+    staged.write_text(json.dumps(note))
+    os.replace(staged, file.with_name(DIGEST_FILE))
+
+
+def _same_stamp(file: Path, noted: dict[str, Any]) -> bool:
+    now = file.stat()
+    return (now.st_size, now.st_mtime_ns) == (noted["size_bytes"], noted["mtime_ns"])
+
+
 def _raw(engine: Engine, statement: str) -> list[Any]:
     connection = engine.raw_connection()  # a PRAGMA that must run outside any transaction
     try:
@@ -84,8 +130,6 @@ def _raw(engine: Engine, statement: str) -> list[Any]:
 
 
 def _on_read_only_disk(file: Path) -> bool:
-    import os
-
     if os.access(file.parent, os.W_OK):
         return False
     log = file.with_name(file.name + "-wal")

@@ -109,6 +109,14 @@ def test_colmap_beside_the_file(tmp_path):
     assert capture.cameras.names == ("a.jpg",)
 
 
+def test_tiles_are_one_scene(tmp_path):
+    out = tmp_path / "town"
+    out.mkdir()
+    write(out / "tileset.json", box(500))
+    (capture,) = read_captures(out)
+    assert (capture.name, len(capture.gaussians)) == ("town", 500)
+
+
 def test_cameras_may_lie_elsewhere(tmp_path):
     (tmp_path / "a").mkdir()
     write(tmp_path / "a" / "hall.ply", box())
