@@ -17,7 +17,7 @@ from gsmap.errors import ConfigError, InputError
 from gsmap.merge import mergers
 from gsmap.merge.parts import MergeResult, Part, inside
 
-__all__ = ["MergeResult", "Part", "default_params", "merge", "methods", "reach_m"]
+__all__ = ["MergeResult", "Part", "default_params", "merge", "methods", "reach_m", "reading_m"]
 
 
 def methods() -> list[str]:
@@ -31,8 +31,14 @@ def default_params(method: str) -> object:
 
 
 def reach_m(method: str, params: object | None = None) -> float:
-    """How far beyond a tile's bounds the parts given to `merge` must reach, in metres."""
+    """How far beyond a tile's border the Gaussians of scenes decide what is in it, in metres."""
     return _merger(method).reach_m(params or default_params(method))
+
+
+def reading_m(method: str, params: object | None = None) -> float:
+    """How far beyond a tile's border the parts given to `merge` should reach: cameras may stand farther away."""
+    merger = _merger(method)
+    return getattr(merger, "reading_m", merger.reach_m)(params or default_params(method))
 
 
 def merge(
@@ -47,7 +53,7 @@ def merge(
     """Merge parts that lie in one frame.
 
     Args:
-        parts: captures in the map frame. For a tile, all of their Gaussians within `reach_m` of the bounds.
+        parts: captures in the map frame. For a tile, all of their Gaussians within `reading_m` of the bounds.
         method: one of `methods()`.
         params: the method's ``Params``; None takes the defaults.
         bounds: (2, 3) lowest and highest corner of a tile; the result holds the Gaussians whose mean lies in it, and

@@ -13,6 +13,7 @@ from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
 
 _MIN_SEEN = 0.02  # share of a picture that must show the tile
+_MARGIN_PX = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +21,12 @@ class References:
     """V pictures to reproduce.
 
     Args:
-        cameras: V cameras, map frame.
+        cameras: V cameras, map frame, cropped to what counts.
         images: V pictures (H, W, 3) uint8.
         weights: V maps (H, W) uint8, 255 where the picture is to be believed and 0 where it says nothing: where the
             capture saw nothing, and outside the tile.
         part: (V,) which part each was rendered from.
-        share: (V,) how much of each picture counts, in [0, 1].
+        share: (V,) how much of each camera's whole picture counts, in [0, 1].
         shown: per part (N_part,) float32: in how many pixels of its own views each Gaussian dominates; below 1 where
             in none; 1 for all where there are no views.
     """
@@ -69,9 +70,10 @@ def render_references(
         share = float(weight.mean())
         if share < _MIN_SEEN:
             continue
-        cameras.append(camera)
-        images.append(np.round(np.clip(seen.colour[0], 0, 1) * 255).astype(np.uint8))
-        weights.append(np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8))
+        window = _window(weight)
+        cameras.append(_cropped(camera, window))
+        images.append(np.round(np.clip(seen.colour[0][window], 0, 1) * 255).astype(np.uint8))
+        weights.append(np.round(np.clip(weight[window], 0, 1) * 255).astype(np.uint8))
         kept.append(i)
         shares.append(share)
     shown = [_shown(p, w, whole=bounds is None) for p, w in zip(pixels, largest, strict=True)]
@@ -82,6 +84,22 @@ def _count(seen: Rendered, pixels: np.ndarray, largest: np.ndarray) -> None:
     dominant = seen.dominant_id[seen.dominant_id >= 0]
     pixels += np.bincount(dominant, minlength=len(pixels))
     np.maximum(largest, seen.max_weight, out=largest)
+
+
+def _window(weight: np.ndarray) -> tuple[slice, slice]:
+    """The part of a picture that counts, with a margin for windows of SSIM."""
+    spans = []
+    for axis in (1, 0):
+        used = np.flatnonzero(weight.any(axis=axis))
+        spans.append(slice(max(0, used[0] - _MARGIN_PX), min(weight.shape[1 - axis], used[-1] + 1 + _MARGIN_PX)))
+    return spans[0], spans[1]
+
+
+def _cropped(camera: Cameras, window: tuple[slice, slice]) -> Cameras:
+    rows, columns = window
+    intrinsics = camera.intrinsics_px - [0, 0, columns.start, rows.start]
+    size = [[columns.stop - columns.start, rows.stop - rows.start]]
+    return Cameras(camera.T_frame_camera, intrinsics, np.array(size), camera.names)
 
 
 def _shown(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.merge import MergeResult, Part, merge, reach_m
+from gsmap.merge import MergeResult, Part, merge, reading_m
 from gsmap.merge.parts import inside
 from gsmap.types import Cameras, Gaussians, Sim3
 
@@ -47,11 +47,11 @@ def merge_tile(
 ) -> MergeResult:
     """Read what lies around a tile, bring it to the map frame and merge it; see `gsmap.merge.merge`.
 
-    Memory is bounded by what lies within `reach_m` of the tile. ``origin`` of the result counts in ``sources``.
+    Memory is bounded by what lies within `reading_m` of the tile. ``origin`` of the result counts in ``sources``.
     """
     if not sources:
         raise InputError("nothing to merge: no scene touches the tile")
-    reach = reach_m(method, params)
+    reach = reading_m(method, params)
     parts = [_read(source, bounds, reach) for source in sources]
     if method == "distance" and bounds is not None:
         parts = [replace(part, centroid=_centroid(source)) for part, source in zip(parts, sources, strict=True)]

@@ -27,6 +27,7 @@ _RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 5
 _LAST_RATE = 0.1  # of the first, reached exponentially
 _SSIM_WEIGHT = 0.2
 _COVER_M = 0.1  # an owner's Gaussian this near stands for another capture's
+_MIN_PASS = 20  # steps, for a tile that few pixels show
 _SURE_SHARE = 0.5  # of the steps that are taken whatever they gain: the first, long ones may lose
 _GAIN_PER_PASS = 0.002  # stop when a pass over all views lowers the loss by less than this share
 
@@ -37,7 +38,7 @@ class Params:
     keep: at most this share of the Gaussians that went in.
     voxel_m: side of the voxels in which Gaussians are first merged.
     cell_m: side of the cells that are given to one capture each.
-    passes: how often each view is used, where steps are not given; fewer when it no longer gains.
+    passes: how often each pixel of the references is used, where steps are not given; fewer when it no longer gains.
     steps: how many optimisation steps, exactly.
     halo_m: how far around a tile its surroundings are rendered along, frozen.
     reach_m: how far around a tile cameras are looked for.
@@ -61,6 +62,10 @@ class Params:
 
 
 def reach_m(params: Params) -> float:
+    return params.halo_m
+
+
+def reading_m(params: Params) -> float:
     return params.halo_m + params.reach_m
 
 
@@ -121,7 +126,8 @@ def _fit(
     progress: Callable[[float, str], None],
 ) -> tuple[Gaussians, int, bool]:
     """The start fitted to the references; steps taken; whether time ran out."""
-    steps = params.steps if params.steps is not None else round(params.passes * len(references))
+    one_pass = max(_MIN_PASS, round(references.share.sum()))
+    steps = params.steps if params.steps is not None else round(params.passes * one_pass)
     fitter = Fitter(start, frozen=frozen, ssim_weight=_SSIM_WEIGHT)
     cameras = [references.cameras[v] for v in range(len(references))]
     losses: list[float] = []
@@ -132,14 +138,14 @@ def _fit(
         losses.append(fitter.step(cameras[view], references.images[view][None], references.weights[view][None]))
         if step % 20 == 0:
             progress(0.2 + 0.8 * step / steps, f"optimising, loss {np.mean(losses[-20:]):.4f}")
-        if params.steps is None and step > _SURE_SHARE * steps and _gains_nothing(losses, len(references)):
+        if params.steps is None and step > _SURE_SHARE * steps and _gains_nothing(losses, one_pass):
             break
     return fitter.gaussians(), len(losses), False
 
 
-def _gains_nothing(losses: list[float], views: int) -> bool:
+def _gains_nothing(losses: list[float], one_pass: int) -> bool:
     """Whether the last pass over all views was hardly better than the one before."""
-    if len(losses) % views or len(losses) < 2 * views:
+    if len(losses) % one_pass or len(losses) < 2 * one_pass:
         return False
-    before, now = np.mean(losses[-2 * views : -views]), np.mean(losses[-views:])
+    before, now = np.mean(losses[-2 * one_pass : -one_pass]), np.mean(losses[-one_pass:])
     return bool(now > (1 - _GAIN_PER_PASS) * before)
