@@ -90,7 +90,7 @@ def walk(place: Place, route: Sequence[int], num_frames: int, seed: int = 0) -> 
 
 def _look_around(room: Room, count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """A loop around the free middle of a room, turning twice, so that every direction is seen from two places."""
-    radii = np.maximum(0.5 * room.size_m - 0.85, 0.3)
+    radii = np.maximum(0.5 * room.size_m - 0.8, 0.3) * rng.uniform(0.6, 1.0, 2)
     phase, turn = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
     yaw0, tilt0, sway = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.3)
     out = []
@@ -160,9 +160,10 @@ def film(
     skin = place.skin.with_shut(shut)
     fine, centre = _pixel_rays(size_px, focal, 2), _pixel_rays(size_px, focal, 1)
     for i, pose in enumerate(poses):
-        colour = _look(skin, pose, fine, 0.5 / focal).reshape(height, 2, width, 2, 3).mean((1, 3))
+        colour = _look(skin, pose, fine, 0.5 / focal).reshape(height, 2, width, 2, 3)
+        colour = 0.25 * (colour[:, 0, :, 0] + colour[:, 0, :, 1] + colour[:, 1, :, 0] + colour[:, 1, :, 1])
         images[i] = np.round(255 * np.clip(gain * colour**gamma, 0, 1))
-        distance, *_ = skin.cast(np.broadcast_to(pose[:3, 3], centre.shape), centre @ pose[:3, :3].T)
+        distance, *_ = skin.cast(*_placed(centre, pose))
         depths[i] = np.where(np.isfinite(distance), distance, 0).reshape(
             height, width
         )  # Rays have unit z: this is depth.
@@ -177,13 +178,19 @@ def _pixel_rays(size_px: tuple[int, int], focal: float, samples: int) -> np.ndar
     x = ((np.arange(width * samples) + 0.5) / samples - width / 2) / focal
     y = ((np.arange(height * samples) + 0.5) / samples - height / 2) / focal
     xx, yy = np.meshgrid(x, y)
-    return np.stack([xx, yy, np.ones_like(xx)], axis=-1).reshape(-1, 3)
+    return np.stack([xx, yy, np.ones_like(xx)], axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+def _placed(rays: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of camera-frame rays in the place's frame."""
+    # einsum, not matmul: so thin a product gains nothing from BLAS threads and loses much when cores are busy.
+    directions = np.einsum("nj,ij->ni", rays, pose[:3, :3].astype(np.float32))
+    return np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape), directions
 
 
 def _look(skin: Skin, pose: np.ndarray, rays: np.ndarray, pixel: float) -> np.ndarray:
     """(n, 3) colours seen along camera-frame rays of unit depth; black where there is nothing."""
-    distance, quad, s, t = skin.cast(np.broadcast_to(pose[:3, 3], rays.shape), rays @ pose[:3, :3].T)
+    distance, quad, s, t = skin.cast(*_placed(rays, pose))
     hit = np.isfinite(distance)
-    out = np.zeros((len(rays), 3), np.float32)
-    out[hit] = skin.colour(quad[hit], s[hit], t[hit], pixel * distance[hit])
-    return out
+    colours = skin.colour(quad, s, t, pixel * np.where(hit, distance, 1))
+    return colours if hit.all() else colours * hit[:, None]
