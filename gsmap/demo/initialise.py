@@ -10,7 +10,7 @@ from gsmap.geometry.rotations import matrices_to_quats
 from gsmap.types import Gaussians
 
 _SH0 = 0.28209479177387814
-_EVEN = 0.01  # Weight of a blank surface against one of that contrast per pixel.
+_EVEN = 0.02  # Weight of a blank surface against one of that contrast per pixel.
 _REACH = 0.6
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from gsmap.demo.capture import Frames, default_routes, film, unused_doors, walk
 from gsmap.demo.initialise import from_depth
 from gsmap.demo.place import Place, make_place
+from gsmap.demo.train import Params, train
 from gsmap.errors import ConfigError
 from gsmap.types import Cameras, Gaussians, Sim3
 
@@ -41,7 +42,7 @@ def make_captures(
     seed: int = 0,
     num_captures: int = 3,
     *,
-    steps: int = 0,
+    steps: int = 600,
     num_frames: int = 60,
     num_gaussians: int = 50_000,
     size_px: tuple[int, int] = (320, 240),
@@ -108,9 +109,7 @@ def fit_frames(
     gaussians = from_depth(frames, num_gaussians, seed)
     if steps == 0:
         return gaussians
-    from gsmap.demo.train import train
-
-    return train(gaussians, frames, steps=steps, seed=seed, progress=progress)
+    return train(gaussians, frames, Params(steps=steps), seed=seed, progress=progress)
 
 
 def put_in_own_frame(

@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gsmap.demo import make_captures, make_place, write_captures
+from gsmap.demo import make_captures, write_captures
 from gsmap.types import Sim3
-
-
-@pytest.fixture(scope="module")
-def place():
-    return make_place(0, texel_m=0.05)
 
 
 @pytest.fixture(scope="module")
 def captures(place):
     return make_captures(
-        0,
         3,
+        3,
+        steps=0,
         place=place,
         num_frames=24,
         num_gaussians=6000,
@@ -63,8 +59,9 @@ def test_captures_overlap_pairwise(captures):
 
 def test_same_seed_same_captures(place, captures):
     again = make_captures(
-        0,
         3,
+        3,
+        steps=0,
         place=place,
         num_frames=24,
         num_gaussians=6000,
