@@ -6,9 +6,9 @@
 namespace gsmap {
 
 constexpr int kTile = 32;        // pixels; larger tiles make fewer intersections, smaller ones cull better
-constexpr int kBlock = 8;        // pixels; Gaussians are culled exactly against 8x8 blocks inside a tile
+constexpr int kBlockX = 8, kBlockY = 8;  // pixels; Gaussians are culled exactly against such blocks inside a tile
 constexpr int kChunk = 1024;     // Gaussians per task of the projection
-constexpr int kRound = 256;      // Gaussians of a tile that are worked on together, in L1
+constexpr int kRound = 64;      // Gaussians of a tile that are worked on together, in L1
 constexpr float kMinAlpha = 1.f / 255.f, kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kNear = 0.01f, kDilation = 0.3f;
 

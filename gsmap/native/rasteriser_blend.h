@@ -4,47 +4,45 @@
 
 namespace GSMAP_ISA {
 
-struct BlendScratch {
-    Round round;
-    alignas(64) TilePixels t, r, g, b, depth, best;
-    alignas(64) int32_t id[kBlocks][kPixels];
-    M alive[kBlocks][kVectors];
+constexpr int kGroup = W == 16 ? kVectors : 2;  // vectors whose state fits the registers
+
+// The pixels of one block: transmittance, what is blended so far, the largest weight and whose it was.
+struct alignas(64) BlendBlock {
+    float t[kPixels], r[kPixels], g[kPixels], b[kPixels], depth[kPixels], best[kPixels];
+    int32_t id[kPixels];
+    M alive[kVectors];
 };
-static thread_local BlendScratch blend_scratch;
 
 template <bool kDepth, bool kId, bool kWeight>
-INLINE void blend_group(BlendScratch &s, const Lanes &lanes, int b, int column, int row, const TileWork &work,
-                        const uint32_t *ids, float *max_weight) {
-    constexpr int kGroup = W == 16 ? 4 : 2;  // vectors whose state fits the registers
-    const Round &round = s.round;
-    const float left = float(b % kAcross * kBlock), top = float(b / kAcross * kBlock);
-    V t[kGroup], r[kGroup], g[kGroup], bl[kGroup], d[kGroup], best[kGroup], py[kGroup];
+INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, int b, int column, int row,
+                        float *max_weight) {
+    const uint32_t *ids = (const uint32_t *)round.field[ID];
+    const float left = float(b % kAcross * kBlockX), top = float(b / kAcross * kBlockY);
+    V t[kGroup], r[kGroup], g[kGroup], bl[kGroup], d[kGroup], best[kGroup];
     I id[kGroup];
     M alive[kGroup];
     int at[kGroup];
-    const V px = lanes.x[column];
     for (int v = 0; v < kGroup; v++) {
         const int k = (row + v) * kColumns + column;
         at[v] = k;
-        t[v] = load(&s.t[b][k * W]), r[v] = load(&s.r[b][k * W]), g[v] = load(&s.g[b][k * W]);
-        bl[v] = load(&s.b[b][k * W]), alive[v] = s.alive[b][k];
-        if (kDepth) d[v] = load(&s.depth[b][k * W]);
-        if (kId) best[v] = load(&s.best[b][k * W]), id[v] = *(const I *)&s.id[b][k * W];
-        py[v] = lanes.y + float((row + v) * kRows);
+        t[v] = load(&s.t[k * W]), r[v] = load(&s.r[k * W]), g[v] = load(&s.g[k * W]);
+        bl[v] = load(&s.b[k * W]), alive[v] = s.alive[k];
+        if (kDepth) d[v] = load(&s.depth[k * W]);
+        if (kId) best[v] = load(&s.best[k * W]), id[v] = *(const I *)&s.id[k * W];
     }
     for (int i = 0; i < round.listed[b]; i++) {
         const int j = round.list[b][i];
-        const Splat splat(round, j, left, top);
+        Splat splat(round, lanes, j, left, top, row);
         const V cr = set1(round.field[R][j]), cg = set1(round.field[G][j]), cb = set1(round.field[B][j]);
         const V depth = kDepth ? set1(round.field[DEPTH][j]) : V{};
         V most{};
         for (int v = 0; v < kGroup; v++) {
-            V u, w;
-            const V alpha = min(splat.alpha(px, py[v], u, w), set1(kMaxAlpha));
-            const V weight = alpha * t[v], rest = t[v] - weight;
-            const M touched = ge(alive[v], alpha, set1(kMinAlpha));
+            const V alpha = min(splat.alpha(splat.u_at(column)), set1(kMaxAlpha));
+            splat.next_row();
+            const V weight = alpha * t[v], rest = fnma(alpha, t[v], t[v]);
+            const M touched = both(ge(alpha, set1(kMinAlpha)), alive[v]);
             const M drawn = gt(touched, rest, set1(kMinTransmittance));
-            alive[v] = (M)(alive[v] ^ touched ^ drawn);  // whoever would fall to 1e-4 stops before
+            alive[v] = first_not_second(alive[v], differ(touched, drawn));  // who would fall to 1e-4 stops before
             r[v] = fma_where(drawn, weight, cr, r[v]);
             g[v] = fma_where(drawn, weight, cg, g[v]);
             bl[v] = fma_where(drawn, weight, cb, bl[v]);
@@ -70,53 +68,55 @@ INLINE void blend_group(BlendScratch &s, const Lanes &lanes, int b, int column, 
     }
     for (int v = 0; v < kGroup; v++) {
         const int k = at[v];
-        store(&s.t[b][k * W], t[v]), store(&s.r[b][k * W], r[v]), store(&s.g[b][k * W], g[v]);
-        store(&s.b[b][k * W], bl[v]), s.alive[b][k] = alive[v];
-        if (kDepth) store(&s.depth[b][k * W], d[v]);
-        if (kId) store(&s.best[b][k * W], best[v]), *(I *)&s.id[b][k * W] = id[v];
+        store(&s.t[k * W], t[v]), store(&s.r[k * W], r[v]), store(&s.g[k * W], g[v]);
+        store(&s.b[k * W], bl[v]), s.alive[k] = alive[v];
+        if (kDepth) store(&s.depth[k * W], d[v]);
+        if (kId) store(&s.best[k * W], best[v]), *(I *)&s.id[k * W] = id[v];
     }
 }
 
 template <bool kDepth, bool kId, bool kWeight> int64_t blend_tile(const TileWork &work, const Image &image) {
-    constexpr int kGroup = W == 16 ? 4 : 2;
-    BlendScratch &s = blend_scratch;
+    Round round;
+    BlendBlock block[kBlocks];
     const Lanes lanes;
-    for (int b = 0; b < kBlocks; b++)
+    for (int b = 0; b < kBlocks; b++) {
+        BlendBlock &s = block[b];
         for (int i = 0; i < kPixels; i++) {
-            s.t[b][i] = 1.f, s.r[b][i] = s.g[b][i] = s.b[b][i] = 0.f;
-            if (kDepth) s.depth[b][i] = 0.f;
-            if (kId) s.best[b][i] = 0.f, s.id[b][i] = -1;
+            s.t[i] = 1.f, s.r[i] = s.g[i] = s.b[i] = 0.f;
+            if (kDepth) s.depth[i] = 0.f;
+            if (kId) s.best[i] = 0.f, s.id[i] = -1;
         }
-    start_alive(work, lanes, s.alive);
+        start_alive(work, lanes, b, s.alive);
+    }
 
     int64_t pairs = 0;
     uint32_t blocks = blocks_in_image(work);
     for (int64_t first = 0; first < work.count && blocks; first += kRound) {
         const int n = int(work.count - first < kRound ? work.count - first : kRound);
-        s.round.gather(work, first, n);
-        s.round.cull(blocks);
-        const uint32_t *ids = (const uint32_t *)s.round.field[ID];
+        round.gather(work, first, n);
+        round.cull(blocks);
         for (int b = 0; b < kBlocks; b++) {
-            if (!(blocks >> b & 1) || !s.round.listed[b]) continue;
-            for (int row = 0; row < kBlock / kRows; row += kGroup)
+            if (!(blocks >> b & 1) || !round.listed[b]) continue;
+            for (int row = 0; row < kBlockY / kRows; row += kGroup)
                 for (int column = 0; column < kColumns; column++)
-                    blend_group<kDepth, kId, kWeight>(s, lanes, b, column, row, work, ids, image.max_weight);
-            pairs += s.round.listed[b] * int64_t(kPixels);
+                    blend_group<kDepth, kId, kWeight>(round, block[b], lanes, b, column, row, image.max_weight);
+            pairs += round.listed[b] * int64_t(kPixels);
             bool any_alive = false;
-            for (int k = 0; k < kVectors; k++) any_alive |= any(s.alive[b][k]);
+            for (int k = 0; k < kVectors; k++) any_alive |= any(block[b].alive[k]);
             if (!any_alive) blocks &= ~(1u << b);
         }
     }
     for_pixels(work, [&](int b, int i, int64_t p) {
-        const float t = s.t[b][i], alpha = 1.f - t;
+        const BlendBlock &s = block[b];
+        const float t = s.t[i], alpha = 1.f - t;
         image.alpha[p] = alpha;
         if (image.colour) {
-            image.colour[3 * p] = s.r[b][i] + t * image.background[0];
-            image.colour[3 * p + 1] = s.g[b][i] + t * image.background[1];
-            image.colour[3 * p + 2] = s.b[b][i] + t * image.background[2];
+            image.colour[3 * p] = s.r[i] + t * image.background[0];
+            image.colour[3 * p + 1] = s.g[i] + t * image.background[1];
+            image.colour[3 * p + 2] = s.b[i] + t * image.background[2];
         }
-        if (kDepth) image.depth[p] = alpha > 0.f ? s.depth[b][i] / alpha : 0.f;
-        if (kId) image.dominant_id[p] = s.id[b][i];
+        if (kDepth) image.depth[p] = alpha > 0.f ? s.depth[i] / alpha : 0.f;
+        if (kId) image.dominant_id[p] = s.id[i];
     });
     return pairs;
 }

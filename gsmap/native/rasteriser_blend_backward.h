@@ -5,41 +5,39 @@
 
 namespace GSMAP_ISA {
 
-struct BackwardScratch {
-    Round round;
-    alignas(64) TilePixels t, rest, gr, gg, gb, gd, ga;
-    M alive[kBlocks][kVectors];
-    alignas(64) float moments[kRound][kMoments];
+// The pixels of one block: transmittance, what is still to come of the loss, and the image's gradient. One block after
+// the other, not one array after the other: those would lie 4 KiB apart, and stores to one would stall loads of the next.
+struct alignas(64) BackwardBlock {
+    float t[kPixels], rest[kPixels], gr[kPixels], gg[kPixels], gb[kPixels], gd[kPixels], ga[kPixels];
+    M alive[kVectors];
 };
-static thread_local BackwardScratch backward_scratch;
 
 // L = sum_i w_i v_i with v = colour . g_colour + depth * g_depth + g_alpha; rest = sum over what is not blended yet.
-template <bool kDepth> INLINE void backward_block(BackwardScratch &s, const Lanes &lanes, int b) {
-    const Round &round = s.round;
-    const float left = float(b % kAcross * kBlock), top = float(b / kAcross * kBlock);
+template <bool kDepth> INLINE void backward_block(const Round &round, BackwardBlock &s, const Lanes &lanes, int b, float (*moments)[kMoments]) {
+    const float left = float(b % kAcross * kBlockX), top = float(b / kAcross * kBlockY);
     for (int i = 0; i < round.listed[b]; i++) {
         const int j = round.list[b][i];
-        const Splat splat(round, j, left, top);
+        Splat splat(round, lanes, j, left, top, 0);
         const V cr = set1(round.field[R][j]), cg = set1(round.field[G][j]), cb = set1(round.field[B][j]);
         const V depth = kDepth ? set1(round.field[DEPTH][j]) : V{};
         V sum[W > 10 ? W : (10 + W - 1) / W * W] = {};
         for (int k = 0; k < kVectors; k++) {
             const int at = k * W;
-            V u, w;
-            const V raw = splat.alpha(lanes.x[k % kColumns], lanes.y + float(k / kColumns * kRows), u, w);
-            const M alive = s.alive[b][k];
-            const M touched = ge(alive, raw, set1(kMinAlpha));
+            const V u = splat.u_at(k % kColumns), w = splat.w, raw = splat.alpha(u);
+            if (k % kColumns == kColumns - 1) splat.next_row();
+            const M alive = s.alive[k];
+            const M touched = both(ge(raw, set1(kMinAlpha)), alive);
             if (W < 16 && !any(touched)) continue;
-            const V alpha = min(raw, set1(kMaxAlpha)), t = load(&s.t[b][at]), weight = alpha * t, next = t - weight;
+            const V alpha = min(raw, set1(kMaxAlpha)), t = load(&s.t[at]), weight = alpha * t, next = fnma(alpha, t, t);
             const M drawn = gt(touched, next, set1(kMinTransmittance));
-            s.alive[b][k] = (M)(alive ^ touched ^ drawn);
-            const V gr = load(&s.gr[b][at]), gg = load(&s.gg[b][at]), gb = load(&s.gb[b][at]);
-            V value = fma(cr, gr, fma(cg, gg, fma(cb, gb, load(&s.ga[b][at]))));
-            if (kDepth) value = fma(depth, load(&s.gd[b][at]), value);
+            s.alive[k] = first_not_second(alive, differ(touched, drawn));
+            const V gr = load(&s.gr[at]), gg = load(&s.gg[at]), gb = load(&s.gb[at]);
+            V value = fma(cr, gr, fma(cg, gg, fma(cb, gb, load(&s.ga[at]))));
+            if (kDepth) value = fma(depth, load(&s.gd[at]), value);
             const V shown = zero_unless(drawn, weight);
-            const V rest = fnma(shown, value, load(&s.rest[b][at]));
-            store(&s.rest[b][at], rest);
-            store(&s.t[b][at], select(drawn, next, t));
+            const V rest = fnma(shown, value, load(&s.rest[at]));
+            store(&s.rest[at], rest);
+            store(&s.t[at], select(drawn, next, t));
             // dL/d ln(alpha) = alpha (T v - rest / (1 - alpha)); none where alpha is clamped
             V g = fma(weight, value, V{} - alpha * rest * reciprocal(1.f - alpha));
             g = zero_unless(first_not_second(drawn, gt(raw, set1(kMaxAlpha))), g);
@@ -48,60 +46,66 @@ template <bool kDepth> INLINE void backward_block(BackwardScratch &s, const Lane
             sum[M_UU] = fma(gu, u, sum[M_UU]), sum[M_UW] = fma(gu, w, sum[M_UW]), sum[M_WW] = fma(gw, w, sum[M_WW]);
             sum[M_R] = fma(shown, gr, sum[M_R]), sum[M_GREEN] = fma(shown, gg, sum[M_GREEN]);
             sum[M_B] = fma(shown, gb, sum[M_B]);
-            if (kDepth) sum[M_DEPTH] = fma(shown, load(&s.gd[b][at]), sum[M_DEPTH]);
+            if (kDepth) sum[M_DEPTH] = fma(shown, load(&s.gd[at]), sum[M_DEPTH]);
         }
-        float *slot = s.moments[j];
+        float *slot = moments[j];
         for (int m = 0; m < 10; m += W) store(slot + m, load(slot + m) + sums_of_lanes(sum + m));
     }
 }
 
 template <bool kDepth>
 void backward_tile(const TileWork &work, const Image &image, const ImageGradient &gradient, float *slots) {
-    BackwardScratch &s = backward_scratch;
+    Round round;
+    BackwardBlock block[kBlocks];
+    alignas(64) float moments[kRound][kMoments];
     const Lanes lanes;
-    for (int b = 0; b < kBlocks; b++)
+    for (int b = 0; b < kBlocks; b++) {
+        BackwardBlock &s = block[b];
         for (int i = 0; i < kPixels; i++) {
-            s.t[b][i] = 1.f, s.rest[b][i] = s.gr[b][i] = s.gg[b][i] = s.gb[b][i] = s.gd[b][i] = s.ga[b][i] = 0.f;
+            s.t[i] = 1.f, s.rest[i] = s.gr[i] = s.gg[i] = s.gb[i] = s.ga[i] = 0.f;
+            if (kDepth) s.gd[i] = 0.f;
         }
-    start_alive(work, lanes, s.alive);
+        start_alive(work, lanes, b, s.alive);
+    }
     for_pixels(work, [&](int b, int i, int64_t p) {
+        BackwardBlock &s = block[b];
         const float alpha = image.alpha[p], t = 1.f - alpha;
         float g_alpha = gradient.alpha ? gradient.alpha[p] : 0.f, total = 0.f;
         if (gradient.colour) {
             const float *g = gradient.colour + 3 * p, *c = image.colour + 3 * p, *bg = image.background;
-            s.gr[b][i] = g[0], s.gg[b][i] = g[1], s.gb[b][i] = g[2];
+            s.gr[i] = g[0], s.gg[i] = g[1], s.gb[i] = g[2];
             g_alpha -= g[0] * bg[0] + g[1] * bg[1] + g[2] * bg[2];
             total += g[0] * (c[0] - t * bg[0]) + g[1] * (c[1] - t * bg[1]) + g[2] * (c[2] - t * bg[2]);
         }
         if (kDepth && alpha > 0.f) {  // the depth shown is sum(w z) / sum(w)
             const float g = gradient.depth[p] / alpha;
-            s.gd[b][i] = g;
+            s.gd[i] = g;
             g_alpha -= g * image.depth[p];
             total += g * image.depth[p] * alpha;
         }
-        s.ga[b][i] = g_alpha;
-        s.rest[b][i] = total + g_alpha * alpha;
+        s.ga[i] = g_alpha;
+        s.rest[i] = total + g_alpha * alpha;
     });
 
     uint32_t blocks = blocks_in_image(work);
     for (int64_t first = 0; first < work.count; first += kRound) {
         const int n = int(work.count - first < kRound ? work.count - first : kRound);
-        s.round.gather(work, first, n);
+        round.gather(work, first, n);
         for (int j = 0; j < n; j++)
-            for (int m = 0; m < kMoments; m++) s.moments[j][m] = 0.f;
-        if (blocks) s.round.cull(blocks);
+            for (int m = 0; m < kMoments; m++) moments[j][m] = 0.f;
+        if (blocks) round.cull(blocks);
         for (int b = 0; b < kBlocks && blocks; b++) {
-            if (!(blocks >> b & 1) || !s.round.listed[b]) continue;
-            backward_block<kDepth>(s, lanes, b);
+            if (!(blocks >> b & 1) || !round.listed[b]) continue;
+            backward_block<kDepth>(round, block[b], lanes, b, moments);
             bool any_alive = false;
-            for (int k = 0; k < kVectors; k++) any_alive |= any(s.alive[b][k]);
+            for (int k = 0; k < kVectors; k++) any_alive |= any(block[b].alive[k]);
             if (!any_alive) blocks &= ~(1u << b);
         }
         for (int j = 0; j < n; j++) {
             const Record &r = work.records[work.list[first + j]];
             float *slot = slots + (int64_t(r.slot) + uint32_t(work.ty - r.ty0) * uint32_t(r.tx1 - r.tx0) +
                                    uint32_t(work.tx - r.tx0)) * kMoments;
-            for (int m = 0; m < kMoments; m += W) store(slot + m, load(&s.moments[j][m]));
+            for (int m = 0; m < kMoments; m += W) store(slot + m, load(&moments[j][m]));
         }
     }
 }

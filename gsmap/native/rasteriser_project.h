@@ -15,7 +15,6 @@ struct ProjectScratch {
     alignas(64) float xc[kPadded], yc[kPadded], zc[kPadded], x[kPadded], y[kPadded], size[kPadded];
     int32_t visible[kPadded];
 };
-static thread_local ProjectScratch scratch;
 
 struct View {  // the camera in floats, broadcast
     V r[9], t[3], fx, fy, min_ux, max_ux, min_uy, max_uy;
@@ -121,7 +120,7 @@ INLINE V pick(const float *array, const int32_t *index) {
 }
 
 int project(const Scene &scene, const Camera &camera, int64_t begin, int64_t end, Record *out) {
-    ProjectScratch &s = scratch;
+    ProjectScratch s;
     const View view(camera);
     const int n = int(end - begin);
     centres(scene, camera, begin, n, s);

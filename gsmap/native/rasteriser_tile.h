@@ -6,19 +6,19 @@
 namespace GSMAP_ISA {
 using namespace gsmap;
 
-constexpr int kBlocks = (kTile / kBlock) * (kTile / kBlock), kPixels = kBlock * kBlock;
-constexpr int kAcross = kTile / kBlock;
-constexpr int kColumns = W < kBlock ? kBlock / W : 1;   // vectors side by side in a block's row
-constexpr int kRows = W > kBlock ? W / kBlock : 1;      // rows of a block in one vector
+constexpr int kAcross = kTile / kBlockX, kDown = kTile / kBlockY;
+constexpr int kBlocks = kAcross * kDown, kPixels = kBlockX * kBlockY;
+constexpr int kColumns = W < kBlockX ? kBlockX / W : 1;  // vectors side by side in a block's row
+constexpr int kRows = W > kBlockX ? W / kBlockX : 1;     // rows of a block in one vector
 constexpr int kVectors = kPixels / W;
 
 // Offsets of a vector's pixel centres from its block's first corner.
 struct Lanes {
     V x[kColumns], y;
     Lanes() {
-        for (int l = 0; l < W; l++) y[l] = 0.5f + float(l / kBlock);
+        for (int l = 0; l < W; l++) y[l] = 0.5f + float(l / kBlockX);
         for (int c = 0; c < kColumns; c++)
-            for (int l = 0; l < W; l++) x[c][l] = 0.5f + float(c * W + l % kBlock);
+            for (int l = 0; l < W; l++) x[c][l] = 0.5f + float(c * W + l % kBlockX);
     }
 };
 
@@ -58,13 +58,13 @@ struct Round {
             // the smallest u^2 + w^2 over a box lies on the side of it that faces the centre, in x or in y
             V x0[kAcross], x1[kAcross], lx[kAcross], best_y[kAcross];
             for (int c = 0; c < kAcross; c++) {
-                x0[c] = (c * kBlock + 0.5f) - x, x1[c] = x0[c] + (kBlock - 1);
+                x0[c] = (c * kBlockX + 0.5f) - x, x1[c] = x0[c] + (kBlockX - 1);
                 const V near = min(max(V{}, x0[c]), x1[c]);
                 lx[c] = l11 * near, best_y[c] = per_dx * near;
             }
             const M valid = first_lanes(count - i);
-            for (int r = 0; r < kAcross; r++) {
-                const V y0 = (r * kBlock + 0.5f) - y, y1 = y0 + (kBlock - 1);
+            for (int r = 0; r < kDown; r++) {
+                const V y0 = (r * kBlockY + 0.5f) - y, y1 = y0 + (kBlockY - 1);
                 const V near = min(max(V{}, y0), y1);
                 const V ly = l12 * near, best_x = per_dy * near, wy = l22 * near, ww = wy * wy;
                 for (int c = 0; c < kAcross; c++) {
@@ -81,9 +81,6 @@ struct Round {
     }
 };
 
-// Pixels of a tile, block by block.
-typedef float TilePixels[kBlocks][kPixels];
-
 // Visits the pixels of the tile that lie in the image: body(block, pixel in block, index in image).
 template <class Body> INLINE void for_pixels(const TileWork &work, Body body) {
     for (int y = 0; y < kTile; y++) {
@@ -92,7 +89,7 @@ template <class Body> INLINE void for_pixels(const TileWork &work, Body body) {
         for (int x = 0; x < kTile; x++) {
             const int px = work.tx * kTile + x;
             if (px >= work.width) break;
-            body(y / kBlock * kAcross + x / kBlock, y % kBlock * kBlock + x % kBlock, int64_t(py) * work.width + px);
+            body(y / kBlockY * kAcross + x / kBlockX, y % kBlockY * kBlockX + x % kBlockX, int64_t(py) * work.width + px);
         }
     }
 }
@@ -100,34 +97,35 @@ template <class Body> INLINE void for_pixels(const TileWork &work, Body body) {
 INLINE uint32_t blocks_in_image(const TileWork &work) {
     uint32_t blocks = 0;
     for (int b = 0; b < kBlocks; b++)
-        if (work.tx * kTile + b % kAcross * kBlock < work.width && work.ty * kTile + b / kAcross * kBlock < work.height)
+        if (work.tx * kTile + b % kAcross * kBlockX < work.width && work.ty * kTile + b / kAcross * kBlockY < work.height)
             blocks |= 1u << b;
     return blocks;
 }
 
-// Marks the pixels of the tile that lie in the image.
-INLINE void start_alive(const TileWork &work, const Lanes &lanes, M alive[kBlocks][kVectors]) {
-    for (int b = 0; b < kBlocks; b++) {
-        const V width = set1(float(work.width - work.tx * kTile - b % kAcross * kBlock));
-        const V height = set1(float(work.height - work.ty * kTile - b / kAcross * kBlock));
-        for (int k = 0; k < kVectors; k++)
-            alive[b][k] = both(lt(lanes.x[k % kColumns], width), lt(lanes.y + float(k / kColumns * kRows), height));
-    }
+// Marks the pixels of a block that lie in the image.
+INLINE void start_alive(const TileWork &work, const Lanes &lanes, int b, M *alive) {
+    const V width = set1(float(work.width - work.tx * kTile - b % kAcross * kBlockX));
+    const V height = set1(float(work.height - work.ty * kTile - b / kAcross * kBlockY));
+    for (int k = 0; k < kVectors; k++)
+        alive[k] = both(lt(lanes.x[k % kColumns], width), lt(lanes.y + float(k / kColumns * kRows), height));
 }
 
-// The exponent of Gaussian j at the pixels of one vector, and the opacity there.
+// One Gaussian over the pixels of a block, row of vectors after row of vectors: (u, w) at a pixel and alpha there.
+// From one vector to the next only additions are left, which other units do than the multiplications that follow.
 struct Splat {
-    V l11, l12, l22, log2_opacity, x, y;
-    INLINE Splat(const Round &round, int j, float left, float top) {
-        l11 = set1(round.field[L11][j]), l12 = set1(round.field[L12][j]), l22 = set1(round.field[L22][j]);
+    V across[kColumns], u, w, du, dw, log2_opacity;
+    // left, top: corner of the block in the tile; row: first row of vectors
+    INLINE Splat(const Round &round, const Lanes &lanes, int j, float left, float top, int row) {
+        const V l11 = set1(round.field[L11][j]), l12 = set1(round.field[L12][j]), l22 = set1(round.field[L22][j]);
+        const V x = set1(round.field[X][j] - left), dy = lanes.y - set1(round.field[Y][j] - top - float(row * kRows));
+        for (int c = 0; c < kColumns; c++) across[c] = l11 * (lanes.x[c] - x);
+        u = l12 * dy, w = l22 * dy;
+        du = l12 * float(kRows), dw = l22 * float(kRows);
         log2_opacity = set1(round.field[LOG2_OPACITY][j]);
-        x = set1(round.field[X][j] - left), y = set1(round.field[Y][j] - top);
     }
-    INLINE V alpha(V px, V py, V &u, V &w) const {
-        const V dy = py - y;
-        u = fma(l11, px - x, l12 * dy), w = l22 * dy;
-        return exp2(fnma(u, u, fnma(w, w, log2_opacity)));
-    }
+    INLINE V u_at(int column) const { return u + across[column]; }
+    INLINE V alpha(V u) const { return exp2(fnma(u, u, fnma(w, w, log2_opacity))); }
+    INLINE void next_row() { u += du, w += dw; }
 };
 
 }  // namespace GSMAP_ISA

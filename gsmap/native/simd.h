@@ -49,10 +49,12 @@ INLINE V sqrt(V a) { return (V)_mm512_sqrt_ps((__m512)a); }
 INLINE M lt(V a, V b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ); }
 INLINE M gt(V a, V b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
 INLINE M ge(V a, V b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
-INLINE M ge(M m, V a, V b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_GE_OQ); }
 INLINE M gt(M m, V a, V b) { return _mm512_mask_cmp_ps_mask(m, (__m512)a, (__m512)b, _CMP_GT_OQ); }
-INLINE M both(M a, M b) { return a & b; }
-INLINE M first_not_second(M a, M b) { return a & ~b; }
+// written as intrinsics to stay in mask registers: the way through an integer register costs 8 cycles
+INLINE M both(M a, M b) { return _kand_mask16(a, b); }
+INLINE M either(M a, M b) { return _kor_mask16(a, b); }
+INLINE M differ(M a, M b) { return _kxor_mask16(a, b); }
+INLINE M first_not_second(M a, M b) { return _kandn_mask16(b, a); }
 INLINE uint32_t bits(M m) { return m; }
 INLINE bool any(M m) { return m != 0; }
 INLINE M first_lanes(int n) { return n >= W ? 0xffff : (M)((1u << n) - 1); }
@@ -102,7 +104,8 @@ INLINE M lt(V a, V b) { return (M)(a < b); }
 INLINE M gt(V a, V b) { return (M)(a > b); }
 INLINE M ge(V a, V b) { return (M)(a >= b); }
 INLINE M both(M a, M b) { return a & b; }
-INLINE M ge(M m, V a, V b) { return m & (M)(a >= b); }
+INLINE M either(M a, M b) { return a | b; }
+INLINE M differ(M a, M b) { return a ^ b; }
 INLINE M gt(M m, V a, V b) { return m & (M)(a > b); }
 INLINE M first_not_second(M a, M b) { return a & ~b; }
 INLINE bool any(M m) { return bits(m) != 0; }
