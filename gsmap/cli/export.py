@@ -51,6 +51,6 @@ def command(
             budget_s=budget,
             provenance=provenance,
         )
-    for tile in report.tiles:
+    for tile in (t for t in report.tiles if t.path):
         print(f"{tile.path}\t{tile.num_gaussians}{chr(9) + 'truncated' if tile.truncated else ''}")
     say(f"{report.recomputed} tiles made, {report.reused} unchanged, {report.removed} removed")

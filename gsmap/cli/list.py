@@ -21,7 +21,7 @@ COLUMNS = {
     What.scenes: ["name", "id", "num_gaussians", "num_nodes", "component", "captured_at", "status"],
     What.edges: ["target", "source", "status", "used", "overlap", "num_inliers", "scale", "reason"],
     What.revisions: ["number", "created_at", "scenes", "components", "edges_used", "edges_tentative", "edges_refused"],
-    What.tiles: ["out", "path", "component", "num_gaussians", "truncated", "method"],
+    What.tiles: ["out", "path", "component", "merge", "num_gaussians", "truncated"],
 }
 
 

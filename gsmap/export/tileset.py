@@ -20,15 +20,17 @@ from gsmap.types import Gaussians, Tile
 FILE_NAME = "tileset.json"
 LEVELS_FOLDER = "levels"
 _MAX_PER_LEVEL = 100_000
+_COARSENING = 4  # a level draws at most this fraction of what replaces it: half the detail on surfaces
 _Cell = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """A node and the file, relative to the component's folder, that holds what it draws."""
+    """A node, the file that holds what it draws, and the digest of what that was made from."""
 
     node: TileNode
     path: Path
+    digest: str
 
     def gaussians(self) -> Gaussians:
         return tiles3d.read_content(self.path)
@@ -52,7 +54,7 @@ def write_tilesets(out: Path, tiles: Sequence[Tile], tile_size_m: float) -> list
     for members in by_component.values():
         folder = (out / members[0].path).parent
         known = _known_boxes(folder)
-        cells = {_cell(tile, tile_size_m): _leaf(folder, tile, known) for tile in members}
+        cells = {_cell(tile, tile_size_m): _leaf(folder, tile) for tile in members}
         while len(cells) > 1:
             cells = _one_level_up(folder, cells, known)
         (root,) = cells.values()
@@ -72,12 +74,9 @@ def _cell(tile: Tile, tile_size_m: float) -> _Cell:
     return x, y, z
 
 
-def _leaf(folder: Path, tile: Tile, known: dict[str, tuple[np.ndarray, float]]) -> _Drawn:
+def _leaf(folder: Path, tile: Tile) -> _Drawn:
     path = folder / Path(tile.path).name
-    # The digest makes a changed tile another key; viewers ignore it.
-    uri = f"{path.name}?{tile.sha256[:12]}"
-    box = known[uri][0] if uri in known else tiles3d.box_of(tiles3d.read_content(path))
-    return _Drawn(TileNode(box, 0.0, uri), path)
+    return _Drawn(TileNode(tiles3d.box_of(tiles3d.read_content(path)), 0.0, path.name), path, tile.sha256)
 
 
 def _one_level_up(
@@ -96,13 +95,14 @@ def _one_level_up(
 
 
 def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndarray, float]]) -> _Drawn:
-    names = "\n".join(str(child.node.uri) for child in children)
-    uri = f"{LEVELS_FOLDER}/{hashlib.sha256(names.encode()).hexdigest()[:24]}.glb"
+    digest = hashlib.sha256("\n".join(child.digest for child in children).encode()).hexdigest()
+    uri = f"{LEVELS_FOLDER}/{digest[:24]}.glb"
     path = folder / uri
     if uri in known and path.exists():
         box, error_m = known[uri]
     else:
-        level, voxel_m = tiles3d.coarser(Gaussians.concatenate([c.gaussians() for c in children]), _MAX_PER_LEVEL)
+        finer = Gaussians.concatenate([c.gaussians() for c in children])
+        level, voxel_m = tiles3d.coarser(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)))
         path.parent.mkdir(exist_ok=True)
         staged = path.with_name(f".{path.name}.partial")
         boxes = np.stack([tiles3d.write_content(staged, level), *(c.node.box for c in children)])
@@ -110,11 +110,11 @@ def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndar
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level must never be finer than what replaces it, or viewers would stop at it too early.
         error_m = max(voxel_m, 1.5 * max(c.node.error_m for c in children), 1e-3)
-    return _Drawn(TileNode(box, error_m, uri, tuple(c.node for c in children)), path)
+    return _Drawn(TileNode(box, error_m, uri, tuple(c.node for c in children)), path, digest)
 
 
 def _known_boxes(folder: Path) -> dict[str, tuple[np.ndarray, float]]:
-    """Box and error of every content that the folder's present tileset names."""
+    """Box and error of every level that the folder's present tileset names."""
     known: dict[str, tuple[np.ndarray, float]] = {}
 
     def walk(tile: dict) -> None:

@@ -67,7 +67,7 @@ def export(store: Store, out: Path, request: Request, progress: Callable[[float,
         partial(_make, store, scenes, request, params),
         out,
         map_id=store.id,
-        method=json.dumps([request.merge, asdict(params), request.steps, request.budget_s, request.provenance]),
+        method=f"{request.merge} {json.dumps([asdict(params), request.budget_s, request.provenance])}",
         format="glb" if request.format == "3dtiles" else request.format,
         write=_writer(request, scenes),
         made=noted,
@@ -149,7 +149,11 @@ def _make(
 def _writer(request: Request, scenes: dict[str, Scene]) -> Callable[[Path, MergeResult], None] | None:
     """How a tile's file is written, where it is not just its Gaussians."""
     if request.format == "3dtiles":
-        return lambda path, made: tiles3d.write_content(path, made.gaussians) and None
+        return _write_content
     if not request.provenance:
         return None
     return lambda path, made: formats.write(path, made.gaussians, extra={"scene": made.origin.astype(np.float32)})
+
+
+def _write_content(path: Path, made: MergeResult) -> None:
+    tiles3d.write_content(path, made.gaussians)

@@ -92,6 +92,7 @@ def tile_rows(store: Store) -> list[dict[str, Any]]:
             "bounds": tile.bounds.tolist(),
             "num_gaussians": tile.num_gaussians,
             "scenes": [names[scene] for scene in tile.poses],
+            "merge": tile.method.split()[0],
             "method": tile.method,
             "truncated": tile.truncated,
             "sha256": tile.sha256,

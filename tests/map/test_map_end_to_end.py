@@ -1,0 +1,256 @@
+"""The whole job on three small captures that gsmap makes itself, against the truth they were made with."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsmap
+import gsmap.map
+from gsmap import demo, formats
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.export.manifest import FILE_NAME
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("captures")
+    made = demo.make_captures(0, 3, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
+    demo.write_captures(folder, made)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def site(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "site.gsmap"
+    with gsmap.map.open_or_create(path) as m:
+        m.update(captures)
+    return path
+
+
+@pytest.fixture
+def copy(site: Path, tmp_path: Path) -> Path:
+    """A map to change: a map is a folder, and copying it is a backup."""
+    return Path(shutil.copytree(site, tmp_path / "copy.gsmap"))
+
+
+def cli(*arguments: object) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "gsmap", *map(str, arguments)], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_scene_is_placed_where_it_was_made(site: Path, captures: Path) -> None:
+    with gsmap.open(site) as m:
+        report = m.evaluate(captures / "truth")
+        rows = m.scene_rows()
+    assert len(report["pairs"]) == 3
+    assert report["pairs_worst_rre_deg"] < 0.2
+    assert report["pairs_worst_centroid_m"] < 0.01
+    assert {row["status"] for row in rows} == {"placed"}
+    assert {row["component"] for row in rows} == {0}
+
+
+def test_the_map_stands_upright(site: Path) -> None:
+    with gsmap.open(site) as m:
+        for pose in m.pose_graph().poses.values():
+            up = m.store.graphs.load(pose.scene).up
+            assert (pose.S_map_scene.rotation @ up)[2] > np.cos(np.radians(5))
+
+
+def test_json_keeps_the_contract(site: Path) -> None:
+    scenes = json.loads(cli("list", site, "scenes", "--json"))
+    assert list(scenes[0]) == [
+        "name",
+        "id",
+        "num_gaussians",
+        "num_nodes",
+        "component",
+        "S_map_scene",
+        "captured_at",
+        "status",
+    ]
+    assert np.shape(scenes[0]["S_map_scene"]) == (4, 4)
+    edges = json.loads(cli("list", site, "edges", "--json"))
+    assert list(edges[0]) == [
+        "target",
+        "source",
+        "status",
+        "reason",
+        "S_target_source",
+        "scale",
+        "information",
+        "num_inliers",
+        "num_correspondences",
+        "overlap",
+        "seconds",
+        "used",
+    ]
+    assert set(edges[0]["seconds"]) == {"match", "refine", "verdict"}
+    assert np.shape(edges[0]["information"]) == (7, 7)
+    assert {e["target"] for e in edges} <= {s["id"] for s in scenes}
+
+
+def test_nothing_is_computed_twice(copy: Path, captures: Path) -> None:
+    with gsmap.open(copy) as m:
+        before = m.revision_rows()
+        assert [r.new for r in m.update(captures)] == [False] * 3
+        assert m.revision_rows() == before
+        assert m.register("auto") == []
+
+
+def test_two_workers_find_what_one_finds(
+    site: Path, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSMAP_WORKERS", "1" if os.cpu_count() != 1 else "2")
+    with gsmap.map.create(tmp_path / "again.gsmap") as again, gsmap.open(site) as m:
+        again.update(captures)
+        for mine, theirs in zip(again.scene_rows(), m.scene_rows(), strict=True):
+            np.testing.assert_allclose(mine["S_map_scene"], theirs["S_map_scene"], atol=1e-9)
+
+
+def test_removing_a_scene_keeps_history(copy: Path) -> None:
+    with gsmap.open(copy) as m:
+        gone = m.remove("capture_b")
+        m.update()
+        assert gone.id not in m.pose_graph().poses
+        assert gone.id in m.pose_graph(1).poses
+        assert [row["change"] for row in m.diff(1, 2) if row["scene"] == "capture_b"] == ["removed"]
+        with pytest.raises(NotFoundError, match="capture_b"):
+            m.show_scene("capture_b")
+
+
+def test_a_person_s_word_counts(copy: Path) -> None:
+    with gsmap.open(copy) as m:
+        for pair in ("capture_a:capture_b", "capture_b:capture_c"):
+            m.reject(pair, note="the doors look alike")
+        m.update()
+        rows = {row["name"]: row for row in m.scene_rows()}
+        assert rows["capture_a"]["component"] == rows["capture_c"]["component"] != rows["capture_b"]["component"]
+        m.confirm("capture_a:capture_b")
+        m.update()
+        assert len({row["component"] for row in m.scene_rows()}) == 1
+        said = [row["what"] for row in m.show_pair("capture_a:capture_b")["history"]]
+        assert said == ["accepted", "reject", "confirm"]
+
+
+def test_shows_scenes_and_pairs(site: Path, tmp_path: Path) -> None:
+    shown = json.loads(cli("show", site, "capture_a", "--json"))
+    assert shown["num_nodes"] > 20
+    assert len(shown["nodes"]) > 10
+    assert len(shown["edges"]) == 2
+    assert shown["translation_sigma_m"] < 0.1
+    pair = json.loads(cli("show", site, "capture_a:capture_b", "--json"))
+    assert pair["evidence"]
+    assert "capture_a" in cli("show", site, "capture_a")
+
+
+def test_exports_only_what_changed(copy: Path, tmp_path: Path) -> None:
+    out = tmp_path / "tiles"
+    with gsmap.open(copy) as m:
+        first = m.export(out, tile_size_m=4, merge="voxel")
+        assert first.recomputed == len(first.tiles) > 3
+        again = m.export(out, tile_size_m=4, merge="voxel")
+        assert (again.recomputed, again.reused) == (0, len(first.tiles))
+        whole = m.export(tmp_path / "whole", tile_size_m=0, merge="voxel")
+        assert sum(t.num_gaussians for t in first.tiles) == sum(t.num_gaussians for t in whole.tiles)
+        assert {row["out"] for row in m.tile_rows()} == {str(out), str(tmp_path / "whole")}
+        m.remove("capture_b")
+        m.update()
+        third = m.export(out, tile_size_m=4, merge="voxel")
+        assert third.recomputed > 0
+        assert third.removed + third.recomputed > 0
+        assert {row["path"] for row in m.tile_rows() if row["out"] == str(out)} == {
+            t.path for t in third.tiles if t.path
+        }
+
+
+def test_an_older_revision_can_be_exported(copy: Path, tmp_path: Path) -> None:
+    with gsmap.open(copy) as m:
+        m.remove("capture_b")
+        m.update()
+        old = m.export(tmp_path / "old", tile_size_m=0, merge="union", revision=1)
+        new = m.export(tmp_path / "new", tile_size_m=0, merge="union")
+    assert old.tiles[0].num_gaussians > new.tiles[0].num_gaussians
+
+
+def test_provenance_names_the_capture(site: Path, tmp_path: Path) -> None:
+    with gsmap.open(site) as m:
+        result = m.export(tmp_path / "out", tile_size_m=0, merge="union", provenance=True)
+        counts = sorted(s.num_gaussians for s in m.scenes())
+    header = (tmp_path / "out" / result.tiles[0].path).read_bytes()[:4096]
+    assert b"property float scene" in header
+    assert result.tiles[0].num_gaussians == sum(counts)
+
+
+def test_3dtiles_tree_holds_every_gaussian_at_its_finest(site: Path, tmp_path: Path) -> None:
+    with gsmap.open(site) as m:
+        tiles = m.export(tmp_path / "t", tile_size_m=4, merge="voxel", format="3dtiles")
+        plain = m.export(tmp_path / "p", tile_size_m=0, merge="voxel")
+    tileset = tmp_path / "t" / "component_0" / "tileset.json"
+    finest = formats.read(tileset)
+    whole = formats.read(tmp_path / "p" / plain.tiles[0].path)
+    assert len(finest) == len(whole) == sum(t.num_gaussians for t in tiles.tiles)
+    np.testing.assert_allclose(np.sort(finest.means, axis=0), np.sort(whole.means, axis=0), atol=1e-4)
+    root = json.loads(tileset.read_text())["root"]
+    assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"bbox": [0, 0, 0, 0, 1, 1]}, InputError, "box"),
+        ({"bbox": [900, 900, 900, 901, 901, 901]}, InputError, "outside the map"),
+        ({"budget_s": 0.0}, ConfigError, "budget"),
+        ({"merge": "glue"}, ConfigError, "merge method 'glue'"),
+        ({"format": "dwg"}, ConfigError, "dwg"),
+        ({"tile_size_m": -1}, ConfigError, "tile size"),
+        ({"revision": 99}, NotFoundError, "no revision 99"),
+        ({"component": 7}, NotFoundError, "no island 7"),
+        ({"merge": "union", "steps": 5}, ConfigError, "takes no steps"),
+        ({"format": "spz", "provenance": True}, ConfigError, "provenance"),
+        ({"format": "3dtiles", "tile_size_m": 0}, ConfigError, "tile-size"),
+    ],
+)
+def test_bad_exports_are_refused_and_leave_nothing(
+    site: Path, tmp_path: Path, options: dict, error: type[Exception], message: str
+) -> None:
+    with gsmap.open(site) as m, pytest.raises(error, match=message):
+        m.export(tmp_path / "out", **options)
+    assert not list((tmp_path / "out").rglob("*.*")) if (tmp_path / "out").exists() else True
+
+
+def test_another_map_s_folder_is_refused(site: Path, captures: Path, tmp_path: Path) -> None:
+    with gsmap.open(site) as m:
+        m.export(tmp_path / "out", tile_size_m=0, merge="union")
+    manifest = (tmp_path / "out" / FILE_NAME).read_text()
+    with gsmap.map.create(tmp_path / "other.gsmap") as other:
+        other.ingest(captures / "capture_a.ply")
+        other.describe()
+        other.optimize()
+        with pytest.raises(ConfigError, match="another map"):
+            other.export(tmp_path / "out", tile_size_m=0, merge="union")
+    assert (tmp_path / "out" / FILE_NAME).read_text() == manifest
+
+
+def test_whole_map_checks_out(site: Path) -> None:
+    with gsmap.open(site) as m:
+        assert m.check() == []
+
+
+def test_bad_pairs_are_refused(site: Path) -> None:
+    with gsmap.open(site) as m:
+        for pair in ("capture_a", "capture_a:nothing", "capture_a:capture_a"):
+            with pytest.raises((NotFoundError, InputError, ConfigError)):
+                m.register(pair)
+        with pytest.raises(NotFoundError, match="no truth"):
+            m.evaluate(site.parent)
