@@ -21,10 +21,11 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map import rows
 from gsmap.store import Store
-from gsmap.types import Edge, PoseGraph, Prior, Registration, Scene, SceneGraph, ScenePose
+from gsmap.types import Edge, PoseGraph, Prior, Registration, Scene, SceneGraph
 
 if TYPE_CHECKING:
     from gsmap.export import ExportResult
+    from gsmap.register.candidates import Placed
 
 Progress = Callable[[str, float, str], None]
 """Called with the stage's name, the fraction done in [0, 1], and what is being worked on."""
@@ -170,18 +171,36 @@ class Map(AbstractContextManager["Map"]):
 
     def _pairs(self, pairs: str, methods: dict[str, str]) -> list[tuple[str, str]]:
         """The scene pairs that ``pairs`` asks for, each as (target, source), in a fixed order."""
-        # from gsmap.register.candidates import candidate_pairs
+        from gsmap.register.candidates import candidate_pairs
 
         described = [scene for scene, method in methods.items() if self.store.graphs.find(scene, method)]
         if pairs == "all":
             return [(a, b) for i, a in enumerate(described) for b in described[i + 1 :]]
         if pairs == "auto":
-            return [(a, b) for i, a in enumerate(described) for b in described[i + 1 :]]
+            graphs = [self._graph(scene, methods[scene]) for scene in described]
+            return candidate_pairs(graphs, placed=self._placed())
         a, b = self._pair(pairs)
         for scene in (a, b):
             if scene.id not in described:
                 raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
         return [(a.id, b.id)]
+
+    def _placed(self) -> dict[str, Placed]:
+        """Where scenes lie, for finding neighbours."""
+        from gsmap.register.candidates import Placed
+
+        bounds = {s.id: s.bounds for s in self.scenes()}
+        graph = self.pose_graph()
+        placed = {}
+        for scene, pose in (graph.poses if graph else {}).items():
+            if scene in bounds:
+                S = pose.S_map_scene
+                radius = S.scale * float(np.linalg.norm(np.diff(bounds[scene], axis=0))) / 2
+                sigma = (
+                    0.0 if pose.covariance is None else S.scale * float(np.sqrt(np.diag(pose.covariance)[3:6].max()))
+                )
+                placed[scene] = Placed(pose.component, S.apply(bounds[scene].mean(0)), radius, sigma)
+        return placed
 
     def _pair(self, pair: str) -> tuple[Scene, Scene]:
         """The scenes of ``A:B``; a name may itself hold a colon."""
@@ -246,11 +265,12 @@ class Map(AbstractContextManager["Map"]):
         """Ingest the files, then describe, register and optimize whatever is missing."""
         ingested = self.ingest(*paths) if paths else []
         self.describe()
-        self.register()
-        placed = self.pose_graph()
-        if placed is None or placed.parameters.get("inputs") != self._pose_inputs()[1]:
-            self.optimize()
-        return ingested
+        while True:
+            self.register()
+            placed = self.pose_graph()
+            if placed is not None and placed.parameters.get("inputs") == self._pose_inputs()[1]:
+                return ingested
+            self.optimize()  # scenes that now turn out to be neighbours are registered in the next round
 
     def set_prior(self, prior: Prior) -> None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`."""
@@ -302,10 +322,6 @@ class Map(AbstractContextManager["Map"]):
     def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
         """The poses of a revision, of the newest one by default; None before the first optimize."""
         return self.store.revisions.get(revision)
-
-    def _poses(self) -> dict[str, ScenePose]:
-        placed = self.pose_graph()
-        return placed.poses if placed else {}
 
     def scene_rows(self) -> list[dict[str, Any]]:
         """``gsmap list MAP scenes``."""
