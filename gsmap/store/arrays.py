@@ -74,10 +74,10 @@ class Arrays:
         fresh = not place.parent.exists()
         place.parent.mkdir(parents=True, exist_ok=True)
         if fresh:
-            _sync_folder(self.root)
+            sync_folder(self.root)
         self.drop(kind, name)  # an orphan of a crash between rename and commit
         os.rename(staged.folder, place)
-        _sync_folder(place.parent)
+        sync_folder(place.parent)
 
     def read(
         self,
@@ -220,11 +220,12 @@ def _synchronise(folder: Path) -> tuple[StoredFile, ...]:
             os.fsync(file.fileno())
         out.append(StoredFile(str(path.relative_to(folder)), path.stat().st_size, sha256))
     for path in [*(p for p in folder.rglob("*") if p.is_dir()), folder]:
-        _sync_folder(path)
+        sync_folder(path)
     return tuple(out)
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

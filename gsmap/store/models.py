@@ -14,6 +14,7 @@ from typing import Any
 from sqlalchemy import Row, insert, select, update
 
 from gsmap.errors import InputError, NotFoundError
+from gsmap.store.arrays import sync_folder
 from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.matrices import plain
 from gsmap.store.schema import models
@@ -128,8 +129,4 @@ def _copy(source: Path, target: Path) -> None:
             os.replace(staged, target)
         finally:
             staged.unlink(missing_ok=True)
-        handle = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        sync_folder(target.parent)

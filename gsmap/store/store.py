@@ -15,7 +15,7 @@ import gsmap
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import catalog as _catalog
 from gsmap.store import integrity, migrate, schema, sqlite
-from gsmap.store.arrays import Arrays
+from gsmap.store.arrays import Arrays, sync_folder
 from gsmap.store.catalog import Catalog
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
@@ -80,7 +80,9 @@ class Store:
                 staged.mkdir()
                 (staged / "arrays").mkdir()
                 _make_catalog(staged, catalog_url)
+                sync_folder(staged)
                 os.rename(staged, folder)
+                sync_folder(folder.parent)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
         return cls.open(path, "w")

@@ -212,6 +212,47 @@ def test_every_truncation_is_refused(tmp_path):
             read(tmp_path / "b.ply")
 
 
+def test_mutations_are_read_or_refused(tmp_path):
+    """Any damage of a small file ends in Gaussians or a typed error, within the memory of the file."""
+    write(tmp_path / "a.ply", some(4, 1))
+    whole = (tmp_path / "a.ply").read_bytes()
+    rng = np.random.default_rng(11)
+    words = [
+        b"0",
+        b"9" * 12,
+        b"-1",
+        b"list",
+        b"property",
+        b"element vertex",
+        b"\n",
+        b"\0",
+        b"ascii",
+        b"\xff",
+        b"double",
+    ]
+    refused = 0
+    for _ in range(1500):
+        data = bytearray(whole)
+        for _ in range(rng.integers(1, 4)):
+            at = int(rng.integers(len(data)))
+            kind = rng.integers(4)
+            if kind == 0:
+                data[at] ^= 1 << int(rng.integers(8))
+            elif kind == 1:
+                del data[at : at + int(rng.integers(1, 40))]
+            elif kind == 2:
+                data[at:at] = words[rng.integers(len(words))]
+            else:
+                data[at:at] = data[int(rng.integers(len(data))) :][: int(rng.integers(1, 60))]
+        (tmp_path / "b.ply").write_bytes(data)
+        try:
+            assert len(read(tmp_path / "b.ply")) * 4 <= len(data)
+            info(tmp_path / "b.ply")
+        except InputError:
+            refused += 1
+    assert 300 < refused < 1500
+
+
 def test_real_capture(shared_data):
     g = read(shared_data / "house" / "c0.ply")
     assert len(g) == 152_000

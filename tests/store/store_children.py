@@ -106,4 +106,20 @@ def write_some(path: str, worker: int, count: int, pipe) -> None:
         pipe.send(repr(error))
 
 
+def read_some(path: str, stop, pipe) -> None:
+    """One of several readers: every scene that is listed can be read, and the map never shrinks."""
+    try:
+        with Store.open(path, "r") as store:
+            seen = rounds = 0
+            while not stop.is_set() or not rounds:
+                scenes = store.scenes.list()
+                assert len(scenes) >= seen
+                seen, rounds = len(scenes), rounds + 1
+                for scene in scenes[-2:]:
+                    assert len(store.scenes.gaussians(scene.id)) == 300
+        pipe.send("done")
+    except BaseException as error:
+        pipe.send(repr(error))
+
+
 CODES = (errno.ENOSPC, errno.EIO)

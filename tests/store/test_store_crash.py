@@ -192,11 +192,17 @@ def test_a_full_disk(tmp_path):
         subprocess.run(["umount", disk], check=True)
 
 
-def test_eight_writers(tmp_path, start):
+def test_eight_writers_and_two_readers(tmp_path, start, context):
     path = tmp_path / "site.gsmap"
     Store.create(path).close()
-    workers = [start(store_children.write_some, str(path), i, 4) for i in range(8)]
-    for process, pipe in workers:
+    stop = context.Event()
+    readers = [start(store_children.read_some, str(path), stop) for _ in range(2)]
+    writers = [start(store_children.write_some, str(path), i, 4) for i in range(8)]
+    for process, pipe in writers:
+        process.join(120)
+        assert messages(pipe) == ["done"]
+    stop.set()
+    for process, pipe in readers:
         process.join(120)
         assert messages(pipe) == ["done"]
     with Store.open(path) as store:
