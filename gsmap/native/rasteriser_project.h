@@ -164,7 +164,8 @@ int project(const Scene &scene, const Camera &camera, int64_t begin, int64_t end
         M live = both(first_lanes(visible - first), gt(reach, V{}));
         live = both(live, both(finite(g.a), both(finite(g.c), both(finite(g.det), gt(g.det, V{})))));
         live = both(live, both(finite(g.b), both(finite(colour[0]), both(finite(colour[1]), finite(colour[2])))));
-        live = both(live, both(lt(ls[0], set1(80.f)), both(lt(ls[1], set1(80.f)), lt(ls[2], set1(80.f)))));  // not NaN
+        const V norm2 = fma(q[0], q[0], fma(q[1], q[1], fma(q[2], q[2], q[3] * q[3])));
+        live = both(live, both(finite(norm2), both(lt(ls[0], set1(80.f)), both(lt(ls[1], set1(80.f)), lt(ls[2], set1(80.f))))));  // not NaN
 
         V record[kFields];
         const V l11 = sqrt(g.c / g.det * (0.5f / kLn2));
