@@ -61,7 +61,7 @@ def test_a_real_capture_looks_the_same(shared_data, tmp_path, name, decibels):
 
 
 def test_a_coarse_level_looks_like_its_originals_from_afar(shared_data):
-    """A sixteenth of the Gaussians: merged they keep the picture of a distant view, dropped and blown up they lose it."""
+    """A sixteenth of the Gaussians: merged they keep a distant view, dropped and blown up they lose it."""
     from gsmap.formats.tiles3d import coarser
 
     g = formats.read(shared_data / "house" / "c0.ply")
