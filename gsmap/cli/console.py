@@ -95,7 +95,7 @@ def _progress_lines() -> Any:
     last: dict[str, str] = {}
 
     def progress(stage: str, fraction: float, text: str = "") -> None:
-        subject = text.split(":")[0]
+        subject = text.split(":")[0].split(",")[0]
         if last.get(stage) == subject:
             return
         last[stage] = subject

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gsmap.cli.console import print_table, progress_bars, say
+
+if TYPE_CHECKING:
+    from gsmap.map import Map
 
 
 def command(
@@ -25,17 +28,30 @@ def command(
     root = Path(folder)
     map_path = root / "demo.gsmap"
     with progress_bars() as progress:
-        captures = demo.make_captures(seed, progress=lambda f, text: progress("capture", f, text))
+        captures = demo.make_captures(seed, progress=lambda fraction, text: progress("capture", fraction, text))
         demo.write_captures(root / "captures", captures)
         with gsmap.map.open_or_create(map_path, progress=progress) as m:
             m.update(root / "captures")
             report = m.export(root / "tiles", tile_size_m=0)
-            m.draw_map(root / "map.png")
+            _draw(m, root / "map.png")
     with gsmap.open(map_path) as m:
         print_map(m)
         truth = m.evaluate(root / "captures" / "truth")
-    print_table("against the truth", list(truth["pairs"][0]), [list(row.values()) for row in truth["pairs"]])
+    columns = ["pair", "rre_deg", "centroid_m"]
+    print_table("errors against the truth", columns, [[row[c] for c in columns] for row in truth["pairs"]])
     for tile in report.tiles:
         say(f"merged tile: {root / 'tiles' / tile.path} ({tile.num_gaussians} Gaussians; any 3DGS viewer opens it)")
     say(f"picture: {root / 'map.png'}")
     say(f"look around: gsmap view {map_path}")
+
+
+def _draw(m: Map, path: Path) -> None:
+    """The map's picture: every placed scene, what ties it to which, and where the cameras went."""
+    from PIL import Image
+
+    from gsmap.demo.picture import map_picture
+
+    names = {scene.id: scene.name for scene in m.scenes()}
+    parts = [(name, *m.read(name, frame="map")) for name in names.values()]
+    edges = [(names[e["target"]], names[e["source"]]) for e in m.edge_rows() if e["used"]]
+    Image.fromarray(map_picture(parts, edges, up=(0, 0, 1))).save(path, optimize=True)

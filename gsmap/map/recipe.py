@@ -21,7 +21,7 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map import rows
 from gsmap.store import Store
-from gsmap.types import Edge, PoseGraph, Prior, Registration, Scene, SceneGraph
+from gsmap.types import Cameras, Edge, Gaussians, PoseGraph, Prior, Registration, Scene, SceneGraph
 
 if TYPE_CHECKING:
     from gsmap.export import ExportResult
@@ -322,6 +322,27 @@ class Map(AbstractContextManager["Map"]):
     def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
         """The poses of a revision, of the newest one by default; None before the first optimize."""
         return self.store.revisions.get(revision)
+
+    def read(self, ref: str, *, frame: str = "scene") -> tuple[Gaussians, Cameras]:
+        """Gaussians and cameras of one scene, in its own frame or in the ``map`` frame of its island.
+
+        Raises:
+            NotFoundError: no such scene, or no pose for it yet.
+            ConfigError: another frame.
+        """
+        from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+
+        scene = self.store.scenes.get(ref)
+        gaussians, cameras = self.store.scenes.gaussians(scene.id), self.store.scenes.cameras(scene.id)
+        if frame == "scene":
+            return gaussians, cameras
+        if frame != "map":
+            raise ConfigError(f"a scene is read in frame 'scene' or 'map', got {frame!r}")
+        graph = self.pose_graph()
+        if graph is None or scene.id not in graph.poses:
+            raise NotFoundError(f"scene {scene.name} has no place in the map yet: run gsmap update first")
+        S_map_scene = graph.poses[scene.id].S_map_scene
+        return transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene)
 
     def scene_rows(self) -> list[dict[str, Any]]:
         """``gsmap list MAP scenes``."""
