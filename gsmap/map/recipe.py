@@ -26,6 +26,7 @@ from gsmap.types import Cameras, Edge, Gaussians, PoseGraph, Prior, Registration
 if TYPE_CHECKING:
     from gsmap.export import ExportResult
     from gsmap.register.candidates import Placed
+    from gsmap.view import ViewServer
 
 Progress = Callable[[str, float, str], None]
 """Called with the stage's name, the fraction done in [0, 1], and what is being worked on."""
@@ -373,6 +374,13 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap show MAP A:B``: the pair's edge, its evidence, and its history."""
         a, b = self._pair(pair)
         return rows.pair_facts(self.store, a, b)
+
+    def view(self, *, port: int = 0) -> ViewServer:
+        """``gsmap view MAP``: a page of splats, graphs, cameras and edges, served on this machine only until closed."""
+        from gsmap.map.viewing import view_of
+        from gsmap.view import ViewServer
+
+        return ViewServer(view_of(self.store), port=port)
 
     def diff(self, before: int, after: int) -> list[dict[str, Any]]:
         """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""

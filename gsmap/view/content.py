@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from gsmap.formats.ply import SH_C0
 from gsmap.formats.tiles3d import coarser
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.geometry.voxels import covariances
-from gsmap.types import Cameras, Gaussians, Registration, Scene, SceneGraph, ScenePose, Sim3
+from gsmap.types import Cameras, Gaussians, Scene, SceneGraph, ScenePose, Sim3
 
 MAX_SPLATS = 1_500_000
 _MAX_NODES = 2_000
@@ -39,10 +39,21 @@ class ViewScene:
 
 @dataclass(frozen=True)
 class ViewEdge:
-    """One registered pair; ``used`` is what the last optimize made of it (True, False, ``"tentative"`` or None)."""
+    """One pair that was tried.
 
-    registration: Registration
+    Args:
+        target, source: scene ids.
+        status: ``accepted``, ``rejected`` or ``no_match``, a person's word included.
+        used: what the last optimize made of it: True, False or ``"tentative"``; None before.
+    """
+
+    target: str
+    source: str
+    status: str
+    reason: str = ""
     used: bool | str | None = None
+    num_inliers: int = 0
+    overlap: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -81,17 +92,9 @@ class ViewMap:
             )
         at = {entry.scene.id: index for index, entry in enumerate(self.scenes)}
         edges = [
-            {
-                "target": at[e.registration.target],
-                "source": at[e.registration.source],
-                "status": e.registration.status,
-                "reason": e.registration.reason,
-                "used": e.used,
-                "num_inliers": e.registration.num_inliers,
-                "overlap": e.registration.overlap,
-            }
-            for e in self.edges
-            if e.registration.target in at and e.registration.source in at
+            {**asdict(edge), "target": at[edge.target], "source": at[edge.source]}
+            for edge in self.edges
+            if edge.target in at and edge.source in at
         ]
         return {"title": self.title, "up": list(self.up), "scenes": scenes, "edges": edges}
 

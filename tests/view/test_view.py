@@ -11,7 +11,7 @@ from headless import Page
 from gsmap.errors import ConfigError, InputError
 from gsmap.evaluate.images import psnr
 from gsmap.geometry.transforms import transform_gaussians
-from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, Scene, SceneGraph, ScenePose, Sim3
+from gsmap.types import Cameras, Gaussians, NodeLayer, Scene, SceneGraph, ScenePose, Sim3
 from gsmap.view import ViewEdge, ViewMap, ViewScene, ViewServer
 
 
@@ -52,8 +52,8 @@ def view() -> ViewMap:
         entry("b", blob(2), ScenePose("b", POSE_B, 0, "tentative"), graph=lambda: graph, cameras=lambda: cameras),
         entry("far <b>away</b>", blob(3), None),
     ]
-    edge = Registration("a", "b", "accepted", "", POSE_A.inverse() @ POSE_B, np.eye(7), 21, 60, 0.4)
-    return ViewMap("a map", scenes, [ViewEdge(edge, True), ViewEdge(Registration("a", "gone", "no_match"))])
+    edge = ViewEdge("a", "b", "accepted", used=True, num_inliers=21, overlap=0.4)
+    return ViewMap("a map", scenes, [edge, ViewEdge("a", "gone", "no_match")])
 
 
 def get(server: ViewServer, path: str, **headers: str) -> http.client.HTTPResponse:

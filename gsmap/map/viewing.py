@@ -1,0 +1,38 @@
+"""What the page of `gsmap.view` shows: the newest poses, the current edges, arrays read when they are asked for."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from gsmap.map import rows
+from gsmap.store import Store
+from gsmap.view import ViewEdge, ViewMap, ViewScene
+
+
+def view_of(store: Store) -> ViewMap:
+    """The living scenes, each with its newest graph, and the edges between them."""
+    placed = store.revisions.get()
+    poses = placed.poses if placed else {}
+    scenes = [
+        ViewScene(
+            scene,
+            poses.get(scene.id),
+            partial(store.scenes.gaussians, scene.id),
+            partial(store.graphs.load, scene.id),
+            partial(store.scenes.cameras, scene.id),
+        )
+        for scene in store.scenes.list()
+    ]
+    edges = [
+        ViewEdge(
+            row["target"],
+            row["source"],
+            row["status"],
+            row["reason"],
+            row["used"] if placed else None,
+            row["num_inliers"],
+            row["overlap"],
+        )
+        for row in rows.edge_rows(store)
+    ]
+    return ViewMap(store.folder.name, scenes, edges)
