@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmark_layer import LandmarkParams, landmark_layer, landmark_method
+from gsmap.describe.models import ModelSpec
+from gsmap.describe.object_layer import ObjectParams, object_layer, object_method
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
 from gsmap.errors import ConfigError
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
@@ -23,20 +25,22 @@ class DescribeParams:
     """What to describe and how.
 
     Args:
-        landmarks: make the landmark layers.
-        landmark: how.
+        landmarks, objects: which layers to make.
+        landmark, object: how.
     """
 
     landmarks: bool = True
+    objects: bool = True
     landmark: LandmarkParams = field(default_factory=LandmarkParams)
+    object: ObjectParams = field(default_factory=ObjectParams)
 
 
 def describe(
     scene_id: str,
     gaussians: Gaussians,
     cameras: Cameras | None,
-    params: DescribeParams = DescribeParams(),
-    models: Mapping[str, object] | None = None,
+    params: DescribeParams | None = None,
+    models: Mapping[str, ModelSpec] | None = None,
     *,
     scale_policy: str = "auto",
     progress: Callable[[float, str], None] | None = None,
@@ -46,20 +50,21 @@ def describe(
     Args:
         scene_id: recorded in the graph.
         gaussians, cameras: the capture, scene frame; cameras may be None or synthesised.
-        models: ONNX models by name, for segmenters and embedders that need them.
+        models: checked ONNX models by kind, for the back ends that need them (`gsmap.describe.models`).
         scale_policy: ``known`` (the unit is the metre: no layers at guessed units), ``unknown`` (only those),
             ``auto`` (both, where a metre is plausible).
 
     Raises:
-        ConfigError: an unknown policy, or back ends without their model.
+        ConfigError: an unknown policy or back end, or a back end without its model.
     """
+    params = params or DescribeParams()
     if scale_policy not in SCALE_POLICIES:
         raise ConfigError(f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
     report = progress or (lambda fraction, text: None)
     report(0.0, "surface")
     cloud = surface_cloud(gaussians)
     up = estimate_up(cloud.points, cameras)
-    guess_m = estimate_unit_m(cloud.points, cameras, up)
+    unit_m = 1.0 if scale_policy == "known" else estimate_unit_m(cloud.points, cameras, up)
     layers: dict[str, NodeLayer] = {}
     notes: list[str] = []
     if len(cloud) == 0:
@@ -67,13 +72,26 @@ def describe(
     elif up is None:
         notes.append("up could not be told (no cameras, no clear floor): no landmarks")
     if params.landmarks:
-        for i, (name, unit_m) in enumerate(landmark_units(guess_m, scale_policy).items()):
-            report(0.1 + 0.2 * i, name)
-            layers[name] = landmark_layer(cloud, up, unit_m, params.landmark)
-        if up is not None and max(len(layer) for layer in layers.values()) < _FEW_NODES:
-            notes.append("few landmarks: little colour or shape to hold on to")
+        units = landmark_units(unit_m, scale_policy)
+        for i, (name, layer_unit_m) in enumerate(units.items()):
+            report(0.05 + 0.55 * i / len(units), name)
+            layers[name] = landmark_layer(cloud, up, layer_unit_m, params.landmark)
+    if params.objects:
+        layers["objects"], remarks = object_layer(
+            gaussians,
+            cameras,
+            cloud,
+            up,
+            unit_m,
+            params.object,
+            models or {},
+            lambda fraction, text: report(0.6 + 0.4 * fraction, text),
+        )
+        notes += remarks
+    if len(cloud) and not any(len(layer) >= _FEW_NODES for layer in layers.values()):
+        notes.append(f"fewer than {_FEW_NODES} nodes in every layer: little colour or shape to hold on to")
     report(1.0, "described")
-    return SceneGraph(scene_id, layers, up, 1.0 if scale_policy == "known" else guess_m, tuple(notes))
+    return SceneGraph(scene_id, layers, up, unit_m, tuple(notes))
 
 
 def landmark_units(guess_m: float, scale_policy: str) -> dict[str, float]:
@@ -85,6 +103,12 @@ def landmark_units(guess_m: float, scale_policy: str) -> dict[str, float]:
     return {"landmarks": 1.0, **levels} if scale_policy == "auto" and plausible else levels
 
 
-def methods(params: DescribeParams = DescribeParams(), models: Mapping[str, object] | None = None) -> dict[str, str]:
-    """Digest by layer kind of what `describe` would do: equal digests mean that a cached graph can be used."""
-    return {"landmarks": landmark_method(params.landmark)} if params.landmarks else {}
+def methods(params: DescribeParams | None = None, models: Mapping[str, ModelSpec] | None = None) -> dict[str, str]:
+    """Digest by kind of layer of what `describe` would do: equal digests mean that a cached graph can be used."""
+    params = params or DescribeParams()
+    out = {}
+    if params.landmarks:
+        out["landmarks"] = landmark_method(params.landmark)
+    if params.objects:
+        out["objects"] = object_method(params.object, models or {})
+    return out

@@ -4,60 +4,17 @@ import json
 
 import numpy as np
 import pytest
+from describe_places import moved, room
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gsmap.describe import describe
+from gsmap.describe import DescribeParams, describe
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
 
-
-def room(seed: int = 0, n: int = 30000, patches: int = 120) -> tuple[Gaussians, Cameras]:
-    """A 6 x 5 x 2.5 m room of flat Gaussians with coloured patches on all six sides and two boxes; 24 cameras."""
-    rng = np.random.default_rng(seed)
-    size = np.array([6.0, 5.0, 2.5])
-    points = rng.uniform(0, 1, (n, 3)) * size
-    side = rng.integers(0, 3, n)
-    points[np.arange(n), side] = rng.integers(0, 2, n) * size[side]
-    boxes = [([1.0, 1.0, 0.0], [2.2, 1.7, 0.75]), ([4.0, 3.0, 0.0], [4.8, 4.5, 0.9])]
-    for low, high in boxes:
-        low, high = np.array(low), np.array(high)
-        p = low + rng.uniform(0, 1, (n // 10, 3)) * (high - low)
-        axis = rng.integers(0, 3, len(p))
-        p[np.arange(len(p)), axis] = np.where(rng.integers(0, 2, len(p)), high[axis], low[axis])
-        points = np.concatenate([points, p])
-    texture = np.random.default_rng(99)
-    centres, colours = texture.uniform(0, 1, (patches, 3)) * size, texture.uniform(-0.4, 0.4, (patches, 3))
-    on = texture.integers(0, 3, patches)
-    centres[np.arange(patches), on] = texture.integers(0, 2, patches) * size[on]
-    distance, index = cKDTree(centres).query(points)
-    rgb = 0.5 + colours[index] * (distance < 0.12)[:, None]
-    dc = (rgb - 0.5) / 0.28209479177387814
-    m = len(points)
-    gaussians = Gaussians(
-        points, np.tile([1.0, 0, 0, 0], (m, 1)), np.full((m, 3), np.log(0.02)), np.full(m, 3.0), dc[:, None]
-    )
-    poses = np.tile(np.eye(4), (24, 1, 1))
-    for i in range(24):
-        yaw, pitch = 2 * np.pi * i / 24, -0.15
-        forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        poses[i, :3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-        poses[i, :3, 3] = [2.5 + 0.3 * np.cos(yaw), 2.5, 1.5]
-    return gaussians, Cameras(poses, np.tile([200.0, 200, 160, 120], (24, 1)), np.tile([320, 240], (24, 1)))
-
-
-def moved(gaussians: Gaussians, cameras: Cameras, S: Sim3) -> tuple[Gaussians, Cameras]:
-    """The capture in another frame (colour has no view dependence here, so SH need not turn)."""
-    log_scales = gaussians.log_scales + np.log(S.scale)
-    poses = cameras.T_frame_camera.copy()
-    poses[:, :3, :3] = S.rotation @ poses[:, :3, :3]
-    poses[:, :3, 3] = S.apply(cameras.centers)
-    g = Gaussians(S.apply(gaussians.means), gaussians.quats, log_scales, gaussians.logit_opacities, gaussians.sh)
-    return g, Cameras(poses, cameras.intrinsics_px, cameras.sizes_px)
+LANDMARKS = DescribeParams(objects=False)
 
 
 def counterparts(a: NodeLayer, b: NodeLayer, S_a_b: Sim3, within: float) -> float:
@@ -79,9 +36,9 @@ def recall(a: NodeLayer, b: NodeLayer, S_a_b: Sim3, within: float) -> float:
 
 def test_landmarks_follow_the_scene_into_any_frame_and_unit():
     gaussians, cameras = room()
-    one = describe("one", gaussians, cameras)
+    one = describe("one", gaussians, cameras, LANDMARKS, scale_policy="unknown")
     S = Sim3(Rotation.random(random_state=3).as_matrix(), np.array([30.0, -7, 12]), 2.7)
-    two = describe("two", *moved(gaussians, cameras, S), scale_policy="unknown")
+    two = describe("two", *moved(gaussians, cameras, S), LANDMARKS, scale_policy="unknown")
     assert two.up @ (S.rotation @ one.up) > np.cos(np.radians(0.5))
     assert two.unit_m == pytest.approx(one.unit_m / 2.7, rel=1e-3)
     a, b = one.layers["landmarks:1"], two.layers["landmarks:1"]
@@ -91,8 +48,8 @@ def test_landmarks_follow_the_scene_into_any_frame_and_unit():
 
 
 def test_two_samplings_of_one_room_share_landmarks_and_one_is_not_another_room():
-    one = describe("one", *room(1), scale_policy="known").layers["landmarks"]
-    two = describe("two", *room(2), scale_policy="known").layers["landmarks"]
+    one = describe("one", *room(1), LANDMARKS, scale_policy="known").layers["landmarks"]
+    two = describe("two", *room(2), LANDMARKS, scale_policy="known").layers["landmarks"]
     assert counterparts(one, two, Sim3.identity(), 0.1) > 0.6
     turned = Sim3(Rotation.from_euler("z", 73, degrees=True).as_matrix(), np.array([1.0, -2, 0]))
     assert counterparts(one, two, turned, 0.1) < 0.15
@@ -126,7 +83,7 @@ def test_a_ball_without_cameras_has_no_up_and_says_so():
     p = rng.normal(size=(5000, 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     ball = Gaussians(p, np.tile([1.0, 0, 0, 0], (5000, 1)), np.full((5000, 3), -4.0), np.full(5000, 3.0), p[:, None])
-    graph = describe("ball", ball, None)
+    graph = describe("ball", ball, None, LANDMARKS)
     assert graph.up is None
     assert graph.layers["landmarks"].positions.shape == (0, 3)
     assert any("up could not be told" in note for note in graph.notes)
@@ -169,7 +126,7 @@ def test_house_landmarks_repeat(shared_data):
     for name in ("c0", "c1"):
         gaussians = formats.read(shared_data / "house" / f"{name}.ply")
         cameras = formats.read_cameras(shared_data / "house" / f"{name}.cameras.json")
-        layers[name] = describe(name, gaussians, cameras, scale_policy="known").layers["landmarks"]
+        layers[name] = describe(name, gaussians, cameras, LANDMARKS, scale_policy="known").layers["landmarks"]
         record = json.loads((shared_data / "house" / "truth" / f"{name}.json").read_text())
         truth[name] = Sim3.from_matrix(np.array(record["T_scene_world"]))
     S = truth["c0"] @ truth["c1"].inverse()

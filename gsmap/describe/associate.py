@@ -1,0 +1,82 @@
+"""Regions of many views become the nodes of one scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.describe.cloud import downsample
+
+
+@dataclass(eq=False)
+class Node:
+    """An object under construction: points (n, 3), their box (2, 3), unit feature (F,), and what it was seen in."""
+
+    points: np.ndarray
+    box: np.ndarray
+    feature: np.ndarray
+    confidences: list[float] = field(default_factory=list)
+    views: set[int] = field(default_factory=set)
+    part: int | None = None
+
+
+def associate(nodes: list[Node], region: Node, tau: float, cell: float) -> Node:
+    """Merge a region (a node seen once) into the node it resembles most, or start a new one; returns the node.
+
+    Resemblance is the cosine of the features plus the generalised IoU of the boxes (paper, tau_asso); regions whose
+    segmenter knows them to be one part are one node. Merging unites the points and thins them to one per cell of size
+    ``cell``, and averages the features over the regions seen so far.
+    """
+    best = _counterpart(nodes, region, tau)
+    if best is None:
+        nodes.append(region)
+        return region
+    united = np.concatenate([best.points, region.points])
+    best.points = downsample(united, united[:, :0], cell)[0]
+    best.box = box_of(best.points)
+    seen = len(best.confidences)
+    mean = (best.feature * seen + region.feature) / (seen + 1)
+    best.feature = mean / max(np.linalg.norm(mean), 1e-12)
+    best.confidences += region.confidences
+    best.views |= region.views
+    return best
+
+
+def region(
+    points: np.ndarray, feature: np.ndarray, confidence: float, view: int, cell: float, part: int | None = None
+) -> Node:
+    """What one mask shows, as a node of its own."""
+    points = downsample(points, points[:, :0], cell)[0]
+    return Node(points, box_of(points), feature, [confidence], {view}, part)
+
+
+def _counterpart(nodes: list[Node], region: Node, tau: float) -> Node | None:
+    if region.part is not None:
+        return next((n for n in nodes if n.part == region.part), None)
+    if not nodes:
+        return None
+    score = np.stack([n.feature for n in nodes]) @ region.feature + giou(np.stack([n.box for n in nodes]), region.box)
+    best = int(np.argmax(score))
+    return nodes[best] if score[best] > tau else None
+
+
+def giou(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Generalised IoU (M,) in (-1, 1] of axis-parallel boxes (M, 2, 3) with one box (2, 3).
+
+    Rezatofighi et al. 2019, in 3D: IoU minus the share of the hull that neither covers. Flat boxes are given a
+    thickness of a thousandth of the hull, so that two equal planes have IoU 1.
+    """
+    low, high = np.minimum(boxes[:, 0], box[0]), np.maximum(boxes[:, 1], box[1])
+    pad = 0.5e-3 * (high - low).max(1, keepdims=True) + 1e-12
+    boxes = np.stack([boxes[:, 0] - pad, boxes[:, 1] + pad], 1)
+    other = np.stack([box[0] - pad, box[1] + pad], 1)
+    inter = np.clip(np.minimum(boxes[:, 1], other[:, 1]) - np.maximum(boxes[:, 0], other[:, 0]), 0, None).prod(1)
+    hull = (np.maximum(boxes[:, 1], other[:, 1]) - np.minimum(boxes[:, 0], other[:, 0])).prod(1)
+    union = (boxes[:, 1] - boxes[:, 0]).prod(1) + (other[:, 1] - other[:, 0]).prod(1) - inter
+    return inter / union - (hull - union) / hull
+
+
+def box_of(points: np.ndarray) -> np.ndarray:
+    """(2, 3) corners of the box that holds the points but for the outermost 2 percent on each side."""
+    return np.percentile(points, [2, 98] if len(points) > 20 else [0, 100], axis=0)

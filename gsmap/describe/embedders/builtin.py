@@ -1,0 +1,115 @@
+"""The embedder that needs no weights: colour, texture and shape of what a mask shows.
+
+Four histograms, each the root of a distribution (so that a dot product is a Bhattacharyya coefficient), side by side:
+
+- *hue*: a*b* direction in 12 soft bins where there is colour, one bin for grey. Gain and gamma leave it nearly alone.
+- *lightness*: L* relative to the median of the view, in 7 soft bins: exposure moves both.
+- *texture*: strength of the L* gradient relative to L*, in 6 soft bins; without direction, so the camera may roll.
+- *shape*: of the surface points in 3D: logarithm of the size (metres by the unit assumed), flatness and elongation
+  from the principal axes, and how the flattest axis stands to gravity; soft bins each.
+
+All are free of the camera's place and roll, so the features of one thing agree over views and captures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.describe.colour import srgb_to_lab
+from gsmap.describe.segmenters import Mask
+from gsmap.describe.views import View
+
+_HUES, _GREY_CHROMA = 12, 8.0
+_LIGHTNESS = np.linspace(-45, 45, 7)
+_TEXTURE = np.linspace(-5, 0, 6)  # natural log of |grad L| / L per pixel
+_SIZE = np.log(np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4]))
+_RATIO = np.linspace(0, 1, 5)
+_PARTS = (_HUES + 1, len(_LIGHTNESS), len(_TEXTURE), len(_SIZE) + 3 * len(_RATIO))
+_WORDS = 48
+
+
+@dataclass(frozen=True)
+class Params:
+    """How much each part of the vector weighs (their squares are shares of the cosine)."""
+
+    hue: float = 1.0
+    lightness: float = 0.7
+    texture: float = 0.5
+    shape: float = 0.9
+
+
+class BuiltinEmbedder:
+    """Appearance and shape, hand-made."""
+
+    def __init__(self, params: Params, up: np.ndarray | None, unit_m: float) -> None:
+        weights = np.array([params.hue, params.lightness, params.texture, params.shape])
+        self.weights = np.repeat(weights / np.linalg.norm(weights), _PARTS).astype(np.float32)
+        self.up, self.unit_m = up, unit_m
+        self.codebook = self._codebook()
+
+    def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
+        if not masks:
+            return np.zeros((0, sum(_PARTS)), np.float32)
+        lab = srgb_to_lab(view.rgb / 255.0)
+        seen = view.alpha > 0.5
+        middle = np.median(lab[seen, 0]) if seen.any() else 50.0
+        slope = np.hypot(*np.gradient(lab[..., 0])) / np.maximum(lab[..., 0], 5.0)
+        rows = []
+        for mask, shown in zip(masks, points, strict=True):
+            pixels, steep = lab[mask.pixels], slope[mask.pixels]
+            parts = [
+                _hues(pixels),
+                _soft(pixels[:, 0] - middle, _LIGHTNESS),
+                _soft(np.log(np.maximum(steep, 1e-4)), _TEXTURE),
+                self._shape(shown),
+            ]
+            rows.append(np.concatenate([np.sqrt(p / max(p.sum(), 1e-12)) for p in parts]) * self.weights)
+        return np.stack(rows).astype(np.float32)
+
+    def _shape(self, points: np.ndarray) -> np.ndarray:
+        values, axes = np.linalg.eigh(np.cov((points * self.unit_m).T) + 1e-8 * np.eye(3))
+        spread = np.sqrt(values)
+        tilt = 0.5 if self.up is None else abs(float(axes[:, 0] @ self.up))
+        ratios = [spread[0] / spread[2], spread[1] / spread[2], tilt]
+        size = _soft(np.log(4 * spread[2:]), _SIZE)
+        return np.concatenate([size, *[_soft(np.array([r]), _RATIO) for r in ratios]])
+
+    def _codebook(self) -> np.ndarray:
+        """Words drawn as things might look: one or two hues, one lightness, texture and shape each; seeded."""
+        rng = np.random.default_rng(7)
+        rows = []
+        for _ in range(_WORDS):
+            parts = []
+            for size in _PARTS[:3]:
+                p = np.full(size, 0.1 / size)
+                p[rng.integers(size)] += 0.6
+                p[rng.integers(size)] += 0.3
+                parts.append(p)
+            picks = [rng.integers(n) for n in (len(_SIZE), *[len(_RATIO)] * 3)]
+            offsets = np.concatenate([[0], np.cumsum([len(_SIZE), *[len(_RATIO)] * 2])])
+            shape = np.full(_PARTS[3], 0.02)
+            shape[offsets + picks] += 1.0
+            rows.append(np.concatenate([np.sqrt(p / p.sum()) for p in [*parts, shape]]) * self.weights)
+        return np.stack(rows).astype(np.float32)
+
+
+def _soft(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Histogram of values over evenly spaced centres, each shared linearly between its two neighbours."""
+    at = np.clip((values - centres[0]) / (centres[1] - centres[0]), 0, len(centres) - 1)
+    low = np.minimum(at.astype(int), len(centres) - 2)
+    share = at - low
+    return np.bincount(low, 1 - share, len(centres)) + np.bincount(low + 1, share, len(centres))
+
+
+def _hues(lab: np.ndarray) -> np.ndarray:
+    """Histogram over hue circle and grey: a pixel is coloured as far as its chroma exceeds that of grey things."""
+    chroma = np.hypot(lab[:, 1], lab[:, 2])
+    coloured = chroma / (chroma + _GREY_CHROMA)
+    at = np.arctan2(lab[:, 2], lab[:, 1]) / (2 * np.pi) * _HUES % _HUES
+    low = at.astype(int) % _HUES
+    share = at - at.astype(int)
+    hues = np.bincount(low, coloured * (1 - share), _HUES) + np.bincount((low + 1) % _HUES, coloured * share, _HUES)
+    return np.concatenate([hues, [(1 - coloured).sum()]])

@@ -1,0 +1,107 @@
+"""Features from an image encoder the user gives: CLIP's visual tower, DINO, MobileNet, any ONNX file of that shape."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from gsmap.describe.context import random_codebook
+from gsmap.describe.models import ModelSpec, open_session
+from gsmap.describe.segmenters import Mask
+from gsmap.describe.views import View
+
+_CODEBOOK_SEED = 20
+_WORDS = 32
+
+
+@dataclass(frozen=True)
+class Params:
+    """How a mask becomes a picture.
+
+    Args:
+        margin: the crop is the mask's box and this share of it around, made square.
+        background: how much of the pixels outside the mask is kept; the rest is the picture's mean.
+        side_px: where the model leaves its input size free.
+        batch: crops per run, where the model takes several.
+    """
+
+    margin: float = 0.1
+    background: float = 0.5
+    side_px: int = 224
+    batch: int = 16
+
+
+class ClipEmbedder:
+    """Runs the encoder on one crop per mask. Size, layout and names are read from the model."""
+
+    def __init__(self, params: Params, spec: ModelSpec) -> None:
+        self.params, self.spec = params, spec
+        self.session = open_session(spec)
+        self.input = spec.inputs[0]
+        n, *rest = self.input.shape
+        self.channels_last = rest[-1] == 3 and rest[0] != 3
+        sides = rest[:2] if self.channels_last else rest[1:]
+        self.size = tuple(s or params.side_px for s in sides)  # height, width
+        self.batch = params.batch if n is None else n
+        self.fixed = n is not None
+        # The embedding is what the model names so, else its first output with one vector per picture.
+        named = [o.name for o in spec.outputs if o.name in ("image_embeds", "embedding", "embeddings", "pooler_output")]
+        flat = [o.name for o in spec.outputs if len(o.shape) == 2]
+        self.output = (named or flat or [spec.outputs[0].name])[0]
+        dim = self._run(np.zeros((1, *self.size, 3), np.float32)).shape[1]
+        self.codebook = random_codebook(_CODEBOOK_SEED, _WORDS, dim)
+
+    def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
+        if not masks:
+            return np.zeros((0, self.codebook.shape[1]), np.float32)
+        crops = np.stack([crop(view.rgb, m.pixels, self.size, self.params) for m in masks])
+        features = self._run(normalise(crops, self.spec))
+        return (features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+
+    def _run(self, pictures: np.ndarray) -> np.ndarray:
+        """(R, F) features of normalised pictures (R, H, W, 3)."""
+        out = []
+        for start in range(0, len(pictures), self.batch):
+            part = pictures[start : start + self.batch]
+            used = len(part)
+            if self.fixed and used < self.batch:
+                part = np.concatenate([part, np.zeros((self.batch - used, *part.shape[1:]), part.dtype)])
+            part = part if self.channels_last else part.transpose(0, 3, 1, 2)
+            dtype = np.float16 if self.input.dtype == "float16" else np.float32
+            feed = {self.input.name: np.ascontiguousarray(part, dtype)}
+            value = self.session.run([self.output], feed)[0].astype(np.float32)
+            if value.ndim == 3:  # tokens: the first is the class token
+                value = value[:, 0]
+            elif value.ndim == 4:  # a feature map: its mean
+                value = value.mean((2, 3)) if value.shape[1] >= value.shape[3] else value.mean((1, 2))
+            out.append(value[:used])
+        return np.concatenate(out)
+
+
+def crop(rgb: np.ndarray, pixels: np.ndarray, size: tuple[int, int], params: Params) -> np.ndarray:
+    """The square around a mask as (height, width, 3) float32 in [0, 1]; what is off the picture is its mean."""
+    rows, columns = np.flatnonzero(pixels.any(1)), np.flatnonzero(pixels.any(0))
+    centre = np.array([rows[0] + rows[-1] + 1, columns[0] + columns[-1] + 1]) / 2
+    side = max(rows[-1] + 1 - rows[0], columns[-1] + 1 - columns[0]) * (1 + 2 * params.margin)
+    low = np.floor(centre - side / 2).astype(int)
+    side = max(2, int(np.ceil(side)))
+    mean = rgb.reshape(-1, 3).mean(0)
+    square = np.tile(mean, (side, side, 1))
+    row = slice(max(low[0], 0), min(low[0] + side, rgb.shape[0]))
+    column = slice(max(low[1], 0), min(low[1] + side, rgb.shape[1]))
+    part = rgb[row, column].astype(np.float64)
+    outside = ~pixels[row, column, None]
+    part = np.where(outside, params.background * part + (1 - params.background) * mean, part)
+    at_row, at_column = row.start - low[0], column.start - low[1]
+    square[at_row : at_row + part.shape[0], at_column : at_column + part.shape[1]] = part
+    image = Image.fromarray(np.clip(square + 0.5, 0, 255).astype(np.uint8))
+    image = image.resize((size[1], size[0]), Image.Resampling.BICUBIC)
+    return np.asarray(image, np.float32) / 255
+
+
+def normalise(pictures: np.ndarray, spec: ModelSpec) -> np.ndarray:
+    """Pictures (..., 3) in [0, 1] scaled as the model expects: ``(rgb - mean) / std``."""
+    return ((pictures - np.float32(spec.mean)) / np.float32(spec.std)).astype(np.float32)

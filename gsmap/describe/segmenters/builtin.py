@@ -1,0 +1,110 @@
+"""The segmenter that needs no weights: parts of the surface itself, seen through the renders.
+
+The surface is cut into parts once, in 3D (Felzenszwalb and Huttenlocher 2004, "Efficient graph-based image
+segmentation", on a neighbour graph of the Gaussians with colour and normal differences as weights); a view's mask of a
+part are the pixels that one of its Gaussians dominates. So the masks of one part agree over all views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from gsmap.describe.cloud import Cloud, downsample, local_planes
+from gsmap.describe.segmenters import Mask
+from gsmap.describe.views import View
+
+
+@dataclass(frozen=True)
+class Params:
+    """How coarse the parts are.
+
+    Args:
+        num_samples: about how many points the surface is thinned to before it is cut.
+        scale: Felzenszwalb's k: larger makes larger parts.
+        min_share: parts of less than this share of the samples join their most similar neighbour.
+        min_area: masks of a smaller share of the image are dropped.
+    """
+
+    num_samples: int = 20000
+    scale: float = 6.0
+    min_share: float = 0.001
+    min_area: float = 0.002
+
+
+class BuiltinSegmenter:
+    """Masks of the surface's parts."""
+
+    def __init__(self, params: Params, cloud: Cloud, num_gaussians: int) -> None:
+        self.params = params
+        self.part_of_gaussian = np.full(num_gaussians + 1, -1)  # the last row is for pixels where nothing was drawn
+        if len(cloud) >= 16:
+            self.part_of_gaussian[cloud.index] = cut_surface(cloud, params)
+
+    def segment(self, view: View) -> list[Mask]:
+        parts = self.part_of_gaussian[view.dominant_id]
+        parts[view.alpha < 0.5] = -1
+        masks = []
+        for part in np.unique(parts[parts >= 0]):
+            # Closing by a pixel bridges the single foreign Gaussians that speckle a part.
+            pixels = ndimage.binary_closing(parts == part, np.ones((3, 3), bool))
+            labels, count = ndimage.label(pixels)
+            sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+            for i in np.flatnonzero(sizes >= self.params.min_area * pixels.size):
+                blob = labels == i + 1
+                masks.append(Mask(blob, float(view.alpha[blob].mean() * sizes[i] / sizes.sum()), int(part)))
+        return masks
+
+
+def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
+    """Part (N,) int of each point of the cloud, numbered from 0."""
+    # A cell so large that the surface covers about num_samples of them.
+    cell = float(np.sqrt(cloud.areas.sum() / params.num_samples)) or 1e-9
+    points, lab = downsample(cloud.points, cloud.lab, cell)
+    normals, _ = local_planes(points, 16)
+    distance, neighbours = cKDTree(points).query(points, k=min(9, len(points)))
+    a = np.repeat(np.arange(len(points)), neighbours.shape[1] - 1)
+    b = neighbours[:, 1:].ravel()
+    once = (a < b) | ~(neighbours[b] == a[:, None]).any(1)
+    near = distance[:, 1:].ravel() < 3 * cell
+    a, b = a[once & near], b[once & near]
+    lab = lab[neighbours].mean(1)  # a Gaussian's own colour is noisy
+    difference = (lab[a] - lab[b]) * [0.5, 1.0, 1.0]  # light and shade part a surface less than a change of hue
+    turn = 1 - np.abs((normals[a] * normals[b]).sum(1))
+    weight = np.linalg.norm(difference, axis=1) / 5.0 + 3.0 * turn
+    parts = felzenszwalb(len(points), a, b, weight, params.scale, max(4, int(params.min_share * len(points))))
+    return parts[cKDTree(points).query(cloud.points)[1]]
+
+
+def felzenszwalb(
+    count: int, a: np.ndarray, b: np.ndarray, weight: np.ndarray, scale: float, min_size: int
+) -> np.ndarray:
+    """Component (count,) int of each node: edges in order of weight join components whose inner difference allows it.
+
+    Components smaller than ``min_size`` are then joined along their lightest edges.
+    """
+    order = np.argsort(weight, kind="stable")
+    edges = list(zip(a[order].tolist(), b[order].tolist(), weight[order].tolist(), strict=True))
+    parent, size, limit = list(range(count)), [1] * count, [scale] * count
+
+    def find(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    for i, j, w in edges:
+        i, j = find(i), find(j)
+        if i != j and w <= limit[i] and w <= limit[j]:
+            parent[j] = i
+            size[i] += size[j]
+            limit[i] = w + scale / size[i]
+    for i, j, _ in edges:
+        i, j = find(i), find(j)
+        if i != j and min(size[i], size[j]) < min_size:
+            parent[j] = i
+            size[i] += size[j]
+    return np.unique([find(i) for i in range(count)], return_inverse=True)[1]

@@ -1,0 +1,137 @@
+"""Segment Anything, run from its published ONNX exports: everything in the picture, prompted by a grid of points.
+
+Contract (segment-anything, ``scripts/export_onnx_model.py``; MobileSAM and others export the same): the encoder takes
+a picture whose longer side is 1024 and gives ``image_embeddings``; the decoder takes those with ``point_coords`` (1,
+P, 2) in the 1024 frame, ``point_labels`` (1, P), ``mask_input``, ``has_mask_input``, ``orig_im_size`` and gives
+``masks`` (1, M, H, W) logits in the picture's size and ``iou_predictions`` (1, M). Where the export leaves its batch
+free, many prompts go through the decoder at once. Cuts and box suppression are those of its automatic mask generator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from gsmap.describe.models import ModelSpec, open_session
+from gsmap.describe.segmenters import Mask
+from gsmap.describe.views import View
+
+_SIDE_PX = 1024
+_PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
+_PIXEL_STD = np.array([58.395, 57.12, 57.375], np.float32)
+
+
+@dataclass(frozen=True)
+class Params:
+    """The automatic mask generator's knobs.
+
+    Args:
+        points_per_side: the prompts form a square grid.
+        batch: prompts per run of the decoder, where it takes several.
+        min_iou: least IoU the model predicts for its own mask.
+        min_stability: least IoU between the mask cut one logit above and one below zero.
+        max_box_iou: of two masks whose boxes overlap more, the one of lower predicted IoU goes.
+        min_area, max_area: share of the image.
+    """
+
+    points_per_side: int = 16
+    batch: int = 64
+    min_iou: float = 0.86
+    min_stability: float = 0.9
+    max_box_iou: float = 0.7
+    min_area: float = 0.002
+    max_area: float = 0.9
+
+
+class SamSegmenter:
+    """Masks of everything SAM finds."""
+
+    def __init__(self, params: Params, encoder: ModelSpec, decoder: ModelSpec) -> None:
+        self.params = params
+        self.encoder, self.decoder = open_session(encoder), open_session(decoder)
+        self.encoder_spec = encoder
+        shapes = {t.name: t.shape for t in decoder.inputs}
+        self.batch = params.batch if shapes["point_coords"][0] is None and shapes["point_labels"][0] is None else 1
+        self.types = {t.name: np.float64 if t.dtype == "double" else np.float32 for t in decoder.inputs}
+
+    def segment(self, view: View) -> list[Mask]:
+        height, width = view.rgb.shape[:2]
+        embeddings = self._encode(view.rgb)
+        side = (np.arange(self.params.points_per_side) + 0.5) / self.params.points_per_side
+        grid = np.stack(np.meshgrid(side * width, side * height), -1).reshape(-1, 2)
+        boxes, scores, masks = [], [], []
+        for start in range(0, len(grid), self.batch):
+            for logits, iou in self._decode(embeddings, grid[start : start + self.batch], height, width):
+                inner, outer = (logits > 1).sum(), (logits > -1).sum()
+                pixels = logits > 0
+                share = pixels.mean()
+                if (
+                    iou >= self.params.min_iou
+                    and inner >= self.params.min_stability * max(outer, 1)
+                    and self.params.min_area <= share <= self.params.max_area
+                ):
+                    rows, columns = np.flatnonzero(pixels.any(1)), np.flatnonzero(pixels.any(0))
+                    boxes.append([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])
+                    scores.append(float(iou))
+                    masks.append(pixels)
+        keep = suppress(np.array(boxes, float).reshape(-1, 4), np.array(scores), self.params.max_box_iou)
+        return [Mask(masks[i], min(1.0, scores[i])) for i in keep]
+
+    def _encode(self, rgb: np.ndarray) -> np.ndarray:
+        """Embeddings (1, C, h, w) of a picture."""
+        height, width = rgb.shape[:2]
+        scale = _SIDE_PX / max(height, width)
+        size = (round(width * scale), round(height * scale))
+        large = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BILINEAR), np.float32)
+        tensor = self.encoder_spec.inputs[0]
+        if len(tensor.shape) == 3:  # exports that normalise and pad inside
+            picture = large
+        else:
+            normal = (large - _PIXEL_MEAN) / _PIXEL_STD
+            padded = np.zeros((_SIDE_PX, _SIDE_PX, 3), np.float32)
+            padded[: size[1], : size[0]] = normal
+            picture = padded[None] if tensor.shape[-1] == 3 else padded.transpose(2, 0, 1)[None]
+        if tensor.dtype == "uint8":
+            picture = picture.astype(np.uint8)
+        outputs = self.encoder.run(None, {tensor.name: picture})
+        return next(o for o in outputs if o.ndim == 4)
+
+    def _decode(self, embeddings: np.ndarray, points: np.ndarray, height: int, width: int):
+        """Yield (logits (H, W), predicted IoU) of each mask of each prompt."""
+        count = len(points)
+        scale = _SIDE_PX / max(height, width)
+        # A prompt without a box carries a padding point labelled -1 (the export's contract).
+        coords = np.zeros((count, 2, 2))
+        coords[:, 0] = points * scale
+        labels = np.tile([1.0, -1.0], (count, 1))
+        feed = {
+            "image_embeddings": embeddings,
+            "point_coords": coords,
+            "point_labels": labels,
+            "mask_input": np.zeros((1, 1, 256, 256)),
+            "has_mask_input": np.zeros(1),
+            "orig_im_size": np.array([height, width]),
+        }
+        feed = {name: value.astype(self.types[name]) for name, value in feed.items()}
+        masks, scores = self.decoder.run(["masks", "iou_predictions"], feed)
+        # Of four masks the first answers prompts of several points; the generator uses the other three.
+        first = 1 if masks.shape[1] == 4 else 0
+        for prompt in range(masks.shape[0]):
+            for m in range(first, masks.shape[1]):
+                yield masks[prompt, m], scores[prompt, m]
+
+
+def suppress(boxes: np.ndarray, scores: np.ndarray, max_iou: float) -> list[int]:
+    """Non-maximum suppression: rows of the boxes (M, 4) ``x0 y0 x1 y1`` to keep, the best first."""
+    areas = (boxes[:, 2:] - boxes[:, :2]).prod(1)
+    left = np.argsort(-scores, kind="stable")
+    keep = []
+    while len(left):
+        best, left = left[0], left[1:]
+        keep.append(int(best))
+        low, high = np.maximum(boxes[best, :2], boxes[left, :2]), np.minimum(boxes[best, 2:], boxes[left, 2:])
+        inter = np.clip(high - low, 0, None).prod(1)
+        left = left[inter <= max_iou * (areas[best] + areas[left] - inter)]
+    return keep

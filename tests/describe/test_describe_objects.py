@@ -1,0 +1,186 @@
+"""Objects: parts found in renders, lifted, associated over views, with their context."""
+
+import networkx as nx
+import numpy as np
+import pytest
+from describe_places import moved, room
+from scipy.spatial.transform import Rotation
+
+from gsmap.describe import DescribeParams, describe, methods
+from gsmap.describe.associate import associate, giou, region
+from gsmap.describe.context import context_histograms, neighbourhood, random_codebook
+from gsmap.describe.lift import visible
+from gsmap.describe.object_layer import ObjectParams
+from gsmap.describe.picture import draw_graph
+from gsmap.describe.segmenters.builtin import felzenszwalb
+from gsmap.describe.views import View, sample_cameras
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.types import Cameras, Sim3
+
+OBJECTS = DescribeParams(landmarks=False, object=ObjectParams(num_cameras=16))
+
+
+def box(low, high) -> np.ndarray:
+    return np.array([low, high], float)
+
+
+def test_giou_by_hand():
+    a = box([0, 0, 0], [2, 2, 2])
+    others = np.stack(
+        [a, box([1, 0, 0], [3, 2, 2]), box([4, 0, 0], [6, 2, 2]), box([2, 2, 2], [4, 4, 4]), box([0, 0, 0], [1, 1, 1])]
+    )
+    # Same; half shifted: 4 / 12; apart: hull 24, union 16; corner to corner: hull 64, union 16; inside: 1 / 8.
+    np.testing.assert_allclose(giou(others, a), [1, 1 / 3, -8 / 24, -48 / 64, 1 / 8], atol=0.02)
+    flat = box([0, 0, 1], [2, 2, 1])
+    np.testing.assert_allclose(giou(flat[None], flat), 1)
+    assert giou(flat[None], box([0, 0, 1.5], [2, 2, 1.5]))[0] < 0
+
+
+def test_two_views_of_two_things_become_two_nodes():
+    rng = np.random.default_rng(0)
+    feature = np.eye(4, dtype=np.float32)
+    cup, chair = rng.uniform(0, 0.1, (200, 3)), rng.uniform(2, 3, (200, 3))
+    nodes = []
+    associate(nodes, region(cup[:150], feature[0], 0.9, 0, 0.01), 1.1, 0.01)
+    associate(nodes, region(chair[:150], feature[1], 0.8, 0, 0.01), 1.1, 0.01)
+    seen_again = feature[0] + 0.3 * feature[2]
+    seen_again /= np.linalg.norm(seen_again)
+    joined = associate(nodes, region(cup[50:], seen_again, 0.7, 1, 0.01), 1.1, 0.01)
+    assert joined is nodes[0]
+    assert len(nodes) == 2
+    assert joined.views == {0, 1}
+    assert np.linalg.norm(joined.feature) == pytest.approx(1)
+    expected = feature[0] + seen_again
+    np.testing.assert_allclose(joined.feature, expected / np.linalg.norm(expected), atol=1e-6)
+    # Points are thinned to one per cell of a cm.
+    assert len(joined.points) <= len(cup)
+    assert len(np.unique(np.floor((joined.points - joined.points.min(0)) / 0.01), axis=0)) >= 0.9 * len(joined.points)
+    # The same place with another look, and the same look elsewhere, are other things.
+    associate(nodes, region(cup, feature[3], 0.9, 2, 0.01), 1.1, 0.01)
+    associate(nodes, region(cup + 5, feature[0], 0.9, 2, 0.01), 1.1, 0.01)
+    assert len(nodes) == 4
+    # Where the segmenter knows two masks to be one part, looks and place do not matter.
+    one = associate(nodes, region(cup + 9, feature[0], 0.9, 3, 0.01, part=7), 1.1, 0.01)
+    assert associate(nodes, region(cup + 12, feature[1], 0.9, 4, 0.01, part=7), 1.1, 0.01) is one
+
+
+def test_lifting_takes_the_visible_surface_only():
+    camera = Cameras(np.eye(4)[None], [[100.0, 100, 50, 40]], [[100, 80]])
+    depth = np.full((80, 100), 2.0, np.float32)
+    view = View(np.zeros((80, 100, 3), np.uint8), depth, np.ones_like(depth), np.zeros((80, 100), np.int32), camera)
+    points = np.array([[0, 0, 2.0], [0.1, 0.2, 2.03], [0, 0, 3], [0, 0, 1], [0, 0, -2], [5, 0, 2]])
+    rows, pixel = visible(points, view)
+    assert rows.tolist() == [0, 1]
+    assert pixel[0].tolist() == [50, 40]
+
+
+def test_neighbourhood_is_networkx_within_hops():
+    positions = np.random.default_rng(1).uniform(0, 6, (40, 3))
+    graph = nx.Graph((i, j) for i, j in np.argwhere(np.linalg.norm(positions[:, None] - positions[None], axis=2) < 1.5))
+    reach = neighbourhood(positions, 1.5, 3)
+    for i in range(40):
+        near = set(nx.single_source_shortest_path_length(graph, i, 3)) - {i}
+        assert set(np.flatnonzero(reach[i])) == near
+
+
+def test_context_counts_neighbours_not_oneself():
+    words = random_codebook(0, 8, 16)
+    features = np.stack([words[0], words[1], words[2], words[3]])
+    positions = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [50, 0, 0.0]])
+    context = context_histograms(features, positions, words, max_distance=1.2, hops=3)
+    np.testing.assert_allclose(context[0] ** 2, np.eye(8)[[1, 2]].mean(0), atol=1e-3)
+    np.testing.assert_array_equal(context[3], 0)
+    one_hop = context_histograms(features, positions, words, max_distance=1.2, hops=1)
+    np.testing.assert_allclose(one_hop[0] ** 2, np.eye(8)[1], atol=1e-3)
+
+
+def test_felzenszwalb_cuts_at_the_heavy_edge():
+    a, b = np.arange(9), np.arange(1, 10)
+    weight = np.where(a == 4, 5.0, 0.1)
+    parts = felzenszwalb(10, a, b, weight, 1.0, 2)
+    assert parts.tolist() == [0] * 5 + [1] * 5
+    assert len(set(felzenszwalb(10, a, b, weight, 1.0, 6))) == 1
+
+
+def test_objects_sit_on_the_furniture_and_follow_the_scene():
+    gaussians, cameras = room()
+    green, red = [-0.4, 0.3, -0.4], [0.4, -0.4, -0.4]
+    rgb = np.zeros_like(gaussians.means)
+    n = len(gaussians) - 2 * 3000
+    rgb[n : n + 3000], rgb[n + 3000 :] = green, red
+    sh = (rgb / 0.28209479177387814)[:, None]
+    gaussians = type(gaussians)(
+        gaussians.means, gaussians.quats, gaussians.log_scales + 0.7, gaussians.logit_opacities, sh
+    )
+    one = describe("one", gaussians, cameras, OBJECTS, scale_policy="known").layers["objects"]
+    S = Sim3(Rotation.random(random_state=5).as_matrix(), np.array([3.0, -7, 12]), 2.0)
+    two = describe("two", *moved(gaussians, cameras, S), OBJECTS, scale_policy="unknown").layers["objects"]
+    positions = S.inverse().apply(two.positions)
+    for centre in ([1.6, 1.35, 0.4], [4.4, 3.75, 0.45]):
+        i = np.argmin(np.linalg.norm(one.positions - centre, axis=1))
+        assert np.linalg.norm(one.positions[i] - centre) < 0.5  # of the faces that cameras see
+        assert (np.ptp(one.extents[i], axis=0) < 2).all()
+        # The box is found in the other frame and unit too, and its embedding finds it.
+        assert np.linalg.norm(positions - one.positions[i], axis=1).min() < 0.15
+        best = np.argmax(two.embeddings @ one.embeddings[i])
+        assert np.linalg.norm(positions[best] - one.positions[i]) < 0.3
+
+
+def test_cameras_inside_walls_are_noted():
+    gaussians, cameras = room()
+    poses = cameras.T_frame_camera.copy()
+    poses[:4, :3, 3] = [0.0, 2.5, 1.2]
+    poses[:4, :3, :3] = np.stack([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], 1)  # in the wall, looking out of the room
+    graph = describe("walled", gaussians, Cameras(poses, cameras.intrinsics_px, cameras.sizes_px), OBJECTS)
+    assert any("stand inside something" in note for note in graph.notes)
+
+
+def test_no_cameras_no_objects_but_a_note():
+    graph = describe("blind", room(n=3000)[0], None, OBJECTS)
+    assert len(graph.layers["objects"]) == 0
+    assert any("no cameras" in note for note in graph.notes)
+
+
+@pytest.mark.parametrize("name", ["segmenter", "embedder"])
+def test_back_ends_that_do_not_exist_are_refused(name):
+    params = DescribeParams(landmarks=False, object=ObjectParams(**{name: "magic"}))
+    with pytest.raises(ConfigError, match="magic"):
+        describe("x", *room(n=500), params)
+
+
+@pytest.mark.parametrize("name", ["sam", "clip"])
+def test_back_ends_without_their_model_say_what_to_add(name):
+    kind = {"sam": "segmenter", "clip": "embedder"}[name]
+    params = DescribeParams(landmarks=False, object=ObjectParams(**{kind: name}))
+    with pytest.raises(ConfigError, match="gsmap models add"):
+        describe("x", *room(n=500), params)
+
+
+def test_methods_change_with_parameters_and_name_the_layers():
+    base = methods()
+    assert set(base) == {"landmarks", "objects"}
+    assert methods() == base
+    other = methods(DescribeParams(object=ObjectParams(tau_asso=1.2)))
+    assert other["landmarks"] == base["landmarks"]
+    assert other["objects"] != base["objects"]
+    graph = describe("x", *room(n=3000), OBJECTS)
+    assert graph.layers["objects"].method == methods(OBJECTS)["objects"]
+
+
+def test_sampled_cameras_are_spread():
+    cameras = room()[1]
+    assert sample_cameras(cameras, 5).names == ("0", "6", "12", "17", "23")
+    assert len(sample_cameras(cameras, 100)) == 24
+
+
+def test_a_picture_of_the_graph_shows_it():
+    gaussians, cameras = room(n=15000)
+    graph = describe("one", gaussians, cameras, scale_policy="known")
+    with_graph = draw_graph(gaussians, cameras, graph, camera="3", width_px=320)
+    assert with_graph.shape == (240, 320, 3)
+    assert with_graph.dtype == np.uint8
+    empty = draw_graph(gaussians, cameras, type(graph)("one"), camera="3", width_px=320)
+    assert (with_graph != empty).any(2).mean() > 0.002
+    assert draw_graph(gaussians, cameras, graph).shape == (720, 960, 3)
+    with pytest.raises(NotFoundError, match="no camera"):
+        draw_graph(gaussians, cameras, graph, camera="attic")
