@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.demo.bake import Skin
-from gsmap.demo.place import Place, Room
+from gsmap.demo.place import Door, Place, Room
 from gsmap.errors import ConfigError, InputError
 from gsmap.types import Cameras
 
@@ -50,9 +50,18 @@ class Frames:
 
 
 def default_routes(place: Place, count: int) -> list[tuple[int, ...]]:
-    """Routes of ``count`` captures, two neighbouring rooms each; three share one room a pair."""
-    pairs = sorted({tuple(sorted((d.a, d.b))) for d in place.doors}, key=lambda p: (p[1] - p[0], p))
-    return [pairs[i % len(pairs)] for i in range(count)]
+    """Routes of ``count`` captures through two neighbouring rooms each; three captures share one room a pair.
+
+    Every route shares a room with an earlier one, and rooms already walked come before new ones, so routes close cycles.
+    """
+    doors = sorted({(min(d.a, d.b), max(d.a, d.b)) for d in place.doors})
+    order, left = doors[:1], doors[1:]
+    while left:
+        walked = {room for route in order for room in route}
+        best = max(left, key=lambda route: len(walked & set(route)))
+        order.append(best)
+        left.remove(best)
+    return [order[i % len(order)] for i in range(count)]
 
 
 def unused_doors(place: Place, route: Sequence[int]) -> list[int]:
@@ -82,16 +91,23 @@ def walk(place: Place, route: Sequence[int], num_frames: int, seed: int = 0) -> 
     shares[int(np.argmax(shares))] += num_frames - per_passage * passages - shares.sum()
     poses = []
     for k, index in enumerate(route):
-        poses += _look_around(place.rooms[index], int(shares[k]), rng)
+        neighbour = route[k + 1] if k < passages else route[k - 1] if k else index
+        door = place.door_between(index, neighbour)
+        poses += _look_around(place.rooms[index], door, int(shares[k]), rng)
         if k < passages:
             poses += _pass_door(place, index, route[k + 1], per_passage, rng)
     return np.stack(poses)
 
 
-def _look_around(room: Room, count: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """A loop around the free middle of a room, turning twice, so that every direction is seen from two places."""
+def _look_around(room: Room, door: Door | None, count: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """A loop around the free middle of a room, beginning and ending by a door.
+
+    The walker turns twice, so that every direction is seen from two places.
+    """
     radii = np.maximum(0.5 * room.size_m - 0.8, 0.3) * rng.uniform(0.6, 1.0, 2)
     phase, turn = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
+    if door is not None:
+        phase = np.arctan2(*((door.xy - room.center) / radii)[::-1]) + rng.uniform(-0.3, 0.3)
     yaw0, tilt0, sway = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.3)
     out = []
     for i in range(count):

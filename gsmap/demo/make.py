@@ -52,6 +52,7 @@ def make_captures(
     scales: Sequence[float] | None = None,
     shut_doors: bool = True,
     vary_exposure: bool = False,
+    hold_out: int = 0,
     place: Place | None = None,
     progress: Progress | None = None,
 ) -> list[DemoCapture]:
@@ -69,6 +70,7 @@ def make_captures(
         shut_doors: shut the doors a capture's route does not pass, so that captures see only the rooms they walk
             through; with open doors they glimpse most of the rooms next to those, too.
         vary_exposure: give each capture its own exposure (gain 0.85 to 1.15, gamma 0.9 to 1.15).
+        hold_out: every so manieth frame is not trained on (see `shown`); it stays among the images and cameras.
         place: a place already built, instead of the one of ``seed``.
 
     Raises:
@@ -96,10 +98,17 @@ def make_captures(
         shut = unused_doors(place, route) if shut_doors else ()
         look = {"size_px": size_px, "shut": shut, "gain": gain, "gamma": gamma, "name": name}
         frames = film(place, poses, **look, progress=_part(step, 0.0, 0.3))
-        gaussians = fit_frames(frames, steps=steps, num_gaussians=num_gaussians, seed=i, progress=_part(step, 0.3, 1.0))
+        known = frames[shown(len(frames), hold_out)]
+        gaussians = fit_frames(known, steps=steps, num_gaussians=num_gaussians, seed=i, progress=_part(step, 0.3, 1.0))
         out.append(put_in_own_frame(gaussians, frames, name, rng, scale))
     report(1.0, "captures made")
     return out
+
+
+def shown(count: int, hold_out: int) -> np.ndarray:
+    """(count,) bool, which frames are trained on: all, or all but every ``hold_out``-th."""
+    rows = np.arange(count)
+    return rows % hold_out != hold_out // 2 if hold_out else rows >= 0
 
 
 def fit_frames(

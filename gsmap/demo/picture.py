@@ -24,7 +24,7 @@ def map_picture(
     *,
     up: np.ndarray | None = None,
     title: str = "",
-    width_px: int = 1600,
+    width_px: int = 1400,
 ) -> np.ndarray:
     """Draw placed scenes: at an angle with the near walls off, from above with the walks, and what is tied to what.
 
