@@ -25,9 +25,12 @@ def match_surfaces(target: Surface, source: Surface, params: Params | None = Non
     """Rigid ``T_target_source`` (metres) by KISS-Matcher on the surfaces' points, and its number of inliers.
 
     Its own confidence is worth little (measured: most of its wrong answers look sure), so it only proposes.
-    None where it found no pose.
+    None where it found no pose, and where the package is missing (it has no wheel for Python 3.13).
     """
-    import kiss_matcher
+    try:
+        import kiss_matcher
+    except ImportError:
+        return None
 
     params = params or Params()
     if len(target.coarse[0]) < 50 or len(source.coarse[0]) < 50:
