@@ -31,7 +31,7 @@ class ChunkIndex:
     def build(cls, gaussians: Gaussians, chunk: int = 4096) -> ChunkIndex:
         """Boxes of runs of ``chunk`` Gaussians, in the order they are stored.
 
-        Sort scattered Gaussians along a Morton curve first (`morton_order`); scenes from the store are.
+        Sort scattered Gaussians first (`gsmap.geometry.morton`); scenes from the store are sorted.
         """
         n = len(gaussians)
         starts = np.append(np.arange(0, n, chunk, dtype=np.int64), n)
