@@ -102,6 +102,9 @@ void bind_rasteriser(nb::module_ &m) {
         .def_prop_ro("workspace_bytes", &View::workspace_bytes);
     m.def("use_instruction_set", &use_instruction_set, nb::arg("name"),
           "Chooses baseline, avx2, avx512 or best, where this machine can run it; returns the one in use.");
+    m.def("blend_limit", [](int64_t repeats) { return kernels->blend_limit(repeats); }, nb::arg("repeats"),
+          nb::call_guard<nb::gil_scoped_release>(),
+          "Runs the blending loop alone on data in L1; returns how many (Gaussian, pixel) pairs it blended.");
     m.def("num_threads", &num_threads);
     m.def("set_num_threads", &set_num_threads);
 }

@@ -9,7 +9,7 @@ constexpr int kTile = 32;        // pixels; larger tiles make fewer intersection
 constexpr int kBlockX = 8, kBlockY = 8;  // pixels; Gaussians are culled exactly against such blocks inside a tile
 constexpr int kChunk = 1024;     // Gaussians per task of the projection
 constexpr int kRound = 64;      // Gaussians of a tile that are worked on together, in L1
-constexpr float kMinAlpha = 1.f / 255.f, kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
+constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kNear = 0.01f, kDilation = 0.3f;
 
 struct Scene {
@@ -88,6 +88,8 @@ struct Kernels {
     int (*project)(const Scene &, const Camera &, int64_t begin, int64_t end, Record *out);
     // Returns how many (Gaussian, pixel) pairs were evaluated.
     int64_t (*blend)(const TileWork &, const Image &);
+    // Blends `repeats` rounds into one block, everything in L1: the speed of the inner loop alone. Returns the pairs.
+    int64_t (*blend_limit)(int64_t repeats);
     // Writes one slot of kMoments floats for every intersection of the tile.
     void (*blend_backward)(const TileWork &, const Image &, const ImageGradient &, float *slots);
     // From the slots of `count` records to gradients; adds dL/dT_camera_world (rows of R, then t) to pose unless null.

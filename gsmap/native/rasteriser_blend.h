@@ -4,7 +4,7 @@
 
 namespace GSMAP_ISA {
 
-constexpr int kGroup = W == 16 ? kVectors : 2;  // vectors whose state fits the registers
+constexpr int kGroup = W == 16 ? kVectors : 4;  // vectors whose state fits the registers
 
 // The pixels of one block: transmittance, what is blended so far, the largest weight and whose it was.
 struct alignas(64) BlendBlock {
@@ -17,7 +17,7 @@ template <bool kDepth, bool kId, bool kWeight>
 INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, int b, int column, int row,
                         float *max_weight) {
     const uint32_t *ids = (const uint32_t *)round.field[ID];
-    const float left = float(b % kAcross * kBlockX), top = float(b / kAcross * kBlockY);
+    const Lanes first = lanes.in_tile(b, row);
     V t[kGroup], r[kGroup], g[kGroup], bl[kGroup], d[kGroup], best[kGroup];
     I id[kGroup];
     M alive[kGroup];
@@ -32,15 +32,16 @@ INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, i
     }
     for (int i = 0; i < round.listed[b]; i++) {
         const int j = round.list[b][i];
-        Splat splat(round, lanes, j, left, top, row);
+        Splat splat(round, first, j);
         const V cr = set1(round.field[R][j]), cg = set1(round.field[G][j]), cb = set1(round.field[B][j]);
         const V depth = kDepth ? set1(round.field[DEPTH][j]) : V{};
         V most{};
         for (int v = 0; v < kGroup; v++) {
-            const V alpha = min(splat.alpha(splat.u_at(column)), set1(kMaxAlpha));
+            const V exponent = splat.exponent(splat.u_at(column));
+            const V alpha = min(exp2_in_range(exponent), set1(kMaxAlpha));
             splat.next_row();
             const V weight = alpha * t[v], rest = fnma(alpha, t[v], t[v]);
-            const M touched = both(ge(alpha, set1(kMinAlpha)), alive[v]);
+            const M touched = both(ge(exponent, set1(kMinLog2Alpha)), alive[v]);
             const M drawn = gt(touched, rest, set1(kMinTransmittance));
             alive[v] = first_not_second(alive[v], differ(touched, drawn));  // who would fall to 1e-4 stops before
             r[v] = fma_where(drawn, weight, cr, r[v]);
@@ -75,6 +76,14 @@ INLINE void blend_group(const Round &round, BlendBlock &s, const Lanes &lanes, i
     }
 }
 
+// All of one block's vectors.
+template <bool kDepth, bool kId, bool kWeight>
+INLINE void blend_block(const Round &round, BlendBlock &s, const Lanes &lanes, int b, float *max_weight) {
+    for (int row = 0; row < kBlockY / kRows; row += kGroup)
+        for (int column = 0; column < kColumns; column++)
+            blend_group<kDepth, kId, kWeight>(round, s, lanes, b, column, row, max_weight);
+}
+
 template <bool kDepth, bool kId, bool kWeight> int64_t blend_tile(const TileWork &work, const Image &image) {
     Round round;
     BlendBlock block[kBlocks];
@@ -97,9 +106,7 @@ template <bool kDepth, bool kId, bool kWeight> int64_t blend_tile(const TileWork
         round.cull(blocks);
         for (int b = 0; b < kBlocks; b++) {
             if (!(blocks >> b & 1) || !round.listed[b]) continue;
-            for (int row = 0; row < kBlockY / kRows; row += kGroup)
-                for (int column = 0; column < kColumns; column++)
-                    blend_group<kDepth, kId, kWeight>(round, block[b], lanes, b, column, row, image.max_weight);
+            blend_block<kDepth, kId, kWeight>(round, block[b], lanes, b, image.max_weight);
             pairs += round.listed[b] * int64_t(kPixels);
             bool any_alive = false;
             for (int k = 0; k < kVectors; k++) any_alive |= any(block[b].alive[k]);
@@ -119,6 +126,30 @@ template <bool kDepth, bool kId, bool kWeight> int64_t blend_tile(const TileWork
         if (kId) image.dominant_id[p] = s.id[i];
     });
     return pairs;
+}
+
+// Not inlined: the compiler would see that nobody looks at most of the result.
+__attribute__((noinline)) void blend_again(const Round &round, BlendBlock &s, const Lanes &lanes) {
+    for (int i = 0; i < kPixels; i++) s.t[i] = 1.f;
+    blend_block<false, false, false>(round, s, lanes, 0, nullptr);
+}
+
+int64_t blend_limit(int64_t repeats) {
+    Round round;
+    BlendBlock block;
+    const Lanes lanes;
+    __builtin_memset(&round, 0, sizeof round);
+    __builtin_memset(&block, 0, sizeof block);
+    round.count = round.listed[0] = kRound;
+    for (int j = 0; j < kRound; j++) {
+        round.list[0][j] = uint16_t(j);
+        round.field[X][j] = round.field[Y][j] = 4.f;
+        round.field[L11][j] = round.field[L22][j] = 0.1f;
+        round.field[LOG2_OPACITY][j] = -7.5f;
+    }
+    for (int k = 0; k < kVectors; k++) block.alive[k] = ge(V{}, V{});
+    for (int64_t i = 0; i < repeats; i++) blend_again(round, block, lanes);
+    return repeats * kRound * kPixels;
 }
 
 int64_t blend(const TileWork &work, const Image &image) {

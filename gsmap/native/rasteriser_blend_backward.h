@@ -14,19 +14,20 @@ struct alignas(64) BackwardBlock {
 
 // L = sum_i w_i v_i with v = colour . g_colour + depth * g_depth + g_alpha; rest = sum over what is not blended yet.
 template <bool kDepth> INLINE void backward_block(const Round &round, BackwardBlock &s, const Lanes &lanes, int b, float (*moments)[kMoments]) {
-    const float left = float(b % kAcross * kBlockX), top = float(b / kAcross * kBlockY);
+    const Lanes first = lanes.in_tile(b, 0);
     for (int i = 0; i < round.listed[b]; i++) {
         const int j = round.list[b][i];
-        Splat splat(round, lanes, j, left, top, 0);
+        Splat splat(round, first, j);
         const V cr = set1(round.field[R][j]), cg = set1(round.field[G][j]), cb = set1(round.field[B][j]);
         const V depth = kDepth ? set1(round.field[DEPTH][j]) : V{};
         V sum[W > 10 ? W : (10 + W - 1) / W * W] = {};
         for (int k = 0; k < kVectors; k++) {
             const int at = k * W;
-            const V u = splat.u_at(k % kColumns), w = splat.w, raw = splat.alpha(u);
+            const V u = splat.u_at(k % kColumns), w = splat.w, exponent = splat.exponent(u);
+            const V raw = exp2_in_range(exponent);
             if (k % kColumns == kColumns - 1) splat.next_row();
             const M alive = s.alive[k];
-            const M touched = both(ge(raw, set1(kMinAlpha)), alive);
+            const M touched = both(ge(exponent, set1(kMinLog2Alpha)), alive);
             if (W < 16 && !any(touched)) continue;
             const V alpha = min(raw, set1(kMaxAlpha)), t = load(&s.t[at]), weight = alpha * t, next = fnma(alpha, t, t);
             const M drawn = gt(touched, next, set1(kMinTransmittance));

@@ -9,7 +9,7 @@
 #define GSMAP_JOIN_(a, b) a##b
 #define GSMAP_JOIN(a, b) GSMAP_JOIN_(a, b)
 
-static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend,
+static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend, GSMAP_ISA::blend_limit,
                                      GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
                                      GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::blur, GSMAP_ISA::ssim};
 const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;

@@ -12,6 +12,8 @@ constexpr int kColumns = W < kBlockX ? kBlockX / W : 1;  // vectors side by side
 constexpr int kRows = W > kBlockX ? W / kBlockX : 1;     // rows of a block in one vector
 constexpr int kVectors = kPixels / W;
 
+constexpr float kMinLog2Alpha = -7.99435343685886f;  // alpha = 1/255
+
 // Offsets of a vector's pixel centres from its block's first corner.
 struct Lanes {
     V x[kColumns], y;
@@ -19,6 +21,13 @@ struct Lanes {
         for (int l = 0; l < W; l++) y[l] = 0.5f + float(l / kBlockX);
         for (int c = 0; c < kColumns; c++)
             for (int l = 0; l < W; l++) x[c][l] = 0.5f + float(c * W + l % kBlockX);
+    }
+    // The same for block b, from the tile's first corner, beginning with a row of vectors.
+    INLINE Lanes in_tile(int b, int row) const {
+        Lanes moved = *this;
+        for (int c = 0; c < kColumns; c++) moved.x[c] += float(b % kAcross * kBlockX);
+        moved.y += float(b / kAcross * kBlockY + row * kRows);
+        return moved;
     }
 };
 
@@ -53,7 +62,7 @@ struct Round {
         for (int i = 0; i < count; i += W) {
             const V x = load(&field[X][i]), y = load(&field[Y][i]);
             const V l11 = load(&field[L11][i]), l12 = load(&field[L12][i]), l22 = load(&field[L22][i]);
-            const V reach = load(&field[LOG2_OPACITY][i]) + (7.99435343685886f + 1e-3f);
+            const V reach = load(&field[LOG2_OPACITY][i]) + (1e-3f - kMinLog2Alpha);
             const V per_dy = V{} - l12 / l11, per_dx = V{} - l11 * l12 / fma(l12, l12, l22 * l22);
             // the smallest u^2 + w^2 over a box lies on the side of it that faces the centre, in x or in y
             V x0[kAcross], x1[kAcross], lx[kAcross], best_y[kAcross];
@@ -114,17 +123,17 @@ INLINE void start_alive(const TileWork &work, const Lanes &lanes, int b, M *aliv
 // From one vector to the next only additions are left, which other units do than the multiplications that follow.
 struct Splat {
     V across[kColumns], u, w, du, dw, log2_opacity;
-    // left, top: corner of the block in the tile; row: first row of vectors
-    INLINE Splat(const Round &round, const Lanes &lanes, int j, float left, float top, int row) {
+    INLINE Splat(const Round &round, const Lanes &first, int j) {
         const V l11 = set1(round.field[L11][j]), l12 = set1(round.field[L12][j]), l22 = set1(round.field[L22][j]);
-        const V x = set1(round.field[X][j] - left), dy = lanes.y - set1(round.field[Y][j] - top - float(row * kRows));
-        for (int c = 0; c < kColumns; c++) across[c] = l11 * (lanes.x[c] - x);
+        const V x = set1(round.field[X][j]), dy = first.y - set1(round.field[Y][j]);
+        for (int c = 0; c < kColumns; c++) across[c] = l11 * (first.x[c] - x);
         u = l12 * dy, w = l22 * dy;
-        du = l12 * float(kRows), dw = l22 * float(kRows);
+        du = kRows == 2 ? l12 + l12 : l12, dw = kRows == 2 ? l22 + l22 : l22;
         log2_opacity = set1(round.field[LOG2_OPACITY][j]);
     }
     INLINE V u_at(int column) const { return u + across[column]; }
-    INLINE V alpha(V u) const { return exp2(fnma(u, u, fnma(w, w, log2_opacity))); }
+    // log2(alpha) before the clamp; alpha itself may only be taken where this is at least kMinLog2Alpha
+    INLINE V exponent(V u) const { return fnma(u, u, fnma(w, w, log2_opacity)); }
     INLINE void next_row() { u += du, w += dw; }
 };
 
