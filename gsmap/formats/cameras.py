@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.types import Cameras
@@ -42,7 +43,7 @@ def read(path: str | os.PathLike[str]) -> Cameras:
         raise InputError(f"{path} does not hold cameras: {what}") from error
 
 
-def load_json(path: Path) -> object:
+def load_json(path: Path) -> Any:
     if not path.exists():
         raise NotFoundError(f"cannot read cameras from {path}: no such file")
     try:

@@ -44,11 +44,16 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True)
 class Element:
-    """One element of a header: ``count`` rows of ``dtype``; None where a property is a list."""
+    """One element of a header: ``count`` rows of ``dtype``, which is empty where a property is a list."""
 
     name: str
     count: int
-    dtype: np.dtype | None
+    dtype: np.dtype
+    has_list: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.dtype.names or ()
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
         return compressed_ply.read(path)
     rows = read_element(path, header, "vertex")
-    names = set(rows.dtype.names)
+    names = set(header.elements["vertex"].names)
     rest = _rest_names(path, names)
     has_dc, flat = "f_dc_0" in names, "scale_2" not in names
     position, quat, opacity = ["x", "y", "z"], ["rot_0", "rot_1", "rot_2", "rot_3"], ["opacity"]
@@ -114,7 +119,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 def info(path: str | os.PathLike[str]) -> Info:
     """Whether it was trained antialiased, and what reading it changed."""
     header = read_header(path)
-    names = header.elements["vertex"].dtype.names if _has_columns(header) else ()
+    names = header.elements["vertex"].names if "vertex" in header.elements else ()
     text = " ".join(header.comments).lower()
     notes = []
     if "splatrendermode: 2dgs" in text or (names and "scale_0" in names and "scale_2" not in names):
@@ -177,7 +182,8 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     if not head.startswith((b"ply\n", b"ply\r")):
         what = "is empty" if not head else f"begins with {head[:4]!r}, not with 'ply'"
         raise InputError(f"{path} is not a PLY file: it {what}")
-    lines, offset = [], 0
+    lines: list[str] = []
+    offset = 0
     while not lines or lines[-1] != "end_header":
         end = head.find(b"\n", offset)
         if end < 0:
@@ -186,7 +192,8 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         lines.append(head[offset:end].decode("utf-8", "replace").strip())
         offset = end + 1
 
-    encoding, comments, blocks = "", [], []
+    encoding, comments = "", []
+    blocks: list[tuple[str, int, list[tuple[str, str | None]]]] = []
     for number, line in enumerate(lines[1:-1], start=2):
         keyword, _, value = line.partition(" ")
         words = value.split()
@@ -209,8 +216,9 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         if name in elements or len({c for c, _ in columns}) < len(columns):
             raise InputError(f"{path}: the PLY header names element {name!r} or one of its properties twice")
         byte_order = _ENCODINGS[encoding]
-        fixed = all(kind is not None for _, kind in columns)
-        elements[name] = Element(name, count, np.dtype([(c, byte_order + k) for c, k in columns]) if fixed else None)
+        fixed = [(c, byte_order + kind) for c, kind in columns if kind is not None]
+        has_list = len(fixed) < len(columns)
+        elements[name] = Element(name, count, np.dtype([] if has_list else fixed), has_list)
     return Header(encoding, elements, tuple(comments), offset)
 
 
@@ -224,16 +232,16 @@ def read_element(path: str | os.PathLike[str], header: Header, name: str) -> np.
         raise InputError(f"{path} has no {name} rows: there is nothing to read")
     offset, skip = header.data_offset, 0
     for element in header.elements.values():
-        if element.dtype is None:
+        if element.has_list:
             raise InputError(f"{path}: element {element.name!r} has a list property: not a 3DGS .ply (a mesh?)")
         if element.name == name:
             break
         offset += element.count * element.dtype.itemsize
         skip += element.count
-    if not element.dtype.names:
+    if not element.names:
         raise InputError(f"{path}: element {name!r} has no properties: not a 3DGS .ply")
     # The smallest an ASCII value can be is one digit and one separator.
-    stride = 2 * len(element.dtype.names) if header.encoding == "ascii" else element.dtype.itemsize
+    stride = 2 * len(element.names) if header.encoding == "ascii" else element.dtype.itemsize
     present = Path(path).stat().st_size - offset
     if element.count * stride > present + (header.encoding == "ascii"):
         raise InputError(
@@ -242,17 +250,12 @@ def read_element(path: str | os.PathLike[str], header: Header, name: str) -> np.
         )
     if header.encoding == "ascii":
         return _read_ascii(path, header, element, skip)
-    return np.memmap(path, element.dtype, "r", offset, (element.count,))
+    return np.memmap(path, dtype=element.dtype, mode="r", offset=offset, shape=(element.count,))
 
 
 def is_compressed(header: Header) -> bool:
     """Whether this is PlayCanvas' ``.compressed.ply`` layout, whatever the file is called."""
-    return _has_columns(header) and "packed_position" in header.elements["vertex"].dtype.names
-
-
-def _has_columns(header: Header) -> bool:
-    vertex = header.elements.get("vertex")
-    return vertex is not None and vertex.dtype is not None and bool(vertex.dtype.names)
+    return "vertex" in header.elements and "packed_position" in header.elements["vertex"].names
 
 
 def _read_ascii(path: str | os.PathLike[str], header: Header, element: Element, skip: int) -> np.ndarray:
@@ -280,9 +283,10 @@ def _rest_names(path: str | os.PathLike[str], names: set[str]) -> list[str]:
 def _take(rows: np.ndarray, names: list[str], out: np.ndarray) -> None:
     """Copy named columns into ``out`` (n, len(names)), all at once where every column is a float32."""
     dtype = rows.dtype
-    if all(dtype[n] == np.float32 for n in dtype.names):
+    order = list(dtype.names or ())
+    if all(dtype[n] == np.float32 for n in order):
         table = rows.view(np.float32).reshape(len(rows), -1)
-        columns = [dtype.names.index(n) for n in names]
+        columns = [order.index(n) for n in names]
         run = slice(columns[0], columns[0] + len(names))
         out[:] = table[:, run] if columns == list(range(run.start, run.stop)) else table[:, columns]
     else:

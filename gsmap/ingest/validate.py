@@ -31,7 +31,7 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
             suspicious = not np.isfinite(rows.sum(dtype=np.float64))
         if suspicious:
             _refuse(where, ~np.isfinite(rows).all(1), f"NaN or infinity in {name}")
-    _refuse(where, ~gaussians.quats.any(1), "a rotation quaternion of zero")
+    _refuse(where, (gaussians.quats == 0).all(1), "a rotation quaternion of zero")
     low, high = np.percentile(_sampled(gaussians).means, [5, 95], axis=0).astype(np.float64)
     widest = gaussians.log_scales.max(1).astype(np.float64)
     extent = max(float(np.linalg.norm(high - low)), float(np.exp(min(np.median(widest), 80.0))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Row, delete, insert, select
@@ -108,7 +109,9 @@ class Graphs:
         arrays = self._arrays.read(KIND, row.group_id, files)
         layers = {}
         for i, (name, layer) in enumerate(row.about["layers"].items()):
-            mine = {key.split(".", 1)[1]: array for key, array in arrays.items() if key.startswith(f"{i}.")}
+            mine: dict[str, Any] = {
+                key.split(".", 1)[1]: array for key, array in arrays.items() if key.startswith(f"{i}.")
+            }
             layers[name] = NodeLayer(**mine, **layer["rest"])
         return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
 

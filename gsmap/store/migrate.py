@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Engine, inspect, text
+from sqlalchemy import Connection, Engine, inspect, text
 
 import gsmap
 from gsmap.errors import CorruptError, SchemaVersionError, StoreError
 from gsmap.store import schema, sqlite
 from gsmap.store.catalog import Catalog, explained
+
+if TYPE_CHECKING:
+    from alembic.config import Config
 
 
 def version(engine: Engine, folder: Path) -> str | None:
@@ -60,7 +64,7 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
         with explained(catalog.folder), catalog.engine.connect() as connection:
             if catalog.is_sqlite:
                 # Batch migrations rebuild tables, which foreign keys would forbid; checked before the commit.
-                connection.connection.driver_connection.execute("PRAGMA foreign_keys = OFF")
+                _driver(connection).execute("PRAGMA foreign_keys = OFF")
             try:
                 with connection.execution_options(gsmap_write=True).begin():
                     _run(connection, revision)
@@ -68,11 +72,11 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
                         raise StoreError(f"{catalog.folder}: the migration would break references; nothing was changed")
             finally:
                 if catalog.is_sqlite:
-                    connection.connection.driver_connection.execute("PRAGMA foreign_keys = ON")
+                    _driver(connection).execute("PRAGMA foreign_keys = ON")
     return before, version(catalog.engine, catalog.folder)
 
 
-def config():
+def config() -> Config:
     """Alembic's configuration, without a file."""
     from alembic.config import Config
 
@@ -90,7 +94,11 @@ def folder() -> Path:
     raise StoreError(f"{package} was installed without its migrations: install gsmap again")
 
 
-def _run(connection, revision: str) -> None:
+def _driver(connection: Connection) -> Any:
+    return connection.connection.driver_connection
+
+
+def _run(connection: Connection, revision: str) -> None:
     from alembic import command
 
     settings = config()
@@ -99,7 +107,7 @@ def _run(connection, revision: str) -> None:
     (command.downgrade if down else command.upgrade)(settings, revision)
 
 
-def _current(connection) -> str | None:
+def _current(connection: Connection) -> str | None:
     from alembic.runtime.migration import MigrationContext
 
     return MigrationContext.configure(connection).get_current_revision()

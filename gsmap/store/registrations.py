@@ -84,8 +84,8 @@ class Registrations:
         chosen: dict[str, Row] = {}
         for row in rows:
             word = standing.get(row.pair)
-            confirmed = word is not None and word.verdict == "confirm"
-            if row.target in alive and row.source in alive and not (confirmed and row.number > word.registration):
+            superseded = word is not None and word.verdict == "confirm" and row.number > word.registration
+            if row.target in alive and row.source in alive and not superseded:
                 chosen[row.pair] = row
         return [_stored(row, standing.get(row.pair)) for row in chosen.values()]
 

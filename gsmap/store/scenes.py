@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, Row, insert, select, text, update
@@ -211,7 +212,7 @@ def _find(connection: Connection, ref: str) -> Row:
     row = connection.execute(select(scenes).where(scenes.c.name == ref, living)).first() or _by_id(connection, ref)
     if row is not None:
         return row
-    rows = []
+    rows: Sequence[Row] = []
     if ref and all(c in "0123456789abcdef" for c in ref):
         rows = connection.execute(select(scenes).where(scenes.c.id.startswith(ref), living).limit(3)).all()
     if len(rows) == 1:
@@ -222,7 +223,7 @@ def _find(connection: Connection, ref: str) -> Row:
     raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes shows what there is")
 
 
-def _by_id(connection: Connection, wanted: str) -> Row | None:
+def _by_id(connection: Connection, wanted: str) -> Any:
     return connection.execute(select(scenes).where(scenes.c.id == wanted)).first()
 
 

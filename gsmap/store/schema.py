@@ -19,7 +19,7 @@ from sqlalchemy import (
     Text,
     text,
 )
-from sqlalchemy.types import TypeDecorator
+from sqlalchemy.types import TypeDecorator, TypeEngine
 
 HEAD = "0001"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
@@ -34,7 +34,9 @@ metadata = MetaData(
 )
 
 Bytes = BigInteger().with_variant(Integer(), "sqlite")
-Real = Double().with_variant(REAL(), "sqlite")  # STRICT tables know REAL; elsewhere REAL would be single precision
+Real: TypeEngine[float] = Double().with_variant(
+    REAL(), "sqlite"
+)  # STRICT tables know REAL; elsewhere REAL would be single precision
 
 
 class Json(TypeDecorator[Any]):

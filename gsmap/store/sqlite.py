@@ -9,7 +9,7 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy import Connection, Engine, PoolProxiedConnection, create_engine, event
 
 from gsmap.errors import StoreError
 
@@ -25,17 +25,18 @@ def engine(file: Path, *, writable: bool) -> Engine:
     fails at once when another has written meanwhile, whatever the busy timeout.
     """
     uri = f"{file.resolve().as_uri()}?mode={'rw' if writable else 'ro'}"
-    if not writable and _on_read_only_disk(file):
-        # A WAL reader must write its index; on a disk where nobody can write nothing can change either.
-        uri += "&immutable=1"
 
     def connect() -> sqlite3.Connection:
-        connection = sqlite3.connect(uri, uri=True, timeout=60.0, isolation_level=None, check_same_thread=False)
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA wal_autocheckpoint = 0")  # `checkpoint` does it under the writer lock
-        connection.execute("PRAGMA trusted_schema = OFF")
-        return connection
+        try:
+            return _connect(uri)
+        except sqlite3.OperationalError:
+            if writable or os.access(file.parent, os.W_OK):
+                raise
+        # A reader in WAL mode must write an index, which it cannot here; then nobody is writing the log either.
+        log = file.with_name(file.name + "-wal")
+        if log.exists() and log.stat().st_size:
+            raise StoreError(f"{file.parent} was not closed cleanly: open it once where it can be written")
+        return _connect(f"{uri}&immutable=1")
 
     made = create_engine("sqlite://", creator=connect)
 
@@ -100,10 +101,14 @@ def backup(engine: Engine, target: Path) -> None:
     connection = engine.raw_connection()
     try:
         with sqlite3.connect(target) as copy:
-            connection.driver_connection.backup(copy)
+            _driver(connection).backup(copy)
         copy.close()
     finally:
         connection.close()
+
+
+def _driver(connection: PoolProxiedConnection) -> Any:
+    return connection.driver_connection
 
 
 def _note_digest(file: Path) -> None:
@@ -121,20 +126,19 @@ def _same_stamp(file: Path, noted: dict[str, Any]) -> bool:
     return (now.st_size, now.st_mtime_ns) == (noted["size_bytes"], noted["mtime_ns"])
 
 
+def _connect(uri: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(uri, uri=True, timeout=60.0, isolation_level=None, check_same_thread=False)
+    connection.execute("PRAGMA foreign_keys = ON")
+    connection.execute("PRAGMA synchronous = FULL")
+    connection.execute("PRAGMA wal_autocheckpoint = 0")  # `checkpoint` does it under the writer lock
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # the file is opened only now
+    return connection
+
+
 def _raw(engine: Engine, statement: str) -> list[Any]:
     connection = engine.raw_connection()  # a PRAGMA that must run outside any transaction
     try:
-        return connection.driver_connection.execute(statement).fetchall()
+        return _driver(connection).execute(statement).fetchall()
     finally:
         connection.close()
-
-
-def _on_read_only_disk(file: Path) -> bool:
-    if os.access(file.parent, os.W_OK):
-        return False
-    log = file.with_name(file.name + "-wal")
-    if log.exists() and log.stat().st_size:
-        raise StoreError(
-            f"{file.parent} was not closed cleanly and its disk is read-only: open it once where it can be written"
-        )
-    return True

@@ -100,6 +100,7 @@ def test_read_only_disk(tmp_path):
         with Store.open(disk / "m", "r") as store:
             assert len(store.scenes.gaussians("a")) == 500
             assert store.check().ok
+            assert not (disk / "m" / "map.sqlite-wal").exists()
         with pytest.raises(StoreError, match="cannot be written"):
             Store.open(disk / "m", "w")
         with pytest.raises(StoreError, match="Read-only"):
