@@ -72,7 +72,7 @@ def render_tensors(
     backend: str,
 ) -> Any:
     """`gsmap.render.render` for tensors."""
-    from gsmap.render.rendering import Rendered, image_size
+    from gsmap.render.rendering import Rendered, gsplat_available, image_size
 
     if not isinstance(gaussians, GaussianTensors):
         raise InputError(f"render needs Gaussians or GaussianTensors, got {type(gaussians).__name__}")
@@ -85,7 +85,7 @@ def render_tensors(
         if not bool(torch.isfinite(pose).all()):
             raise InputError("T_camera_frame holds NaN or infinity")
     on_cuda = gaussians.means.device.type == "cuda"
-    if backend == "gsplat" or (backend == "auto" and on_cuda):
+    if backend != "native" and (backend == "gsplat" or on_cuda or gsplat_available()):
         from gsmap.render import gsplat
 
         return gsplat.render_tensors(gaussians, cameras, pose, background, depth, dominant_id, max_weight)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -69,7 +70,8 @@ def render(
         index: boxes of chunks of the Gaussians, to skip what no camera sees (see `ChunkIndex`).
         T_camera_frame: (C, 4, 4) tensor of view matrices that replaces the cameras' poses, where the pose is to be
             optimised. The viewing direction is taken from the centre ``-R^T t``.
-        backend: ``native`` (CPU), ``gsplat`` (CUDA), or ``auto``: gsplat for CUDA tensors, native for everything else.
+        backend: ``native`` (CPU), ``gsplat`` (CUDA; not the same bits in every run), or ``auto``: gsplat where it is
+            installed and torch sees a GPU, else native.
 
     Raises:
         InputError: shapes or dtypes that do not fit, cameras of several sizes, a view matrix with NaN.
@@ -85,7 +87,7 @@ def render(
     if isinstance(gaussians, Gaussians):
         if T_camera_frame is not None:
             raise InputError("T_camera_frame goes with GaussianTensors; for numpy, put the pose into the cameras")
-        if backend == "gsplat":
+        if backend == "gsplat" or (backend == "auto" and gsplat_available()):
             from gsmap.render import gsplat
 
             return gsplat.render_numpy(gaussians, cameras, colour, depth, dominant_id, max_weight)
@@ -101,6 +103,15 @@ def render(
     return autograd.render_tensors(
         gaussians, cameras, T_camera_frame, colour, depth, dominant_id, max_weight, index, backend
     )
+
+
+def gsplat_available() -> bool:
+    """Whether the CUDA backend can be used here."""
+    if importlib.util.find_spec("gsplat") is None:
+        return False  # without importing torch, which numpy callers may do without
+    from gsmap.render import gsplat
+
+    return gsplat.available()
 
 
 def image_size(cameras: Cameras) -> tuple[int, int]:

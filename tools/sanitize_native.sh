@@ -1,0 +1,23 @@
+#!/bin/sh
+# Builds the kernels with AddressSanitizer and UndefinedBehaviourSanitizer in a folder of their own and runs the core of
+# the renderer's tests against them, once per instruction set this machine has.
+# Usage: [PYTHON=python3] tools/sanitize_native.sh [pytest arguments]
+set -eu
+cd "$(dirname "$0")/.."
+PYTHON=${PYTHON:-python3}
+"$PYTHON" -m cmake --version >/dev/null 2>&1 && CMAKE="$PYTHON -m cmake" || CMAKE=cmake
+BUILD=build/sanitize
+FLAGS="-fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1"
+$CMAKE -S . -B $BUILD -DPython_EXECUTABLE="$(command -v "$PYTHON")" -DCMAKE_BUILD_TYPE=Release \
+    -DCMAKE_CXX_FLAGS="$FLAGS" -DCMAKE_MODULE_LINKER_FLAGS="$FLAGS" >/dev/null
+$CMAKE --build $BUILD -j "$(nproc)"
+# A copy of the package with the instrumented module, so that the working tree keeps its fast one.
+rm -rf $BUILD/tree
+mkdir -p $BUILD/tree
+cp -r gsmap $BUILD/tree/gsmap
+rm -f $BUILD/tree/gsmap/_native*.so
+$CMAKE --install $BUILD --prefix $BUILD/tree >/dev/null
+# Leaks are not looked for: the interpreter and torch keep memory to the end on purpose.
+LD_PRELOAD="$(${CXX:-g++} -print-file-name=libasan.so) $(${CXX:-g++} -print-file-name=libubsan.so)" \
+ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONPATH=$BUILD/tree \
+    "$PYTHON" -m pytest -q -p no:cacheprovider tests/render "$@"
