@@ -70,7 +70,10 @@ def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) ->
     for i, (group, kind) in enumerate(named.items()):
         if progress:
             progress(i / len(named), f"{kind}/{group[:12]}")
-        problems += arrays.problems(kind, group, manifests[group])
+        found = arrays.problems(kind, group, manifests[group])
+        if found:  # unless it was pruned or mended meanwhile
+            with catalog.read() as connection:
+                problems += found if manifest(connection, group) == manifests[group] else []
     orphans = tuple(f"{kind}/{name}" for kind, name in arrays.groups() if named.get(name) != kind)
     num_bytes = sum(f.size_bytes for files in manifests.values() for f in files)
     if progress:
