@@ -36,6 +36,7 @@ class Params:
         poor_nodes: a graph none of whose layers has this many nodes is poor.
         max_poses: poses that are refined and judged at most.
         hopeless_log_nfa: a clique that chance explains this easily is not looked into.
+        coarse, glance: the first, rough refinement and the look that decides whether to go on.
     """
 
     kinds: tuple[str, ...] = ("landmarks", "objects")
@@ -43,10 +44,12 @@ class Params:
     fallback: str = "auto"
     poor_nodes: int = 500
     max_poses: int = 3
-    hopeless_log_nfa: float = 5.0
+    hopeless_log_nfa: float = 6.0
     propose: propose.Params = field(default_factory=propose.Params)
     surface: surface.Params = field(default_factory=surface.Params)
-    coloured: coloured.Params = field(default_factory=coloured.Params)
+    coarse: coloured.Params = field(default_factory=lambda: coloured.Params((0.4, 0.15), max_points=(3000, 6000)))
+    glance: agreement_.Params = field(default_factory=lambda: agreement_.Params(num_cameras=3, max_points=4000))
+    coloured: coloured.Params = field(default_factory=lambda: coloured.Params((0.06,), max_points=(20_000,)))
     gicp: gicp.Params = field(default_factory=gicp.Params)
     dense: dense.Params = field(default_factory=dense.Params)
     agreement: agreement_.Params = field(default_factory=agreement_.Params)
@@ -177,27 +180,36 @@ class _Pair:
         params, S = self.params, proposal.S_target_source
         if proposal.flaw:
             return _Judged(proposal, Agreement(0.0, 0, float("nan"), 0, 0.0, 0.0), None, proposal.flaw)
+        # Both surfaces go to target metres, the source with the proposed scale, so what remains is nearly rigid.
+        unit_t = self._target_unit_m(proposal.with_scale)
+        unit_s = unit_t * S.scale
         with self.clock.step("refine"):
-            # Both surfaces go to target metres, the source with the proposed scale, so what remains is nearly rigid.
-            unit_t = self._target_unit_m(proposal.with_scale)
-            unit_s = unit_t * S.scale
             target = self.target.surface(unit_t, params.surface)
             source = self.source.surface(unit_s, params.surface)
             pose = Sim3(S.rotation, S.translation * unit_t)
-            if params.refiner == "gicp" and not proposal.with_scale:
-                pose = gicp.refine(target, source, pose, params.gicp)
-            elif params.refiner != "none":
-                pose = coloured.refine(target, source, pose, params.coloured, with_scale=proposal.with_scale)
-            refined = Sim3(pose.rotation, pose.translation / unit_t, pose.scale * S.scale)
-            proposal = replace(proposal, S_target_source=refined)
+            if params.refiner != "none":
+                pose = coloured.refine(target, source, pose, params.coarse, with_scale=proposal.with_scale)
         with self.clock.step("verdict"):
             cameras = _in_metres(self.target.cameras, unit_t), _in_metres(self.source.cameras, unit_s)
-            seen = agreement_.measure(target, source, pose, cameras, params.agreement)
-            known = covariance_.pose_covariance(target, source, pose, params.covariance, with_scale=proposal.with_scale)
-            covariance, sigmas = known if known is not None else (None, None)
-            flaw = verdict.judge(proposal, seen, sigmas, params.verdict)
-            if covariance is not None:
-                covariance = covariance_.in_scene_units(covariance, unit_s)
+            seen = agreement_.measure(target, source, pose, cameras, params.glance)
+            flaw = verdict.hopeless(seen, params.verdict)
+        covariance = sigmas = None
+        if not flaw:
+            with self.clock.step("refine"):
+                if params.refiner == "gicp" and not proposal.with_scale:
+                    pose = gicp.refine(target, source, pose, params.gicp)
+                elif params.refiner != "none":
+                    pose = coloured.refine(target, source, pose, params.coloured, with_scale=proposal.with_scale)
+            with self.clock.step("verdict"):
+                seen = agreement_.measure(target, source, pose, cameras, params.agreement)
+                known = covariance_.pose_covariance(
+                    target, source, pose, params.covariance, with_scale=proposal.with_scale
+                )
+                if known is not None:
+                    covariance, sigmas = covariance_.in_scene_units(known[0], unit_s), known[1]
+        refined = Sim3(pose.rotation, pose.translation / unit_t, pose.scale * S.scale)
+        proposal = replace(proposal, S_target_source=refined)
+        flaw = flaw or verdict.judge(proposal, seen, sigmas, params.verdict)
         return _Judged(proposal, seen, covariance, flaw)
 
 
@@ -245,7 +257,7 @@ def _conclude(pair: _Pair, judged: list[_Judged]) -> Registration:
     if len(accepted) > 1:
         status, reason = "no_match", "ambiguous: two different poses both fit"
     elif not accepted and not (best.proposal.log_nfa < pair.params.verdict.max_log_nfa):
-        status = "no_match"
+        status, reason = "no_match", f"no match that chance would not explain ({reason})"
     p, a = best.proposal, best.agreement
     information = None
     if status == "accepted":

@@ -16,7 +16,8 @@ class Params:
 
     Args:
         max_log_nfa, max_runner_up: a clique is significant when fewer false alarms than this (log10) are expected and
-            no disagreeing clique comes nearer than this share of it.
+            no disagreeing clique comes nearer than this share of it. Rooms furnished alike repeat whole arrangements,
+            which chance does not know of: measured down to -7 between different made places, so the bar is lower.
         min_coinciding: source cells that must coincide with the target's surface.
         max_contradiction: share of points in front of what the other scene's cameras saw.
         min_colour_correlation, min_colour_t: local colours of coinciding surfaces must agree this well, this surely.
@@ -24,23 +25,28 @@ class Params:
             agree this well.
         strong_overlap, strong_contradiction, strong_colour_correlation, strong_colour_t: what the surfaces must show to
             carry a pose whose clique is not significant, or that came from no clique.
+        hopeless_colour_correlation, hopeless_colour_t, hopeless_contradiction: a rough pose that shows less, or
+            contradicts more, is not worth refining further.
         min_seen: fewer points than this judged by cameras is no judgement.
         max_rotation_sigma_deg, max_translation_sigma_m, max_scale_sigma: a pose known less well (standard deviation in
             the least known direction, at the overlap's centroid) is not an edge.
     """
 
-    max_log_nfa: float = -2.0
+    max_log_nfa: float = -8.0
     max_runner_up: float = 0.7
     min_coinciding: int = 300
     max_contradiction: float = 0.08
-    min_colour_correlation: float = 0.10
+    min_colour_correlation: float = 0.12
     min_colour_t: float = 2.5
     changed_contradiction: float = 0.15
     changed_colour_correlation: float = 0.35
-    strong_overlap: float = 0.05
-    strong_contradiction: float = 0.06
-    strong_colour_correlation: float = 0.18
+    strong_overlap: float = 0.10
+    strong_contradiction: float = 0.05
+    strong_colour_correlation: float = 0.20
     strong_colour_t: float = 3.0
+    hopeless_colour_correlation: float = 0.05
+    hopeless_colour_t: float = 1.5
+    hopeless_contradiction: float = 0.3
     min_seen: int = 100
     max_rotation_sigma_deg: float = 1.5
     max_translation_sigma_m: float = 0.05
@@ -51,6 +57,17 @@ def is_significant(proposal: Proposal, params: Params | None = None) -> bool:
     """The correspondences alone rule out chance, and no rival pose comes near."""
     params = params or Params()
     return bool(proposal.log_nfa < params.max_log_nfa and proposal.runner_up <= params.max_runner_up)
+
+
+def hopeless(agreement: Agreement, params: Params | None = None) -> str:
+    """Why a roughly refined pose cannot come to be accepted; empty while it may."""
+    params = params or Params()
+    colours = agreement.colour_correlation < params.hopeless_colour_correlation
+    if agreement.num_coinciding < 50 or (colours and agreement.colour_t < params.hopeless_colour_t):
+        return f"colours disagree where surfaces coincide (correlation {agreement.colour_correlation:.2f})"
+    if agreement.num_seen >= params.min_seen and agreement.contradiction > params.hopeless_contradiction:
+        return f"{agreement.contradiction:.0%} of the points seen contradict what cameras saw"
+    return ""
 
 
 def judge(

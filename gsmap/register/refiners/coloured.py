@@ -11,13 +11,15 @@ from gsmap.register.covariance import point_to_plane_jacobian
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
+_COLOUR_RADIUS_M = 0.1  # farther away, lightness extrapolated in a tangent plane means nothing
+
 
 @dataclass(frozen=True)
 class Params:
     """Args (metres):
     radii_m: correspondence distances, coarse to fine.
     iterations: Gauss-Newton steps at each.
-    colour_weight: metres of distance that one standard deviation of local colour counts for, at the finest radius;
+    colour_weight: metres of distance that one standard deviation of local colour counts for, at fine radii;
         0 leaves colour out.
     max_points: source cells that take part at each radius.
     """
@@ -61,7 +63,7 @@ def refine(
             jacobian = point_to_plane_jacobian(centred, points[hit] - centre, normals)
             system = (jacobian * weights[:, None]).T @ jacobian
             gradient = (jacobian * weights[:, None]).T @ plane
-            if params.colour_weight > 0 and radius == params.radii_m[-1]:
+            if params.colour_weight > 0 and radius <= _COLOUR_RADIUS_M:
                 gradients = target.lightness_gradients(row)
                 expected = target.lightness[row] + (gradients * offset).sum(1)
                 gain, bias = _exposure(expected, light[hit])

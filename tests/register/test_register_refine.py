@@ -1,0 +1,199 @@
+"""Refiners, covariance, significance and the scale vote against known answers."""
+
+import numpy as np
+import pytest
+from register_worlds import node_world, splat_world
+
+from gsmap.evaluate.registration import pose_error, scene_centroid
+from gsmap.geometry.rotations import exp_so3, retract
+from gsmap.register.agreement import measure
+from gsmap.register.correspondences import Correspondences
+from gsmap.register.covariance import in_scene_units, point_to_plane_jacobian, pose_covariance
+from gsmap.register.refiners import coloured, gicp
+from gsmap.register.scale import vote_scales
+from gsmap.register.significance import _log10_binomial_tail, agreeing, log10_nfa
+from gsmap.register.surface import Params as SurfaceParams
+from gsmap.register.surface import Surface
+from gsmap.types import Gaussians, Sim3
+
+
+@pytest.fixture(scope="module")
+def world():
+    return splat_world(0, points=30_000)
+
+
+@pytest.fixture(scope="module")
+def surfaces(world):
+    return Surface.of(world.target.gaussians), Surface.of(world.source.gaussians)
+
+
+def _off(pose: Sim3, about: np.ndarray, degrees: float, metres: float, factor: float = 1.0) -> Sim3:
+    turn = exp_so3(np.radians(degrees) * np.array([0.6, 0.0, 0.8]))
+    return pose @ Sim3(turn, about - factor * turn @ about + metres * np.array([0.0, 0.6, 0.8]), factor)
+
+
+def test_coloured_refiner_comes_back_from_four_degrees(world, surfaces):
+    centre = scene_centroid(world.source.gaussians)
+    found = coloured.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15))
+    error = pose_error(found, world.S_target_source, centre)
+    assert (error.rre_deg < 0.05, error.centroid_m < 0.003, found.scale) == (True, True, 1.0)
+
+
+def test_coloured_refiner_finds_the_scale(world, surfaces):
+    centre = scene_centroid(world.source.gaussians)
+    found = coloured.refine(*surfaces, _off(world.S_target_source, centre, 2, 0.08, 1.02), with_scale=True)
+    assert pose_error(found, world.S_target_source, centre).rse < 0.002
+
+
+def test_gicp_refiner_agrees(world, surfaces):
+    centre = scene_centroid(world.source.gaussians)
+    found = gicp.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15))
+    error = pose_error(found, world.S_target_source, centre)
+    assert error.rre_deg < 0.1
+    assert error.centroid_m < 0.01
+
+
+def test_refiners_give_back_the_start_where_nothing_overlaps(surfaces):
+    target, source = surfaces
+    away = Sim3(np.eye(3), [500.0, 0, 0])
+    nothing = Surface.of(Gaussians.empty())
+    for refine in (coloured.refine, gicp.refine):
+        assert np.allclose(refine(target, source, away).matrix(), away.matrix())
+        assert refine(target, nothing, away) is away
+        assert refine(nothing, source, away) is away
+
+
+def test_colour_fixes_what_a_bare_wall_leaves_free():
+    def wall(seed):
+        p = np.c_[np.random.default_rng(seed).uniform(0, 4, (12_000, 2)), np.zeros(12_000)]
+        tone = 0.5 + 0.2 * np.sin(4 * p[:, 0]) + 0.2 * np.sin(5 * p[:, 1] + p[:, 0])
+        sh = ((np.stack([tone] * 3, 1) - 0.5) / 0.28209479177387814)[:, None]
+        return Gaussians(p, np.tile([1.0, 0, 0, 0], (len(p), 1)), np.full((len(p), 3), -4.0), np.full(len(p), 3.0), sh)
+
+    target, source = Surface.of(wall(1)), Surface.of(wall(2))
+    start = Sim3(exp_so3([0, 0, 0.01]), [0.05, -0.01, 0.0])
+    with_colour = coloured.refine(target, source, start)
+    without = coloured.refine(target, source, start, coloured.Params(colour_weight=0))
+    assert np.linalg.norm(with_colour.apply([2.0, 2, 0]) - [2.0, 2, 0]) < 0.008
+    assert np.linalg.norm(without.apply([2.0, 2, 0]) - [2.0, 2, 0]) > 0.02
+
+
+def test_jacobian_equals_finite_differences():
+    rng = np.random.default_rng(1)
+    pose = Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3), 1.7)
+    points, normals = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    analytic = point_to_plane_jacobian(pose, points, normals)
+    for k in range(7):
+        step = np.zeros(7)
+        step[k] = 1e-6
+        up = (normals * retract(pose, step).apply(points)).sum(1)
+        down = (normals * retract(pose, -step).apply(points)).sum(1)
+        assert np.allclose((up - down) / 2e-6, analytic[:, k], atol=1e-6)
+
+
+def test_covariance_moves_with_the_source_frame_and_is_no_less_than_its_floor(world, surfaces):
+    target, source = surfaces
+    covariance, sigmas = pose_covariance(target, source, world.S_target_source)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    assert np.degrees(sigmas[0]) >= 0.15
+    assert sigmas[1] >= 0.01
+    # The same source with its origin 40 m away: the spread of any of its points in the target stays as it was.
+    shift = np.array([40.0, 0, 0])
+    moved = Surface(source.points + shift, source.colours, source.resolution_m)
+    pose = world.S_target_source @ Sim3(np.eye(3), -shift)
+    other, _ = pose_covariance(target, moved, pose)
+    point = source.points.mean(0)
+    a = point_to_plane_jacobian(world.S_target_source, np.tile(point, (3, 1)), np.eye(3))
+    b = point_to_plane_jacobian(pose, np.tile(point + shift, (3, 1)), np.eye(3))
+    assert np.allclose(a @ covariance @ a.T, b @ other @ b.T, rtol=0.05)
+
+
+def test_covariance_in_scene_units_scales_translations_only():
+    covariance = np.diag(np.arange(1.0, 8.0))
+    moved = in_scene_units(covariance, 0.5)
+    assert np.allclose(np.diag(moved), [1, 2, 3, 16, 20, 24, 7])
+
+
+def test_a_small_overlap_knows_angles_and_scale_less_well(world, surfaces):
+    target, source = surfaces
+    inside = world.S_target_source.apply(source.points)
+    near = np.linalg.norm(inside - [3.0, 0.0, 0.5], axis=1) < 0.8
+    part = Surface(source.points[near], source.colours[near], source.resolution_m)
+    _, all_of_it = pose_covariance(target, source, world.S_target_source, with_scale=True)
+    _, little = pose_covariance(target, part, world.S_target_source, with_scale=True)
+    assert little[0] > 2 * all_of_it[0]
+    assert little[2] > 2 * all_of_it[2]
+
+
+def test_agreement_tells_right_from_wrong(world, surfaces):
+    cameras = world.target.cameras, world.source.cameras
+    right = measure(*surfaces, world.S_target_source, cameras)
+    assert right.contradiction < 0.02
+    assert right.colour_correlation > 0.5
+    assert right.colour_t > 5
+    assert right.num_seen > 500
+    # Half a turn about the vertical through the middle of the shared part.
+    turn = exp_so3([0, 0, np.pi])
+    middle = np.array([3.0, 2.0, 1.2])
+    wrong = measure(*surfaces, Sim3(turn, middle - turn @ middle) @ world.S_target_source, cameras)
+    assert wrong.colour_correlation < 0.1
+    assert wrong.contradiction > 5 * right.contradiction
+
+
+def test_colour_agreement_does_not_mind_exposure(world, surfaces):
+    target, source = surfaces
+    dim = Surface(source.points, 0.7 * source.colours + 0.05, source.resolution_m)
+    a, b = (measure(target, s, world.S_target_source) for s in (source, dim))
+    assert abs(a.colour_correlation - b.colour_correlation) < 0.02
+
+
+def test_surface_leaves_out_what_is_faint_or_huge():
+    g = Gaussians(np.arange(12.0).reshape(4, 3), np.tile([1.0, 0, 0, 0], (4, 1)),
+                  np.log([[0.02] * 3, [0.02] * 3, [3.0] * 3, [0.02] * 3]), [3.0, -3.0, 3.0, 3.0],
+                  np.zeros((4, 1, 3)))  # fmt: skip
+    kept = Surface.of(g, unit_m=2.0, params=SurfaceParams(max_scale_quantile=0.0))
+    assert np.allclose(kept.points, 2.0 * g.means[[0, 3]])
+
+
+def test_binomial_tail_far_out():
+    from scipy.stats import binom
+
+    for n, k, p in [(50, 10, 0.02), (200, 100, 0.01), (30, 1, 0.5)]:
+        assert _log10_binomial_tail(n, k, p) == pytest.approx(binom.logsf(k - 1, n, p) / np.log(10), rel=1e-9)
+
+
+def test_chance_is_never_significant_and_a_planted_pose_is():
+    scores = []
+    for seed in range(20):
+        world = node_world(seed, shared=40, extra=60, wrong=300)
+        rng = np.random.default_rng(seed)
+        m = world.matches
+        shuffled = rng.permutation(len(m))
+        wrong = Correspondences(m.target, m.source[shuffled], m.target_ids, m.source_ids[shuffled], m.similarity)
+        # The best of many three-point poses, as a clique would find it.
+        from gsmap.register.clique import maximum_clique
+        from gsmap.register.consistency import consistency_graph
+        from gsmap.register.pose import fit_pose
+
+        members = wrong[maximum_clique(consistency_graph(wrong)).members]
+        pose = fit_pose(members.target, members.source).S_target_source
+        scores.append(log10_nfa(world.target, world.source, world.source.positions, wrong, pose))
+        right = log10_nfa(world.target, world.source, world.source.positions, m, world.S_target_source)
+        assert right < -10
+    assert min(scores) > -2
+
+
+def test_agreeing_is_one_to_one():
+    m = Correspondences(
+        np.zeros((3, 3)), np.array([[0.01, 0, 0], [0.0, 0, 0], [9.0, 0, 0]]),
+        np.array([0, 0, 1], np.int32), np.array([0, 1, 2], np.int32), np.ones(3, np.float32),
+    )  # fmt: skip
+    assert agreeing(m, Sim3.identity(), 0.1).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.0, 1.25])
+def test_scale_vote(scale):
+    world = node_world(3, shared=60, wrong=400, scale=scale)
+    best, score = vote_scales(world.matches)[0]
+    assert abs(np.log(best / scale)) < 0.015
+    assert score > 5
