@@ -1,14 +1,16 @@
-"""Seconds (CPU) and bytes to write and read every format, next to gsply and Open3D in the same run.
+"""Seconds (CPU), bytes and picture of every format, next to gsply and Open3D in the same run.
 
-    python tools/bench_formats.py [FILE | --count N] [--degree D] [--json OUT]
+    python tools/bench_formats.py [FILE [--cameras CAMERAS] | --count N] [--degree D] [--json OUT]
 
-Without FILE, N random Gaussians, which compress worse than trained ones.
+Without FILE, N random Gaussians, which compress worse than trained ones. With CAMERAS, the PSNR of what gsmap reads
+back against FILE itself, over five views that gsmap renders.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,19 +25,33 @@ from gsmap.types import Gaussians
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", nargs="?")
+    parser.add_argument("--cameras")
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--degree", type=int, default=3)
     parser.add_argument("--json")
     args = parser.parse_args()
     g = formats.read(args.file) if args.file else random_gaussians(args.count, args.degree)
     print(f"{len(g):,} Gaussians, SH degree {g.sh_degree}; CPU seconds")
-    print(f"{'format':20} {'by':8} {'write s':>8} {'read s':>8} {'MB':>8}")
+    print(f"{'format':20} {'by':8} {'write s':>8} {'read s':>8} {'MB':>8} {'PSNR dB':>8}")
     rows = []
+    picture_of = renderer(args.cameras) if args.cameras else None
+    truth = picture_of(g) if picture_of else None
     with tempfile.TemporaryDirectory() as folder:
         for name, by, write, read in ways(g, Path(folder)):
-            row = {"format": name, "by": by, "write_s": seconds(write), "read_s": seconds(read), "mb": size_mb(folder)}
+            (write_s, _), (read_s, back) = timed(write), timed(read)
+            row = {
+                "format": name,
+                "by": by,
+                "write_s": write_s,
+                "read_s": read_s,
+                "mb": size_mb(folder),
+                "psnr_db": None,
+            }
+            if truth is not None and isinstance(back, Gaussians):
+                row["psnr_db"] = -10 * math.log10(max(float(((picture_of(back) - truth) ** 2).mean()), 1e-15))
             rows.append(row)
-            numbers = [f"{row[k]:8.2f}" if row[k] is not None else f"{'-':>8}" for k in ("write_s", "read_s", "mb")]
+            keys = ("write_s", "read_s", "mb", "psnr_db")
+            numbers = [f"{row[k]:8.2f}" if row[k] is not None else f"{'-':>8}" for k in keys]
             print(f"{name:20} {by:8} {' '.join(numbers)}", flush=True)
             for file in sorted(Path(folder).rglob("*"), reverse=True):
                 file.rmdir() if file.is_dir() else file.unlink()
@@ -77,12 +93,23 @@ def ways(g: Gaussians, folder: Path):
     yield ".spz", "open3d", None, lambda: open3d.t.io.read_point_cloud(str(spz))
 
 
-def seconds(call: Callable[[], object] | None) -> float | None:
+def timed(call: Callable[[], object] | None) -> tuple[float | None, object]:
+    """CPU seconds of a call, and what it returned."""
     if call is None:
-        return None
+        return None, None
     start = time.process_time()
-    call()
-    return time.process_time() - start
+    back = call()
+    return time.process_time() - start, back
+
+
+def renderer(path: str) -> Callable[[Gaussians], np.ndarray]:
+    from gsmap.render import render
+    from gsmap.types import Cameras
+
+    cameras = formats.read_cameras(path)
+    some = np.linspace(0, len(cameras) - 1, 5).astype(int)
+    cameras = Cameras(cameras.T_frame_camera[some], cameras.intrinsics_px[some], cameras.sizes_px[some])
+    return lambda g: np.clip(render(g, cameras, depth=False, dominant_id=False).colour, 0, 1)
 
 
 def size_mb(folder: str) -> float:

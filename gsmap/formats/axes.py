@@ -51,7 +51,8 @@ def _turn_sh(sh: np.ndarray, M: np.ndarray) -> np.ndarray:
     near = np.round(matrix)
     if np.abs(matrix - near).max() < 1e-9 and (np.abs(near).sum(1) == 1).all():  # signs and order only
         order = np.abs(near).argmax(1)
-        return sh[:, order] * near[range(len(near)), order].astype(np.float32)[:, None]
+        signs = near[range(len(near)), order].astype(np.float32)[:, None]
+        return sh * signs if np.array_equal(order, range(len(order))) else sh[:, order] * signs
     return np.einsum("ij,njc->nic", matrix.astype(np.float32), sh, optimize=True)
 
 

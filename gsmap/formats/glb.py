@@ -64,7 +64,7 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
         raise InputError(f"{path} is not valid glTF: {type(error).__name__} {error}") from error
     if not parts:
         raise InputError(f"{path} holds no Gaussian splats ({EXTENSION}): a mesh or a point cloud?")
-    return Gaussians.concatenate(parts)
+    return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)
 
 
 def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.ndarray | None = None) -> None:

@@ -298,8 +298,11 @@ def _encode(header: _Header, g: Gaussians, sh_bits: tuple[int, int]) -> list[np.
 
 def _quantise_sh(values: np.ndarray, step: int) -> np.ndarray:
     """1/128 a level, rounded to multiples of ``step``, so that zero stays zero and the last bits compress away."""
-    level = np.round(values * np.float32(128 / step))
-    return np.clip(level * step + 128, 0, 255).astype(np.uint8)
+    level = values * np.float32(128 / step)
+    np.rint(level, out=level)
+    level *= step
+    level += 128
+    return np.clip(level, 0, 255, out=level).astype(np.uint8)
 
 
 def _decode(header: _Header, streams: dict[str, np.ndarray]) -> Gaussians:

@@ -175,11 +175,13 @@ export class Renderer {
     for (let i = 0; i < count; i++) {
       const from = 10 * i;
       const to = 12 * (first + i);
-      this.texels.set(words.subarray(from, from + 3), to);
+      for (let k = 0; k < 3; k++) {
+        this.texels[to + k] = words[from + k];
+        this.positions[3 * (first + i) + k] = floats[from + k];
+      }
       this.texels[to + 3] = words[from + 9];
-      this.texels.set(words.subarray(from + 3, from + 9), to + 4);
+      for (let k = 0; k < 6; k++) this.texels[to + 4 + k] = words[from + 3 + k];
       this.texels[to + 10] = scene;
-      this.positions.set(floats.subarray(from, from + 3), 3 * (first + i));
     }
     this.scenes.fill(scene, first, first + count);
     this.rows += rows;
