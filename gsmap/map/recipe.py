@@ -122,10 +122,11 @@ class Map(AbstractContextManager["Map"]):
 
     def describe(self, *scenes: str) -> list[SceneGraph]:
         """The scene graph of every scene (or of those named), made where the present method has not made it yet."""
-        from gsmap.describe import DescribeParams
+        from gsmap.map import models as kept
         from gsmap.map.jobs import describe_scene
 
-        params, models = DescribeParams(), self._models()
+        models = kept.specs(self.store)
+        params = kept.describe_params(models)
         wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
         methods = {s.id: self._method(s) for s in wanted}
         missing = [s for s in wanted if self.store.graphs.find(s.id, methods[s.id]) is None]
@@ -138,8 +139,10 @@ class Map(AbstractContextManager["Map"]):
     def _method(self, scene: Scene) -> str:
         """Text that decides a scene's graph beside its content: what is described, how, and under which scale."""
         from gsmap.describe import methods
+        from gsmap.map import models as kept
 
-        how = methods(models=self._models())
+        models = kept.specs(self.store)
+        how = methods(kept.describe_params(models), models)
         return _digest(scene.scale_policy, *(f"{layer} {digest}" for layer, digest in sorted(how.items())))
 
     def _graph(self, scene_id: str, method: str) -> SceneGraph:
@@ -382,6 +385,18 @@ class Map(AbstractContextManager["Map"]):
 
         return ViewServer(view_of(self.store), port=port)
 
+    def draw_graph(self, ref: str, path: str | os.PathLike[str]) -> None:
+        """``gsmap show MAP SCENE --picture``: the scene's graph over a render, for a person to judge."""
+        from PIL import Image
+
+        from gsmap.describe.picture import draw_graph
+
+        scene = self.store.scenes.get(ref)
+        graph = self.store.graphs.load(scene.id, self._method(scene))
+        if graph is None:
+            raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
+        Image.fromarray(draw_graph(*self.read(scene.id), graph)).save(path)
+
     def diff(self, before: int, after: int) -> list[dict[str, Any]]:
         """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""
         from gsmap.optimize import diff
@@ -428,12 +443,10 @@ class Map(AbstractContextManager["Map"]):
         return self.store.prune().num_bytes
 
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
-        """Register an ONNX model: checked, then kept (or referenced) and used by every later describe."""
-        raise NotImplementedError
+        """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""
+        from gsmap.map import models as kept
 
-    def _models(self) -> dict[str, object]:
-        """The models to describe with, by name."""
-        return {}
+        kept.add(self.store, kind, path, preset, copy)
 
 
 def _digest(*texts: str) -> str:

@@ -22,7 +22,7 @@ from gsmap.export.manifest import FILE_NAME
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures")
-    made = demo.make_captures(0, 3, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
+    made = demo.make_captures(0, 3, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
     demo.write_captures(folder, made)
     return folder
 
@@ -254,3 +254,34 @@ def test_bad_pairs_are_refused(site: Path) -> None:
                 m.register(pair)
         with pytest.raises(NotFoundError, match="no truth"):
             m.evaluate(site.parent)
+
+
+def test_models_are_checked_kept_and_used(copy: Path, tmp_path: Path) -> None:
+    model = tmp_path / "encoder.onnx"
+    model.write_bytes(_image_encoder())
+    with gsmap.open(copy) as m:
+        before = m.describe("capture_a")[0].layers["objects"].method
+        m.add_model("clip", model, preset="unit")
+        model.unlink()  # the map has its own copy
+        after = m.describe("capture_a")[0].layers["objects"]
+        assert after.method != before
+        assert [row["kind"] for row in m.model_rows()] == ["clip"]
+        m.draw_graph("capture_a", tmp_path / "graph.png")
+        with pytest.raises(InputError, match="not an ONNX model"):
+            m.add_model("clip", copy / "map.sqlite")
+    assert (tmp_path / "graph.png").stat().st_size > 10_000
+
+
+def _image_encoder() -> bytes:
+    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
+    from onnx import TensorProto, helper
+
+    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
+    flat = helper.make_node("Flatten", ["pooled"], ["features"])
+    graph = helper.make_graph(
+        [pool, flat],
+        "encoder",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
+        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()

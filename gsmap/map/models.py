@@ -1,0 +1,50 @@
+"""The map's ONNX models: checked when they are added, used by every describe from then on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+
+from gsmap.describe import DescribeParams
+from gsmap.describe.models import ModelSpec, Tensor, check_model
+from gsmap.store import Store
+
+
+def add(store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool) -> ModelSpec:
+    """Check a model and keep it under its kind, in place of the one there was; see `check_model` for the errors."""
+    spec = check_model(kind, path, preset)
+    store.models.add(kind, path, kind=kind, options=spec.to_json(), copy=copy)
+    return spec
+
+
+def specs(store: Store) -> dict[str, ModelSpec]:
+    """The map's models by kind, as `gsmap.describe` takes them."""
+    return {model.kind: _spec(model.options, str(model.path)) for model in store.models.list()}
+
+
+def describe_params(models: Mapping[str, ModelSpec]) -> DescribeParams:
+    """The defaults, with SAM's masks and the image encoder's features where their models are there."""
+    params = DescribeParams()
+    how = params.object
+    if {"sam-encoder", "sam-decoder"} <= set(models):
+        how = replace(how, segmenter="sam")
+    if "clip" in models:
+        how = replace(how, embedder="clip")
+    return replace(params, object=how)
+
+
+def _spec(options: dict, path: str) -> ModelSpec:
+    def tensors(rows: list[dict]) -> tuple[Tensor, ...]:
+        return tuple(Tensor(row["name"], tuple(row["shape"]), row["dtype"]) for row in rows)
+
+    return ModelSpec(
+        kind=options["kind"],
+        path=path,
+        sha256=options["sha256"],
+        preset=options["preset"],
+        mean=tuple(options["mean"]),
+        std=tuple(options["std"]),
+        inputs=tensors(options["inputs"]),
+        outputs=tensors(options["outputs"]),
+    )
