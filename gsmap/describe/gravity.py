@@ -30,7 +30,7 @@ def estimate_up(points: np.ndarray, cameras: Cameras | None) -> np.ndarray | Non
         return up
     directions = _sphere(8000)
     if up is None:
-        return _up_of_room(sample, normals, weights, directions)
+        return _up_of_room(sample, normals, weights, directions[directions[:, 2] >= 0])
     near = directions[directions @ up > np.cos(np.radians(cone_deg))]
     return _refine(near[np.argmax(_uprightness(near, normals, weights))], normals, weights)
 
@@ -79,10 +79,10 @@ def _sphere(count: int) -> np.ndarray:
 
 def _uprightness(directions: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Weight of the normals along each direction plus half of that of those across it, (D,)."""
-    cosine = np.abs(directions.astype(np.float32) @ normals.T.astype(np.float32))
-    angle = np.degrees(np.arccos(np.minimum(cosine, 1)))
-    along, across = np.exp(-0.5 * (angle / _KERNEL_DEG) ** 2), np.exp(-0.5 * ((90 - angle) / _KERNEL_DEG) ** 2)
-    return (along + 0.5 * across) @ (weights / weights.sum()).astype(np.float32)
+    squared = (directions.astype(np.float32) @ normals.T.astype(np.float32)) ** 2
+    sharp = np.float32(0.5 / np.radians(_KERNEL_DEG) ** 2)  # the sine of an angle stands for the angle
+    score = np.exp(-sharp * (1 - squared)) + 0.5 * np.exp(-sharp * squared)
+    return score @ (weights / weights.sum()).astype(np.float32)
 
 
 def _refine(up: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -103,8 +103,8 @@ def _up_of_room(
 
     Candidates are the axes of the strongest heaps of normals. A vertical has what no horizontal axis has: nearly every
     cell of the plan seen along it lies over a floor or under a ceiling, and the plan is large. Its sign: between floor
-    and ceiling there is more surface in the lower half. None when the best axis does not beat the next by a fifth, or
-    the halves balance.
+    and ceiling there is more surface in the lower half. None when floor and ceiling together cover less than 0.7 of the
+    plan (a part of a room), the best axis does not beat the next by a fifth, or the halves balance.
     """
     score = _uprightness(directions, normals, weights)
     axes: list[np.ndarray] = []
@@ -114,8 +114,10 @@ def _up_of_room(
         if len(axes) == 6:
             break
     axes = [_refine(a, normals, weights) for a in axes]
-    covers = np.array([_plan_cover(points, a) for a in axes])
+    covers, shares = np.array([_plan_cover(points, a) for a in axes]).T
     best = int(np.argmax(covers))
+    if shares[best] < 0.7:
+        return None
     others = [c for a, c in zip(axes, covers, strict=True) if abs(a @ axes[best]) < np.cos(np.radians(10))]
     if others and covers[best] < 1.2 * max(others):
         return None
@@ -128,14 +130,21 @@ def _up_of_room(
     return axes[best] if below > above else -axes[best]
 
 
-def _plan_cover(points: np.ndarray, axis: np.ndarray) -> float:
-    """Area of the plan seen along ``axis`` whose lowest or highest point lies on an outermost plane (mean of both)."""
+def _plan_cover(points: np.ndarray, axis: np.ndarray) -> tuple[float, float]:
+    """How much of the plan seen along ``axis`` has surface on the lowest and on the highest plane.
+
+    Returns:
+        The mean area of the two, and the sum of both as shares of the plan.
+    """
     local = points @ rotation_to_z(axis).T
     low, high = np.percentile(local[:, 2], [2, 98])
     cell = float(np.ptp(points, axis=0).max()) / 60 or 1.0
     slab = 0.04 * (high - low)
-    covered = 0
-    for plane in (low, high):
-        on = local[np.abs(local[:, 2] - plane) < slab, :2]
-        covered += len(np.unique(np.floor(on / cell).astype(np.int64), axis=0))
-    return 0.5 * covered * cell**2
+    plan = _num_cells(local, cell)
+    covered = sum(_num_cells(local[np.abs(local[:, 2] - plane) < slab], cell) for plane in (low, high))
+    return 0.5 * covered * cell**2, covered / plan
+
+
+def _num_cells(points: np.ndarray, cell: float) -> int:
+    key = np.floor(points[:, :2] / cell).astype(np.int64)
+    return len(np.unique(key[:, 0] * 2**32 + key[:, 1]))

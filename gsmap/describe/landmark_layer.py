@@ -13,7 +13,7 @@ from gsmap.describe.landmarks import find_blobs
 from gsmap.describe.method import method_digest
 from gsmap.types import NodeLayer
 
-_VERSION = 2
+_VERSION = 3
 _DIM = 4 * NUM_BINS + 3
 
 
@@ -35,7 +35,7 @@ class LandmarkParams:
     lab_threshold: float = 2.0
     density_threshold: float = 0.6
     max_per_octave: int = 1500
-    context_cell_m: float = 0.05
+    context_cell_m: float = 0.07
 
 
 def landmark_method(params: LandmarkParams) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,8 +27,8 @@ class ObjectParams:
     """How objects are found; lengths are metres under the layer's unit.
 
     Args:
-        segmenter: ``builtin`` or ``sam``.
-        embedder: ``builtin`` or ``clip``.
+        segmenter: ``builtin``, ``sam``, or ``auto``: sam where its two models are given.
+        embedder: ``builtin``, ``clip``, or ``auto``: clip where its model is given.
         num_cameras: views to render, evenly spread.
         longest_side_px: of a render.
         c_mask: masks of lower confidence are dropped (paper).
@@ -42,8 +42,8 @@ class ObjectParams:
         segmenter_params, embedder_params: the back ends' own; their defaults where None.
     """
 
-    segmenter: str = "builtin"
-    embedder: str = "builtin"
+    segmenter: str = "auto"
+    embedder: str = "auto"
     num_cameras: int = 48
     longest_side_px: int = 320
     c_mask: float = 0.5
@@ -54,19 +54,35 @@ class ObjectParams:
     local_distance_m: float = 1.5
     hops: int = 3
     context_weight: float = 0.5
-    segmenter_params: object = field(default=None)
-    embedder_params: object = field(default=None)
+    segmenter_params: object = None
+    embedder_params: object = None
+
+
+def resolved(params: ObjectParams, models: Mapping[str, ModelSpec]) -> ObjectParams:
+    """The parameters with ``auto`` and None replaced by what they stand for.
+
+    Raises:
+        ConfigError: a back end that does not exist.
+    """
+    segmenter, embedder = params.segmenter, params.embedder
+    if segmenter == "auto":
+        segmenter = "sam" if all(kind in models for kind in _NEEDS["sam"]) else "builtin"
+    if embedder == "auto":
+        embedder = "clip" if "clip" in models else "builtin"
+    return replace(
+        params,
+        segmenter=segmenter,
+        embedder=embedder,
+        segmenter_params=params.segmenter_params or segmenters.params_of(segmenter),
+        embedder_params=params.embedder_params or embedders.params_of(embedder),
+    )
 
 
 def object_method(params: ObjectParams, models: Mapping[str, ModelSpec]) -> str:
     """Digest that two comparable object layers share."""
+    params = resolved(params, models)
     kinds = [k for name in (params.segmenter, params.embedder) for k in _NEEDS.get(name, ())]
-    used = [models[k].digest if k in models else k for k in kinds]
-    defaults = (
-        params.segmenter_params or segmenters.params_of(params.segmenter),
-        params.embedder_params or embedders.params_of(params.embedder),
-    )
-    return method_digest("objects", _VERSION, params, *defaults, used)
+    return method_digest("objects", _VERSION, params, [models[k].digest if k in models else k for k in kinds])
 
 
 def object_layer(
@@ -88,10 +104,9 @@ def object_layer(
         ConfigError: a back end that does not exist or lacks its model.
     """
     method = object_method(params, models)
-    segmenter_params = params.segmenter_params or segmenters.params_of(params.segmenter)
-    embedder_params = params.embedder_params or embedders.params_of(params.embedder)
-    segmenter = segmenters.make_segmenter(params.segmenter, segmenter_params, cloud, len(gaussians), models)
-    embedder = embedders.make_embedder(params.embedder, embedder_params, up, unit_m, models)
+    params = resolved(params, models)
+    segmenter = segmenters.make_segmenter(params.segmenter, params.segmenter_params, cloud, len(gaussians), models)
+    embedder = embedders.make_embedder(params.embedder, params.embedder_params, up, unit_m, models)
     level = np.eye(3) if up is None else rotation_to_z(up)
     cell = params.voxel_m / unit_m
     nodes: list[Node] = []

@@ -63,7 +63,7 @@ def test_any_two_units_have_a_pair_of_levels_within_20_percent():
 
 
 def test_up_is_found_with_and_without_cameras():
-    gaussians, cameras = room()
+    gaussians, cameras = room(n=10000)
     R = Rotation.random(random_state=1).as_matrix()
     gaussians, cameras = moved(gaussians, cameras, Sim3(R, np.zeros(3)))
     points = surface_cloud(gaussians).points

@@ -10,6 +10,7 @@ from gsmap.describe import DescribeParams, describe, methods
 from gsmap.describe.associate import associate, giou, region
 from gsmap.describe.context import context_histograms, neighbourhood, random_codebook
 from gsmap.describe.lift import visible
+from gsmap.describe.models import check_model
 from gsmap.describe.object_layer import ObjectParams
 from gsmap.describe.picture import draw_graph
 from gsmap.describe.segmenters.builtin import felzenszwalb
@@ -184,3 +185,22 @@ def test_a_picture_of_the_graph_shows_it():
     assert draw_graph(gaussians, cameras, graph).shape == (720, 960, 3)
     with pytest.raises(NotFoundError, match="no camera"):
         draw_graph(gaussians, cameras, graph, camera="attic")
+
+
+def test_models_that_are_given_are_used(tmp_path):
+    networks = pytest.importorskip("describe_networks", reason="needs the onnx package")
+    models = {
+        "sam-encoder": check_model("sam-encoder", networks.sam_encoder(tmp_path / "e.onnx")),
+        "sam-decoder": check_model("sam-decoder", networks.sam_decoder(tmp_path / "d.onnx")),
+        "clip": check_model("clip", networks.image_encoder(tmp_path / "c.onnx"), "unit"),
+    }
+    params = DescribeParams(landmarks=False, object=ObjectParams(num_cameras=4, min_views=1))
+    gaussians, cameras = room(n=15000)
+    graph = describe("models", gaussians, cameras, params, models)
+    layer = graph.layers["objects"]
+    assert len(layer) > 0
+    assert layer.features.shape[1] == 3
+    assert layer.method == methods(params, models)["objects"]
+    assert (
+        len({methods(params, {})["objects"], layer.method, methods(params, {"clip": models["clip"]})["objects"]}) == 3
+    )

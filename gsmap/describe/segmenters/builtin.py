@@ -48,14 +48,18 @@ class BuiltinSegmenter:
         parts = self.part_of_gaussian[view.dominant_id]
         parts[view.alpha < 0.5] = -1
         masks = []
-        for part in np.unique(parts[parts >= 0]):
+        for part, place in enumerate(ndimage.find_objects(parts + 1)):
+            if place is None:
+                continue
+            window = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in place)
             # Closing by a pixel bridges the single foreign Gaussians that speckle a part.
-            pixels = ndimage.binary_closing(parts == part, np.ones((3, 3), bool))
+            pixels = ndimage.binary_closing(np.pad(parts[window] == part, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
             labels, count = ndimage.label(pixels)
             sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-            for i in np.flatnonzero(sizes >= self.params.min_area * pixels.size):
-                blob = labels == i + 1
-                masks.append(Mask(blob, float(view.alpha[blob].mean() * sizes[i] / sizes.sum()), int(part)))
+            for i in np.flatnonzero(sizes >= self.params.min_area * parts.size):
+                blob = np.zeros(parts.shape, bool)
+                blob[window] = labels == i + 1
+                masks.append(Mask(blob, float(view.alpha[blob].mean() * sizes[i] / sizes.sum()), part))
         return masks
 
 
