@@ -52,7 +52,7 @@ class Frames:
 def default_routes(place: Place, count: int) -> list[tuple[int, ...]]:
     """Routes of ``count`` captures through two neighbouring rooms each; three captures share one room a pair.
 
-    Every route shares a room with an earlier one, and rooms already walked come before new ones, so routes close cycles.
+    Every route shares a room with an earlier one; rooms already walked come before new ones, so routes close cycles.
     """
     doors = sorted({(min(d.a, d.b), max(d.a, d.b)) for d in place.doors})
     order, left = doors[:1], doors[1:]
