@@ -1,3 +1,4 @@
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -18,6 +19,33 @@ def store(tmp_path):
 @pytest.fixture
 def two_scenes(store):
     return [store.scenes.add(make_gaussians(seed=i), make_cameras(), name=f"scene{i}")[0] for i in range(2)]
+
+
+@pytest.fixture(scope="session")
+def context():
+    """Processes that start in a moment: the server has imported everything, and has no threads."""
+    made = multiprocessing.get_context("forkserver")
+    made.set_forkserver_preload(["gsmap.store", "zarr", "zarr.codecs"])
+    return made
+
+
+@pytest.fixture
+def start(context):
+    started = []
+
+    def run(target, *arguments):
+        ours, theirs = context.Pipe(duplex=False)
+        process = context.Process(target=target, args=(*arguments, theirs))
+        process.start()
+        theirs.close()
+        started.append(process)
+        return process, ours
+
+    yield run
+    for process in started:
+        if process.is_alive():
+            process.kill()
+        process.join()
 
 
 def _postgres_binary(name: str) -> str | None:

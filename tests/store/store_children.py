@@ -122,4 +122,14 @@ def read_some(path: str, stop, pipe) -> None:
         pipe.send(repr(error))
 
 
+def messages(pipe) -> list:
+    out = []
+    try:
+        while pipe.poll(0):
+            out.append(pipe.recv())
+    except EOFError:
+        pass
+    return out
+
+
 CODES = (errno.ENOSPC, errno.EIO)

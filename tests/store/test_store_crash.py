@@ -1,6 +1,5 @@
 """Killed anywhere, the map opens whole and nothing that was acknowledged is lost."""
 
-import multiprocessing
 import os
 import random
 import signal
@@ -9,47 +8,11 @@ import time
 
 import pytest
 import store_children
+from store_children import messages
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import StoreError
 from gsmap.store import Store
-
-
-@pytest.fixture(scope="module")
-def context():
-    """Processes that start in a moment: the server has imported everything, and has no threads."""
-    made = multiprocessing.get_context("forkserver")
-    made.set_forkserver_preload(["gsmap.store", "zarr", "zarr.codecs"])
-    return made
-
-
-@pytest.fixture
-def start(context):
-    started = []
-
-    def run(target, *arguments):
-        ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(target=target, args=(*arguments, theirs))
-        process.start()
-        theirs.close()
-        started.append(process)
-        return process, ours
-
-    yield run
-    for process in started:
-        if process.is_alive():
-            process.kill()
-        process.join()
-
-
-def messages(pipe) -> list:
-    out = []
-    try:
-        while pipe.poll(0):
-            out.append(pipe.recv())
-    except EOFError:
-        pass
-    return out
 
 
 def kill_at_random(tmp_path, start, kills: int, seed: int) -> None:

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import store_children
+from store_children import messages
 from store_samples import make_cameras, make_gaussians
 from test_store_nouns import graph_of, layer, registration, tile
 
@@ -74,3 +76,16 @@ def test_a_server_that_is_not_there(tmp_path):
         with pytest.raises(ConfigError, match="database URL"):
             Store.create(tmp_path / "m", catalog_url=url)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_four_writers_on_postgres(tmp_path, postgres_database, start):
+    path = tmp_path / "m"
+    Store.create(path, catalog_url=postgres_database).close()
+    writers = [start(store_children.write_some, str(path), i, 3) for i in range(4)]
+    for process, pipe in writers:
+        process.join(120)
+        assert messages(pipe) == ["done"]
+    with Store.open(path) as store:
+        assert len(store.scenes.list()) == 4 * 3 + 3
+        assert [r.number for r in store.revisions.list()] == list(range(1, 13))
+        assert store.check().problems == ()
