@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from gsmap.merge.parts import Part
+from gsmap.merge.parts import Part, overlapping
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians
 
@@ -57,11 +57,15 @@ def overruled_pixels(camera: Cameras, depth: np.ndarray, later: list[Gaussians])
 
 
 def _later(parts: list[Part]) -> list[list[Part]]:
-    """For each part, the parts captured after it that have cameras."""
+    """For each part, the parts of the same place that were captured after it and have cameras."""
     times = [_time(part.captured_at) for part in parts]
     return [
-        [p for p, t in zip(parts, times, strict=True) if time and t and t > time and p.cameras is not None]
-        for time in times
+        [
+            other
+            for other, then in zip(parts, times, strict=True)
+            if time and then and then > time and other.cameras is not None and overlapping(part, other)
+        ]
+        for part, time in zip(parts, times, strict=True)
     ]
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmap.merge.parts import Part
+from gsmap.merge.parts import Part, overlapping, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians
 
@@ -47,10 +47,8 @@ def _ratios(parts: list[Part]) -> list[tuple[int, int, np.ndarray, float]]:
     """(i, j, median log(colour_i / colour_j) (3,), pixels) of every pair of parts that show a surface in common."""
     found = []
     for i, part in enumerate(parts):
-        if part.cameras is None or len(part.gaussians) == 0:
-            continue
         for j, other in enumerate(parts):
-            if i == j or len(other.gaussians) == 0:
+            if i == j or part.cameras is None or not overlapping(part, other):
                 continue
             cameras = _looking_at(part.cameras, other.gaussians)
             samples = [_same_surface(part, other, cameras[c]) for c in range(len(cameras))]
@@ -62,15 +60,9 @@ def _ratios(parts: list[Part]) -> list[tuple[int, int, np.ndarray, float]]:
 
 def _looking_at(cameras: Cameras, gaussians: Gaussians) -> Cameras:
     """The few cameras that have most of the Gaussians' means in view."""
-    means = gaussians.means[:: max(1, len(gaussians) // 2000)].astype(np.float64)
-    T = cameras.T_camera_frame
-    local = np.einsum("cij,nj->cni", T[:, :3, :3], means) + T[:, None, :3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = (
-            local[..., :2] / local[..., 2:] * cameras.intrinsics_px[:, None, :2] + cameras.intrinsics_px[:, None, 2:]
-        )
-        count = ((local[..., 2] > 0.1) & (pixel > 0).all(-1) & (pixel < cameras.sizes_px[:, None]).all(-1)).sum(1)
-    return cameras[np.argsort(-count, kind="stable")[:_VIEWS_PER_PAIR]].resized(_LONGEST_SIDE_PX)
+    share = share_in_view(cameras, gaussians.means)
+    best = np.argsort(-share, kind="stable")[:_VIEWS_PER_PAIR]
+    return cameras[best[share[best] > 0]].resized(_LONGEST_SIDE_PX)
 
 
 def _same_surface(part: Part, other: Part, camera: Cameras) -> np.ndarray:

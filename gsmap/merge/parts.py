@@ -61,3 +61,26 @@ def united(parts: list[Part]) -> tuple[Gaussians, np.ndarray]:
     """All Gaussians of the parts in order, and the index (N,) int32 of the part of each."""
     origin = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.gaussians) for p in parts])
     return Gaussians.concatenate([p.gaussians for p in parts]), origin
+
+
+def overlapping(a: Part, b: Part) -> bool:
+    """Whether the boxes around two parts' means meet: cheap, and spares comparing captures of different places."""
+    if len(a.gaussians) == 0 or len(b.gaussians) == 0:
+        return False
+    low = np.maximum(a.gaussians.means.min(0), b.gaussians.means.min(0))
+    return bool((low <= np.minimum(a.gaussians.means.max(0), b.gaussians.means.max(0))).all())
+
+
+def share_in_view(cameras: Cameras, points: np.ndarray, sample: int = 2000) -> np.ndarray:
+    """(C,) share of points (N, 3) that lie in front of each camera and in its picture, from an even sample of them."""
+    points = points[:: max(1, len(points) // sample)].astype(np.float64)
+    if len(points) == 0:
+        return np.zeros(len(cameras))
+    T = cameras.T_camera_frame
+    local = np.einsum("cij,nj->cni", T[:, :3, :3], points) + T[:, None, :3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixel = (
+            local[..., :2] / local[..., 2:] * cameras.intrinsics_px[:, None, :2] + cameras.intrinsics_px[:, None, 2:]
+        )
+        seen = (local[..., 2] > 0) & (pixel > 0).all(-1) & (pixel < cameras.sizes_px[:, None]).all(-1)
+    return seen.mean(1)

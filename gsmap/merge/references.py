@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.merge.changes import overruled_pixels
-from gsmap.merge.parts import Part, inside
+from gsmap.merge.parts import Part, inside, share_in_view
 from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
 
 _MIN_SEEN = 0.02  # share of a picture that must show the tile
+_ENOUGH_SEEN = 0.25
 _MARGIN_PX = 6
 
 
@@ -41,10 +42,16 @@ class References:
     def __len__(self) -> int:
         return len(self.images)
 
+    @property
+    def turns(self) -> np.ndarray:
+        """(V,) how often to use each view in one pass over all: once where it shows enough, else now and then."""
+        return np.minimum(1.0, self.share / _ENOUGH_SEEN)
+
 
 def render_references(
     parts: list[Part],
     bounds: np.ndarray | None,
+    band_m: float,
     longest_side_px: int,
     later: list[list[Gaussians]] | None,
     progress: Callable[[float, str], None],
@@ -52,10 +59,11 @@ def render_references(
     """Render each part from its own cameras; keep the views that show enough of the tile.
 
     A camera of one capture says nothing about what that capture never saw: pixels count as far as the capture itself
-    covers them, and, for a tile, where the surface seen lies inside it. ``later`` (see `gsmap.merge.changes`) holds
+    covers them, and, for a tile, where the surface seen lies inside it or within a band around it, so that what is at
+    the border is held from both sides. ``later`` (see `gsmap.merge.changes`) holds
     for each part what stands there by now.
     """
-    todo = [(i, c) for i, part in enumerate(parts) if part.cameras is not None for c in range(len(part.cameras))]
+    todo = [(i, c) for i, part in enumerate(parts) for c in _looking_at(part, bounds, band_m)]
     cameras, images, weights, kept, shares = [], [], [], [], []
     pixels = [np.zeros(len(part.gaussians), dtype=np.int64) for part in parts]
     largest = [np.zeros(len(part.gaussians), dtype=np.float32) for part in parts]
@@ -64,7 +72,7 @@ def render_references(
         progress(done / len(todo), "rendering the captures")
         seen = render(parts[i].gaussians, camera, max_weight=True)
         _count(seen, pixels[i], largest[i])
-        weight = seen.alpha[0] * inside_pixels(camera, seen.depth[0], bounds)
+        weight = seen.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, band_m)
         if later is not None and later[i]:
             weight = weight * ~overruled_pixels(camera, seen.depth[0], later[i])
         share = float(weight.mean())
@@ -78,6 +86,14 @@ def render_references(
         shares.append(share)
     shown = [_shown(p, w, whole=bounds is None) for p, w in zip(pixels, largest, strict=True)]
     return References(_joined(cameras), images, weights, np.array(kept, dtype=np.int64), np.array(shares), shown)
+
+
+def _looking_at(part: Part, bounds: np.ndarray | None, band_m: float) -> np.ndarray:
+    """Indices of the cameras that can see any of the part's Gaussians near the tile."""
+    if part.cameras is None:
+        return np.zeros(0, dtype=int)
+    near = inside(part.gaussians.means, bounds, band_m)
+    return np.flatnonzero(share_in_view(part.cameras, part.gaussians.means[near]) > 0)
 
 
 def _count(seen: Rendered, pixels: np.ndarray, largest: np.ndarray) -> None:
@@ -111,11 +127,11 @@ def _shown(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
     return np.where(pixels > 0, pixels, np.where(largest > 0, 0.1 * largest, unseen)).astype(np.float32)
 
 
-def order_of_views(share: np.ndarray, steps: int, seed: int) -> np.ndarray:
-    """(steps,) which view to use at each step: each in proportion to what it shows, spread evenly over time."""
+def order_of_views(turns: np.ndarray, steps: int, seed: int) -> np.ndarray:
+    """(steps,) which view to use at each step: each in proportion to its turns, spread evenly over time."""
     rng = np.random.default_rng(seed)
     times, views = [], []
-    for view, rate in enumerate(share / share.sum()):
+    for view, rate in enumerate(turns / turns.sum()):
         count = int(np.ceil(steps * rate)) + 1
         # Every view takes its turn once per 1/rate steps, at a phase of its own each time.
         times.append((np.arange(count) + rng.random(count)) / rate)
@@ -123,11 +139,11 @@ def order_of_views(share: np.ndarray, steps: int, seed: int) -> np.ndarray:
     return np.concatenate(views)[np.argsort(np.concatenate(times), kind="stable")][:steps]
 
 
-def inside_pixels(camera: Cameras, depth: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
-    """(H, W) bool, whether the surface seen in each pixel of a depth map lies in the bounds."""
+def inside_pixels(camera: Cameras, depth: np.ndarray, bounds: np.ndarray | None, band_m: float) -> np.ndarray:
+    """(H, W) bool, whether the surface seen in each pixel of a depth map lies in the bounds grown by a band."""
     if bounds is None:
         return np.ones(depth.shape, dtype=bool)
-    return inside(surface_points(camera, depth).reshape(-1, 3), bounds).reshape(depth.shape) & (depth > 0)
+    return inside(surface_points(camera, depth).reshape(-1, 3), bounds, band_m).reshape(depth.shape) & (depth > 0)
 
 
 def surface_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:

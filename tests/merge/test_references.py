@@ -24,10 +24,10 @@ def test_surface_points_lie_on_the_wall():
 
 def test_references_count_only_what_was_seen_of_the_tile():
     parts = two_parts()
-    whole = render_references(parts, None, 64, None, quiet)
+    whole = render_references(parts, None, 0.0, 64, None, quiet)
     assert len(whole) == 14
     tile = np.array([[0.6, -2, -2], [2, 2, 2]])
-    views = render_references(parts, tile, 64, None, quiet)
+    views = render_references(parts, tile, 0.0, 64, None, quiet)
     # Only capture b reaches there, and only some of its cameras look that way.
     assert set(views.part.tolist()) == {1}
     assert 0 < len(views) < 7
@@ -90,8 +90,8 @@ def test_what_came_later_is_not_asked_away_by_older_pictures():
     new = Part(Gaussians.concatenate([wall(0, -1.5, 1.5), box]), cameras, "new", "2026-02-01T00:00:00+00:00")
     later = what_came_later([old, new])
     assert [len(x) for x in later] == [1, 0]
-    plain = render_references([old, new], None, 64, None, quiet)
-    views = render_references([old, new], None, 64, later, quiet)
+    plain = render_references([old, new], None, 0.0, 64, None, quiet)
+    views = render_references([old, new], None, 0.0, 64, later, quiet)
     middle = 3  # looks straight at the box
     assert plain.weights[middle][24, 32] > 250
     assert views.weights[middle][24, 32] == 0

@@ -22,8 +22,8 @@ from gsmap.merge.selection import most_shown, one_owner_per_cell
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians
 
-# Adam's steps for Gaussians that are nearly right; those for positions are in metres.
-_RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh_base": 5e-3, "sh_rest": 5e-3}
+# Adam's first steps, for Gaussians that are nearly right; for positions as a share of the Gaussians' median size.
+_RATES = {"means": 0.035, "quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh_base": 5e-3, "sh_rest": 5e-3}
 _LAST_RATE = 0.1  # of the first, reached exponentially
 _SSIM_WEIGHT = 0.2
 _COVER_M = 0.1  # an owner's Gaussian this near stands for another capture's
@@ -38,7 +38,7 @@ class Params:
     keep: at most this share of the Gaussians that went in.
     voxel_m: side of the voxels in which Gaussians are first merged.
     cell_m: side of the cells that are given to one capture each.
-    passes: how often each pixel of the references is used, where steps are not given; fewer when it no longer gains.
+    passes: how often each view is used, where steps are not given; fewer when it no longer gains.
     steps: how many optimisation steps, exactly.
     halo_m: how far around a tile its surroundings are rendered along, frozen.
     reach_m: how far around a tile cameras are looked for.
@@ -55,7 +55,7 @@ class Params:
     steps: int | None = None
     halo_m: float = 0.5
     reach_m: float = 3.0
-    longest_side_px: int = 640
+    longest_side_px: int = 960
     balance_exposure: bool = True
     newer_wins: bool = True
     seed: int = 0
@@ -91,11 +91,11 @@ def merge(
         if log_gains.any():
             notes.append(f"exposures differed by up to {np.ptp(log_gains, axis=0).max() / np.log(2):.2f} stops")
     references = render_references(
-        parts, bounds, params.longest_side_px, later, lambda f, text: progress(0.2 * f, text)
+        parts, bounds, params.halo_m / 2, params.longest_side_px, later, lambda f, text: progress(0.2 * f, text)
     )
     start, origin = _start(parts, references, params, bounds)
-    if len(references) == 0:
-        notes.append("no camera sees it: not optimised")
+    if len(references) == 0 or not inside(start.means, bounds).any():
+        notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
     fitted, steps, truncated = _fit(start, ~inside(start.means, bounds), references, params, deadline, progress)
     return MergeResult(fitted, origin, steps=steps, truncated=truncated, notes=tuple(notes))
@@ -126,15 +126,16 @@ def _fit(
     progress: Callable[[float, str], None],
 ) -> tuple[Gaussians, int, bool]:
     """The start fitted to the references; steps taken; whether time ran out."""
-    one_pass = max(_MIN_PASS, round(references.share.sum()))
+    one_pass = max(_MIN_PASS, round(references.turns.sum()))
     steps = params.steps if params.steps is not None else round(params.passes * one_pass)
     fitter = Fitter(start, frozen=frozen, ssim_weight=_SSIM_WEIGHT)
     cameras = [references.cameras[v] for v in range(len(references))]
+    rates = _RATES | {"means": _RATES["means"] * float(np.exp(np.median(start.log_scales.max(1))))}
     losses: list[float] = []
-    for step, view in enumerate(order_of_views(references.share, steps, params.seed)):
+    for step, view in enumerate(order_of_views(references.turns, steps, params.seed)):
         if deadline is not None and time.monotonic() > deadline:
             return fitter.gaussians(), step, True
-        fitter.learning_rates = LearningRates(**{k: r * _LAST_RATE ** (step / steps) for k, r in _RATES.items()})
+        fitter.learning_rates = LearningRates(**{k: r * _LAST_RATE ** (step / steps) for k, r in rates.items()})
         losses.append(fitter.step(cameras[view], references.images[view][None], references.weights[view][None]))
         if step % 20 == 0:
             progress(0.2 + 0.8 * step / steps, f"optimising, loss {np.mean(losses[-20:]):.4f}")
