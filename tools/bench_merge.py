@@ -1,6 +1,6 @@
 """The merging table: how close a merged map comes to rendering each capture alone.
 
-    python tools/bench_merge.py CAPTURES [--scenes c0 c1] [--map site.gsmap] [--curve] [--tiles 5] [--json out.json]
+    python tools/bench_merge.py CAPTURES [--scenes c0 c1] [--map site.gsmap] [--curve 0.5 0.4] [--tiles 6] [--json out.json]
 
 CAPTURES is a folder of captures (``NAME.ply`` with ``NAME.cameras.json``), with ``truth/NAME.json`` holding
 ``T_scene_world`` and ``frames/`` holding pictures named like cameras. Rows: the oracle (each capture alone, at its own
@@ -34,8 +34,8 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["c0", "c1"], help="names of captures to merge")
     parser.add_argument("--images", type=Path, help="folder of pictures, CAPTURES/frames else")
     parser.add_argument("--map", type=Path, help="a map of the same captures, for rows under estimated poses")
-    parser.add_argument("--methods", nargs="+", default=["union", "distance", "voxel", "tto"])
-    parser.add_argument("--curve", action="store_true", help="tto over a range of sizes")
+    parser.add_argument("--methods", nargs="*", default=["union", "distance", "voxel", "tto"])
+    parser.add_argument("--curve", nargs="*", type=float, default=[], help="tto at these sizes (share of the union)")
     parser.add_argument("--tiles", type=float, help="also merge in tiles of this edge (m) and compare with one tile")
     parser.add_argument("--json", type=Path, help="write all figures here")
     arguments = parser.parse_args()
@@ -47,16 +47,16 @@ def main() -> None:
     if arguments.map:
         poses["estimated"] = estimated_poses(arguments.map, truth)
     rows = [oracle_row(captures, images)]
+    print_title()
+    print_row(rows[0])
     for kind, S_map_scene in poses.items():
         for method in arguments.methods:
-            rows.append(merge_row(captures, S_map_scene, images, method, default_params(method), f"{method} ({kind})"))
-        if arguments.curve:
-            for keep in (0.9, 0.7, 0.6, 0.5, 0.4):
-                params = type(default_params("tto"))(keep=keep)
-                rows.append(merge_row(captures, S_map_scene, images, "tto", params, f"tto keep={keep} ({kind})"))
+            add(rows, merge_row(captures, S_map_scene, images, method, default_params(method), f"{method} ({kind})"))
+        for keep in arguments.curve:
+            params = type(default_params("tto"))(keep=keep)
+            add(rows, merge_row(captures, S_map_scene, images, "tto", params, f"tto keep={keep:g} ({kind})"))
         if arguments.tiles:
-            rows.append(tiled_row(captures, S_map_scene, images, arguments.tiles, f"tto, tiles ({kind})"))
-    print_table(rows)
+            add(rows, tiled_row(captures, S_map_scene, images, arguments.tiles, f"tto, tiles ({kind})"))
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=1))
 
@@ -155,7 +155,12 @@ def ply_mb(gaussians: Gaussians) -> float:
     return len(gaussians) * 4 * (14 + 3 * gaussians.sh.shape[1]) / 1e6
 
 
-def print_table(rows: list[dict]) -> None:
+def add(rows: list[dict], row: dict) -> None:
+    rows.append(row)
+    print_row(row)
+
+
+def print_title() -> None:
     columns = (
         ("PSNR", 6),
         ("SSIM", 6),
@@ -167,11 +172,14 @@ def print_table(rows: list[dict]) -> None:
         ("steps", 5),
     )
     print(" " * 30, *(f"{title:>{width}}" for title, width in columns))
-    for r in rows:
-        print(
-            f"{r['name']:30} {r['psnr_db']:6.2f} {r['ssim']:6.4f} {r['num_gaussians']:9d} {r['share']:6.1%} "
-            f"{r['mb']:6.1f} {r.get('wall_s', 0):7.1f} {r.get('cpu_s', 0):7.1f} {r.get('steps', 0):5d}"
-        )
+
+
+def print_row(r: dict) -> None:
+    print(
+        f"{r['name']:30} {r['psnr_db']:6.2f} {r['ssim']:6.4f} {r['num_gaussians']:9d} {r['share']:6.1%} "
+        f"{r['mb']:6.1f} {r.get('wall_s', 0):7.1f} {r.get('cpu_s', 0):7.1f} {r.get('steps', 0):5d}",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
