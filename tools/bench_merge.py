@@ -1,6 +1,6 @@
 """The merging table: how close a merged map comes to rendering each capture alone.
 
-    python tools/bench_merge.py CAPTURES [--scenes c0 c1] [--map site.gsmap] [--curve 0.5 0.4] [--tiles 6] [--json out.json]
+    python tools/bench_merge.py CAPTURES [--scenes c0 c1] [--map site.gsmap] [--curve 0.5 0.4] [--tiles 6]
 
 CAPTURES is a folder of captures (``NAME.ply`` with ``NAME.cameras.json``), with ``truth/NAME.json`` holding
 ``T_scene_world`` and ``frames/`` holding pictures named like cameras. Rows: the oracle (each capture alone, at its own
