@@ -51,7 +51,7 @@ class Params:
     keep: float = 0.6
     voxel_m: float = 0.01
     cell_m: float = 0.5
-    passes: float = 5.0
+    passes: float = 6.0
     steps: int | None = None
     halo_m: float = 0.5
     reach_m: float = 3.0
