@@ -15,6 +15,7 @@ from gsmap.types import Cameras, Gaussians
 _MIN_SEEN = 0.02  # share of a picture that must show the tile
 _ENOUGH_SEEN = 0.25
 _MARGIN_PX = 6
+WEIGHT_UNIT = 0.1  # of `References.shown`, for what dominates no pixel: always less than one pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,8 @@ class References:
             capture saw nothing, and outside the tile.
         part: (V,) which part each was rendered from.
         share: (V,) how much of each camera's whole picture counts, in [0, 1].
-        shown: per part (N_part,) float32: in how many pixels of its own views each Gaussian dominates; below 1 where
-            in none; 1 for all where there are no views.
+        shown: per part (N_part,) float32: in how many pixels of its own views each Gaussian dominates; where
+            it dominates none, `WEIGHT_UNIT` times its largest weight in any pixel; 1 for all where there are no views.
     """
 
     cameras: Cameras
@@ -51,7 +52,7 @@ class References:
 def render_references(
     parts: list[Part],
     bounds: np.ndarray | None,
-    band_m: float,
+    halo_m: float,
     longest_side_px: int,
     later: list[list[Gaussians]] | None,
     progress: Callable[[float, str], None],
@@ -59,11 +60,19 @@ def render_references(
     """Render each part from its own cameras; keep the views that show enough of the tile.
 
     A camera of one capture says nothing about what that capture never saw: pixels count as far as the capture itself
-    covers them, and, for a tile, where the surface seen lies inside it or within a band around it, so that what is at
-    the border is held from both sides. ``later`` (see `gsmap.merge.changes`) holds
+    covers them. For a tile they count where the surface seen lies inside it or within half the halo, so that what is
+    at the border is held from both sides, and they show what lies within the halo alone: what glimmers through from
+    beyond is not there when the tile is fitted, and must not be made up for. ``later`` (`gsmap.merge.changes`) holds
     for each part what stands there by now.
     """
-    todo = [(i, c) for i, part in enumerate(parts) for c in _looking_at(part, bounds, band_m)]
+    near = [inside(part.gaussians.means, bounds, halo_m) for part in parts]
+    pieces = [part.gaussians if n.all() else part.gaussians[n] for part, n in zip(parts, near, strict=True)]
+    todo = [
+        (i, c)
+        for i, (part, piece) in enumerate(zip(parts, pieces, strict=True))
+        if part.cameras is not None
+        for c in np.flatnonzero(share_in_view(part.cameras, piece.means) > 0)
+    ]
     cameras, images, weights, kept, shares = [], [], [], [], []
     pixels = [np.zeros(len(part.gaussians), dtype=np.int64) for part in parts]
     largest = [np.zeros(len(part.gaussians), dtype=np.float32) for part in parts]
@@ -72,7 +81,8 @@ def render_references(
         progress(done / len(todo), "rendering the captures")
         seen = render(parts[i].gaussians, camera, max_weight=True)
         _count(seen, pixels[i], largest[i])
-        weight = seen.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, band_m)
+        local = seen if pieces[i] is parts[i].gaussians else render(pieces[i], camera, depth=False, dominant_id=False)
+        weight = local.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, halo_m / 2)
         if later is not None and later[i]:
             weight = weight * ~overruled_pixels(camera, seen.depth[0], later[i])
         share = float(weight.mean())
@@ -80,20 +90,12 @@ def render_references(
             continue
         window = _window(weight)
         cameras.append(_cropped(camera, window))
-        images.append(np.round(np.clip(seen.colour[0][window], 0, 1) * 255).astype(np.uint8))
+        images.append(np.round(np.clip(local.colour[0][window], 0, 1) * 255).astype(np.uint8))
         weights.append(np.round(np.clip(weight[window], 0, 1) * 255).astype(np.uint8))
         kept.append(i)
         shares.append(share)
     shown = [_shown(p, w, whole=bounds is None) for p, w in zip(pixels, largest, strict=True)]
     return References(_joined(cameras), images, weights, np.array(kept, dtype=np.int64), np.array(shares), shown)
-
-
-def _looking_at(part: Part, bounds: np.ndarray | None, band_m: float) -> np.ndarray:
-    """Indices of the cameras that can see any of the part's Gaussians near the tile."""
-    if part.cameras is None:
-        return np.zeros(0, dtype=int)
-    near = inside(part.gaussians.means, bounds, band_m)
-    return np.flatnonzero(share_in_view(part.cameras, part.gaussians.means[near]) > 0)
 
 
 def _count(seen: Rendered, pixels: np.ndarray, largest: np.ndarray) -> None:
@@ -124,7 +126,7 @@ def _shown(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
     if not largest.any():
         return np.ones(len(pixels), dtype=np.float32)
     unseen = 0.0 if whole else 0.5
-    return np.where(pixels > 0, pixels, np.where(largest > 0, 0.1 * largest, unseen)).astype(np.float32)
+    return np.where(pixels > 0, pixels, np.where(largest > 0, WEIGHT_UNIT * largest, unseen)).astype(np.float32)
 
 
 def order_of_views(turns: np.ndarray, steps: int, seed: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge.changes import drop_what_is_gone, what_came_later
 from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.parts import MergeResult, Part, inside, united
-from gsmap.merge.references import References, order_of_views, render_references
+from gsmap.merge.references import WEIGHT_UNIT, References, order_of_views, render_references
 from gsmap.merge.selection import most_shown, one_owner_per_cell
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians
@@ -35,7 +35,8 @@ _GAIN_PER_PASS = 0.002  # stop when a pass over all views lowers the loss by les
 @dataclass(frozen=True)
 class Params:
     """Args:
-    keep: at most this share of the Gaussians that went in.
+    min_weight: drop what nowhere makes up this share of a pixel of its capture's own views, and dominates none.
+    keep: at most this share of the Gaussians that went in, by what shows most; of each tile.
     voxel_m: side of the voxels in which Gaussians are first merged.
     cell_m: side of the cells that are given to one capture each.
     passes: how often each view is used, where steps are not given; fewer when it no longer gains.
@@ -48,7 +49,8 @@ class Params:
     seed: of the order of views.
     """
 
-    keep: float = 0.6
+    min_weight: float = 0.1
+    keep: float = 0.8
     voxel_m: float = 0.01
     cell_m: float = 0.5
     passes: float = 6.0
@@ -91,7 +93,7 @@ def merge(
         if log_gains.any():
             notes.append(f"exposures differed by up to {np.ptp(log_gains, axis=0).max() / np.log(2):.2f} stops")
     references = render_references(
-        parts, bounds, params.halo_m / 2, params.longest_side_px, later, lambda f, text: progress(0.2 * f, text)
+        parts, bounds, params.halo_m, params.longest_side_px, later, lambda f, text: progress(0.2 * f, text)
     )
     start, origin = _start(parts, references, params, bounds)
     if len(references) == 0 or not inside(start.means, bounds).any():
@@ -112,6 +114,7 @@ def _start(
     shown = np.bincount(labels, np.concatenate(references.shown)[near], minlength=len(merged))
     origin = origin[near][heaviest]
     stays = one_owner_per_cell(merged, origin, shown, params.cell_m, _COVER_M)
+    stays &= shown >= WEIGHT_UNIT * params.min_weight
     mine = inside(merged.means, bounds)
     stays &= ~mine | most_shown(shown, stays & mine, int(params.keep * inside(gaussians.means, bounds).sum()))
     return merged[stays], origin[stays]
