@@ -83,7 +83,6 @@ class Ours:
     def both(self, i: int) -> None:
         self.forward(i)
         gradients = [np.zeros_like(a) for a in self.arrays]
-        names = ("g_means", "g_quats", "g_log_scales", "g_logit_opacities", "g_sh")
         self.view.backward(
             *self.arrays,
             background=BLACK,
@@ -93,7 +92,7 @@ class Ours:
             g_colour=self.g_colour,
             g_depth=None,
             g_alpha=None,
-            **dict(zip(names, gradients, strict=True)),
+            gradients=gradients,
             g_pose=None,
         )
 

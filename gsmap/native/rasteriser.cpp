@@ -3,9 +3,12 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include <optional>
+#include <stdexcept>
 #include <string>
+#include <vector>
 
 #include "bindings.h"
 #include "rasteriser_view.h"
@@ -52,17 +55,20 @@ void forward(View &view, const Floats &means, const Floats &quats, const Floats 
     view.forward(scene, camera, ranges ? ranges->data() : nullptr, ranges ? int64_t(ranges->shape(0)) : 0, image);
 }
 
-// Adds to the gradients given; what was rendered must be unchanged since forward().
+// Adds to the gradients given (of means, quats, log-scales, logit-opacities, SH; or none of them); what was rendered must be unchanged since forward().
 void backward(View &view, const Floats &means, const Floats &quats, const Floats &log_scales, const Floats &logits,
               const Floats &sh, const Floats &background, const FloatsOut &colour, const std::optional<FloatsOut> &depth,
               const FloatsOut &alpha, const std::optional<Floats> &g_colour, const std::optional<Floats> &g_depth,
-              const std::optional<Floats> &g_alpha, const FloatsOut &g_means, const FloatsOut &g_quats,
-              const FloatsOut &g_log_scales, const FloatsOut &g_logits, const FloatsOut &g_sh,
+              const std::optional<Floats> &g_alpha, const std::optional<std::vector<FloatsOut>> &gradients,
               const std::optional<DoublesOut> &g_pose) {
     const Scene scene = scene_of(means, quats, log_scales, logits, sh);
     SceneGradient gradient{};
-    gradient.means = g_means.data(), gradient.quats = g_quats.data(), gradient.log_scales = g_log_scales.data();
-    gradient.logit_opacities = g_logits.data(), gradient.sh = g_sh.data();
+    if (gradients) {
+        const auto &g = *gradients;
+        if (g.size() != 5) throw std::invalid_argument("five gradients or none");
+        gradient.means = g[0].data(), gradient.quats = g[1].data(), gradient.log_scales = g[2].data();
+        gradient.logit_opacities = g[3].data(), gradient.sh = g[4].data();
+    }
     const Image image = image_of(background, colour, depth, alpha);
     const ImageGradient g{g_colour ? g_colour->data() : nullptr, g_depth ? g_depth->data() : nullptr,
                           g_alpha ? g_alpha->data() : nullptr};
@@ -94,8 +100,7 @@ void bind_rasteriser(nb::module_ &m) {
              none("max_weight"))
         .def("backward", &backward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("logit_opacities"),
              nb::arg("sh"), nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"), none("g_colour"),
-             none("g_depth"), none("g_alpha"), nb::arg("g_means"), nb::arg("g_quats"), nb::arg("g_log_scales"),
-             nb::arg("g_logit_opacities"), nb::arg("g_sh"), none("g_pose"))
+             none("g_depth"), none("g_alpha"), none("gradients"), none("g_pose"))
         .def_prop_ro("visible", &View::visible)
         .def_prop_ro("intersections", &View::intersections)
         .def_prop_ro("pairs", &View::pairs)

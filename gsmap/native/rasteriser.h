@@ -19,7 +19,7 @@ struct Scene {
 };
 
 struct SceneGradient {  // added to
-    float *means, *quats, *log_scales, *logit_opacities, *sh;
+    float *means, *quats, *log_scales, *logit_opacities, *sh;  // all null where only the pose is wanted
     float *mean2d;          // (n, 2) in pixels; may be null
     uint8_t *touched;       // (n,) set to 1 where something was added; may be null
     const uint8_t *frozen;  // (n,) not 0: leave out; may be null; always of the whole scene

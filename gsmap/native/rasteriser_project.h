@@ -161,11 +161,12 @@ int project(const Scene &scene, const Camera &camera, int64_t begin, int64_t end
         const V dz = fma(view.r[2], xc, fma(view.r[5], yc, view.r[8] * zc));
         sh_colour(scene.k, dx, dy, dz, coefficients, colour);
 
-        M live = both(first_lanes(visible - first), gt(reach, V{}));
-        live = both(live, both(finite(g.a), both(finite(g.c), both(finite(g.det), gt(g.det, V{})))));
-        live = both(live, both(finite(g.b), both(finite(colour[0]), both(finite(colour[1]), finite(colour[2])))));
+        // NaN and overflow anywhere: not drawn. A scale of zero is fine, it leaves the dilation.
         const V norm2 = fma(q[0], q[0], fma(q[1], q[1], fma(q[2], q[2], q[3] * q[3])));
-        live = both(live, both(finite(norm2), both(lt(ls[0], set1(80.f)), both(lt(ls[1], set1(80.f)), lt(ls[2], set1(80.f))))));  // not NaN
+        M live = both(first_lanes(visible - first), both(gt(reach, V{}), gt(g.det, V{})));
+        const V values[] = {g.a, g.b, g.c, g.det, norm2, colour[0], colour[1], colour[2]};
+        for (const V value : values) live = both(live, finite(value));
+        for (const V value : ls) live = both(live, lt(value, set1(80.f)));
 
         V record[kFields];
         const V l11 = sqrt(g.c / g.det * (0.5f / kLn2));

@@ -157,6 +157,7 @@ void finish_group(const Scene &scene, const View &view, Group &group, const Scen
         for (int l = 0; l < rows; l++) row[l] = array + cols * (id[l] - gradient.first);
         add_to_rows(values, cols, row, rows);
     };
+    if (!gradient.means) return;  // only the pose is wanted
     add(gradient.means, g.mean, 3);
     add(gradient.quats, g.quat, 4);
     add(gradient.log_scales, g.log_scale, 3);

@@ -129,7 +129,8 @@ class _Render(torch.autograd.Function):
         *tensors, pose, colour, alpha = ctx.saved_tensors[:8]
         depth = ctx.saved_tensors[8].numpy() if len(ctx.saved_tensors) > 8 else None
         arrays = tuple(t.detach().contiguous().numpy() for t in tensors)
-        out = tuple(np.zeros_like(a) for a in arrays)
+        # Where only the pose is to be optimised, the Gaussians' gradients are not even allocated.
+        out = [np.zeros_like(a) for a in arrays] if any(ctx.needs_input_grad[:5]) else None
         g_pose = np.zeros((len(pose), 4, 4)) if ctx.needs_input_grad[5] else None
         if not (g_colour is None and g_alpha is None and g_depth is None):
             for i, view in enumerate(ctx.views):
@@ -142,12 +143,9 @@ class _Render(torch.autograd.Function):
                     g_colour=None if g_colour is None else g_colour[i],
                     g_depth=None if g_depth is None else g_depth[i],
                     g_alpha=None if g_alpha is None else g_alpha[i],
-                    g_means=out[0],
-                    g_quats=out[1],
-                    g_log_scales=out[2],
-                    g_logit_opacities=out[3],
-                    g_sh=out[4],
+                    gradients=out,
                     g_pose=None if g_pose is None else g_pose[i, :3],
                 )
         pose_gradient = None if g_pose is None else torch.from_numpy(g_pose).to(pose)
-        return (*(torch.from_numpy(g) for g in out), pose_gradient, None)
+        inputs = (None,) * 5 if out is None else tuple(torch.from_numpy(g) for g in out)
+        return (*inputs, pose_gradient, None)

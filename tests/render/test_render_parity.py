@@ -105,3 +105,15 @@ def test_same_bits_for_any_number_of_threads():
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             assert np.array_equal(a, b)
+
+
+def test_pose_only_gradient_is_the_same():
+    gaussians, cameras = random_scene(4)
+    poses = []
+    for requires_grad in (True, False):
+        tensors = GaussianTensors.of(gaussians, requires_grad=requires_grad)
+        pose = torch.tensor(cameras.T_camera_frame, requires_grad=True)
+        render(tensors, cameras, T_camera_frame=pose, depth=False).colour.square().sum().backward()
+        assert (tensors.means.grad is not None) == requires_grad
+        poses.append(pose.grad)
+    assert torch.equal(*poses)
