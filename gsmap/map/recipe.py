@@ -26,6 +26,7 @@ from gsmap.types import Cameras, Edge, Gaussians, PoseGraph, Prior, Registration
 if TYPE_CHECKING:
     from gsmap.export import ExportResult
     from gsmap.register.candidates import Placed
+    from gsmap.store.integrity import Pruned
     from gsmap.view import ViewServer
 
 Progress = Callable[[str, float, str], None]
@@ -438,9 +439,9 @@ class Map(AbstractContextManager["Map"]):
         """Read every byte of the map and compare it with what was written; one line per problem."""
         return list(self.store.check(lambda f, text: self._progress("check", f, text)).problems)
 
-    def prune(self) -> int:
-        """Delete leftovers of interrupted work and what no kept revision names; returns the bytes freed."""
-        return self.store.prune().num_bytes
+    def prune(self, keep_revisions: int | None = None) -> Pruned:
+        """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
+        return self.store.prune(keep_revisions=keep_revisions)
 
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""

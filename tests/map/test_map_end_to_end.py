@@ -129,6 +129,17 @@ def test_removing_a_scene_keeps_history(copy: Path) -> None:
             m.show_scene("capture_b")
 
 
+def test_prune_frees_what_no_kept_revision_names(copy: Path) -> None:
+    with gsmap.open(copy) as m:
+        m.remove("capture_b")
+        m.update()
+        assert m.prune().scenes == []
+        freed = m.prune(keep_revisions=1)
+        assert freed.scenes == ["capture_b"]
+        assert freed.num_bytes > 100_000
+        assert m.check() == []
+
+
 def test_a_person_s_word_counts(copy: Path) -> None:
     with gsmap.open(copy) as m:
         for pair in ("capture_a:capture_b", "capture_b:capture_c"):
