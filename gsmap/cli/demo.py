@@ -54,4 +54,4 @@ def _draw(m: Map, path: Path) -> None:
     names = {scene.id: scene.name for scene in m.scenes()}
     parts = [(name, *m.read(name, frame="map")) for name in names.values()]
     edges = [(names[e["target"]], names[e["source"]]) for e in m.edge_rows() if e["used"]]
-    Image.fromarray(map_picture(parts, edges, up=(0, 0, 1))).save(path, optimize=True)
+    Image.fromarray(map_picture(parts, edges)).save(path, optimize=True)
