@@ -67,6 +67,7 @@ def ways(g: Gaussians, folder: Path):
         (".splat", {}),
         (".spz", {}),
         (".spz v4", {"version": 4}),
+        (".spz 8 bits of SH", {"sh_bits": (8, 8)}),
         (".glb", {}),
         ("tileset.json", {}),
     ):

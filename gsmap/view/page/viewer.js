@@ -191,8 +191,16 @@ function overlays() {
   for (const i of shown) {
     const colour = [...palette[i % 64], 0.9];
     const box = map.scenes[i].corners;
-    if ($("show-boxes").checked)
+    if ($("show-boxes").checked) {
+      const S = map.scenes[i].S_map_scene; // its frame: x red, y green, z blue, a twentieth of its box long
+      const long = Math.hypot(...add(box[7], box[0], -1)) / 20;
+      const origin = S.slice(0, 3).map((line) => line[3]);
+      for (let a = 0; a < 3; a++) {
+        const axis = unit(S.slice(0, 3).map((line) => line[a]));
+        segment(origin, add(origin, axis, long), [0, 1, 2].map((c) => (c === a ? 1 : 0.25)).concat(1));
+      }
       for (let a = 0; a < 8; a++) for (const bit of [1, 2, 4]) if (!(a & bit)) segment(box[a], box[a | bit], colour);
+    }
     const more = extras.get(i);
     if (!more) continue;
     if ($("show-cameras").checked)
