@@ -36,16 +36,26 @@ def optimize(
         scene_ids: all scenes of the map, oldest first (the oldest scene of a component holds its frame).
         edges: the measurements to consider; leave out what a person rejected.
         priors: outside knowledge. A component whose priors leave a freedom open is held there by its anchor scene.
-        previous: the last answer. Its largest component's frame survives, so that maps do not jump.
+        previous: the last answer. Its largest component's frame survives, so that maps do not jump. If only few
+            scenes are new, they are placed in it (``parameters["method"] == "incremental"``); see `OptimizeParams`.
         params: see `OptimizeParams`.
         progress: called with a fraction and a short text.
 
     Raises:
         InputError: an edge or prior is unusable, or confirmed edges contradict each other; the message names it.
     """
-    from gsmap.optimize.batch import OptimizeParams, solve_batch
+    from dataclasses import replace
 
-    return solve_batch(scene_ids, edges, priors, previous, params or OptimizeParams(), progress)
+    from gsmap.optimize.batch import OptimizeParams, solve_batch
+    from gsmap.optimize.incremental import fingerprint, place_new
+
+    params = params or OptimizeParams()
+    if previous is not None and params.growth > 0:
+        placed = place_new(scene_ids, edges, priors, previous, params)
+        if placed is not None:
+            return placed
+    answer = solve_batch(scene_ids, edges, priors, previous, params, progress)
+    return replace(answer, parameters={**answer.parameters, "measured": f"{fingerprint(edges, priors):016x}"})
 
 
 def __getattr__(name: str) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import networkx
 import numpy as np
@@ -13,6 +13,7 @@ from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import clean
 from gsmap.optimize.components import SMALL_ISLAND, Walk, allowed, bridges, closes, forest, grow, joins, merge_islands
+from gsmap.optimize.conflicts import contradicted_priors, undecided_groups
 from gsmap.optimize.cycles import Vote, vote
 from gsmap.optimize.gauge import anchor_of, onto_anchor, onto_priors
 from gsmap.optimize.measurements import Measurements, check_priors, measurements
@@ -60,7 +61,20 @@ class State:
     poses: Similarities
     accepted: np.ndarray
     failures: np.ndarray
+    undecided: np.ndarray
+    rejected: np.ndarray
+    terms: PriorTerms
     pending: dict[int, str]
+
+    @classmethod
+    def fresh(cls, m: Measurements, poses: Similarities, accepted: np.ndarray, terms: PriorTerms) -> State:
+        no = np.zeros(len(m), dtype=bool)
+        return cls(poses, accepted, np.zeros(len(m), dtype=np.int64), no, no, terms, {})
+
+    @property
+    def open(self) -> np.ndarray:
+        """Rows of the edges that may still be taken in."""
+        return np.flatnonzero(~self.accepted & ~self.undecided & ~self.rejected & (self.failures < 2))
 
 
 def solve_batch(
@@ -75,72 +89,75 @@ def solve_batch(
     report = progress or (lambda fraction, text: None)
     check_priors(scene_ids, priors)
     m = measurements(scene_ids, edges, rigid=_all_rigid(edges, priors, previous))
-    terms = PriorTerms.stack(m.scene_ids, priors)
     gate = float(chi2.ppf(params.gate_probability, m.dim))
 
     report(0.05, "voting on cycles")
     votes = vote(m, params.gate_probability)
-    state = _begin(m, votes, params)
-    _refine(m, terms, state, gate, params.anneal)
+    state = _begin(m, votes, PriorTerms.stack(m.scene_ids, priors), params)
+    _refine(m, state, gate, params.anneal)
     for turn in range(MAX_ROUNDS):
         report(0.1 + 0.6 * turn / MAX_ROUNDS, "growing components")
-        agreed = False
-        while _close_loops(m, state, params) or _join(m, state, params, single=False):
-            agreed = True
-        if agreed:
+        if _take_in_agreeing(m, state, params):
             _cut_weak_bridges(m, state)
-            _refine(m, terms, state, gate, 1.0)
-        elif not _join(m, state, params, single=True):
+            _refine(m, state, gate, 1.0)
+        elif not _join(m, state, params, single=True) and not _part_lookalikes(m, votes, state, gate):
             break
     _forgive(m, state, gate)
     _check_confirmed(m, state, gate)
 
     report(0.75, "final solve")
-    return _answer(m, terms, state, votes, previous, gate, params, report)
+    return _answer(m, state, votes, priors, previous, params, report)
 
 
-def _begin(m: Measurements, votes: Vote, params: OptimizeParams) -> State:
+def _begin(m: Measurements, votes: Vote, terms: PriorTerms, params: OptimizeParams) -> State:
     """Spread poses along the best supported edges; keep the supported edges that agree with them."""
     accepted = (votes.agree > 0) | m.confirmed
     rows = np.flatnonzero(accepted)
-    # A person's word first, then the number of agreeing triangles, then the more certain measurement.
+    # A person's word first, then the share of agreeing triangles, then the more certain measurement.
     certainty = np.trace(m.covariance[rows], axis1=1, axis2=2)
-    order = np.lexsort((certainty, -votes.agree[rows], ~m.confirmed[rows]))
+    order = np.lexsort((certainty, -votes.share[rows], ~m.confirmed[rows]))
     cost = np.empty(len(rows))
     cost[order] = np.arange(1, len(rows) + 1)
     poses = spread(m, rows, cost, Similarities.identity(m.num_scenes))
     if len(rows):
         accepted[rows] = closes(m, rows, Walk.over(m, rows, poses), params.gate_probability) | m.confirmed[rows]
-    return State(poses, accepted, np.zeros(len(m), dtype=np.int64), {})
+    return State.fresh(m, poses, accepted, terms)
 
 
-def _refine(m: Measurements, terms: PriorTerms, state: State, gate: float, widest: float) -> None:
+def _refine(m: Measurements, state: State, gate: float, widest: float) -> None:
     """Robust poses of every island from its accepted edges; edges that do not fit are let go."""
     rows = np.flatnonzero(state.accepted)
     if not len(rows):
         return
     labels = islands(m, rows)
-    held = np.isin(labels, np.unique(labels[terms.scenes]))
-    anchors = roots(labels)
     fixed = np.zeros(m.num_scenes, dtype=bool)
-    fixed[anchors] = True
+    fixed[roots(labels)] = True
     edges = m[rows]
     if (chi_squares(edges, state.poses) > DRIFTED * gate).any():
         state.poses = chordal(edges, fixed, state.poses)
-    for island in np.unique(labels[terms.scenes]):
-        scenes = np.flatnonzero(labels == island)
-        mine = terms[labels[terms.scenes] == island]
-        state.poses = onto_priors(state.poses, scenes, int(scenes[0]), mine, m.dim)
-    descent = Descent(edges, fixed & ~held, terms, anchors[held[anchors]])
-    state.poses = descent.anneal(state.poses, gate, widest, edges.confirmed)
+    state.poses = Descent(edges, fixed).anneal(state.poses, gate, widest, edges.confirmed)
     bad = (chi_squares(edges, state.poses) > gate) & ~edges.confirmed
     state.accepted[rows[bad]] = False
     state.failures[rows[bad]] += 1
 
 
+def _take_in_agreeing(m: Measurements, state: State, params: OptimizeParams) -> bool:
+    """Take in edges and join islands as long as edges agree; poses are moved, not yet refined."""
+    any_taken = False
+    while _close_loops(m, state, params) or _join(m, state, params, single=False):
+        any_taken = True
+    return any_taken
+
+
+def take_in(m: Measurements, state: State, params: OptimizeParams) -> None:
+    """Take in what agrees, and then what single strong edges attach."""
+    while _take_in_agreeing(m, state, params) or _join(m, state, params, single=True):
+        pass
+
+
 def _close_loops(m: Measurements, state: State, params: OptimizeParams) -> bool:
     """Take in the edges inside an island that agree with what the island predicts for them."""
-    rows = np.flatnonzero(~state.accepted & (state.failures < 2))
+    rows = state.open
     if not len(rows):
         return False
     walk = Walk.over(m, np.flatnonzero(state.accepted), state.poses)
@@ -151,7 +168,7 @@ def _close_loops(m: Measurements, state: State, params: OptimizeParams) -> bool:
 
 def _join(m: Measurements, state: State, params: OptimizeParams, *, single: bool) -> bool:
     """Join islands where edges agree, or, with ``single``, where one strong edge attaches a small island."""
-    rows = np.flatnonzero(~state.accepted & (state.failures < 2))
+    rows = state.open
     if not len(rows):
         return False
     walk = Walk.over(m, np.flatnonzero(state.accepted), state.poses)
@@ -171,6 +188,23 @@ def _join(m: Measurements, state: State, params: OptimizeParams, *, single: bool
         return False
     taken, state.poses = merge_islands(m, chosen, walk.labels, state.poses)
     state.accepted[taken] = True
+    return True
+
+
+def _part_lookalikes(m: Measurements, votes: Vote, state: State, gate: float) -> bool:
+    """Part islands where a group of edges contradicts them and is not clearly outweighed."""
+    wrong, right, unclear = undecided_groups(m, state.accepted, state.undecided | state.rejected, state.poses, votes)
+    if len(state.terms):
+        elsewhere, outweighed = contradicted_priors(m, state.accepted, state.poses, votes, state.terms)
+        wrong |= elsewhere
+        state.terms = state.terms[np.flatnonzero(~outweighed)]
+    if not (wrong | unclear).any():
+        return False
+    state.accepted &= ~(wrong | unclear)
+    state.undecided |= unclear
+    state.rejected |= wrong
+    state.failures[right] = 0
+    _refine(m, state, gate, 1.0)
     return True
 
 
@@ -203,7 +237,7 @@ def _forgive(m: Measurements, state: State, gate: float) -> None:
     """Take back edges that failed on the way and fit now."""
     labels = islands(m, np.flatnonzero(state.accepted))
     inside = labels[m.targets] == labels[m.sources]
-    state.accepted |= inside & (chi_squares(m, state.poses) < gate)
+    state.accepted |= inside & ~state.undecided & ~state.rejected & (chi_squares(m, state.poses) < gate)
 
 
 def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
@@ -219,8 +253,7 @@ def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
     labels = islands(alone, np.arange(len(rows)))
     fixed = np.zeros(m.num_scenes, dtype=bool)
     fixed[roots(labels)] = True
-    none = PriorTerms.stack((), ())
-    poses = Descent(alone, fixed, none).fit(chordal(alone, fixed, Similarities.identity(m.num_scenes)))
+    poses = Descent(alone, fixed).fit(chordal(alone, fixed, Similarities.identity(m.num_scenes)))
     worst = chi_squares(alone, poses)
     if worst.max() > CONTRADICTION * gate:
         target, source = alone.keys[int(np.argmax(worst))]
@@ -231,11 +264,10 @@ def _check_confirmed(m: Measurements, state: State, gate: float) -> None:
 
 def _answer(
     m: Measurements,
-    terms: PriorTerms,
     state: State,
     votes: Vote,
+    priors: Sequence[Prior],
     previous: PoseGraph | None,
-    gate: float,
     params: OptimizeParams,
     report: Callable[[float, str], None],
 ) -> PoseGraph:
@@ -249,42 +281,51 @@ def _answer(
     members = np.split(np.argsort(labels, kind="stable"), np.cumsum(sizes)[:-1]) if m.num_scenes else []
     edge_order = rows[np.argsort(labels[m.targets[rows]], kind="stable")]
     edge_members = np.split(edge_order, np.cumsum(np.bincount(labels[m.targets[rows]], minlength=len(sizes)))[:-1])
+    terms = state.terms
     prior_labels = labels[terms.scenes]
     component = np.zeros(m.num_scenes, dtype=np.int64)
     tied = set(prior_labels.tolist())
+    world: int | None = None
     for index, island in enumerate(order):
         report(0.75 + 0.25 * index / len(order), "final solve")
         scenes, mine = members[island], edge_members[island]
-        priors = terms[prior_labels == island] if island in tied else terms[:0]
+        own = terms[np.flatnonzero(prior_labels == island)] if island in tied else terms[:0]
         anchor = anchor_of(scenes, m.scene_ids, previous)
         component[scenes] = index
-        if len(priors):
-            poses = onto_priors(poses, scenes, anchor, priors, m.dim)
-        else:
-            old = previous.poses.get(m.scene_ids[anchor]) if previous else None
-            poses = onto_anchor(poses, scenes, anchor, old.S_map_scene if old else Sim3.identity())
-        if len(mine) or len(priors):
-            poses, found = clean.solve(m[mine], poses, anchor, priors, marginals=params.marginals)
+        old = previous.poses.get(m.scene_ids[anchor]) if previous else None
+        poses = onto_anchor(poses, scenes, anchor, old.S_map_scene if old else Sim3.identity())
+        if len(own):
+            poses = onto_priors(poses, scenes, anchor, own, m.dim)
+            if not len(clean.open_gauge(poses, scenes, anchor, own, m.dim)):
+                # Fully known to the outside: it shares the world's frame with every other such island.
+                component[scenes] = world = index if world is None else world
+        if len(mine) or len(own):
+            poses, found = clean.solve(m[mine], poses, anchor, own, marginals=params.marginals)
             if found is not None:
                 covariances[scenes] = found[scenes]
-    return _describe(m, poses, component, covariances, state, votes, gate, params)
+    _, component = np.unique(component, return_inverse=True)
+    answer = answer_of(m, poses, component, covariances, state, votes, params)
+    known = {m.scene_ids[k] for k in terms.scenes.tolist()}
+    dropped = [p.scene for p in priors if p.scene not in known]
+    return replace(answer, parameters={**answer.parameters, "contradicted_priors": dropped})
 
 
-def _describe(
+def answer_of(
     m: Measurements,
     poses: Similarities,
     component: np.ndarray,
     covariances: np.ndarray,
     state: State,
     votes: Vote,
-    gate: float,
     params: OptimizeParams,
 ) -> PoseGraph:
+    """Everything a person wants to know about scenes and edges, in words and by id."""
+    gate = float(chi2.ppf(params.gate_probability, m.dim))
     chi = chi_squares(m, poses)
     together = component[m.targets] == component[m.sources]
     single = bridges(m, state.accepted)
     firm = state.accepted & (~single | m.confirmed)
-    status = _statuses(m, component, state.accepted, firm)
+    status = _statuses(m, state.accepted, firm)
 
     used: dict[tuple[str, str], bool | str] = {}
     residual: dict[tuple[str, str], float] = {}
@@ -299,14 +340,19 @@ def _describe(
         if state.accepted[k]:
             reasons[key] = "in no agreeing cycle: rests on its own verdict alone"
         elif not together[k]:
-            reasons[key] = state.pending.get(k, "ties two islands that nothing else joins")
+            open_question = "edges that agree among themselves contradict each other here: places that look alike?"
+            reasons[key] = (
+                open_question
+                if state.undecided[k]
+                else state.pending.get(k, "contradicts what else is known of the two islands")
+            )
             undecided.append(key)
         else:
             reasons[key] = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
             doubtful = status[m.targets[k]] == "tentative" or status[m.sources[k]] == "tentative"
             if votes.agree[k] > 0:
                 reasons[key] += "; it agrees with others that do too (a place that looks alike?)"
-            if votes.agree[k] > 0 or doubtful:
+            if votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k]:
                 undecided.append(key)
     return PoseGraph(
         poses={
@@ -327,13 +373,15 @@ def _describe(
     )
 
 
-def _statuses(m: Measurements, component: np.ndarray, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:
-    """(N,) ``placed`` in the largest firmly tied part of a component, ``tentative`` beside it, ``isolated`` alone."""
+def _statuses(m: Measurements, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:
+    """(N,) ``placed`` in the largest firmly tied part of an island, ``tentative`` beside it, ``isolated`` alone."""
+    component = islands(m, np.flatnonzero(accepted))
     blocks = islands(m, np.flatnonzero(firm))
     sizes = np.bincount(blocks, minlength=1)[blocks]
     order = np.lexsort((blocks, -sizes, component))
-    leads = order[np.unique(component[order], return_index=True)[1]]
-    main = blocks == blocks[leads][component]
+    _, first, which = np.unique(component[order], return_index=True, return_inverse=True)
+    main = np.empty(m.num_scenes, dtype=bool)
+    main[order] = blocks[order] == blocks[order[first]][which]
     status = np.where(main & (sizes > 1), "placed", "tentative").astype(object)
     tied = np.zeros(m.num_scenes, dtype=bool)
     rows = np.flatnonzero(accepted)

@@ -50,13 +50,11 @@ class BlockSystem:
         B: np.ndarray,
         W: np.ndarray,
         r: np.ndarray,
-        unary: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
         """One least-squares solve.
 
         Args:
             A, B: (E, M, dim). W: (E, M, M). r: (E, M, K): K right-hand sides at once.
-            unary: scenes (P,), Hessians (P, dim, dim) and gradients (P, dim, K) of terms on single scenes.
 
         Returns:
             (N, dim, K).
@@ -74,11 +72,6 @@ class BlockSystem:
             np.concatenate([a[a >= 0], b[b >= 0]]), np.concatenate([(AW @ r)[a >= 0], (BW @ r)[b >= 0]]), n
         )
         diagonal = np.flatnonzero(self._indices == np.repeat(np.arange(n), np.diff(self._indptr)))
-        if unary is not None:
-            scenes, hessians, gradients = unary
-            rows = self.row[scenes]
-            np.add.at(data, diagonal[rows[rows >= 0]], hessians[rows >= 0])
-            np.add.at(gradient, rows[rows >= 0], gradients[rows >= 0])
         # Unit diagonals: radians, metres and stiff scale rows differ by many powers of ten.
         root = np.sqrt(np.maximum(np.einsum("nii->ni", data[diagonal]), 1e-300))
         owner = np.repeat(np.arange(n), np.diff(self._indptr))

@@ -44,6 +44,8 @@ class Walk:
         graph = ((graph + graph.T) > 0).astype(np.float64)
         depth = dijkstra(graph, directed=False, indices=roots(labels), unweighted=True, min_only=True)
         rows = rows if len(rows) else np.arange(len(edges))
+        if not len(edges):
+            return cls(graph, labels, depth, np.zeros(4), poses)
         diagonal = np.einsum("eii->ei", edges.covariance[rows])
         unit = np.exp(poses.log_scales[edges.sources[rows]])
         length = np.linalg.norm(edges.measured.translations[rows], axis=1) * np.exp(
@@ -141,12 +143,18 @@ def joins(edges: Measurements, rows: np.ndarray, walk: Walk, probability: float)
         best = begin + int(np.lexsort((weight[begin:end], count[begin:end], edges.confirmed[rows[begin:end]]))[-1])
         mine = np.zeros(end - begin, dtype=bool)
         mine[np.r_[neighbours.indices[neighbours.indptr[best] : neighbours.indptr[best + 1]], best] - begin] = True
-        others = begin + np.flatnonzero(~mine)
-        rival = int(count[others].max()) + 1 if len(others) else 0
+        rival = _largest_apart(neighbours, begin, mine)
         group = np.r_[best, begin + np.flatnonzero(mine)]
         group = group[np.sort(np.unique(group, return_index=True)[1])]
         out.append(Join(int(low[begin]), int(high[begin]), rows[group], rival, rows[begin:end]))
     return out
+
+
+def _largest_apart(neighbours: sp.csr_matrix, begin: int, mine: np.ndarray) -> int:
+    """Size of the largest agreeing group among edges that agree with none of ``mine``."""
+    block = neighbours[begin : begin + len(mine), begin : begin + len(mine)]
+    apart = ~mine & (block @ mine.astype(float) == 0)
+    return int((block[apart] @ apart.astype(float)).max()) + 1 if apart.any() else 0
 
 
 def allowed(join: Join, edges: Measurements, sizes: np.ndarray) -> str:
@@ -154,14 +162,16 @@ def allowed(join: Join, edges: Measurements, sizes: np.ndarray) -> str:
     rows = join.edges
     if edges.confirmed[join.offered].any():
         return "agreed"
-    if len(rows) <= join.rival:
+    large = min(sizes[join.target], sizes[join.source]) >= SMALL_ISLAND
+    # Chance never makes two wrong edges agree: a rival group of two is a place that looks like another.
+    if len(rows) <= join.rival or (large and join.rival >= 2):
         return f"{len(rows)} edges agree and {join.rival} others contradict them: undecided"
     low, high = (
         np.minimum(edges.targets[rows], edges.sources[rows]),
         np.maximum(edges.targets[rows], edges.sources[rows]),
     )
     pairs = len(np.unique(low * edges.num_scenes + high))
-    if min(sizes[join.target], sizes[join.source]) >= SMALL_ISLAND:
+    if large:
         if pairs >= BRIDGE_EDGES:
             return "agreed"
         return (

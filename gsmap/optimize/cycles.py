@@ -13,24 +13,34 @@ from gsmap.optimize.measurements import Measurements
 
 @dataclass(frozen=True, eq=False)
 class Vote:
-    """(E,) int64 counts of triangles through each edge: those that agree, and all."""
+    """What the triangles through each edge say.
+
+    Args:
+        agree: (E,) number of triangles that agree.
+        share: (E,) agreeing triangles as a share of the neighbours of both ends (the Jaccard index). High inside a
+            place, whose scenes see the same neighbours; low for edges to a place that only looks the same, unless
+            every single pair there was mistaken.
+    """
 
     agree: np.ndarray
-    total: np.ndarray
+    share: np.ndarray
+
+    @classmethod
+    def of(cls, edges: Measurements, agree: np.ndarray) -> Vote:
+        degree = np.bincount(np.r_[edges.targets, edges.sources], minlength=edges.num_scenes)
+        either = degree[edges.targets] + degree[edges.sources] - 1 - agree
+        return cls(agree, agree / np.maximum(either, 1))
 
 
 def vote(edges: Measurements, probability: float) -> Vote:
-    """Count the triangles through every edge, and how many close within their noise.
+    """Count the triangles through every edge that close within their noise.
 
     A triangle agrees if the chi-square of the product of its three measurements, with their covariances transported
     to one frame, is below the quantile ``probability``. All triangles at once; no loop over edges.
     """
     triangles, signs = list_triangles(edges.targets, edges.sources, edges.num_scenes)
     agrees = cycle_chi2(edges, triangles, signs) < chi2.ppf(probability, edges.dim)
-    count = len(edges)
-    return Vote(
-        np.bincount(triangles[agrees].ravel(), minlength=count), np.bincount(triangles.ravel(), minlength=count)
-    )
+    return Vote.of(edges, np.bincount(triangles[agrees].ravel(), minlength=len(edges)))
 
 
 def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) -> tuple[np.ndarray, np.ndarray]:

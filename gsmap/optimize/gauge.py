@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.geometry.similarities import Similarities, exp
+from gsmap.geometry.similarities import Similarities, exp, rotation_vectors
 from gsmap.geometry.umeyama import umeyama
 from gsmap.optimize.clean import open_gauge
 from gsmap.optimize.priors import UP, PriorTerms
@@ -58,6 +58,39 @@ def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: Pr
         if np.abs(step).max() < 1e-10:
             break
     return poses
+
+
+def far_off(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarray:
+    """(P,) bool: priors that stay far off under the one motion of the component that satisfies most of them.
+
+    Far is more than five sigmas, and more than a typical edge's length or ten degrees, so that drift is not mistaken
+    for contradiction. The motions tried are those of single full poses and of triples of positions (at most 200,
+    drawn with a fixed seed).
+    """
+    knows = priors.root_weights > 0
+    motions = []
+    for k in np.flatnonzero(knows[:, :6].all(1))[:100]:
+        want, have = priors.expected.item(k), poses.item(int(priors.scenes[k]))
+        motions.append(Sim3(want.rotation, want.translation, have.scale) @ have.inverse())
+    placed = np.flatnonzero(knows[:, 3:6].all(1))
+    rng = np.random.default_rng(0)
+    for _ in range(200 if len(placed) >= 4 else 0):
+        three = placed[rng.choice(len(placed), 3, replace=False)]
+        try:
+            motions.append(umeyama(priors.expected.translations[three], poses.translations[priors.scenes[three]]))
+        except InputError:  # all three at one place
+            continue
+    best = np.zeros(len(priors), dtype=bool)
+    for S in motions:
+        moved = Similarities.stack([S] * len(priors)) @ poses[priors.scenes]
+        shift = np.linalg.norm(moved.translations - priors.expected.translations, axis=1)
+        with np.errstate(divide="ignore"):
+            allowed = np.maximum(length, 5 / priors.root_weights[:, 3:6].min(1))
+            turn = np.maximum(np.radians(10), 5 / priors.root_weights[:, :3].min(1))
+        angle = np.linalg.norm(rotation_vectors(priors.expected.rotations.transpose(0, 2, 1) @ moved.rotations), axis=1)
+        good = (shift < allowed) & (angle < turn)
+        best = good if good.sum() > best.sum() else best
+    return ~best if best.any() else best
 
 
 def _guess(poses: Similarities, scenes: np.ndarray, priors: PriorTerms, dim: int) -> Similarities:

@@ -70,15 +70,6 @@ class PriorTerms:
         J[:, 7:, :3] = skew(UP) @ pose.rotations @ skew(self.ups)
         return residual * self.root_weights, J * self.root_weights[:, :, None]
 
-    def normal(self, poses: Similarities, dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Scenes (P,), Hessians (P, dim, dim) and gradients (P, dim)."""
-        r, J = self.linearised(poses)
-        J = J[:, :, :dim]
-        return self.scenes, J.transpose(0, 2, 1) @ J, np.einsum("pij,pi->pj", J, r)
-
-    def cost(self, poses: Similarities) -> float:
-        return float((self.linearised(poses)[0] ** 2).sum())
-
 
 def _inverse_right_jacobian(omega: np.ndarray) -> np.ndarray:
     """(N, 3, 3) derivative of ``Log(R Exp(x))`` at x = 0, with ``omega = Log(R)``."""

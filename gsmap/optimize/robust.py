@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from gsmap.geometry.similarities import Similarities, commutator, exp
 from gsmap.optimize.blocks import BlockSystem
 from gsmap.optimize.measurements import Measurements
-from gsmap.optimize.priors import PriorTerms
 
 
 def islands(edges: Measurements, rows: np.ndarray) -> np.ndarray:
@@ -129,14 +128,10 @@ class Descent:
     Args:
         edges: what to fit.
         fixed: (N,) scenes that stay where they are.
-        priors: terms on single scenes, never weighted down.
-        anchors: free scenes whose step is damped, so that what the priors leave open stays put.
     """
 
     edges: Measurements
     fixed: np.ndarray
-    priors: PriorTerms
-    anchors: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         touched = np.zeros(self.edges.num_scenes, dtype=bool)
@@ -155,13 +150,8 @@ class Descent:
         B = inverse_right[:, :d, :d]
         back = (poses[edges.sources].inverse() @ poses[edges.targets]).adjoint()
         A = -(inverse_right @ back)[:, :d, :d]
-        scenes, hessians, gradients = self.priors.normal(poses, d)
-        if len(self.anchors):
-            scenes = np.concatenate([scenes, self.anchors])
-            hessians = np.concatenate([hessians, np.tile(np.eye(d), (len(self.anchors), 1, 1))])
-            gradients = np.concatenate([gradients, np.zeros((len(self.anchors), d))])
         W = edges.information * weights[:, None, None]
-        return self.system.solve(A, B, W, r[:, :, None], (scenes, hessians, gradients[:, :, None]))[:, :, 0]
+        return self.system.solve(A, B, W, r[:, :, None])[:, :, 0]
 
     def fit(self, poses: Similarities, max_steps: int = 20, tolerance: float = 1e-6) -> Similarities:
         """Least squares from a good guess, with step halving; stops when the cost gains less than ``tolerance``."""
@@ -205,4 +195,4 @@ class Descent:
             c = max(gate, c / 4)
 
     def _cost(self, poses: Similarities) -> float:
-        return float(chi_squares(self.edges, poses).sum() + self.priors.cost(poses))
+        return float(chi_squares(self.edges, poses).sum())

@@ -85,3 +85,45 @@ def city(count: int, wrong_share: float, seed: int = 0, edges_per_scene: int = 5
         off = poses_at(rng.normal(0, 3, (1, 3)), int(rng.integers(1 << 30)))
         edges.append(Edge(ids[a], ids[b], off.item(0), information()))
     return World(ids, edges, truth, np.arange(len(edges)) >= len(pairs))
+
+
+def twin_wings(
+    count: int, wrong_share: float, seed: int = 0, door_m: float | None = None, density: float = 0.0
+) -> World:
+    """A hall with two wings that look the same; wrong edges say that scenes of one wing lie in the other.
+
+    The wrong edges agree with each other and with the true ones inside either wing: only the way round through the
+    hall contradicts them.
+
+    Args:
+        wrong_share: of all edges.
+        door_m: width of the opening between hall and wing; None leaves the whole side open.
+        density: also tie this share of look-alike pairs, on top of ``wrong_share``.
+    """
+    rng = np.random.default_rng(seed)
+    wing = count // 5
+    width = 3.0 * np.sqrt(wing)
+    length, depth = 4 * width, 3.0 * (count - 2 * wing) * 3 / (4 * width)
+    hall = rng.uniform(0, 1, (count - 2 * wing, 3)) * [length, depth, 3]
+    one = rng.uniform(0, 1, (wing, 3)) * [width, width, 3] + [0, depth, 0]
+    shift = np.array([length - width, 0, 0])
+    truth = poses_at(np.r_[hall, one, one + shift], seed)
+    truth.rotations[count - wing :] = truth.rotations[count - 2 * wing : count - wing]
+    ids = [f"s{k:05d}" for k in range(count)]
+    pairs = near_pairs(truth.translations, 5 * count, rng)
+    if door_m is not None:
+        y = truth.translations[:, 1]
+        x = truth.translations[:, 0] % (length - width)
+        crosses = (y[pairs[:, 0]] < depth) != (y[pairs[:, 1]] < depth)
+        far = np.abs(x[pairs] - width / 2).max(1) > door_m / 2
+        pairs = pairs[~(crosses & far)]
+    edges = true_edges(truth, pairs, rng, ids)
+    # Scene k of the second wing seems to lie where scene k of the first one is.
+    seems = truth.replaced(np.arange(count - wing, count), truth[np.arange(count - 2 * wing, count - wing)])
+    first = np.arange(count - 2 * wing, count - wing)
+    near = near_pairs(truth.translations[first], 5 * wing, rng)
+    mixed = np.r_[near, near[:, ::-1]] + [count - 2 * wing, count - wing]
+    keep = max(round(wrong_share * len(edges)), round(density * len(mixed)))
+    mixed = mixed[np.sort(rng.permutation(len(mixed))[:keep])]
+    wrong = true_edges(seems, mixed, rng, ids)
+    return World(ids, edges + wrong, truth, np.arange(len(edges) + len(wrong)) >= len(edges))

@@ -9,7 +9,9 @@ from gsmap.optimize.robust import chi_squares
 OPTIMA = {"smallGrid3D": 517.925, "parking-garage": 0.634192, "sphere2500": 675.701, "torus3D": 12117.64}
 
 
-@pytest.mark.parametrize("name", [n if n != "torus3D" else pytest.param(n, marks=pytest.mark.slow) for n in OPTIMA])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ("torus3D", "sphere2500") else n for n in OPTIMA]
+)
 def test_known_optimum(shared_data, name):
     from gsmap.optimize.measurements import measurements
 

@@ -1,0 +1,54 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_worlds import twin_wings
+
+from gsmap.geometry.umeyama import umeyama
+from gsmap.optimize import OptimizeParams, optimize
+
+QUICK = OptimizeParams(marginals=False)
+
+
+def worst_island_error(world, answer):
+    """Largest RMSE in metres over islands of at least 10 scenes, each aligned by itself: a folded one is metres off."""
+    worst = 0.0
+    for island in {p.component for p in answer.poses.values()}:
+        rows = [
+            k
+            for k, s in enumerate(world.ids)
+            if answer.poses[s].component == island and answer.poses[s].status == "placed"
+        ]
+        if len(rows) < 10:
+            continue
+        found = np.array([answer.poses[world.ids[k]].S_map_scene.translation for k in rows])
+        error = umeyama(world.truth.translations[rows], found).apply(found) - world.truth.translations[rows]
+        worst = max(worst, float(np.sqrt((error**2).sum(1).mean())))
+    return worst
+
+
+@pytest.mark.parametrize(("door_m", "seed"), [(None, 0), (None, 1), (8.0, 0), (8.0, 2), (4.0, 1), (4.0, 2)])
+def test_a_duplicated_wing_folds_nothing(door_m, seed):
+    world = twin_wings(300, 0.03, seed, door_m)
+    answer = optimize(world.ids, world.edges, params=QUICK)
+    assert worst_island_error(world, answer) < 0.5
+    assert not [key for key in world.wrong_keys if answer.used[key] is True]
+    listed = set(answer.undecided) & world.wrong_keys
+    assert len(listed) >= 5
+    assert all(answer.reasons[key] for key in listed)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_persons_word_opens_a_fold_that_nothing_else_shows(seed):
+    """The second wing is reached by look-alike edges only, until someone vouches for one way in."""
+    world = twin_wings(150, 0.06, seed)
+    into = [(e.target < "s00090" or e.source < "s00090") and max(e.target, e.source) >= "s00120" for e in world.edges]
+    edges = [e for e, way in zip(world.edges, into, strict=True) if not way]
+    folded = optimize(world.ids, edges, params=QUICK)
+    assert worst_island_error(world, folded) > 5
+    word = next(e for e, way in zip(world.edges, into, strict=True) if way)
+    sure = optimize(world.ids, [*edges, replace(word, confirmed=True)], params=QUICK)
+    assert sure.used[word.target, word.source] is True
+    assert sure.poses[word.source].component == sure.poses[word.target].component
+    assert not [key for key in world.wrong_keys if sure.used[key] is True]
+    assert worst_island_error(world, sure) < 0.5

@@ -1,0 +1,229 @@
+"""Measures the optimiser against gtsam's own solvers, PCM-style pruning and a clean-graph oracle.
+
+    python tools/bench_pose_graph.py                       # N = 100, 1000; 10, 30, 50 % wrong edges; 3 seeds
+    python tools/bench_pose_graph.py --scenes 10000 --wrong 0.3 --seeds 1 --limit-s 120
+    python tools/bench_pose_graph.py --g2o FOLDER          # also the .g2o sets of a folder
+    python tools/bench_pose_graph.py --json out.json
+
+Worlds are those of the tests (`tests/optimize/made_worlds.py`): scenes on a floor, five edges per scene between
+neighbours, noise 0.5 deg and 5 cm, wrong edges between random scenes with random poses. ATE is in metres, over the
+scenes each method places in its largest component (``placed``: their share). ``wrong`` counts wrong edges that were
+used. CPU seconds are process time of the solve alone; each run has its own process and stops at ``--limit-s``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "optimize")]
+METHODS = ("gsmap", "lm", "lm+cauchy", "gnc", "pcm", "oracle")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, nargs="+", default=[100, 1000])
+    parser.add_argument("--wrong", type=float, nargs="+", default=[0.1, 0.3, 0.5])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS)
+    parser.add_argument("--limit-s", type=int, default=60, help="CPU seconds for one run")
+    parser.add_argument("--marginals", action="store_true", help="also compute covariances in gsmap's runs")
+    parser.add_argument("--place", type=int, default=0, help="also place this many scenes one by one in 1000")
+    parser.add_argument("--g2o", type=Path, help="folder of .g2o files")
+    parser.add_argument("--json", type=Path, help="write all rows here")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker:
+        task = json.loads(args.worker)
+        resource.setrlimit(resource.RLIMIT_CPU, (task["limit_s"], task["limit_s"] + 5))
+        print(json.dumps(run_g2o(task) if "file" in task else run_place(task) if "place" in task else run(task)))
+        return
+
+    rows = []
+    print("scenes  wrong     method    ATE m  /oracle  placed used bad   CPU s")
+    for scenes in args.scenes:
+        for share in args.wrong:
+            found = {m: [] for m in args.methods}
+            for method in args.methods:
+                for seed in range(args.seeds):
+                    task = {"scenes": scenes, "share": share, "seed": seed, "method": method}
+                    row = spawn({**task, "limit_s": args.limit_s, "marginals": args.marginals})
+                    found[method].append({**task, **row})
+            rows += [row for group in found.values() for row in group]
+            report(scenes, share, found)
+    if args.place:
+        row = spawn({"place": args.place, "limit_s": args.limit_s * 4})
+        rows.append(row)
+        if "median_ms" in row:
+            speed = f"median {row['median_ms']:.1f} ms CPU, p90 {row['p90_ms']:.1f}, {row['full']} full solves"
+            print(f"placing one scene in 1000: {speed}")
+    for file in sorted(args.g2o.glob("*.g2o")) if args.g2o else []:
+        row = {"file": file.name, **spawn({"file": str(file), "limit_s": args.limit_s})}
+        rows.append(row)
+        print(
+            f"{file.name:>22}: error {row.get('error', float('nan')):.6g}, CPU {row.get('cpu_s', float('nan')):.2f} s"
+        )
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1))
+
+
+def spawn(task: dict) -> dict:
+    command = [sys.executable, __file__, "--worker", json.dumps(task)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return json.loads(done.stdout.splitlines()[-1])
+    late = done.returncode in (-24, -9)  # SIGXCPU
+    return {"failed": "timeout" if late else done.stderr.strip().splitlines()[-1:]}
+
+
+def report(scenes: int, share: float, found: dict[str, list[dict]]) -> None:
+    def middle(method: str, key: str) -> float:
+        values = [row[key] for row in found.get(method, ()) if key in row]
+        return float(np.median(values)) if values else float("nan")
+
+    for method, group in found.items():
+        ratios = [
+            row["ate_m"] / other["ate_m"]
+            for row, other in zip(group, found.get("oracle", ()), strict=False)
+            if "ate_m" in row and "ate_m" in other
+        ]
+        ratio = float(np.median(ratios)) if ratios else float("nan")
+        late = sum("failed" in row for row in group)
+        note = f"  ({late} of {len(group)} failed: {next(r['failed'] for r in group if 'failed' in r)})" if late else ""
+        print(
+            f"{scenes:7d} {share:6.0%} {method:>10} {middle(method, 'ate_m'):8.3f} {ratio:8.3f} "
+            f"{middle(method, 'placed'):7.1%} {middle(method, 'used_wrong'):8.0f} {middle(method, 'cpu_s'):7.2f}{note}",
+            flush=True,
+        )
+
+
+def run(task: dict) -> dict:
+    from made_worlds import city
+
+    from gsmap.geometry.similarities import Similarities
+    from gsmap.geometry.umeyama import umeyama
+    from gsmap.optimize import OptimizeParams, optimize
+
+    world = city(task["scenes"], task["share"], task["seed"])
+    clean = [e for e, bad in zip(world.edges, world.wrong, strict=True) if not bad]
+    optimize(world.ids[:2], [])  # imports are not the solver's time
+    begin = time.process_time()
+    if task["method"] in ("gsmap", "oracle"):
+        edges = world.edges if task["method"] == "gsmap" else clean
+        answer = optimize(world.ids, edges, params=OptimizeParams(marginals=task["marginals"]))
+        seconds = time.process_time() - begin
+        rows = [
+            k for k, s in enumerate(world.ids) if answer.poses[s].component == 0 and answer.poses[s].status == "placed"
+        ]
+        poses = Similarities.stack([answer.poses[s].S_map_scene for s in world.ids])
+        used_wrong = sum(answer.used.get(key) is True for key in world.wrong_keys)
+    else:
+        poses, rows, used = peer(task["method"], world)
+        seconds = time.process_time() - begin
+        used_wrong = int((used & world.wrong).sum())
+    S = umeyama(world.truth.translations[rows], poses.translations[rows])
+    error = S.apply(poses.translations[rows]) - world.truth.translations[rows]
+    return {
+        "ate_m": float(np.sqrt((error**2).sum(1).mean())),
+        "placed": len(rows) / len(world.ids),
+        "used_wrong": used_wrong,
+        "cpu_s": seconds,
+    }
+
+
+def peer(method: str, world):
+    """gtsam's solvers on all edges, or on those that two consistent triangles support (PCM's pairwise test)."""
+    import gtsam
+
+    from gsmap.geometry.similarities import Similarities
+    from gsmap.optimize.clean import GAUGE_SIGMAS, _from_gtsam, _to_gtsam
+    from gsmap.optimize.cycles import vote
+    from gsmap.optimize.measurements import measurements
+    from gsmap.optimize.robust import islands, spread
+
+    m = measurements(world.ids, world.edges)
+    n = m.num_scenes
+    used = np.ones(len(m), dtype=bool)
+    if method == "pcm":
+        used = vote(m, 0.999).agree >= 2
+    labels = islands(m, np.flatnonzero(used))
+    lead = labels == np.argmax(np.bincount(labels))
+    used &= lead[m.targets]
+    scenes, rows = np.flatnonzero(lead), np.flatnonzero(used)
+    graph = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Gaussian.Information(m.information[0])
+    if method == "lm+cauchy":
+        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(1.0), noise)
+    for k in rows.tolist():
+        graph.push_back(
+            gtsam.BetweenFactorPose3(int(m.targets[k]), int(m.sources[k]), _to_gtsam(m.measured, k, 6), noise)
+        )
+    anchor = int(scenes[0])
+    graph.push_back(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(GAUGE_SIGMAS[:6])))
+    if method in ("lm", "pcm"):
+        start = gtsam.InitializePose3.initialize(graph)
+    else:
+        cost = np.random.default_rng(0).random(len(rows)) + 0.1  # any spanning tree
+        tree = spread(m, rows, cost, Similarities.identity(n))
+        start = gtsam.Values()
+        for k in scenes.tolist():
+            start.insert(k, _to_gtsam(tree, k, 6))
+    params = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    params.setMaxIterations(100)
+    if method == "gnc":
+        settings = gtsam.GncLMParams(params)
+        settings.setKnownInliers([len(rows)])
+        values = gtsam.GncLMOptimizer(graph, start, settings).optimize()
+    else:
+        values = gtsam.LevenbergMarquardtOptimizer(graph, start, params).optimize()
+    return Similarities.identity(n).replaced(scenes, _from_gtsam(values, scenes, 6)), scenes, used
+
+
+def run_place(task: dict) -> dict:
+    from made_worlds import city
+
+    from gsmap.optimize import optimize
+
+    world = city(1000 + task["place"], 0.1, 0)
+    ids = set(world.ids[:1000])
+    answer = optimize(world.ids[:1000], [e for e in world.edges if e.target in ids and e.source in ids])
+    seconds, full = [], 0
+    for count in range(1001, len(world.ids) + 1):
+        ids.add(world.ids[count - 1])
+        edges = [e for e in world.edges if e.target in ids and e.source in ids]
+        begin = time.process_time()
+        answer = optimize(world.ids[:count], edges, previous=answer)
+        seconds.append(time.process_time() - begin)
+        full += answer.parameters["method"] == "batch"
+    return {
+        "median_ms": 1e3 * float(np.median(seconds)),
+        "p90_ms": 1e3 * float(np.percentile(seconds, 90)),
+        "full": full,
+    }
+
+
+def run_g2o(task: dict) -> dict:
+    from gsmap.formats.g2o import read_graph
+    from gsmap.geometry.similarities import Similarities
+    from gsmap.optimize import OptimizeParams, optimize
+    from gsmap.optimize.clean import objective
+    from gsmap.optimize.measurements import measurements
+
+    graph = read_graph(task["file"])
+    begin = time.process_time()
+    answer = optimize(list(graph.poses), graph.edges, params=OptimizeParams(marginals=False))
+    seconds = time.process_time() - begin
+    poses = Similarities.stack([p.S_map_scene for p in answer.poses.values()])
+    return {"error": objective(measurements(list(graph.poses), graph.edges), poses), "cpu_s": seconds}
+
+
+if __name__ == "__main__":
+    main()
