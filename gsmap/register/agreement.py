@@ -108,7 +108,7 @@ def _contradiction(surface: Surface, cameras: Cameras | None, points: np.ndarray
     views = cameras.T_camera_frame
     agree, contradict = np.zeros(len(points), bool), np.zeros(len(points), bool)
     own = surface.points.astype(np.float32)
-    for c in _choose(cameras, points, params.num_cameras):
+    for c in choose_cameras(cameras, points, params.num_cameras):
         width, height = cameras.sizes_px[c]
         pixel, z, at = _project(own, views[c], cameras.intrinsics_px[c], width, height)
         nearest = np.full(width * height, np.inf, np.float32)
@@ -124,7 +124,7 @@ def _contradiction(surface: Surface, cameras: Cameras | None, points: np.ndarray
     return (float((contradict & ~agree).sum()) / judged if judged else float("nan")), judged
 
 
-def _choose(cameras: Cameras, points: np.ndarray, count: int) -> list[int]:
+def choose_cameras(cameras: Cameras, points: np.ndarray, count: int) -> list[int]:
     """Greedy choice of the cameras with most of the points in front of them, each point counted once."""
     sample = points[np.linspace(0, len(points) - 1, min(len(points), 400)).astype(int)].astype(np.float32)
     inside = np.zeros((len(cameras), len(sample)), dtype=bool)

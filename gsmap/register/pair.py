@@ -32,6 +32,8 @@ class Params:
     Args:
         kinds: of nodes, that propose.
         refiner: ``coloured`` (point-to-plane and colour; scale too), ``gicp`` (rigid only) or ``none``.
+        photometric: also lay renders over each other, and keep that where local colours then agree better. Off: it
+            wins nothing where scenes share most views, and misleads where they share few.
         fallback: ``auto`` asks the surfaces where the graphs are poor or suggest nothing sure, ``never``, ``always``.
         poor_nodes: a graph none of whose layers has this many nodes is poor.
         max_poses: poses that are refined and judged at most.
@@ -41,6 +43,7 @@ class Params:
 
     kinds: tuple[str, ...] = ("landmarks", "objects")
     refiner: str = "coloured"
+    photometric: bool = False
     fallback: str = "auto"
     poor_nodes: int = 500
     max_poses: int = 3
@@ -202,15 +205,33 @@ class _Pair:
                     pose = coloured.refine(target, source, pose, params.coloured, with_scale=proposal.with_scale)
             with self.clock.step("verdict"):
                 seen = agreement_.measure(target, source, pose, cameras, params.agreement)
+            if params.photometric and cameras[0] is not None:
+                with self.clock.step("photometric"):
+                    tried = self._photometric(pose, S.scale, unit_t, proposal.with_scale)
+                    better = agreement_.measure(target, source, tried, cameras, params.agreement)
+                    if better.colour_correlation > seen.colour_correlation:
+                        pose, seen = tried, better
+            with self.clock.step("verdict"):
                 known = covariance_.pose_covariance(
                     target, source, pose, params.covariance, with_scale=proposal.with_scale
                 )
                 if known is not None:
                     covariance, sigmas = covariance_.in_scene_units(known[0], unit_s), known[1]
-        refined = Sim3(pose.rotation, pose.translation / unit_t, pose.scale * S.scale)
-        proposal = replace(proposal, S_target_source=refined)
+        proposal = replace(
+            proposal, S_target_source=Sim3(pose.rotation, pose.translation / unit_t, pose.scale * S.scale)
+        )
         flaw = flaw or verdict.judge(proposal, seen, sigmas, params.verdict)
         return _Judged(proposal, seen, covariance, flaw)
+
+    def _photometric(self, pose: Sim3, scale: float, unit_m: float, with_scale: bool) -> Sim3:
+        """A pose between metres, refined on renders of the scenes in their own units."""
+        from gsmap.register.refiners import photometric
+
+        own = Sim3(pose.rotation, pose.translation / unit_m, pose.scale * scale)
+        own = photometric.refine(
+            self.target.gaussians, self.source.gaussians, self.target.cameras, own, unit_m=unit_m, with_scale=with_scale
+        )
+        return Sim3(own.rotation, own.translation * unit_m, own.scale / scale)
 
 
 def _most_nodes(view: SceneView) -> int:

@@ -91,7 +91,7 @@ def propose(
     best, i, s = min(found, key=lambda f: (f[0].log_nfa, -f[0].num_inliers))
     if with_scale and not best.flaw:
         # The vote is good to a percent; at the scale its own clique implies more correspondences agree.
-        s = best.S_target_source.scale * fields[i].a.unit_m / fields[i].b.unit_m
+        s = best.S_target_source.scale * fields[i].units_m[0] / fields[i].units_m[1]
         again = fields[i].solve(fields[i].matches, s)
         if again is not None and again.num_inliers > best.num_inliers:
             best = again
@@ -139,13 +139,14 @@ class _Field:
         sigma = params.objects_sigma_m if kind == "objects" else params.consistency.sigma_m
         self.test = replace(params.consistency, sigma_m=sigma)
         self.radius_m = max(4.0 * np.sqrt(2.0) * sigma, 0.15)
-        self.source_points = b.positions * b.unit_m
+        # A rigid pose needs one metre for both scenes, whatever each was guessed to be.
+        common = float(np.sqrt(a.unit_m * b.unit_m))
+        self.units_m = (a.unit_m, b.unit_m) if with_scale else (common, common)
+        self.source_points = b.positions * self.units_m[1]
         up = target.up is not None and source.up is not None
         self.source_heights = self.source_points @ source.up if up else None
         matching = params.objects if kind == "objects" else params.landmarks
-        self.matches = correspondences.correspondences(
-            a, b, matching, units_m=(a.unit_m, b.unit_m), ups=(target.up, source.up)
-        )
+        self.matches = correspondences.correspondences(a, b, matching, units_m=self.units_m, ups=(target.up, source.up))
 
     def solve(self, among: Correspondences, at_scale: float) -> Proposal | None:
         """The pose of the largest clique among some of the correspondences."""
@@ -184,10 +185,10 @@ class _Field:
 
     def disagreeing(self, S_target_source: Sim3, beyond_m: float = 1.0) -> Correspondences:
         """The correspondences that a pose leaves farther apart than this."""
-        moved = S_target_source.apply(self.matches.source / self.b.unit_m) * self.a.unit_m
+        moved = S_target_source.apply(self.matches.source / self.units_m[1]) * self.units_m[0]
         return self.matches[np.linalg.norm(moved - self.matches.target, axis=1) > beyond_m]
 
     def _in_scene_units(self, pose: Sim3) -> Sim3:
         """A pose between metres as one between the scenes' own units."""
-        own = pose.scale * self.b.unit_m / self.a.unit_m if self.with_scale else 1.0
-        return Sim3(pose.rotation, pose.translation / self.a.unit_m, own)
+        own = pose.scale * self.units_m[1] / self.units_m[0] if self.with_scale else 1.0
+        return Sim3(pose.rotation, pose.translation / self.units_m[0], own)

@@ -197,3 +197,20 @@ def test_scale_vote(scale):
     best, score = vote_scales(world.matches)[0]
     assert abs(np.log(best / scale)) < 0.015
     assert score > 5
+
+
+def test_photometric_refiner_lays_renders_over_each_other():
+    from gsmap.geometry.transforms import transform_gaussians
+    from gsmap.register.refiners import photometric
+
+    world = splat_world(4, points=30_000)
+    target, cameras, S = world.target.gaussians, world.target.cameras, world.S_target_source
+    source = transform_gaussians(target, S.inverse())
+    centre = scene_centroid(source)
+    start = _off(S, centre, 0.3, 0.015)
+    found = photometric.refine(target, source, cameras, start, photometric.Params(iterations=6))
+    before, after = (pose_error(p, S, centre) for p in (start, found))
+    assert after.rre_deg < 0.2 * before.rre_deg
+    assert after.centroid_m < 0.2 * before.centroid_m
+    away = Sim3(np.eye(3), [500.0, 0, 0])
+    assert photometric.refine(target, source, cameras, away) is away
