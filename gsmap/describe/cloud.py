@@ -41,7 +41,7 @@ def surface_cloud(gaussians: Gaussians, *, min_opacity: float = 0.1) -> Cloud:
     4 times the median such distance. Colour is the view-independent part (SH degree 0).
     """
     scale = gaussians.scales.max(1, initial=0)
-    finite = np.isfinite(gaussians.means).all(1) & np.isfinite(scale)
+    finite = np.isfinite(gaussians.means).all(1) & np.isfinite(scale) & np.isfinite(gaussians.sh[:, 0]).all(1)
     keep = np.flatnonzero((gaussians.opacities > min_opacity) & finite)
     if len(keep):
         keep = keep[scale[keep] <= 3.5 * np.median(scale[keep])]

@@ -70,7 +70,7 @@ def describe(
     if len(cloud) == 0:
         notes.append("no opaque Gaussians: nothing to describe")
     elif up is None:
-        notes.append("up could not be told (no cameras, no clear floor): no landmarks")
+        notes.append("up is unknown (no cameras, no clear floor): landmarks match only scenes that lack it too")
     if params.landmarks:
         units = landmark_units(unit_m, scale_policy)
         for i, (name, layer_unit_m) in enumerate(units.items()):

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.describe.cloud import Cloud
-from gsmap.describe.cylinder import NUM_BINS, cylinder_context
 from gsmap.describe.gravity import rotation_to_z
 from gsmap.describe.landmarks import find_blobs
 from gsmap.describe.method import method_digest
+from gsmap.describe.surroundings import NUM_RINGS, NUM_SHELLS, cylinder_context, shell_context
 from gsmap.types import NodeLayer
 
 _VERSION = 3
-_DIM = 4 * NUM_BINS + 3
 
 
 @dataclass(frozen=True)
@@ -38,29 +37,32 @@ class LandmarkParams:
     context_cell_m: float = 0.07
 
 
-def landmark_method(params: LandmarkParams) -> str:
-    """Digest that two comparable landmark layers share."""
-    return method_digest("landmarks", _VERSION, params)
+def landmark_method(params: LandmarkParams, *, upright: bool = True) -> str:
+    """Digest that two comparable landmark layers share; contexts with and without a vertical do not compare."""
+    return method_digest("landmarks", _VERSION, params, upright)
 
 
 def landmark_layer(
-    cloud: Cloud, up: np.ndarray | None, unit_m: float, params: LandmarkParams = LandmarkParams()
+    cloud: Cloud, up: np.ndarray | None, unit_m: float, params: LandmarkParams | None = None
 ) -> NodeLayer:
     """Landmarks of a surface cloud.
 
     Args:
         cloud: in the scene's frame and unit.
-        up: (3,) against gravity, or None: an empty layer (contexts of different verticals cannot be compared).
+        up: (3,) against gravity, or None: contexts are then counted in shells, which tell places apart less well.
         unit_m: metres per scene unit to assume.
 
     Returns:
-        Positions and extents in the scene's frame and unit; ``features`` are the blob's own colour and strength,
+        Positions and extents in the scene's frame and unit; ``features`` are the blob's response and scale,
         ``weights`` its response over the threshold.
     """
-    method = landmark_method(params)
-    if up is None or len(cloud) == 0:
-        return NodeLayer.empty(method, _DIM, unit_m)
-    level = rotation_to_z(up)
+    params = params or LandmarkParams()
+    method = landmark_method(params, upright=up is not None)
+    surroundings, bins = (shell_context, NUM_SHELLS) if up is None else (cylinder_context, NUM_RINGS)
+    dim = 4 * bins + 3
+    if len(cloud) == 0:
+        return NodeLayer.empty(method, dim, unit_m)
+    level = np.eye(3) if up is None else rotation_to_z(up)
     points = cloud.points @ level.T * unit_m
     blobs = find_blobs(
         points,
@@ -73,8 +75,8 @@ def landmark_layer(
         max_per_octave=params.max_per_octave,
     )
     if len(blobs) == 0:
-        return NodeLayer.empty(method, _DIM, unit_m)
-    context = cylinder_context(blobs.positions, points, cloud.lab, params.context_cell_m)
+        return NodeLayer.empty(method, dim, unit_m)
+    context = surroundings(blobs.positions, points, cloud.lab, params.context_cell_m)
     positions = blobs.positions @ level / unit_m
     half = (1.5 * blobs.sigmas_m / unit_m)[:, None]
     return NodeLayer(
@@ -104,5 +106,5 @@ def _embed(context: np.ndarray) -> np.ndarray:
     spread = np.sqrt((occupancy * relative**2).sum(1) / total) + 0.15
     relative *= 0.7 * np.sqrt(occupancy) / spread[:, None]
     parts = [0.75 * occupancy[..., 0], relative.reshape(len(context), -1)]
-    vector = np.concatenate([np.concatenate(parts, 1) / np.sqrt(NUM_BINS), mean * [0.3, 0.5, 0.5]], 1)
+    vector = np.concatenate([np.concatenate(parts, 1) / np.sqrt(context.shape[1]), mean * [0.3, 0.5, 0.5]], 1)
     return vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9)

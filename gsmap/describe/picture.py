@@ -6,14 +6,15 @@ import colorsys
 
 import numpy as np
 from PIL import Image, ImageDraw
+from scipy.spatial import cKDTree
 
-from gsmap.describe.context import neighbourhood
 from gsmap.describe.lift import visible
 from gsmap.describe.views import View, render_views, sample_cameras
 from gsmap.errors import InputError, NotFoundError
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
 
 _MAX_LANDMARKS = 150
+_EDGES = 4  # drawn per object
 
 
 def draw_graph(
@@ -27,8 +28,8 @@ def draw_graph(
 ) -> np.ndarray:
     """The graph over a render: (H, W, 3) uint8.
 
-    Objects are discs with their number (the row of the layer), joined to the visible neighbours that their context is
-    counted over; a disc is a small ring where the object is hidden. The strongest landmarks are small
+    Objects are discs with their number (the row of the layer), joined to the nearest of the visible neighbours that
+    their context is counted over; a disc is a small ring where the object is hidden. The strongest landmarks are small
     squares in the colour of their channel: white and black lighter and darker than around, red and green, yellow and
     blue along a* and b*, magenta for density.
 
@@ -70,10 +71,11 @@ def _best_view(gaussians: Gaussians, cameras: Cameras, graph: SceneGraph, width_
 def _draw_objects(draw: ImageDraw.ImageDraw, layer: NodeLayer, view: View, local_distance: float) -> None:
     at, inside = _pixels(layer.positions, view)
     shown = np.isin(np.arange(len(layer)), visible(layer.positions, view, 0.15)[0])
-    edges = neighbourhood(layer.positions, local_distance, 1)
-    for i, j in np.argwhere(np.triu(edges)):
-        if inside[i] and inside[j] and shown[i] and shown[j]:
-            draw.line([*at[i], *at[j]], fill=(255, 255, 255, 70), width=1)
+    rows = np.flatnonzero(inside & shown)
+    if len(rows) > 1:
+        distance, near = cKDTree(layer.positions[rows]).query(layer.positions[rows], k=min(_EDGES + 1, len(rows)))
+        for i, k in np.argwhere(distance <= local_distance):
+            draw.line([*at[rows[i]], *at[rows[near[i, k]]]], fill=(255, 255, 255, 90), width=1)
     for i in np.flatnonzero(inside):
         colour = tuple(int(255 * c) for c in colorsys.hsv_to_rgb(i * 0.618034 % 1, 0.75, 1.0))
         x, y = at[i]

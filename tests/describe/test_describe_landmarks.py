@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from gsmap.describe import DescribeParams, describe
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
+from gsmap.describe.landmark_layer import LandmarkParams, landmark_method
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
 
@@ -82,11 +83,36 @@ def test_a_ball_without_cameras_has_no_up_and_says_so():
     rng = np.random.default_rng(0)
     p = rng.normal(size=(5000, 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
-    ball = Gaussians(p, np.tile([1.0, 0, 0, 0], (5000, 1)), np.full((5000, 3), -4.0), np.full(5000, 3.0), p[:, None])
-    graph = describe("ball", ball, None, LANDMARKS)
+    rgb = np.where(np.sin(9 * p).prod(1, keepdims=True) > 0.2, 0.4, -0.4) * [1, 0.5, -1]
+    ball = Gaussians(p, np.tile([1.0, 0, 0, 0], (5000, 1)), np.full((5000, 3), -4.0), np.full(5000, 3.0), rgb[:, None])
+    graph = describe("ball", ball, None, LANDMARKS, scale_policy="known")
     assert graph.up is None
-    assert graph.layers["landmarks"].positions.shape == (0, 3)
-    assert any("up could not be told" in note for note in graph.notes)
+    assert any("up is unknown" in note for note in graph.notes)
+    # Its landmarks are found all the same, compare in any frame, and never with those of upright scenes.
+    S = Sim3(Rotation.random(random_state=2).as_matrix(), np.array([1.0, 2, 3]))
+    turned, _ = moved(ball, room(n=100)[1], S)
+    one, two = (describe("x", g, None, LANDMARKS, scale_policy="known").layers["landmarks"] for g in (ball, turned))
+    assert len(one) > 20
+    assert counterparts(one, two, S.inverse(), 0.1) > 0.7
+    assert one.method != landmark_method(LandmarkParams())
+
+
+@pytest.mark.parametrize("shape", ["line", "point", "two points", "plane", "far away"])
+def test_degenerate_scenes_are_described_without_a_fuss(shape):
+    rng, n = np.random.default_rng(0), 1500
+    p = {
+        "line": np.linspace(0, 5, n)[:, None] * [1, 0.5, 0.2],
+        "point": np.ones((n, 3)),
+        "two points": np.repeat([[0.0, 0, 0], [1, 1, 1]], n // 2, 0),
+        "plane": rng.uniform(0, 5, (n, 3)) * [1, 1, 0],
+        "far away": rng.uniform(0, 5, (n, 3)) + 1e6,
+    }[shape]
+    m = len(p)
+    sh = rng.uniform(-1, 1, (m, 1, 3))
+    g = Gaussians(p, np.tile([1.0, 0, 0, 0], (m, 1)), np.full((m, 3), -3.5), np.full(m, 3.0), sh)
+    for cameras in (room(n=100)[1], None):
+        graph = describe(shape, g, cameras)
+        assert all(np.isfinite(layer.positions).all() for layer in graph.layers.values())
 
 
 @pytest.mark.parametrize("n", [0, 1, 5])
@@ -102,6 +128,8 @@ def test_transparent_scene_is_empty_with_a_note():
     g = Gaussians(g.means, g.quats, g.log_scales, np.full(len(g), -6.0), g.sh)
     graph = describe("clear", g, cameras)
     assert graph.num_nodes == 0
+    full = describe("full", *room(n=2000), LANDMARKS, scale_policy="known").layers["landmarks"]
+    assert graph.layers["landmarks"].embeddings.shape[1] == full.embeddings.shape[1]
     assert "no opaque Gaussians" in graph.notes[0]
 
 

@@ -41,7 +41,7 @@ class BuiltinSegmenter:
     def __init__(self, params: Params, cloud: Cloud, num_gaussians: int) -> None:
         self.params = params
         self.part_of_gaussian = np.full(num_gaussians + 1, -1)  # the last row is for pixels where nothing was drawn
-        if len(cloud) >= 16:
+        if len(cloud):
             self.part_of_gaussian[cloud.index] = cut_surface(cloud, params)
 
     def segment(self, view: View) -> list[Mask]:
@@ -68,6 +68,8 @@ def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
     # A cell so large that the surface covers about num_samples of them.
     cell = float(np.sqrt(cloud.areas.sum() / params.num_samples)) or 1e-9
     points, lab = downsample(cloud.points, cloud.lab, cell)
+    if len(points) < 16:
+        return np.zeros(len(cloud), np.int64)
     normals, _ = local_planes(points, 16)
     distance, neighbours = cKDTree(points).query(points, k=min(9, len(points)))
     a = np.repeat(np.arange(len(points)), neighbours.shape[1] - 1)
