@@ -175,7 +175,7 @@ class _Pair:
     def _target_unit_m(self, with_scale: bool) -> float:
         """Metres per target unit: 1 where metres are plausible and nothing else is asked for, else the guess."""
         graph = self.target.graph
-        metric = not with_scale and any(name in graph.layers for name in self.params.kinds)
+        metric = not with_scale and "landmarks" in graph.layers  # made under the scene's own unit
         return 1.0 if metric or self.target.scale_policy == "known" else graph.unit_m
 
     def judge(self, proposal: Proposal) -> _Judged:
