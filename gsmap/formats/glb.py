@@ -84,10 +84,12 @@ def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.n
         degree = degree_of[k]
         arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = g.sh[:, k]
 
-    views, accessors, length = [], [], 0
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    length = 0
     for name, values in arrays.items():
         width = values.shape[1] if values.ndim == 2 else 1
-        accessor = {
+        accessor: dict[str, Any] = {
             "bufferView": len(views),
             "componentType": 5121 if values.dtype == np.uint8 else 5126,
             "count": len(g),

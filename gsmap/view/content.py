@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -76,18 +76,17 @@ class ViewMap:
         islands = 1 + max((s.pose.component for s in self.scenes if s.pose is not None), default=-1)
         scenes = []
         for index, entry in enumerate(self.scenes):
-            placed = entry.pose is not None
-            low_high = _corners(entry.scene.bounds)
+            pose = entry.pose
             scenes.append(
                 {
                     "name": entry.scene.name,
                     "id": entry.scene.id,
                     "num_gaussians": entry.scene.num_gaussians,
                     "captured_at": entry.scene.captured_at,
-                    "component": entry.pose.component if placed else islands + index,
-                    "status": entry.pose.status if placed else "not placed",
+                    "component": pose.component if pose else islands + index,
+                    "status": pose.status if pose else "not placed",
                     "S_map_scene": _pose(entry).matrix().tolist(),
-                    "corners": _pose(entry).apply(low_high).tolist(),
+                    "corners": _pose(entry).apply(_corners(entry.scene.bounds)).tolist(),
                 }
             )
         at = {entry.scene.id: index for index, entry in enumerate(self.scenes)}
@@ -107,11 +106,12 @@ class ViewMap:
         g = entry.gaussians()
         finite = np.isfinite(g.means).all(1) & np.isfinite(g.log_scales).all(1) & np.isfinite(g.quats).all(1)
         largest = float(np.ptp(entry.scene.bounds, axis=0).max()) * _MAX_SPLAT_TO_SCENE
-        g = g[finite & (g.opacities > _LEAST_OPACITY) & (g.scales.max(1, initial=0) < max(largest, 1e-6))]
-        if not len(g):
+        shown = finite & (g.opacities > _LEAST_OPACITY) & (g.scales.max(1, initial=0) < max(largest, 1e-6))
+        if not shown.any():
             return b""
+        g = replace(g, sh=g.sh[:, :1])[shown]
         g, _ = coarser(g, max(1000, self.max_splats // len(self.scenes)))
-        g = transform_gaussians(Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1]), _pose(entry))
+        g = transform_gaussians(g, _pose(entry))
         rows = np.empty((len(g), 10), "<f4")
         rows[:, :3] = g.means
         rows[:, 3:9] = covariances(g).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
