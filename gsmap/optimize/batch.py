@@ -35,7 +35,7 @@ class OptimizeParams:
     Args:
         gate_probability: an edge or cycle is consistent if its chi-square is below this quantile.
         anneal: width, in gates, at which the robust kernel starts.
-        marginals: compute a covariance per scene.
+        marginals: compute a covariance per scene, in components of up to 3000 scenes.
         growth: with a previous answer, place new scenes one by one until the map has grown by this share since the
             last full solve; 0 always solves in full.
     """
@@ -361,7 +361,7 @@ def answer_of(
                 poses.item(k),
                 int(component[k]),
                 str(status[k]),
-                covariances[k] if params.marginals and status[k] != "isolated" else None,
+                covariances[k] if covariances[k].any() else None,
             )
             for k, scene in enumerate(m.scene_ids)
         },
