@@ -60,7 +60,7 @@ def landmark_layer(
     method = landmark_method(params, upright=up is not None)
     surroundings, bins = (shell_context, NUM_SHELLS) if up is None else (cylinder_context, NUM_RINGS)
     dim = 4 * bins + 3
-    if len(cloud) == 0:
+    if not cloud.areas.any():  # nothing, or only coincident points
         return NodeLayer.empty(method, dim, unit_m)
     level = np.eye(3) if up is None else rotation_to_z(up)
     points = cloud.points @ level.T * unit_m
