@@ -1,4 +1,4 @@
-"""Feed every reader of `gsmap.formats` damaged files: it must answer with Gaussians or an InputError, in bounds.
+"""Feed every reader of `gsmap.formats` damaged files: Gaussians, cameras or an InputError must come back.
 
     python tools/fuzz_formats.py [--count N] [--seed S] [--format .spz ...] [--keep FOLDER]
 
@@ -76,17 +76,23 @@ def main() -> int:
 
 def fuzz(suffix: str, seeds: list[bytes], count: int, seed: int, folder: Path, keep: Path) -> int:
     rng = random.Random(f"{suffix} {seed}")
-    path = folder / (suffix if suffix == "tileset.json" else f"fuzzed{suffix}")
+    path = folder / (f"fuzzed{suffix}" if suffix.startswith(".") else suffix)
     outcomes: Counter[str] = Counter()
     slowest, failures, start = 0.0, 0, time.process_time()
     for number in range(count):
         data = mutate(suffix, rng.choice(seeds), rng, seeds)
         path.write_bytes(data)
+        if suffix.endswith(".bin"):  # a COLMAP model is two files
+            other = next(name for name in COLMAP if name != suffix)
+            (folder / other).write_bytes(COLMAP[other])
         begin = time.process_time()
         signal.setitimer(signal.ITIMER_VIRTUAL, LIMIT_S)
         try:
-            formats.read(path)
-            formats.info(path)
+            if suffix in CAMERAS:
+                formats.read_cameras(folder if suffix.endswith(".bin") else path)
+            else:
+                formats.read(path)
+                formats.info(path)
             outcomes["read"] += 1
         except InputError as error:
             outcomes["refused"] += 1
@@ -253,6 +259,40 @@ def spz(folder: Path) -> list[bytes]:
     return out
 
 
+def colmap() -> dict[str, bytes]:
+    """A COLMAP model of two cameras and three images, one of them with two points."""
+    cameras = struct.pack("<Q", 2) + struct.pack("<IiQQ4d", 1, 1, 640, 480, 500, 500, 320, 240)
+    cameras += struct.pack("<IiQQ3d", 2, 0, 640, 480, 500, 320, 240)
+    images = struct.pack("<Q", 3)
+    for i in range(3):
+        images += struct.pack("<I7dI", i + 1, 1, 0, 0, 0.1 * i, i, 0, 0, 1 + i % 2) + b"image.jpg\0"
+        images += struct.pack("<Q", 2 * (i == 1)) + struct.pack("<ddq", 1, 2, -1) * 2 * (i == 1)
+    return {"cameras.bin": cameras, "images.bin": images}
+
+
+def inria(folder: Path) -> list[bytes]:
+    turn = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    row = {"img_name": "a", "width": 640, "height": 480, "position": [1, 2, 3], "rotation": turn, "fx": 500, "fy": 500}
+    return [json.dumps([{"id": i, **row} for i in range(3)]).encode()]
+
+
+def nerfstudio(folder: Path) -> list[bytes]:
+    pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    frames = [{"file_path": f"{i}.jpg", "transform_matrix": pose} for i in range(3)]
+    size = {"w": 640, "h": 480, "fl_x": 500, "fl_y": 500, "cx": 320, "cy": 240}
+    each = [{**frame, **size} for frame in frames]
+    return [
+        json.dumps(c).encode()
+        for c in (
+            {**size, "frames": frames},
+            {"frames": each},
+            {"camera_angle_x": 0.8, "w": 640, "h": 480, "frames": frames},
+        )
+    ]
+
+
+COLMAP = colmap()
+CAMERAS = ("cameras.json", "transforms.json", "cameras.bin", "images.bin")
 SEEDS: dict[str, Callable[[Path], list[bytes]]] = {
     ".compressed.ply": written(".compressed.ply"),
     ".glb": written(".glb"),
@@ -260,7 +300,11 @@ SEEDS: dict[str, Callable[[Path], list[bytes]]] = {
     ".sog": sog,
     ".splat": written(".splat"),
     ".spz": spz,
+    "cameras.bin": lambda folder: [COLMAP["cameras.bin"]],
+    "cameras.json": inria,
+    "images.bin": lambda folder: [COLMAP["images.bin"]],
     "tileset.json": written("tileset.json", {"max_per_tile": 10}),
+    "transforms.json": nerfstudio,
 }
 
 if __name__ == "__main__":

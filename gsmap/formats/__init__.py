@@ -28,6 +28,7 @@ MODULES: dict[str, str] = {
     ".spz": "spz",
     "tileset.json": "tiles3d",
 }
+_MAX_MESSAGE = 300
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,8 @@ def read_cameras(path: str | os.PathLike[str]) -> Cameras:
     """Cameras of a ``cameras.json``, ``transforms.json`` or COLMAP folder; see `gsmap.formats.cameras.read`."""
     from gsmap.formats import cameras
 
-    return cameras.read(path)
+    with _explained(Path(path), "read"), np.errstate(all="ignore"):
+        return cameras.read(path)
 
 
 def known(verb: str) -> list[str]:
@@ -122,9 +124,15 @@ def _module(path: Path, verb: str) -> ModuleType:
 
 @contextlib.contextmanager
 def _explained(path: Path, verb: str):
-    """Turn what the operating system says into one typed line."""
+    """Turn what the operating system says into one typed line, and keep what a damaged file says within one."""
     try:
         yield
+    except InputError as error:
+        text = " ".join(str(error).split())
+        limit = len(str(path)) + _MAX_MESSAGE
+        if text == str(error) and len(text) <= limit:
+            raise
+        raise InputError(text if len(text) <= limit else f"{text[:limit]}...") from error
     except FileNotFoundError as error:
         what = "no such file" if verb == "read" else f"no such folder: {path.parent}"
         raise NotFoundError(f"cannot {verb} {path}: {what}") from error

@@ -72,6 +72,8 @@ def _calibration(model: object, width: int, height: int, params: list[float]) ->
     camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
     if not camera.verify_params():
         raise ValueError(f"{len(params)} parameters do not fit the camera model {camera.model_name}")
+    if not camera.focal_length_idxs():  # asking such a camera for its focal length ends the process
+        raise ValueError(f"camera model {camera.model_name} is no pinhole: undistort the images first")
     focal = camera.focal_length_x, camera.focal_length_y
     return *focal, camera.principal_point_x, camera.principal_point_y, width, height
 

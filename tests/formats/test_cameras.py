@@ -1,4 +1,5 @@
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -175,3 +176,16 @@ def test_missing(tmp_path):
         read_cameras(tmp_path / "none.json")
     with pytest.raises(InputError, match="no COLMAP model"):
         read_cameras(tmp_path)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_camera_without_a_focal_length_is_refused(tmp_path, text):
+    """pycolmap ends the process when it is asked for one."""
+    folder = tmp_path / "sparse"
+    write_colmap(folder, some(), text=text)
+    if text:
+        (folder / "cameras.txt").write_text("7 EQUIRECTANGULAR 640 480 640 480\n")
+    else:
+        (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 7, 17, 640, 480, 640, 480))
+    with pytest.raises(InputError, match="not a readable COLMAP model"):
+        read_cameras(folder)

@@ -57,3 +57,16 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         formats.write(path, one(5))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_damaged_file_says_stays_within_one_line(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty list " + b"y" * 3000 + b"\n")
+    with pytest.raises(InputError) as caught:
+        formats.read(path)
+    (tmp_path / "cameras.json").write_text('[{"id": "' + "a\\n" * 2000 + '"}]')
+    with pytest.raises(InputError) as also:
+        formats.read_cameras(tmp_path / "cameras.json")
+    for error in (caught, also):
+        assert len(str(error.value)) < len(str(tmp_path)) + 400
+        assert "\n" not in str(error.value)
