@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import lru_cache
 
-from gsmap.describe import DescribeParams, describe
+from gsmap.describe import describe
+from gsmap.describe.models import ModelSpec
 from gsmap.register import Params as RegisterParams
 from gsmap.register import SceneView, register_pair
 from gsmap.store import Store
@@ -27,11 +28,12 @@ def _view(path: str, scene_id: str, method: str) -> SceneView:
     return SceneView(scene_id, scenes.gaussians(scene_id), scenes.cameras(scene_id), graph, policy)
 
 
-def describe_scene(path: str, scene_id: str, params: DescribeParams, models: Mapping[str, object]) -> SceneGraph:
+def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec]) -> SceneGraph:
     """The graph of one scene of the map at ``path``."""
     scenes = _store(path).scenes
     policy = scenes.get(scene_id).scale_policy
-    return describe(scene_id, scenes.gaussians(scene_id), scenes.cameras(scene_id), params, models, scale_policy=policy)
+    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    return describe(scene_id, gaussians, cameras, models=models, scale_policy=policy)
 
 
 def register_scenes(

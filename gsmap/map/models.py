@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import replace
 
-from gsmap.describe import DescribeParams
 from gsmap.describe.models import ModelSpec, Tensor, check_model
 from gsmap.store import Store
 
@@ -21,17 +18,6 @@ def add(store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy
 def specs(store: Store) -> dict[str, ModelSpec]:
     """The map's models by kind, as `gsmap.describe` takes them."""
     return {model.kind: _spec(model.options, str(model.path)) for model in store.models.list()}
-
-
-def describe_params(models: Mapping[str, ModelSpec]) -> DescribeParams:
-    """The defaults, with SAM's masks and the image encoder's features where their models are there."""
-    params = DescribeParams()
-    how = params.object
-    if {"sam-encoder", "sam-decoder"} <= set(models):
-        how = replace(how, segmenter="sam")
-    if "clip" in models:
-        how = replace(how, embedder="clip")
-    return replace(params, object=how)
 
 
 def _spec(options: dict, path: str) -> ModelSpec:

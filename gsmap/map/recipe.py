@@ -127,11 +127,10 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.jobs import describe_scene
 
         models = kept.specs(self.store)
-        params = kept.describe_params(models)
         wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
         methods = {s.id: self._method(s) for s in wanted}
         missing = [s for s in wanted if self.store.graphs.find(s.id, methods[s.id]) is None]
-        jobs = [(str(self.store.folder), s.id, params, models) for s in missing]
+        jobs = [(str(self.store.folder), s.id, models) for s in missing]
         for done, (i, graph) in enumerate(run_jobs(describe_scene, jobs), 1):
             self.store.graphs.save(graph, methods[graph.scene_id])
             self._progress("describe", done / len(missing), f"{missing[i].name}: {graph.num_nodes} nodes")
@@ -142,8 +141,7 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.describe import methods
         from gsmap.map import models as kept
 
-        models = kept.specs(self.store)
-        how = methods(kept.describe_params(models), models)
+        how = methods(models=kept.specs(self.store))
         return _digest(scene.scale_policy, *(f"{layer} {digest}" for layer, digest in sorted(how.items())))
 
     def _graph(self, scene_id: str, method: str) -> SceneGraph:
