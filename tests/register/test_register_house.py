@@ -1,0 +1,46 @@
+"""The hardest true pair and a true negative of a real house, described and registered (slow; needs the captures)."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gsmap.describe import describe
+from gsmap.evaluate.registration import pose_error, scene_centroid
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.ingest import read_captures
+from gsmap.register import SceneView, register_pair
+from gsmap.types import Sim3
+
+pytestmark = pytest.mark.slow
+
+
+def _capture(house, name: str, unit: float = 1.0, policy: str = "auto") -> tuple[SceneView, Sim3]:
+    capture = read_captures(house / f"{name}.ply")[0]
+    S = Sim3(np.eye(3), np.zeros(3), unit)
+    gaussians, cameras = transform_gaussians(capture.gaussians, S), transform_cameras(capture.cameras, S)
+    truth = Sim3.from_matrix(np.array(json.loads((house / "truth" / f"{name}.json").read_text())["T_scene_world"]))
+    graph = describe(name, gaussians, cameras, scale_policy=policy)
+    return SceneView(name, gaussians, cameras, graph, policy), S @ truth
+
+
+def test_a_quarter_of_overlap_is_enough_and_none_is_not(shared_data):
+    house = shared_data / "house"
+    (c0, _), (c3, S3), (c5, S5) = (_capture(house, name) for name in ("c0", "c3", "c5"))
+    found = register_pair(c3, c5)
+    assert found.status == "accepted"
+    error = pose_error(found.S_target_source, S3 @ S5.inverse(), scene_centroid(c5.gaussians))
+    assert error.rre_deg < 0.1
+    assert error.centroid_m < 0.01
+    assert register_pair(c0, c5).status != "accepted"
+
+
+def test_an_unknown_unit_is_found(shared_data):
+    house = shared_data / "house"
+    (c0, S0), (c2, S2) = _capture(house, "c0", 0.3, "unknown"), _capture(house, "c2", 4.0, "unknown")
+    found = register_pair(c0, c2)
+    assert found.status == "accepted"
+    error = pose_error(found.S_target_source, S0 @ S2.inverse(), scene_centroid(c2.gaussians))
+    assert error.rse < 0.005
+    assert error.rre_deg < 0.3
+    assert error.centroid_m / 0.3 < 0.02
