@@ -154,11 +154,12 @@ class Map(AbstractContextManager["Map"]):
     def register(self, pairs: str = "auto") -> list[Registration]:
         """Register pairs of described scenes that lack an edge: ``auto`` candidates, ``all``, or one pair ``A:B``."""
         from gsmap.map.jobs import register_scenes
-        from gsmap.register import Params
+        from gsmap.register import METHOD_VERSION, Params
 
         methods = {s.id: self._method(s) for s in self.scenes()}
         wanted = self._pairs(pairs, methods)
-        keys = [_digest(a, methods[a], b, methods[b], repr(Params())) for a, b in wanted]
+        how = f"{METHOD_VERSION} {Params()!r}"
+        keys = [_digest(a, methods[a], b, methods[b], how) for a, b in wanted]
         if pairs in ("auto", "all"):
             lacking = [i for i, key in enumerate(keys) if self.store.registrations.find(key) is None]
             wanted, keys = [wanted[i] for i in lacking], [keys[i] for i in lacking]
