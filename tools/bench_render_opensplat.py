@@ -22,20 +22,26 @@ _SHIM = """
 #include <torch/extension.h>
 #include <memory>
 #include "gsplat_cpu.cpp"
-struct Hits { std::vector<int32_t> *lists; ~Hits() { delete[] lists; } };
+using torch::Tensor;
+struct Hits {
+    std::vector<int32_t> *lists = nullptr;
+    ~Hits() { delete[] lists; }
+};
 PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
     py::class_<Hits, std::shared_ptr<Hits>>(m, "Hits");
     m.def("project", &project_gaussians_forward_tensor_cpu);
     m.def("sh", &compute_sh_forward_tensor_cpu);
-    m.def("forward", [](int w, int h, torch::Tensor xys, torch::Tensor conics, torch::Tensor colors, torch::Tensor opacity,
-                        torch::Tensor background, torch::Tensor cov2d, torch::Tensor depths) {
+    m.def("forward", [](int w, int h, Tensor xys, Tensor conics, Tensor colors, Tensor opacity, Tensor background,
+                        Tensor cov2d, Tensor depths) {
         auto t = rasterize_forward_tensor_cpu(w, h, xys, conics, colors, opacity, background, cov2d, depths);
-        return std::make_tuple(std::get<0>(t), std::get<1>(t), std::make_shared<Hits>(Hits{std::get<2>(t)}));
+        auto hits = std::make_shared<Hits>();
+        hits->lists = std::get<2>(t);
+        return std::make_tuple(std::get<0>(t), std::get<1>(t), hits);
     });
-    m.def("backward", [](int h, int w, torch::Tensor xys, torch::Tensor conics, torch::Tensor colors, torch::Tensor opacity,
-                         torch::Tensor background, torch::Tensor cov2d, torch::Tensor depths, torch::Tensor t,
-                         std::shared_ptr<Hits> hits, torch::Tensor v, torch::Tensor va) {
-        return rasterize_backward_tensor_cpu(h, w, xys, conics, colors, opacity, background, cov2d, depths, t, hits->lists, v, va);
+    m.def("backward", [](int h, int w, Tensor xys, Tensor conics, Tensor colors, Tensor opacity, Tensor background,
+                         Tensor cov2d, Tensor depths, Tensor t, std::shared_ptr<Hits> hits, Tensor v, Tensor va) {
+        return rasterize_backward_tensor_cpu(h, w, xys, conics, colors, opacity, background, cov2d, depths, t,
+                                             hits->lists, v, va);
     });
 }
 """
@@ -103,18 +109,19 @@ class OpenSplat:
         return _Rasterise.apply(self.module, width, height, xys, conics, rgb, opacity, background, cov2d, depths)
 
     def measure(self, gaussians: Gaussians, cameras: Cameras, repeats: int = 2) -> dict:
-        """CPU milliseconds of forward (no gradients recorded) and of forward and backward, one thread."""
+        """CPU milliseconds of forward (no gradients recorded) and of forward and backward, one thread; the image."""
         torch.set_num_threads(1)
         leaves = [torch.tensor(a) for a in native.arrays_of(gaussians)]
         forward, both = [], []
         for _ in range(repeats):
             with torch.no_grad():
                 start = time.process_time()
-                self.render(leaves, cameras)
+                image = self.render(leaves, cameras).numpy()
                 forward.append(time.process_time() - start)
             learned = [t.clone().requires_grad_() for t in leaves]
             start = time.process_time()
-            image = self.render(learned, cameras)
-            image.backward(torch.from_numpy(np.random.default_rng(0).normal(size=image.shape).astype(np.float32)))
+            gradient = np.random.default_rng(0).normal(size=image.shape).astype(np.float32)
+            self.render(learned, cameras).backward(torch.from_numpy(gradient))
             both.append(time.process_time() - start)
-        return {"opensplat_forward_ms": 1e3 * min(forward), "opensplat_forward_backward_ms": 1e3 * min(both)}
+        times = {"opensplat_forward_ms": 1e3 * min(forward), "opensplat_forward_backward_ms": 1e3 * min(both)}
+        return {**times, "image": image}

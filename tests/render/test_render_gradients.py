@@ -20,7 +20,7 @@ def test_finite_differences_agree():
     rng = np.random.default_rng(3)
     n = 20
     soft = Gaussians(  # wider than the image and faint: nothing crosses the cuts at 1/255 and 1e-4, where it jumps
-        rng.uniform(-0.5, 0.5, size=(n, 3)) + [0, 0, 4],
+        rng.uniform([-0.5, -0.5, 3.5], [0.5, 0.5, 4.5], size=(n, 3)),
         rng.normal(size=(n, 4)),
         rng.uniform(0.5, 0.9, size=(n, 3)),
         rng.uniform(-2.5, -1.5, size=n),
