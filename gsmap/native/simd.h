@@ -28,6 +28,7 @@ constexpr int W = 4;
 
 typedef float V __attribute__((vector_size(W * 4)));
 typedef int32_t I __attribute__((vector_size(W * 4)));
+typedef uint32_t U __attribute__((vector_size(W * 4)));  // wraps around, where I may not
 typedef float VU __attribute__((vector_size(W * 4), aligned(4), may_alias));
 
 INLINE V set1(float x) { return V{} + x; }
@@ -133,7 +134,7 @@ INLINE V exp2_in_range(V x) {
     p = fma(p, r, set1(0.24022120237350464f));
     p = fma(p, r, set1(0.6931469440460205f));
     p = fma(p, r, set1(1.0000001192092896f));
-    return (V)((I)p + ((I)shifted << 23));
+    return (V)((U)p + ((U)shifted << 23));
 }
 INLINE V exp2(V x) { return exp2_in_range(max(x, set1(-126.f))); }
 #endif
@@ -145,7 +146,7 @@ INLINE V exp(V x) { return exp2(x * 1.44269504088896341f); }
 // log2 of positive normal numbers, absolute error 1e-7 near 1
 INLINE V log2(V x) {
     const I e = (((I)x - 0x3f3504f3) >> 23);  // so that the mantissa lies in [sqrt(1/2), sqrt(2))
-    const V m = (V)((I)x - (e << 23));
+    const V m = (V)((U)x - ((U)e << 23));
     const V s = (m - 1.f) / (m + 1.f), s2 = s * s;
     V p = fma(s2, set1(2.88539008f / 9), set1(2.88539008f / 7));
     p = fma(p, s2, set1(2.88539008f / 5));
