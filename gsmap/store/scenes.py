@@ -9,10 +9,11 @@ import numpy as np
 from sqlalchemy import Connection, Row, insert, select, text, update
 
 from gsmap.errors import InputError, NotFoundError, StoreError
+from gsmap.geometry.morton import morton_order
 from gsmap.store.arrays import CHUNK_ROWS, Arrays, digest
+from gsmap.store.boxes import chunk_boxes
 from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.groups import has_group, manifest, publish
-from gsmap.store.morton import chunk_boxes, morton_order
 from gsmap.store.schema import CHUNK_BOXES, scenes
 from gsmap.types import Cameras, Gaussians, Scene
 

@@ -14,3 +14,13 @@ def test_a_grid_is_walked_cell_by_cell():
 def test_ties_keep_their_order_and_nothing_is_fine():
     np.testing.assert_array_equal(morton_order(np.zeros((5, 3))), range(5))
     assert len(morton_order(np.zeros((0, 3)))) == 0
+
+
+def test_morton_order_is_the_bit_interleaving():
+    grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+
+    def interleave(p: list[int]) -> int:
+        return sum(((v >> bit) & 1) << (3 * bit + 2 - axis) for axis, v in enumerate(p) for bit in range(2))
+
+    expected = np.argsort([interleave(p) for p in grid.tolist()])
+    np.testing.assert_array_equal(morton_order(grid.astype(np.float32)), expected)

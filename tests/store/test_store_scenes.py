@@ -4,9 +4,10 @@ from sqlalchemy import text
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
+from gsmap.geometry.morton import morton_order
 from gsmap.store import Store, scene_id
 from gsmap.store.arrays import CHUNK_ROWS
-from gsmap.store.morton import chunk_boxes, morton_order
+from gsmap.store.boxes import chunk_boxes
 from gsmap.types import Gaussians
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
@@ -162,16 +163,6 @@ def test_morton_order_keeps_neighbours_together():
     volume = np.prod(boxes[:, 1] - boxes[:, 0], axis=1).mean() / np.prod(plain[:, 1] - plain[:, 0], axis=1).mean()
     assert volume < 0.25
     np.testing.assert_array_equal(morton_order(np.zeros((5, 3), np.float32)), np.arange(5))
-
-
-def test_morton_order_is_the_bit_interleaving():
-    grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3)
-
-    def interleave(p: list[int]) -> int:
-        return sum(((v >> bit) & 1) << (3 * bit + axis) for axis, v in enumerate(p) for bit in range(2))
-
-    expected = np.argsort([interleave(p) for p in grid.tolist()])
-    np.testing.assert_array_equal(morton_order(grid.astype(np.float32)), expected)
 
 
 def test_chunk_boxes_hold_three_sigmas():
