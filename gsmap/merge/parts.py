@@ -57,6 +57,16 @@ def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -
     return ((points >= bounds[0] - margin) & (points < bounds[1] + margin)).all(1)
 
 
+def pulled_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
+    """Float32 points (N, 3) moved to the nearest place that `inside` calls inside."""
+    if bounds is None:
+        return points
+    low, high = bounds.astype(np.float32)
+    low = np.where(low < bounds[0], np.nextafter(low, np.float32(np.inf)), low)
+    high = np.where(high >= bounds[1], np.nextafter(high, np.float32(-np.inf)), high)
+    return np.clip(points, low, high)
+
+
 def united(parts: list[Part]) -> tuple[Gaussians, np.ndarray]:
     """All Gaussians of the parts in order, and the index (N,) int32 of the part of each."""
     origin = np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.gaussians) for p in parts])

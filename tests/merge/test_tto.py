@@ -65,6 +65,9 @@ def test_tiles_fit_together_in_any_order():
     tiles = [merge(parts, "tto", params, bounds=box) for box in boxes]
     for tile, box in zip(tiles, boxes, strict=True):
         assert ((tile.gaussians.means >= box[0]) & (tile.gaussians.means < box[1])).all()
+    # Every Gaussian belongs to one tile, whichever way it was pushed at the border.
+    apart = [merge(parts, "tto", Params(steps=s, keep=1.0, min_weight=0.0), bounds=b) for b in boxes for s in (0, 40)]
+    assert sum(len(t.gaussians) for t in apart[0::2]) == sum(len(t.gaussians) for t in apart[1::2])
     whole = merge(parts, "tto", params)
     together = Gaussians.concatenate([t.gaussians for t in tiles])
     assert likeness(together, parts) > likeness(whole.gaussians, parts) - 0.2

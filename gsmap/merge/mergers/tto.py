@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge.changes import drop_what_is_gone, what_came_later
 from gsmap.merge.exposure import balance_exposure
-from gsmap.merge.parts import MergeResult, Part, inside, united
+from gsmap.merge.parts import MergeResult, Part, inside, pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, order_of_views, render_references
 from gsmap.merge.selection import most_shown, one_owner_per_cell
 from gsmap.render.fit import Fitter, LearningRates
@@ -41,7 +41,7 @@ class Params:
     cell_m: side of the cells that are given to one capture each.
     passes: how often each view is used, where steps are not given; fewer when it no longer gains.
     steps: how many optimisation steps, exactly.
-    halo_m: how far around a tile its surroundings are rendered along, frozen.
+    halo_m: how far around a tile its surroundings are rendered along, the outer half of it frozen.
     reach_m: how far around a tile cameras are looked for.
     longest_side_px: size of the pictures that are compared.
     balance_exposure: bring captures to one exposure first.
@@ -55,8 +55,8 @@ class Params:
     cell_m: float = 0.5
     passes: float = 6.0
     steps: int | None = None
-    halo_m: float = 0.5
-    reach_m: float = 3.0
+    halo_m: float = 1.0
+    reach_m: float = 10.0
     longest_side_px: int = 960
     balance_exposure: bool = True
     newer_wins: bool = True
@@ -99,8 +99,14 @@ def merge(
     if len(references) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
-    fitted, steps, truncated = _fit(start, ~inside(start.means, bounds), references, params, deadline, progress)
-    return MergeResult(fitted, origin, steps=steps, truncated=truncated, notes=tuple(notes))
+    # The near half of the halo is fitted along, then dropped: were it frozen, what is at the border would make up for
+    # neighbours that are going to be refined too.
+    frozen = ~inside(start.means, bounds, params.halo_m / 2)
+    fitted, steps, truncated = _fit(start, frozen, references, params, deadline, progress)
+    # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
+    mine = inside(start.means, bounds)
+    fitted = replace(fitted[mine], means=pulled_inside(fitted.means[mine], bounds))
+    return MergeResult(fitted, origin[mine], steps=steps, truncated=truncated, notes=tuple(notes))
 
 
 def _start(
