@@ -30,6 +30,7 @@ _HOME = {
     "Sim3": "gsmap.types",
     "Tile": "gsmap.types",
     "errors": "",
+    "map": "",
     "open": "gsmap.map",
     "read": "gsmap.formats",
     "render": "",
@@ -52,6 +53,7 @@ __all__ = [
     "Tile",
     "__version__",
     "errors",
+    "map",
     "open",
     "read",
     "render",
@@ -59,7 +61,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from gsmap import errors, render
+    from gsmap import errors, map, render
     from gsmap.formats import read, write
     from gsmap.map import Map, open
     from gsmap.types import (

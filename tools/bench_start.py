@@ -1,6 +1,6 @@
 """How long gsmap takes to start: bare Python, ``import gsmap`` and ``gsmap --help``, median wall milliseconds.
 
-    python tools/bench_start.py [--runs 11]
+python tools/bench_start.py [--runs 11]
 """
 
 from __future__ import annotations

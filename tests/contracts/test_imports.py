@@ -99,6 +99,7 @@ def test_public_surface() -> None:
             "Tile",
             "__version__",
             "errors",
+            "map",
             "open",
             "read",
             "render",
