@@ -67,7 +67,7 @@ def true_pose(path: Path) -> Sim3:
 
 def estimated_poses(map_folder: Path, truth: dict[str, Sim3]) -> dict[str, Sim3]:
     """Poses as ``gsmap list MAP scenes --json`` tells them; all scenes must lie in one component."""
-    command = [sys.executable, "-m", "gsmap", "list", str(map_folder), "scenes", "--json"]
+    command = [sys.executable, "-P", "-m", "gsmap", "list", str(map_folder), "scenes", "--json"]
     scenes = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     placed = {s["name"]: s for s in scenes if s["name"] in truth and s["S_map_scene"] is not None}
     if set(placed) != set(truth) or len({s["component"] for s in placed.values()}) != 1:

@@ -14,7 +14,7 @@ import time
 COMMANDS = {
     "python -c pass": ["-c", "pass"],
     "import gsmap": ["-c", "import gsmap"],
-    "gsmap --help": ["-m", "gsmap", "--help"],
+    "gsmap --help": ["-P", "-m", "gsmap", "--help"],
 }
 
 

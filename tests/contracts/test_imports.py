@@ -110,7 +110,7 @@ def test_public_surface() -> None:
         assert getattr(gsmap, name) is not None
 
 
-@pytest.mark.parametrize("arguments", [["-c", "import gsmap"], ["-m", "gsmap", "--help"]])
+@pytest.mark.parametrize("arguments", [["-P", "-c", "import gsmap"], ["-P", "-m", "gsmap", "--help"]])
 def test_light_start(arguments: list[str]) -> None:
     """Neither importing gsmap nor its help loads a heavy library: that is what keeps --help quick."""
     heavy = sorted({*HOMES, "scipy", "pandas", "matplotlib"} - {"typer", "rich"})

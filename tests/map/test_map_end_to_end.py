@@ -43,7 +43,7 @@ def copy(site: Path, tmp_path: Path) -> Path:
 
 def cli(*arguments: object) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "gsmap", *map(str, arguments)], capture_output=True, text=True, timeout=300
+        [sys.executable, "-P", "-m", "gsmap", *map(str, arguments)], capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -41,7 +41,7 @@ def test_python_serves_what_the_store_holds(folder):
 
 
 def test_the_command_serves_until_it_is_interrupted(folder):
-    command = [sys.executable, "-m", "gsmap", "view", str(folder), "--no-browser"]
+    command = [sys.executable, "-P", "-m", "gsmap", "view", str(folder), "--no-browser"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             line = process.stderr.readline()
