@@ -14,7 +14,9 @@ README = Path(__file__).resolve().parents[2] / "README.md"
 
 
 def gsmap(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-P", "-m", "gsmap", *arguments], capture_output=True, text=True, timeout=120)
+    return subprocess.run(
+        [sys.executable, "-P", "-m", "gsmap", *arguments], capture_output=True, text=True, timeout=120
+    )
 
 
 @pytest.mark.parametrize("verb", VERBS)
