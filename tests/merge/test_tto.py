@@ -81,9 +81,10 @@ def test_tiles_fit_together_in_any_order():
         assert (in_tiles - in_one).max() < 0.05
 
 
-def test_differing_exposure_is_noted_and_removed():
+def test_differing_exposure_is_removed_when_asked_and_noted():
     a, b = two_parts()
-    result = merge([a, Part(apply_gain(b.gaussians, np.full(3, 1.4)), b.cameras, "b")], "tto", Params(steps=5))
+    brighter = Part(apply_gain(b.gaussians, np.full(3, 1.4)), b.cameras, "b")
+    result = merge([a, brighter], "tto", Params(steps=5, balance_exposure=True))
     assert any("stops" in note for note in result.notes)
 
 

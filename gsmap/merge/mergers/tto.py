@@ -2,7 +2,7 @@
 
 Graph-GSReg's merging (voxelise the union, then minimise the difference to renders of the originals; no photographs
 needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
-shows least goes first, newer captures win where the place changed, and exposures are balanced.
+shows least goes first, newer captures win where the place changed, and exposures can be balanced.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Params:
     halo_m: how far around a tile its surroundings are rendered along, the outer half of it frozen.
     reach_m: how far around a tile cameras are looked for.
     longest_side_px: size of the pictures that are compared.
-    balance_exposure: bring captures to one exposure first.
+    balance_exposure: bring captures to one exposure first: even to the eye, but no longer what each capture looks like.
     newer_wins: drop what later captures looked through.
     seed: of the order of views.
     """
 
-    min_weight: float = 0.1
+    min_weight: float = 0.05
     keep: float = 0.8
     voxel_m: float = 0.01
     cell_m: float = 0.5
@@ -58,7 +58,7 @@ class Params:
     halo_m: float = 1.0
     reach_m: float = 10.0
     longest_side_px: int = 960
-    balance_exposure: bool = True
+    balance_exposure: bool = False
     newer_wins: bool = True
     seed: int = 0
 
