@@ -27,7 +27,14 @@ def worst_island_error(world, answer):
     return worst
 
 
-@pytest.mark.parametrize(("door_m", "seed"), [(None, 0), (None, 1), (8.0, 0), (8.0, 2), (4.0, 1), (4.0, 2)])
+# Known gap: these worlds do fold, or a scene of them goes to the wrong wing.
+_FOLDS = pytest.mark.xfail(reason="look-alikes denser than the true ties still win here", strict=False)
+
+
+@pytest.mark.parametrize(
+    ("door_m", "seed"),
+    [(None, 0), (None, 1), (8.0, 0), (8.0, 2), (4.0, 1), (4.0, 2), pytest.param(4.0, 0, marks=_FOLDS)],
+)
 def test_a_duplicated_wing_folds_nothing(door_m, seed):
     world = twin_wings(300, 0.03, seed, door_m)
     answer = optimize(world.ids, world.edges, params=QUICK)
@@ -38,7 +45,7 @@ def test_a_duplicated_wing_folds_nothing(door_m, seed):
     assert all(answer.reasons[key] for key in listed)
 
 
-@pytest.mark.parametrize("seed", [2])
+@pytest.mark.parametrize("seed", [2, pytest.param(0, marks=_FOLDS), pytest.param(1, marks=_FOLDS)])
 def test_a_persons_word_opens_a_fold_that_nothing_else_shows(seed):
     """The second wing is reached by look-alike edges only, until someone vouches for one way in."""
     world = twin_wings(150, 0.06, seed)
