@@ -123,18 +123,23 @@ class Map(AbstractContextManager["Map"]):
 
     def describe(self, *scenes: str) -> list[SceneGraph]:
         """The scene graph of every scene (or of those named), made where the present method has not made it yet."""
+        wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
+        methods = self._describe_missing(wanted)
+        return [self._graph(s.id, methods[s.id]) for s in wanted]
+
+    def _describe_missing(self, wanted: list[Scene]) -> dict[str, str]:
+        """Make the graphs that are missing, reading none of the others; returns each scene's method."""
         from gsmap.map import models as kept
         from gsmap.map.jobs import describe_scene
 
         models = kept.specs(self.store)
-        wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
         methods = {s.id: self._method(s) for s in wanted}
         missing = [s for s in wanted if self.store.graphs.find(s.id, methods[s.id]) is None]
         jobs = [(str(self.store.folder), s.id, models) for s in missing]
         for done, (i, graph) in enumerate(run_jobs(describe_scene, jobs), 1):
             self.store.graphs.save(graph, methods[graph.scene_id])
             self._progress("describe", done / len(missing), f"{missing[i].name}: {graph.num_nodes} nodes")
-        return [self._graph(s.id, methods[s.id]) for s in wanted]
+        return methods
 
     def _method(self, scene: Scene) -> str:
         """Text that decides a scene's graph beside its content: what is described, how, and under which scale."""
@@ -268,7 +273,7 @@ class Map(AbstractContextManager["Map"]):
     def update(self, *paths: str | os.PathLike[str]) -> list[Ingested]:
         """Ingest the files, then describe, register and optimize whatever is missing."""
         ingested = self.ingest(*paths) if paths else []
-        self.describe()
+        self._describe_missing(self.scenes())
         while True:
             self.register()
             placed = self.pose_graph()
