@@ -49,13 +49,18 @@ int count(const Word *a, int words) {
 }
 
 // The subgraph induced by `members`, renumbered 0, 1, ... in their order.
-BitGraph induced(const Word *bits, int words, const std::vector<int> &members) {
+BitGraph induced(const BitGraph &of, const std::vector<int> &members, long long &steps) {
     BitGraph g(int(members.size()));
+    std::vector<Word> among(of.words, 0);
+    std::vector<int> place(of.n);
+    for (int i = 0; i < g.n; ++i) set(among.data(), members[i]), place[members[i]] = i;
     for (int i = 0; i < g.n; ++i) {
-        const Word *row = bits + std::size_t(members[i]) * words;
-        for (int j = 0; j < i; ++j)
-            if (has(row, members[j])) set(g.row(i), j), set(g.row(j), i);
+        const Word *row = of.row(members[i]);
+        Word *out = g.row(i);
+        for (int w = 0; w < of.words; ++w)
+            for (Word both = row[w] & among[w]; both; both &= both - 1, ++steps) set(out, place[w * 64 + lowest(both)]);
     }
+    steps += (long long)g.n * of.words;
     return g;
 }
 
@@ -87,10 +92,10 @@ void degeneracy(const BitGraph &g, std::vector<int> &order, std::vector<int> &co
 }
 
 // A clique grown from `first` by always taking the candidate that keeps most candidates.
-std::vector<int> grow(const BitGraph &g, int first) {
+std::vector<int> grow(const BitGraph &g, int first, long long &steps) {
     std::vector<int> members;
     for_each_bit(g.row(first), g.words, [&](int u) { members.push_back(u); });
-    BitGraph sub = induced(g.bits.data(), g.words, members);
+    BitGraph sub = induced(g, members, steps);
     std::vector<Word> left(sub.words, 0);
     std::vector<int> degree(sub.n), clique{first};
     for (int i = 0; i < sub.n; ++i) set(left.data(), i), degree[i] = count(sub.row(i), sub.words);
@@ -116,6 +121,27 @@ std::vector<int> grow(const BitGraph &g, int first) {
     return clique;
 }
 
+// Whether greedy colouring of `candidates` needs no more than `colours`: then no clique among them is larger.
+bool colourable(const BitGraph &g, std::vector<Word> candidates, int colours, long long &steps) {
+    int words = int(candidates.size()), first = 0;
+    std::vector<Word> available;
+    for (int k = 0;; ++k) {
+        while (first < words && !candidates[first]) ++first;
+        if (first == words) return true;
+        if (k == colours) return false;
+        available = candidates;
+        for (int w = first; w < words; ++w) {
+            while (available[w]) {
+                int v = w * 64 + lowest(available[w]);
+                unset(candidates.data(), v);
+                unset(available.data(), v);
+                for (int x = w; x < words; ++x) available[x] &= ~g.row(v)[x];
+                steps += words - w;
+            }
+        }
+    }
+}
+
 // Exact branch and bound inside one subgraph, bounded by greedy colouring with one-step recolouring
 // (San Segundo et al. 2011, "An exact bit-parallel algorithm for the maximum clique problem", with Re-NUMBER of
 // Tomita et al. 2010).
@@ -136,7 +162,7 @@ struct Search {
             steps += g.words;
             int neighbour = -1, hits = 0;
             for (int w = 0; w < g.words && hits < 2; ++w)
-                if (Word both = classes[k][w] & g.row(v)[w]) hits += popcount(both), neighbour = w * 64 + lowest(both);
+                if (Word both = classes[k][w] & g.row(v)[w]) hits += both & (both - 1) ? 2 : 1, neighbour = w * 64 + lowest(both);
             if (hits == 0) return set(classes[k].data(), v), true;
             if (hits > 1) continue;
             for (int other = k + 1; other <= keep; ++other) {
@@ -210,62 +236,57 @@ struct Search {
 
 }  // namespace
 
-// Maximum clique of a graph given as bit rows. Returns (members ascending, exact, steps).
-static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *bits, int n, int words,
+// Maximum clique of a graph given as bit rows, if it has more than `floor` vertices. Returns (members ascending, exact,
+// steps).
+static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *bits, int n, int words, int floor,
                                                                     long long limit) {
     if (n == 0) return {{}, true, 0};
-    BitGraph g(n);
-    std::memcpy(g.bits.data(), bits, g.bits.size() * sizeof(Word));
-    for (int i = 0; i < n; ++i) unset(g.row(i), i);
+    BitGraph raw(n);
+    std::memcpy(raw.bits.data(), bits, raw.bits.size() * sizeof(Word));
+    for (int i = 0; i < n; ++i) unset(raw.row(i), i);
     std::vector<int> order, core;
-    degeneracy(g, order, core);
+    degeneracy(raw, order, core);
+    // Dense cores, last removed, come first: a clique is found from its last vertex, among few vertices before it, and
+    // in this order greedy colouring needs few colours.
+    std::reverse(order.begin(), order.end());
+    long long steps = 0;
+    BitGraph g = induced(raw, order, steps);
 
     // Start from good cliques: grown from the vertices of the densest cores, spread over the order.
-    std::vector<int> best{order.back()};
+    std::vector<int> best;
+    int bound = std::max(floor, 1);  // only larger cliques count
+    if (floor < 1) best = {0};
     std::vector<char> covered(n, 0);
-    long long steps = 0;
-    for (int k = n - 1, done = 0; k >= 0 && done < 24 && (done < 3 || steps < limit / 8); --k) {
-        if (covered[order[k]] || core[order[k]] < int(best.size())) continue;
-        auto clique = grow(g, order[k]);
-        for (int v : clique) covered[v] = 1;
+    for (int v = 0, done = 0; v < n && core[order[v]] >= bound && done < 24 && (done < 3 || steps < limit / 8); ++v) {
+        if (covered[v]) continue;
+        auto clique = grow(g, v, steps);
+        for (int u : clique) covered[u] = 1;
         ++done;
-        steps += (long long)core[order[k]] * core[order[k]];
-        if (clique.size() > best.size()) best = clique;
+        if (int(clique.size()) > bound) best = clique, bound = int(best.size());
     }
 
     bool exact = true;
-    std::vector<int> rank(n);
-    for (int k = 0; k < n; ++k) rank[order[k]] = k;
-    // Dense cores last removed hold the large cliques: search them first, so the bound rises early.
-    for (int k = n - 1; k >= 0; --k) {
-        int v = order[k];
-        if (core[v] < int(best.size())) continue;
-        std::vector<int> members;
-        for_each_bit(g.row(v), g.words, [&](int u) {
-            if (rank[u] > k && core[u] >= int(best.size())) members.push_back(u);
-        });
-        if (members.size() < best.size()) continue;
-        steps += (long long)members.size() * members.size();
-        BitGraph raw = induced(g.bits.data(), g.words, members);
-        std::vector<int> inner, inner_core;
-        degeneracy(raw, inner, inner_core);
-        if (inner_core[inner.back()] + 2 <= int(best.size())) continue;
-        std::reverse(inner.begin(), inner.end());
-        BitGraph sub = induced(raw.bits.data(), raw.words, inner);
-        std::size_t bound = best.size() - 1;
-        Search search(sub, bound, limit, steps);
+    std::vector<int> members;
+    for (int v = 0; v < n && core[order[v]] >= bound && exact; ++v) {
+        if (!(exact = steps <= limit)) break;
+        std::vector<Word> candidates(g.row(v), g.row(v) + (v >> 6) + 1);
+        candidates.back() &= (Word(1) << (v & 63)) - 1;
+        members.clear();
+        for_each_bit(candidates.data(), int(candidates.size()), [&](int u) { members.push_back(u); });
+        if (int(members.size()) < bound || colourable(g, candidates, bound - 1, steps)) continue;
+        BitGraph sub = induced(g, members, steps);
+        Search search(sub, bound - 1, limit, steps);
         std::vector<Word> all(sub.words, 0);
         for (int i = 0; i < sub.n; ++i) set(all.data(), i);
         search.expand(all);
-        if (search.best.size() > bound) {
+        if (!search.best.empty()) {
             best = {v};
-            for (int i : search.best) best.push_back(members[inner[i]]);
+            for (int i : search.best) best.push_back(members[i]);
+            bound = int(best.size());
         }
-        if (search.stopped) {
-            exact = false;
-            break;
-        }
+        exact = !search.stopped;
     }
+    for (int &v : best) v = order[v];
     std::sort(best.begin(), best.end());
     return {best, exact, steps};
 }
@@ -299,7 +320,7 @@ static void consistency_rows(int n, const double *target, const double *source, 
     }
     const float slack_f = float(slack), rel_f = float(relative_slack), min_f = float(min_distance);
     const float hs = float(height_slack), slope = float(height_slope), ratio_f = float(ratio);
-    std::vector<std::uint8_t> ok(n);
+    std::vector<std::uint8_t> ok(words * 64 + 1, 0);  // of the pairs (i, j > i)
     for (int i = 0; i < n; ++i) {
         const float ax = tx[i], ay = ty[i], az = tz[i], bx = sx[i], by = sy[i], bz = sz[i], ah = th[i], bh = sh[i];
         const std::int32_t it = target_ids[i], is = source_ids[i];
@@ -315,8 +336,17 @@ static void consistency_rows(int n, const double *target, const double *source, 
                     ((!heights) | (dh < hs + slope * high));
         }
         Word *row = out + std::size_t(i) * words;
-        for (int j = i + 1; j < n; ++j)
-            if (ok[j]) set(row, j), set(out + std::size_t(j) * words, i);
+        for (int w = (i + 1) / 64; w < words; ++w) {
+            Word bits = 0;
+            for (int k = 0; k < 8; ++k) {  // eight bytes of 0 or 1 to eight bits at a time
+                Word eight;
+                std::memcpy(&eight, &ok[w * 64 + k * 8], 8);
+                bits |= (eight * 0x0102040810204080u >> 56) << (k * 8);
+            }
+            row[w] |= bits;
+            for (; bits; bits &= bits - 1) set(out + std::size_t(w * 64 + lowest(bits)) * words, i);
+        }
+        ok[i + 1] = 0;
     }
 }
 
@@ -347,13 +377,13 @@ void bind_clique(nb::module_ &m) {
         nb::arg("height_slope"), "Bit rows (n, ceil(n / 64)) of the graph in which correspondences agree.");
     m.def(
         "maximum_clique",
-        [](Bits bits, long long step_limit) {
+        [](Bits bits, int floor, long long step_limit) {
             std::size_t n = bits.shape(0), words = bits.shape(1);
             if (words != (n + 63) / 64) throw std::invalid_argument("bit rows must hold ceil(n / 64) words");
             std::tuple<std::vector<int>, bool, long long> found;
             {
                 nb::gil_scoped_release release;
-                found = maximum_clique(bits.data(), int(n), int(words), step_limit);
+                found = maximum_clique(bits.data(), int(n), int(words), floor, step_limit);
             }
             auto &members = std::get<0>(found);
             auto *out = new std::int32_t[members.size() + 1];
@@ -362,5 +392,6 @@ void bind_clique(nb::module_ &m) {
             return nb::make_tuple(nb::ndarray<nb::numpy, std::int32_t, nb::ndim<1>>(out, {members.size()}, owner),
                                   std::get<1>(found), std::get<2>(found));
         },
-        nb::arg("bits"), nb::arg("step_limit"), "Largest clique: (members, exact, steps of work).");
+        nb::arg("bits"), nb::arg("floor"), nb::arg("step_limit"),
+        "Largest clique of more than `floor` vertices: (members, exact, steps of work).");
 }

@@ -27,12 +27,13 @@ class Clique:
         return len(self.members)
 
 
-def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000) -> Clique:
+def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000, *, more_than: int = 0) -> Clique:
     """Maximum clique of a graph given as symmetric bit rows (`consistency_graph`).
 
     Exact branch and bound over a degeneracy order, bounded by greedy colouring with recolouring (San Segundo et al.
     2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts steps of work (about a nanosecond
-    each), not seconds, so the answer is the same on every machine.
+    each), not seconds, so the answer is the same on every machine. Cliques of no ``more_than`` members do not count:
+    where none is larger the answer is empty, and mostly quick.
 
     Raises:
         InputError: rows that are not (M, ceil(M / 64)) uint64.
@@ -42,5 +43,5 @@ def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000) -> Clique:
     rows = np.ascontiguousarray(rows)
     if rows.dtype != np.uint64 or rows.ndim != 2 or rows.shape[1] != -(-len(rows) // 64):
         raise InputError(f"a graph needs (M, ceil(M / 64)) uint64 bit rows, got {rows.shape} {rows.dtype}")
-    members, exact, steps = _native.maximum_clique(rows, int(step_limit))
+    members, exact, steps = _native.maximum_clique(rows, int(more_than), int(step_limit))
     return Clique(members.astype(np.int64), bool(exact), int(steps))

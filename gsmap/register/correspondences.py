@@ -99,9 +99,13 @@ def _match_type(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Candidates among the nodes of one type: rows of the target, rows of the source, similarity."""
     similarity = target.embeddings[rows_t] @ source.embeddings[rows_s].T
-    k_s, k_t = min(params.top_k, len(rows_s)), min(params.top_k, len(rows_t))
     keep = np.zeros(similarity.shape, dtype=bool)
-    np.put_along_axis(keep, np.argpartition(-similarity, k_s - 1, axis=1)[:, :k_s], True, axis=1)
-    np.put_along_axis(keep, np.argpartition(-similarity, k_t - 1, axis=0)[:k_t], True, axis=0)
+    for axis in (0, 1):
+        k = min(params.top_k, similarity.shape[axis])
+        if k == 1:
+            best = np.expand_dims(similarity.argmax(axis), axis)
+        else:
+            best = np.argpartition(-similarity, k - 1, axis=axis).take(np.arange(k), axis)
+        np.put_along_axis(keep, best, True, axis=axis)
     t, s = np.nonzero(keep & (similarity >= params.min_similarity))
     return rows_t[t], rows_s[s], similarity[t, s]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from gsmap.register import consistency, correspondences, scale
 from gsmap.register.clique import maximum_clique
 from gsmap.register.correspondences import Correspondences
 from gsmap.register.pose import fit_pose
-from gsmap.register.significance import agreeing, log10_nfa
+from gsmap.register.significance import Chance, agreeing
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 
 
@@ -142,11 +143,15 @@ class _Field:
         # A rigid pose needs one metre for both scenes, whatever each was guessed to be.
         common = float(np.sqrt(a.unit_m * b.unit_m))
         self.units_m = (a.unit_m, b.unit_m) if with_scale else (common, common)
-        self.source_points = b.positions * self.units_m[1]
-        up = target.up is not None and source.up is not None
-        self.source_heights = self.source_points @ source.up if up else None
+        self.ups = (target.up, source.up)
         matching = params.objects if kind == "objects" else params.landmarks
-        self.matches = correspondences.correspondences(a, b, matching, units_m=self.units_m, ups=(target.up, source.up))
+        self.matches = correspondences.correspondences(a, b, matching, units_m=self.units_m, ups=self.ups)
+
+    @cached_property
+    def chance(self) -> Chance:
+        points = self.b.positions * self.units_m[1]
+        heights = None if self.ups[0] is None or self.ups[1] is None else points @ self.ups[1]
+        return Chance(self.a, self.b, points, self.matches, source_heights=heights)
 
     def solve(self, among: Correspondences, at_scale: float) -> Proposal | None:
         """The pose of the largest clique among some of the correspondences."""
@@ -163,15 +168,6 @@ class _Field:
         inliers = among[agreeing(among, pose, self.radius_m)]
         if not fit.flaw and len(inliers) > len(clique):
             pose = fit_pose(inliers.target, inliers.source, with_scale=self.with_scale, sigma_m=sigma).S_target_source
-        nfa = log10_nfa(
-            self.a,
-            self.b,
-            self.source_points,
-            self.matches,
-            pose,
-            radius_m=self.radius_m,
-            source_heights=self.source_heights,
-        )
         return Proposal(
             self.kind,
             self._in_scene_units(pose),
@@ -179,7 +175,7 @@ class _Field:
             len(clique),
             len(self.matches),
             clique.exact,
-            nfa,
+            self.chance.log10_nfa(pose, self.radius_m),
             flaw=fit.flaw,
         )
 

@@ -37,21 +37,26 @@ def vote_scales(matches: Correspondences, params: Params | None = None) -> list[
     """
     from scipy.ndimage import gaussian_filter1d
 
+    from gsmap import _native
+
     params = params or Params()
     matches = matches[np.arange(min(len(matches), params.max_correspondences))]
-    i, j = np.triu_indices(len(matches), 1)
-    target, source = matches.target.astype(np.float32), matches.source.astype(np.float32)
-    dt, ds = _lengths(target, i, j), _lengths(source, i, j)
-    use = (dt > params.min_distance_m) & (ds > params.min_distance_m)
-    use &= (matches.target_ids[i] != matches.target_ids[j]) & (matches.source_ids[i] != matches.source_ids[j])
-    if matches.target_heights is not None:
-        # Where gravity is known a right pair of pairs also rises alike, whatever the scale.
-        rise_t, rise_s = (h.astype(np.float32) for h in (matches.target_heights, matches.source_heights))
-        use &= np.abs((rise_t[i] - rise_t[j]) * ds - (rise_s[i] - rise_s[j]) * dt) < params.rise_tolerance * dt * ds
-    ratio = np.log(dt[use]) - np.log(ds[use])
     limit, margin = np.log(params.max_factor), 0.3
     bins = int(np.ceil(2 * (limit + margin) / params.bin_width))
-    counts, edges = np.histogram(ratio, bins, (-limit - margin, limit + margin))
+    # Where gravity is known a right pair of pairs also rises alike, whatever the scale.
+    counts = _native.ratio_histogram(
+        target=matches.target,
+        source=matches.source,
+        target_ids=matches.target_ids,
+        source_ids=matches.source_ids,
+        target_heights=matches.target_heights,
+        source_heights=matches.source_heights,
+        min_distance=params.min_distance_m,
+        rise_tolerance=params.rise_tolerance,
+        limit=limit + margin,
+        bins=bins,
+    )
+    edges = np.linspace(-limit - margin, limit + margin, bins + 1)
     smooth = gaussian_filter1d(counts.astype(float), 1.5)
     background = gaussian_filter1d(counts.astype(float), 0.1 / params.bin_width)
     centres = 0.5 * (edges[1:] + edges[:-1])
@@ -64,11 +69,3 @@ def vote_scales(matches: Correspondences, params: Params | None = None) -> list[
         if all(abs(centres[at] - np.log(s)) > 3.5 * params.bin_width for s, _ in scales):
             scales.append((float(np.exp(centres[at])), float(score[at])))
     return scales
-
-
-def _lengths(points: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Distances between pairs of points, from their Gram matrix."""
-    points = points - points.mean(0)
-    squares = (points**2).sum(1)
-    gram = points @ points.T
-    return np.sqrt(np.maximum(squares[i] + squares[j] - 2 * gram[i, j], 0.0))

@@ -7,6 +7,8 @@ import numpy as np
 from gsmap.register.correspondences import Correspondences
 from gsmap.types import NodeLayer, Sim3
 
+_FAR_M = 1e4  # farther than any radius
+
 
 def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
     """(M,) true for correspondences within the radius under the pose, one to one, nearest first."""
@@ -24,59 +26,70 @@ def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarra
     return keep
 
 
-def log10_nfa(
-    target: NodeLayer,
-    source: NodeLayer,
-    source_points_m: np.ndarray,
-    matches: Correspondences,
-    pose: Sim3,
-    *,
-    radius_m: float = 0.15,
-    cell_m: float = 0.5,
-    source_heights: np.ndarray | None = None,
-    height_band_m: float = 0.5,
-) -> float:
-    """log10 of the number of false alarms: how many poses this good to expect if partners were drawn at random.
+class Chance:
+    """How well poses do at candidate correspondences, against partners drawn at random.
 
     Under the null each candidate's partner is any source node of its type (and of about its height, where gravity is
     known). A node's context covers its neighbours', so near matches err together: cells of ``cell_m`` are the trials,
-    not nodes. With n cells that could agree, mean chance p each, and k that do, every triple of candidates fixing a
-    pose: ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000; the triple itself
-    agrees by construction). Below -2 chance is no explanation.
-    """
-    from scipy.spatial import cKDTree
+    not nodes.
 
-    if len(matches) < 4:
-        return np.inf
-    predicted = pose.inverse().apply(matches.target)
-    kinds = target.types[matches.target_ids]
-    chance = np.zeros(len(matches))
-    for kind in np.unique(kinds):
-        rows = np.flatnonzero(kinds == kind)
-        nodes = np.flatnonzero(source.types == kind)
-        if not len(nodes):
-            continue
-        near = cKDTree(source_points_m[nodes]).query_ball_point(
-            predicted[rows], radius_m / pose.scale, return_length=True
-        )
-        pool = np.full(len(rows), float(len(nodes)))
-        if source_heights is not None and matches.source_heights is not None:
-            heights = np.sort(source_heights[nodes])
-            own = matches.source_heights[rows]
-            pool = np.searchsorted(heights, own + height_band_m) - np.searchsorted(heights, own - height_band_m)
-        chance[rows] = np.minimum(1.0, near / np.maximum(pool, 1.0))
-    hits = agreeing(matches, pose, radius_m)
-    _, cell = np.unique(np.floor(matches.target / cell_m).astype(int), axis=0, return_inverse=True)
-    cell = cell.ravel()
-    missed = np.bincount(cell, np.log1p(-np.minimum(chance, 1 - 1e-9)))
-    possible = np.bincount(cell, chance > 0) > 0
-    n, k = int(possible.sum()), int((np.bincount(cell, hits) > 0).sum())
-    if n < 4 or k < 4:
-        return np.inf
-    p = float((1.0 - np.exp(missed[possible])).mean())
-    m = len(matches)
-    triples = np.log10(m) + np.log10(m - 1) + np.log10(m - 2) - np.log10(6)
-    return float(triples + _log10_binomial_tail(n - 3, k - 3, p))
+    Args:
+        source_points_m: (N, 3) positions of the source's nodes, in metres.
+        matches: the candidates.
+        source_heights: (N,) heights of the source's nodes in metres, or None.
+    """
+
+    def __init__(
+        self,
+        target: NodeLayer,
+        source: NodeLayer,
+        source_points_m: np.ndarray,
+        matches: Correspondences,
+        *,
+        source_heights: np.ndarray | None = None,
+        cell_m: float = 0.5,
+        height_band_m: float = 0.5,
+    ) -> None:
+        from scipy.spatial import cKDTree
+
+        self.matches = matches
+        kinds = target.types[matches.target_ids].astype(np.float64)
+        # Nodes of another type lie in another layer of a fourth dimension, so one tree serves all.
+        self._layer = kinds * _FAR_M
+        self._tree = cKDTree(np.column_stack([source_points_m, source.types * _FAR_M]))
+        known = source_heights is not None and matches.source_heights is not None
+        theirs = source_heights if known else np.zeros(len(source))
+        own = matches.source_heights if known else np.zeros(len(matches))
+        apart, low = float(np.ptp(theirs)) + 4 * height_band_m, theirs.min()
+        stacked = np.sort(source.types * apart + (theirs - low))
+        own = kinds * apart + (own - low)
+        pool = np.searchsorted(stacked, own + height_band_m) - np.searchsorted(stacked, own - height_band_m)
+        self._pool = np.maximum(pool, 1.0)
+        _, cell = np.unique(np.floor(matches.target / cell_m).astype(int), axis=0, return_inverse=True)
+        self._cell = cell.ravel()
+
+    def log10_nfa(self, pose: Sim3, radius_m: float = 0.15) -> float:
+        """log10 of the number of false alarms: how many poses this good to expect of chance.
+
+        With n cells that could agree, mean chance p each, and k that do, every triple of candidates fixing a pose:
+        ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000; the triple itself agrees
+        by construction). Below -2 chance is no explanation.
+        """
+        m, cell = len(self.matches), self._cell
+        if m < 4:
+            return np.inf
+        predicted = np.column_stack([pose.inverse().apply(self.matches.target), self._layer])
+        near = self._tree.query_ball_point(predicted, radius_m / pose.scale, return_length=True)
+        chance = np.minimum(1.0, near / self._pool)
+        hits = agreeing(self.matches, pose, radius_m)
+        missed = np.bincount(cell, np.log1p(-np.minimum(chance, 1 - 1e-9)))
+        possible = np.bincount(cell, chance > 0) > 0
+        n, k = int(possible.sum()), int((np.bincount(cell, hits) > 0).sum())
+        if n < 4 or k < 4:
+            return np.inf
+        p = float((1.0 - np.exp(missed[possible])).mean())
+        triples = np.log10(m) + np.log10(m - 1) + np.log10(m - 2) - np.log10(6)
+        return float(triples + _log10_binomial_tail(n - 3, k - 3, p))
 
 
 def _log10_binomial_tail(n: int, k: int, p: float) -> float:

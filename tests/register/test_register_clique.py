@@ -50,6 +50,18 @@ def test_finds_a_planted_clique_in_a_large_graph():
     assert clique.members.tolist() == sorted(members.tolist())
 
 
+def test_only_cliques_of_more_than_so_many_members_count():
+    adjacency = _random_graph(120, 0.3, 7)
+    size = len(maximum_clique(pack(adjacency)))
+    for more_than in (1, size - 1):
+        clique = maximum_clique(pack(adjacency), more_than=more_than)
+        assert len(clique) == size
+        assert _is_clique(adjacency, clique.members)
+    none = maximum_clique(pack(adjacency), more_than=size)
+    assert len(none) == 0
+    assert none.exact
+
+
 def test_limit_gives_a_clique_that_is_not_called_exact():
     adjacency = _random_graph(300, 0.9, 5)
     clique = maximum_clique(pack(adjacency), step_limit=10**5)

@@ -11,7 +11,7 @@ from gsmap.register.correspondences import Correspondences
 from gsmap.register.covariance import in_scene_units, point_to_plane_jacobian, pose_covariance
 from gsmap.register.refiners import coloured, gicp
 from gsmap.register.scale import vote_scales
-from gsmap.register.significance import _log10_binomial_tail, agreeing, log10_nfa
+from gsmap.register.significance import Chance, _log10_binomial_tail, agreeing
 from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Sim3
@@ -177,8 +177,9 @@ def test_chance_is_never_significant_and_a_planted_pose_is():
 
         members = wrong[maximum_clique(consistency_graph(wrong)).members]
         pose = fit_pose(members.target, members.source).S_target_source
-        scores.append(log10_nfa(world.target, world.source, world.source.positions, wrong, pose))
-        right = log10_nfa(world.target, world.source, world.source.positions, m, world.S_target_source)
+        scores.append(Chance(world.target, world.source, world.source.positions, wrong).log10_nfa(pose))
+        chance = Chance(world.target, world.source, world.source.positions, m)
+        right = chance.log10_nfa(world.S_target_source)
         assert right < -10
     assert min(scores) > -2
 
@@ -197,6 +198,28 @@ def test_scale_vote(scale):
     best, score = vote_scales(world.matches)[0]
     assert abs(np.log(best / scale)) < 0.015
     assert score > 5
+
+
+@pytest.mark.parametrize("heights", [True, False])
+def test_ratio_histogram_equals_its_definition(heights):
+    from gsmap import _native
+
+    rng = np.random.default_rng(5)
+    n, limit, bins = 150, 0.6, 48
+    target, source = rng.normal(size=(2, n, 3)) * 2 + 1e4
+    ids = rng.integers(0, 100, (2, n)).astype(np.int32)
+    rises = (target[:, 2].copy(), source[:, 2].copy()) if heights else (None, None)
+    got = _native.ratio_histogram(target, source, *ids, *rises, 1.0, 0.3, limit, bins)
+    i, j = np.triu_indices(n, 1)
+    dt, ds = (np.linalg.norm(p[i] - p[j], axis=1) for p in (target, source))
+    use = (dt > 1.0) & (ds > 1.0) & (ids[:, i] != ids[:, j]).all(0)
+    if heights:
+        use &= np.abs((rises[0][i] - rises[0][j]) / dt - (rises[1][i] - rises[1][j]) / ds) <= 0.3
+    expected, _ = np.histogram(np.log(dt[use] / ds[use]), bins, (-limit, limit))
+    assert expected.sum() > 500
+    # float32 may differ exactly on a threshold
+    assert abs(got.sum() - expected.sum()) <= 2
+    assert np.abs(np.cumsum(got) - np.cumsum(expected)).max() <= 3
 
 
 def test_photometric_refiner_lays_renders_over_each_other():
