@@ -13,7 +13,7 @@ from gsmap.describe.method import method_digest
 from gsmap.describe.surroundings import NUM_RINGS, NUM_SHELLS, cylinder_context, shell_context
 from gsmap.types import NodeLayer
 
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def landmark_layer(
     params = params or LandmarkParams()
     method = landmark_method(params, upright=up is not None)
     surroundings, bins = (shell_context, NUM_SHELLS) if up is None else (cylinder_context, NUM_RINGS)
-    dim = 4 * bins + 3
+    dim = 4 * bins
     if not cloud.areas.any():  # nothing, or only coincident points
         return NodeLayer.empty(method, dim, unit_m)
     level = np.eye(3) if up is None else rotation_to_z(up)
@@ -93,18 +93,17 @@ def landmark_layer(
 
 
 def _embed(context: np.ndarray) -> np.ndarray:
-    """Unit vectors (M, 4 * bins + 3) of contexts (M, bins, 4): occupancy, relative colour, and the mean colour.
+    """Unit vectors (M, 4 * bins) of contexts (M, bins, 4): occupancy and relative colour.
 
-    Another exposure adds to L and stretches it (gain and gamma in the logarithm of light), so each bin's colour is
-    taken relative to the mean of the whole surrounding and divided by its spread; the mean itself is kept at less
-    weight, the lightness least. A bin counts by the root of its occupancy.
+    Another exposure adds to L and stretches it (gain and gamma in the logarithm of light), another white balance adds
+    to a and b, so each bin's colour is taken relative to the mean of the whole surrounding and divided by its spread.
+    The mean itself is left out: measured, it wins nothing within one light and costs most matches where two captures'
+    white balances differ by a fifth. A bin counts by the root of its occupancy.
     """
     occupancy, colour = context[..., 3:], np.clip(context[..., :3], -2.5, 2.5)
     total = np.maximum(occupancy.sum(1), 1e-6)
-    mean = (occupancy * colour).sum(1) / total
-    relative = colour - mean[:, None]
+    relative = colour - ((occupancy * colour).sum(1) / total)[:, None]
     spread = np.sqrt((occupancy * relative**2).sum(1) / total) + 0.15
     relative *= 0.7 * np.sqrt(occupancy) / spread[:, None]
-    parts = [0.75 * occupancy[..., 0], relative.reshape(len(context), -1)]
-    vector = np.concatenate([np.concatenate(parts, 1) / np.sqrt(context.shape[1]), mean * [0.3, 0.5, 0.5]], 1)
+    vector = np.concatenate([0.75 * occupancy[..., 0], relative.reshape(len(context), -1)], 1)
     return vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9)

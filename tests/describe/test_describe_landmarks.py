@@ -13,6 +13,7 @@ from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmark_layer import LandmarkParams, landmark_method
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
+from gsmap.register.correspondences import correspondences
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
 
 LANDMARKS = DescribeParams(objects=False)
@@ -54,6 +55,20 @@ def test_two_samplings_of_one_room_share_landmarks_and_one_is_not_another_room()
     assert counterparts(one, two, Sim3.identity(), 0.1) > 0.6
     turned = Sim3(Rotation.from_euler("z", 73, degrees=True).as_matrix(), np.array([1.0, -2, 0]))
     assert counterparts(one, two, turned, 0.1) < 0.15
+
+
+def test_another_white_balance_leaves_landmarks_alike():
+    """Two samplings of one room under a warm and a cold light: the candidates of registration stay the right ones."""
+    layers = []
+    for seed, light in ((1, [1.3, 1.0, 0.7]), (2, [0.75, 1.0, 1.25])):
+        g, cameras = room(seed)
+        rgb = np.clip(0.5 + 0.28209479177387814 * g.sh, 0, 1)
+        lit = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, (light * rgb - 0.5) / 0.28209479177387814)
+        layers.append(describe("room", lit, cameras, LANDMARKS, scale_policy="known").layers["landmarks"])
+    found = correspondences(*layers)
+    right = np.linalg.norm(found.target - found.source, axis=1) < 0.1
+    assert right.sum() > 90
+    assert right.mean() > 0.3
 
 
 def test_any_two_units_have_a_pair_of_levels_within_20_percent():
