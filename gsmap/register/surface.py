@@ -19,11 +19,15 @@ class Params:
 
     Args:
         min_opacity, max_scale_m: a surface Gaussian is opaque and not huge; floaters and sky are the rest.
+        min_opaque_share, faintest_opacity: of a capture whose trainer left it fainter, this share of the Gaussians
+            counts as opaque, down to the faintest of these opacities.
         max_scale_quantile: of the opaque Gaussians at least this share is surface, however coarse the scene is.
         resolution_m: points are averaged over cells of this size before they are aligned.
     """
 
     min_opacity: float = 0.5
+    min_opaque_share: float = 0.4
+    faintest_opacity: float = 0.1
     max_scale_m: float = 0.08
     max_scale_quantile: float = 0.7
     resolution_m: float = 0.05
@@ -51,7 +55,11 @@ class Surface:
         """The surface of a scene whose unit is ``unit_m`` metres."""
         params = params or Params()
         largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
-        opaque = gaussians.logit_opacities > np.log(params.min_opacity / (1 - params.min_opacity))
+        opacities = gaussians.opacities
+        bar = params.min_opacity
+        if len(opacities):
+            bar = np.clip(np.quantile(opacities, 1 - params.min_opaque_share), params.faintest_opacity, bar)
+        opaque = opacities >= bar
         limit = np.log(params.max_scale_m)
         if opaque.any():
             limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))

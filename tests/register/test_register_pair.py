@@ -30,6 +30,18 @@ def test_overlapping_captures_are_accepted_to_the_millimetre():
     assert set(found.seconds) >= {"match", "refine", "verdict"}
 
 
+def test_captures_trained_too_briefly_to_turn_opaque_still_register():
+    world = splat_world(0)
+    rng = np.random.default_rng(0)
+    views = []
+    for view in (world.target, world.source):
+        opacities = rng.uniform(0.1, 0.45, len(view.gaussians))
+        views.append(replace(view, gaussians=replace(view.gaussians, logit_opacities=-np.log(1 / opacities - 1))))
+    found = register_pair(*views)
+    assert found.status == "accepted"
+    assert _error(world, found).centroid_m < 0.01
+
+
 def test_the_answer_is_the_same_both_ways_and_twice():
     world = splat_world(1)
     there, back = register_pair(world.target, world.source), register_pair(world.source, world.target)
