@@ -18,6 +18,7 @@ PRESETS = {  # mean and standard deviation of rgb in [0, 1]
     "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
     "unit": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
 }
+SAM_SIDE_PX = 1024
 # What the published SAM decoder export takes (segment-anything, scripts/export_onnx_model.py).
 SAM_DECODER_INPUTS = (
     "image_embeddings",
@@ -113,7 +114,12 @@ def check_model(kind: str, path: str | os.PathLike[str], preset: str = "clip") -
     if problem:
         have = ", ".join(f"{t.name} {list(t.shape)}" for t in inputs)
         raise InputError(f"{path} is not a {kind} model: {problem}; its inputs are {have or 'none'}")
-    return ModelSpec(kind, str(path), sha256, preset, mean, std, inputs, outputs)
+    spec = ModelSpec(kind, str(path), sha256, preset, mean, std, inputs, outputs)
+    if kind == "clip":
+        from gsmap.describe.embedders import clip
+
+        clip.ClipEmbedder(clip.Params(), spec)  # runs it once: declared shapes do not tell all that can go wrong
+    return spec
 
 
 def open_session(spec: ModelSpec) -> Any:
@@ -129,6 +135,18 @@ def open_session(spec: ModelSpec) -> Any:
     if hashlib.sha256(path.read_bytes()).hexdigest() != spec.sha256:
         raise InputError(f"model {spec.kind} has changed since it was added: {path}; add it again")
     return _session(spec.path, spec.sha256)
+
+
+def run(spec: ModelSpec, session: Any, outputs: list[str] | None, feed: dict[str, Any]) -> list[Any]:
+    """The session's outputs; what onnxruntime raises becomes an InputError that names the model."""
+    try:
+        return session.run(outputs, feed)
+    except Exception as error:  # onnxruntime raises many types
+        given = ", ".join(f"{name} {list(value.shape)}" for name, value in feed.items())
+        reason = str(error).splitlines()[0][:200]
+        raise InputError(
+            f"model {spec.kind} ({spec.path}) does not run on {given}: {reason}; add another with `gsmap models add`"
+        ) from error
 
 
 @lru_cache(maxsize=4)
@@ -165,6 +183,8 @@ def _image_encoder(inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...]) -> s
 def _sam_encoder(inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...]) -> str:
     if len(inputs) != 1 or not is_image(inputs[0]):
         return "a SAM encoder takes one image, (1, 3, 1024, 1024) or (H, W, 3)"
+    if any(side not in (1, 3, SAM_SIDE_PX, None) for side in inputs[0].shape):
+        return f"a SAM encoder takes images of {SAM_SIDE_PX} x {SAM_SIDE_PX} pixels"
     return "" if any(len(t.shape) == 4 for t in outputs) else "a SAM encoder gives embeddings (1, C, h, w)"
 
 

@@ -20,10 +20,11 @@ def _value(name, shape, kind=TensorProto.FLOAT):
     return helper.make_tensor_value_info(name, kind, shape)
 
 
-def sam_encoder(path: Path) -> Path:
-    """(1, 3, 1024, 1024) to the mean colour of each 16 x 16 cell, (1, 3, 64, 64)."""
-    node = helper.make_node("AveragePool", ["image"], ["image_embeddings"], kernel_shape=[16, 16], strides=[16, 16])
-    return _save(path, [node], [_value("image", [1, 3, 1024, 1024])], [_value("image_embeddings", [1, 3, 64, 64])], {})
+def sam_encoder(path: Path, side: int = 1024, cell: int = 16) -> Path:
+    """(1, 3, side, side) to the mean colour of each cell x cell pixels, of 1024 and 16 to (1, 3, 64, 64)."""
+    node = helper.make_node("AveragePool", ["image"], ["image_embeddings"], kernel_shape=[cell] * 2, strides=[cell] * 2)
+    out = [1, 3, side // cell, side // cell]
+    return _save(path, [node], [_value("image", [1, 3, side, side])], [_value("image_embeddings", out)], {})
 
 
 def sam_decoder(path: Path, *, batch: int | str = "batch") -> Path:
@@ -101,6 +102,13 @@ def image_encoder(path: Path, side: int | str = 8, *, channels_last: bool = Fals
     axes = [1, 2] if channels_last else [2, 3]
     node = helper.make_node("ReduceMean", ["pixels"], ["features"], axes=axes, keepdims=0)
     return _save(path, [node], [_value("pixels", shape)], [_value("features", [batch, 3])], {})
+
+
+def fixed_inside(path: Path) -> Path:
+    """An image encoder that declares any size and takes only 64 x 64."""
+    node = helper.make_node("Reshape", ["pixels", "shape"], ["features"])
+    constants = {"shape": np.array([1, 3 * 64 * 64], np.int64)}
+    return _save(path, [node], [_value("pixels", ["n", 3, "h", "w"])], [_value("features", ["n", 12288])], constants)
 
 
 def external(path: Path) -> Path:

@@ -163,6 +163,18 @@ def test_models_of_another_kind_are_refused(tmp_path):
         check_model("clip", networks.sam_decoder(tmp_path / "d.onnx"))
 
 
+def test_models_that_fit_on_paper_only_are_refused(tmp_path):
+    with pytest.raises(InputError, match="1024 x 1024"):
+        check_model("sam-encoder", networks.sam_encoder(tmp_path / "small.onnx", side=512))
+    with pytest.raises(InputError, match=r"does not run on pixels \[1, 3, 224, 224\]"):
+        check_model("clip", networks.fixed_inside(tmp_path / "fixed.onnx"))
+    # An encoder and a decoder of different models: each is one, together they do not run.
+    encoder = check_model("sam-encoder", networks.sam_encoder(tmp_path / "coarse.onnx", cell=32))
+    decoder = check_model("sam-decoder", networks.sam_decoder(tmp_path / "decoder.onnx"))
+    with pytest.raises(InputError, match=r"model sam-decoder .* does not run"):
+        sam.SamSegmenter(sam.Params(), encoder, decoder).segment(view_of(np.zeros((60, 80, 3), np.uint8)))
+
+
 def test_a_model_that_changed_after_it_was_added_is_refused(tmp_path):
     path = networks.image_encoder(tmp_path / "m.onnx")
     spec = check_model("clip", path)

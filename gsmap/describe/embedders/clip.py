@@ -9,9 +9,10 @@ import numpy as np
 from PIL import Image
 
 from gsmap.describe.context import random_codebook
-from gsmap.describe.models import ModelSpec, open_session
+from gsmap.describe.models import ModelSpec, open_session, run
 from gsmap.describe.segmenters import Mask
 from gsmap.describe.views import View
+from gsmap.errors import InputError
 
 _CODEBOOK_SEED = 20
 _WORDS = 32
@@ -72,11 +73,15 @@ class ClipEmbedder:
             part = part if self.channels_last else part.transpose(0, 3, 1, 2)
             dtype = np.float16 if self.input.dtype == "float16" else np.float32
             feed = {self.input.name: np.ascontiguousarray(part, dtype)}
-            value = self.session.run([self.output], feed)[0].astype(np.float32)
+            value = run(self.spec, self.session, [self.output], feed)[0].astype(np.float32)
             if value.ndim == 3:  # tokens: the first is the class token
                 value = value[:, 0]
             elif value.ndim == 4:  # a feature map: its mean
                 value = value.mean((2, 3)) if value.shape[1] >= value.shape[3] else value.mean((1, 2))
+            if value.ndim != 2 or len(value) < used:
+                raise InputError(
+                    f"model {self.spec.kind} ({self.spec.path}) gives {list(value.shape)} for {used} pictures"
+                )
             out.append(value[:used])
         return np.concatenate(out)
 

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from gsmap.describe.models import ModelSpec, open_session
+from gsmap.describe.models import SAM_SIDE_PX, ModelSpec, open_session, run
 from gsmap.describe.segmenters import Mask
 from gsmap.describe.views import View
 
-_SIDE_PX = 1024
 _PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _PIXEL_STD = np.array([58.395, 57.12, 57.375], np.float32)
 
@@ -51,7 +50,7 @@ class SamSegmenter:
     def __init__(self, params: Params, encoder: ModelSpec, decoder: ModelSpec) -> None:
         self.params = params
         self.encoder, self.decoder = open_session(encoder), open_session(decoder)
-        self.encoder_spec = encoder
+        self.encoder_spec, self.decoder_spec = encoder, decoder
         shapes = {t.name: t.shape for t in decoder.inputs}
         self.batch = params.batch if shapes["point_coords"][0] is None and shapes["point_labels"][0] is None else 1
         self.types = {t.name: np.float64 if t.dtype == "double" else np.float32 for t in decoder.inputs}
@@ -82,7 +81,7 @@ class SamSegmenter:
     def _encode(self, rgb: np.ndarray) -> np.ndarray:
         """Embeddings (1, C, h, w) of a picture."""
         height, width = rgb.shape[:2]
-        scale = _SIDE_PX / max(height, width)
+        scale = SAM_SIDE_PX / max(height, width)
         size = (round(width * scale), round(height * scale))
         large = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BILINEAR), np.float32)
         tensor = self.encoder_spec.inputs[0]
@@ -90,18 +89,18 @@ class SamSegmenter:
             picture = large
         else:
             normal = (large - _PIXEL_MEAN) / _PIXEL_STD
-            padded = np.zeros((_SIDE_PX, _SIDE_PX, 3), np.float32)
+            padded = np.zeros((SAM_SIDE_PX, SAM_SIDE_PX, 3), np.float32)
             padded[: size[1], : size[0]] = normal
             picture = padded[None] if tensor.shape[-1] == 3 else padded.transpose(2, 0, 1)[None]
         if tensor.dtype == "uint8":
             picture = picture.astype(np.uint8)
-        outputs = self.encoder.run(None, {tensor.name: picture})
+        outputs = run(self.encoder_spec, self.encoder, None, {tensor.name: picture})
         return next(o for o in outputs if o.ndim == 4)
 
     def _decode(self, embeddings: np.ndarray, points: np.ndarray, height: int, width: int):
         """Yield (logits (H, W), predicted IoU) of each mask of each prompt."""
         count = len(points)
-        scale = _SIDE_PX / max(height, width)
+        scale = SAM_SIDE_PX / max(height, width)
         # A prompt without a box carries a padding point labelled -1 (the export's contract).
         coords = np.zeros((count, 2, 2))
         coords[:, 0] = points * scale
@@ -115,7 +114,7 @@ class SamSegmenter:
             "orig_im_size": np.array([height, width]),
         }
         feed = {name: value.astype(self.types[name]) for name, value in feed.items()}
-        masks, scores = self.decoder.run(["masks", "iou_predictions"], feed)
+        masks, scores = run(self.decoder_spec, self.decoder, ["masks", "iou_predictions"], feed)
         # Of four masks the first answers prompts of several points; the generator uses the other three.
         first = 1 if masks.shape[1] == 4 else 0
         for prompt in range(masks.shape[0]):
