@@ -36,6 +36,7 @@ static void ratio_histogram(std::size_t n, const double *target, const double *s
     const float *tx = t[0].data(), *ty = t[1].data(), *tz = t[2].data(), *th = rise_t.data();
     const float *sx = s[0].data(), *sy = s[1].data(), *sz = s[2].data(), *sh = rise_s.data();
     float *out = place.data();
+    std::vector<int> bin(n + 1);
     const float per_bin = float(bins) / (2 * limit), nowhere = -1.f;
     for (std::size_t i = 0; i < n; ++i) {
         const float ax = tx[i], ay = ty[i], az = tz[i], bx = sx[i], by = sy[i], bz = sz[i], ah = th[i], bh = sh[i];
@@ -54,8 +55,12 @@ static void ratio_histogram(std::size_t n, const double *target, const double *s
                        (slopes <= rise_tolerance * dt * ds) & (at >= 0) & (at < float(bins));
             out[j] = use ? at : nowhere;
         }
-        for (std::size_t j = i + 1; j < n; ++j)
-            if (out[j] >= 0) ++counts[int(out[j])];
+        std::size_t used = 0;  // few pairs are: gathered without a branch, which would be foreseen badly
+        for (std::size_t j = i + 1; j < n; ++j) {
+            bin[used] = int(out[j]);
+            used += out[j] >= 0;
+        }
+        for (std::size_t k = 0; k < used; ++k) ++counts[bin[k]];
     }
 }
 

@@ -31,9 +31,9 @@ def maximum_clique(rows: np.ndarray, step_limit: int = 50_000_000, *, more_than:
     """Maximum clique of a graph given as symmetric bit rows (`consistency_graph`).
 
     Exact branch and bound over a degeneracy order, bounded by greedy colouring with recolouring (San Segundo et al.
-    2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts steps of work (about a nanosecond
-    each), not seconds, so the answer is the same on every machine. Cliques of no ``more_than`` members do not count:
-    where none is larger the answer is empty, and mostly quick.
+    2011; Tomita et al. 2010), starting from greedily grown cliques. The limit counts steps of work (about two
+    nanoseconds each), not seconds, so the answer is the same on every machine. Cliques of no ``more_than`` members do
+    not count: where none is larger the answer is empty.
 
     Raises:
         InputError: rows that are not (M, ceil(M / 64)) uint64.

@@ -76,13 +76,23 @@ def correspondences(
         ups: unit vectors against gravity, or None.
     """
     params = params or Params()
-    pairs = [
-        _match_type(target, source, np.flatnonzero(target.types == kind), np.flatnonzero(source.types == kind), params)
-        for kind in np.intersect1d(target.types, source.types)
-    ]
-    t = np.concatenate([p[0] for p in pairs]) if pairs else np.zeros(0, int)
-    s = np.concatenate([p[1] for p in pairs]) if pairs else np.zeros(0, int)
-    similarity = np.concatenate([p[2] for p in pairs]) if pairs else np.zeros(0, np.float32)
+    # Nodes of one type are brought together, so that each type's similarities are one product of two blocks.
+    order_t, order_s = (np.argsort(layer.types, kind="stable") for layer in (target, source))
+    types_t, types_s = target.types[order_t], source.types[order_s]
+    embeddings_t, embeddings_s = target.embeddings[order_t], source.embeddings[order_s]
+    kinds = np.intersect1d(types_t, types_s)
+    bounds = (np.searchsorted(t, kinds, side) for t in (types_t, types_s) for side in ("left", "right"))
+    t, s, similarity = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0, np.float32)]
+    for t0, t1, s0, s1 in zip(*bounds, strict=True):
+        block = embeddings_t[t0:t1] @ embeddings_s[s0:s1].T
+        rows, columns = _alike(block, params)
+        t.append(order_t[t0 + rows])
+        s.append(order_s[s0 + columns])
+        similarity.append(block[rows, columns])
+    t, s, similarity = np.concatenate(t), np.concatenate(s), np.concatenate(similarity)
+    if len(t) > params.max_correspondences:
+        least = np.partition(similarity, -params.max_correspondences)[-params.max_correspondences]
+        t, s, similarity = t[similarity >= least], s[similarity >= least], similarity[similarity >= least]
     order = np.lexsort((s, t, -similarity))[: params.max_correspondences]
     t, s = t[order], s[order]
     points_t, points_s = target.positions[t] * units_m[0], source.positions[s] * units_m[1]
@@ -94,18 +104,18 @@ def correspondences(
     )
 
 
-def _match_type(
-    target: NodeLayer, source: NodeLayer, rows_t: np.ndarray, rows_s: np.ndarray, params: Params
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Candidates among the nodes of one type: rows of the target, rows of the source, similarity."""
-    similarity = target.embeddings[rows_t] @ source.embeddings[rows_s].T
-    keep = np.zeros(similarity.shape, dtype=bool)
-    for axis in (0, 1):
-        k = min(params.top_k, similarity.shape[axis])
-        if k == 1:
-            best = np.expand_dims(similarity.argmax(axis), axis)
-        else:
-            best = np.argpartition(-similarity, k - 1, axis=axis).take(np.arange(k), axis)
-        np.put_along_axis(keep, best, True, axis=axis)
-    t, s = np.nonzero(keep & (similarity >= params.min_similarity))
-    return rows_t[t], rows_s[s], similarity[t, s]
+def _alike(similarity: np.ndarray, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the entries that are among the ``top_k`` of their row or of their column."""
+    height, width = similarity.shape
+    if params.top_k == 1:
+        column, row = similarity.argmax(1), similarity.argmax(0)
+        once = np.flatnonzero(column[row] != np.arange(width))  # the others are in already, from their row
+        rows, columns = np.concatenate([np.arange(height), row[once]]), np.concatenate([column, once])
+    else:
+        k, m = min(params.top_k, width), min(params.top_k, height)
+        keep = np.zeros(similarity.shape, dtype=bool)
+        np.put_along_axis(keep, np.argpartition(-similarity, k - 1, axis=1)[:, :k], True, axis=1)
+        np.put_along_axis(keep, np.argpartition(-similarity, m - 1, axis=0)[:m], True, axis=0)
+        rows, columns = np.nonzero(keep)
+    enough = similarity[rows, columns] >= params.min_similarity
+    return rows[enough], columns[enough]

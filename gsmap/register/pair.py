@@ -20,7 +20,7 @@ from gsmap.register.refiners import coloured, gicp
 from gsmap.register.scene_view import SceneView
 from gsmap.types import Cameras, Registration, Sim3
 
-METHOD_VERSION = 2
+METHOD_VERSION = 3
 
 Progress = Callable[[float, str], None]
 

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from gsmap.errors import InputError
 from gsmap.register.clique import maximum_clique
-from gsmap.register.consistency import pack, unpack
+from gsmap.register.consistency import consistency_graph, pack, unpack
+from gsmap.register.correspondences import Correspondences
 
 
 def _random_graph(n: int, density: float, seed: int) -> np.ndarray:
@@ -60,6 +61,23 @@ def test_only_cliques_of_more_than_so_many_members_count():
     none = maximum_clique(pack(adjacency), more_than=size)
     assert len(none) == 0
     assert none.exact
+
+
+@pytest.mark.parametrize("room_m", [(20, 15, 3), (4, 4, 2)])
+def test_work_on_500_nodes_and_6000_correspondences_is_bounded(room_m):
+    rng = np.random.default_rng(0)
+    nodes, shared = 500, 200
+    target, source = (rng.uniform(0, 1, (nodes, 3)) * room_m for _ in range(2))
+    source[:shared] = target[:shared] + rng.normal(size=(shared, 3)) * 0.02
+    rows_t, rows_s = (np.r_[np.arange(shared), rng.integers(0, nodes, 6000 - shared)] for _ in range(2))
+    matches = Correspondences(
+        target[rows_t], source[rows_s], rows_t.astype(np.int32), rows_s.astype(np.int32), np.ones(6000, np.float32)
+    )
+    limit = 20_000_000
+    clique = maximum_clique(consistency_graph(matches), limit)
+    assert clique.steps < 1.1 * limit
+    assert clique.exact == (clique.steps <= limit)
+    assert np.isin(np.arange(shared), clique.members).mean() > 0.7
 
 
 def test_limit_gives_a_clique_that_is_not_called_exact():
