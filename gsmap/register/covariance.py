@@ -15,15 +15,14 @@ from gsmap.types import Sim3
 class Params:
     """Args (metres, degrees):
     radius_m: pairs farther apart than this are not counted.
-    cell_m: residuals within a cell of this size are taken to share their error.
-    floor_deg, floor_m: errors that no residual shows (a trainer's bias, a sensor's distortion), at the overlap's
-        centroid. A small overlap cannot fix angles better than ``floor_m`` over its radius, nor the scale.
-    factor: on the sandwich, from measured normalised errors.
+    cell_m: residuals within a cell of this size are taken to share their error; cells are independent.
+    floor_m: error of a cell that no residual shows (a trainer's bias, a sensor's distortion): many cells average it
+        out, and over the overlap's radius it turns and scales the pose.
+    factor: on the sandwich, from measured normalised errors and triangles (``tools/bench_register.py`` prints them).
     """
 
     radius_m: float = 0.08
     cell_m: float = 1.0
-    floor_deg: float = 0.15
     floor_m: float = 0.01
     factor: float = 2.0
 
@@ -39,7 +38,8 @@ def pose_covariance(
 
     An ICP Hessian is overconfident 10 to 900 times on splats, for neighbouring points share their error. So: the
     sandwich ``H^-1 (sum over cells of g g^T) H^-1`` of the point-to-plane problem, where each cell's gradient g counts
-    once, times a factor, plus a floor at the overlap's centroid moved to the source's frame.
+    once, times a factor, plus a floor at the overlap's centroid moved to the source's frame. C cells that fit D
+    parameters show too little of their error: ``C / (C - D)`` makes up for it, as with residuals of any regression.
 
     Returns:
         The (7, 7) matrix over [rot_rad, trans, log_scale] applied on the source side, and the standard deviations
@@ -63,15 +63,16 @@ def pose_covariance(
     jacobian = jacobian @ np.linalg.inv(to_centroid)
     hessian = jacobian.T @ jacobian + 1e-9 * np.trace(jacobian.T @ jacobian) / dim * np.eye(dim)
     _, cell = np.unique(np.floor(moved[hit] / params.cell_m).astype(int), axis=0, return_inverse=True)
-    gradient = np.zeros((cell.max() + 1, dim))
+    cells = int(cell.max()) + 1
+    gradient = np.zeros((cells, dim))
     np.add.at(gradient, cell.ravel(), jacobian * residual[:, None])
     inverse = np.linalg.inv(hessian)
-    sandwich = inverse @ (gradient.T @ gradient) @ inverse
+    sandwich = inverse @ (gradient.T @ gradient) @ inverse * (cells / max(cells - dim, 1))
     spread = points[hit] - points[hit].mean(0)
     radius = float(np.sqrt((spread**2).sum(1).mean()))
-    relative = params.floor_m / max(radius * pose.scale, 1e-6)
-    turn = max(np.radians(params.floor_deg), relative)
-    floor = np.r_[np.full(3, turn), np.full(3, params.floor_m / pose.scale), relative]
+    shift = params.floor_m / np.sqrt(cells)
+    turn = shift / max(radius * pose.scale, 1e-6)
+    floor = np.r_[np.full(3, turn), np.full(3, shift / pose.scale), turn]
     covariance = np.diag(np.r_[floor[:6], _RIGID_LOG_SCALE_SIGMA] ** 2)
     covariance[:dim, :dim] = params.factor * sandwich + np.diag(floor[:dim] ** 2)
     sigmas = (
