@@ -58,6 +58,7 @@ def main() -> None:
     known = ", ".join([*METHODS, *ABLATIONS])
     parser.add_argument("--methods", default="gsmap", help=f"all (without ablations), ablations, none, or of: {known}")
     parser.add_argument("--rescale", action="store_true", help="each capture in a random unit, 1/5 to 5, not told")
+    parser.add_argument("--overlapping", action="store_true", help="only pairs that overlap, for slow methods")
     parser.add_argument("--cache", type=Path, help="keep scene graphs and generated places here")
     parser.add_argument("--json", type=Path, help="keep the rows here; those it holds already are printed along")
     parser.add_argument("--verbose", action="store_true", help="one line per pair")
@@ -69,6 +70,7 @@ def main() -> None:
         names.remove("splatreg")
     with tempfile.TemporaryDirectory() as temporary:
         pairs = read_pairs(options, options.cache or Path(temporary)) if names else []
+        pairs = [p for p in pairs if not options.overlapping or p[2] >= OVERLAPPING]
         for name in names:
             row = measure(name, {**METHODS, **ABLATIONS}[name], pairs, options.verbose)
             row["method"] += " rescaled" if options.rescale else ""
@@ -242,8 +244,8 @@ def print_table(rows: list[dict]) -> None:
         for bar in ("fine", "coarse"):
             right = [round(p["recall"][bar] * p["num_pairs"]) for p in places]
             cells.append("+".join(map(str, right)) if len(right) <= 3 else str(sum(right)))
-        cells += [r["wrong"], f"{r['accepted_apart']} of {r['apart']}"]
-        cells += [r["told"] if r["scored"] else ""]
+        cells += [r["wrong"], f"{r['accepted_apart']} of {r['apart']}" if r["apart"] else "not run"]
+        cells += [r["told"] if r["scored"] and r["apart"] else ""]
         cells += [f"{s[f'{k}_rre_deg']:.2f}d {100 * s[f'{k}_centroid_m']:.1f}cm" for k in ("median", "worst")]
         cells += [f"{s['mean_rse']:.2%}", f"{r['cpu_s']:.2f}", f"{r['cpu_s_max']:.2f}"]
         print(f"{r['method']:22s}" + "".join(f"{c!s:>{w}s}" for c, w in zip(cells, widths, strict=True)))
