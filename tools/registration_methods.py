@@ -23,7 +23,7 @@ from gsmap.register.consistency import consistency_graph, unpack
 from gsmap.register.correspondences import Correspondences, correspondences
 from gsmap.register.pose import fit_pose
 from gsmap.register.refiners import gicp
-from gsmap.register.significance import agreeing, log10_nfa
+from gsmap.register.significance import Chance, agreeing
 from gsmap.register.surface import Params as SurfaceParams
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 
@@ -115,6 +115,8 @@ def ablation(change: str, kinds: tuple[str, ...] = KINDS) -> Method:
 def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tuple[float, Sim3, int] | None:
     """log10 NFA, pose and number of correspondences it rests on."""
     params = propose.Params()
+    if any(kind not in c.graph.layers or not len(c.graph.layers[kind]) for c in (target, source)):
+        return None
     a, b = _layer(target, kind, change), _layer(source, kind, change)
     unit = float(np.sqrt(a.unit_m * b.unit_m))  # one metre for both: the pose is rigid
     ups = target.graph.up, source.graph.up
@@ -145,7 +147,7 @@ def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tup
         pose = fit_pose(inliers.target, inliers.source).S_target_source
     points = b.positions * unit
     heights = None if m.source_heights is None else points @ ups[1]
-    log_nfa = log10_nfa(a, b, points, m, pose, radius_m=radius, source_heights=heights)
+    log_nfa = Chance(a, b, points, m, source_heights=heights).log10_nfa(pose, radius)
     return log_nfa, Sim3(pose.rotation, pose.translation / unit), len(members)
 
 
@@ -170,7 +172,7 @@ def _layer(capture: Capture, kind: str, change: str) -> NodeLayer:
         return replace(layer, embeddings=_unit((own - own.mean(0)) / (own.std(0) + 1e-9)))
     if change == "no-context":
         return replace(layer, embeddings=layer.features)
-    if change == "5-hop" and kind == "objects" and len(layer):
+    if change == "5-hop" and kind == "objects":
         p = ObjectParams()
         codebook = BuiltinEmbedder(EmbedderParams(), None, 1.0).codebook
         reach = p.local_distance_m / layer.unit_m
