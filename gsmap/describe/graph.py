@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
-from gsmap.describe.landmark_layer import LandmarkParams, landmark_layer, landmark_method
+from gsmap.describe.landmark_layer import LandmarkParams, landmark_layer, landmark_method, unlevelled
 from gsmap.describe.models import ModelSpec
 from gsmap.describe.object_layer import ObjectParams, object_layer, object_method
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
@@ -70,12 +70,15 @@ def describe(
     if len(cloud) == 0:
         notes.append("no opaque Gaussians: nothing to describe")
     elif up is None:
-        notes.append("up is unknown (no cameras, no clear floor): landmarks match only scenes that lack it too")
+        notes.append("up is unknown (no cameras, no clear floor): landmarks are matched without it")
     if params.landmarks:
         units = landmark_units(unit_m, scale_policy)
         for i, (name, layer_unit_m) in enumerate(units.items()):
             report(0.05 + 0.55 * i / len(units), name)
             layers[name] = landmark_layer(cloud, up, layer_unit_m, params.landmark)
+        if up is not None:
+            name = "landmarks" if "landmarks" in layers else "landmarks:1"
+            layers[name.replace("landmarks", "unlevelled")] = unlevelled(layers[name], cloud, params.landmark)
     if params.objects:
         layers["objects"], remarks = object_layer(
             gaussians,

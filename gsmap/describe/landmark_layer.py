@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from gsmap.describe.method import method_digest
 from gsmap.describe.surroundings import NUM_RINGS, NUM_SHELLS, cylinder_context, shell_context
 from gsmap.types import NodeLayer
 
-_VERSION = 4
+_VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,17 @@ def landmark_layer(
         method=method,
         unit_m=unit_m,
     )
+
+
+def unlevelled(layer: NodeLayer, cloud: Cloud, params: LandmarkParams | None = None) -> NodeLayer:
+    """An upright scene's landmarks as scenes whose vertical is unknown see theirs: with contexts in shells."""
+    params = params or LandmarkParams()
+    method = landmark_method(params, upright=False)
+    if len(layer) == 0:
+        return NodeLayer.empty(method, 4 * NUM_SHELLS, layer.unit_m)
+    points = cloud.points * layer.unit_m
+    context = shell_context(layer.positions * layer.unit_m, points, cloud.lab, params.context_cell_m)
+    return replace(layer, embeddings=_embed(context), method=method)
 
 
 def _embed(context: np.ndarray) -> np.ndarray:

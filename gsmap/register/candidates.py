@@ -87,9 +87,12 @@ def _votes(graphs: Sequence[SceneGraph], asked: Sequence[int], params: Params) -
     budget = max(16, min(params.nodes_per_scene, params.max_nodes // max(1, len(graphs))))
     # Layers of one method are compared with each other; with guessed units a scene speaks through several.
     methods: dict[str, list[tuple[int, NodeLayer]]] = defaultdict(list)
+    upright = all(graph.up is not None for graph in graphs)
     for i, graph in enumerate(graphs):
         metric = {name for name in graph.layers if ":" not in name}
         for name, layer in sorted(graph.layers.items()):
+            if upright and name.startswith("unlevelled"):
+                continue
             if len(layer) and (name in metric or name.split(":")[0] not in metric):
                 methods[layer.method].append((i, layer))
     row_of = {scene: row for row, scene in enumerate(asked)}

@@ -117,12 +117,15 @@ def propose(
 def _layers(target: SceneGraph, source: SceneGraph, kind: str, with_scale: bool) -> list[tuple[NodeLayer, NodeLayer]]:
     """Pairs of layers of one kind that may be compared: the metric ones, or all guesses of the metre."""
 
-    def of(graph: SceneGraph) -> list[NodeLayer]:
-        guesses = [layer for name, layer in graph.layers.items() if name.startswith(f"{kind}:")]
-        plain = [graph.layers[kind]] if kind in graph.layers else []
+    def of(graph: SceneGraph, other: SceneGraph) -> list[NodeLayer]:
+        turned = kind == "landmarks" and graph.up is not None and other.up is None
+        own = "unlevelled" if turned else kind
+        guesses = [layer for name, layer in graph.layers.items() if name.startswith(f"{own}:")]
+        plain = [graph.layers[own]] if own in graph.layers else []
         return (guesses or plain) if with_scale else plain
 
-    pairs = [(a, b) for a in of(target) for b in of(source) if a.method == b.method and len(a) and len(b)]
+    compared = [(a, b) for a in of(target, source) for b in of(source, target)]
+    pairs = [(a, b) for a, b in compared if a.method == b.method and len(a) and len(b)]
     if not with_scale:
         return pairs
     # Guesses come in fixed steps, so several pairs stand for one relative scale: keep the one with most nodes.

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from gsmap.describe import DescribeParams, describe
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
-from gsmap.describe.landmark_layer import LandmarkParams, landmark_method
+from gsmap.describe.landmark_layer import LandmarkParams, landmark_layer, landmark_method
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
 from gsmap.register.correspondences import correspondences
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
@@ -69,6 +69,20 @@ def test_another_white_balance_leaves_landmarks_alike():
     right = np.linalg.norm(found.target - found.source, axis=1) < 0.1
     assert right.sum() > 90
     assert right.mean() > 0.3
+
+
+def test_a_scene_that_knows_up_still_matches_one_that_does_not():
+    graph = describe("upright", *room(1), LANDMARKS, scale_policy="known")
+    R = Rotation.random(random_state=5).as_matrix()
+    turned, _ = moved(*room(2), Sim3(R, np.zeros(3)))
+    other = landmark_layer(surface_cloud(turned), None, 1.0)
+    assert other.method != graph.layers["landmarks"].method
+    assert other.method == graph.layers["unlevelled"].method
+    found = correspondences(graph.layers["unlevelled"], other)
+    right = np.linalg.norm(found.target @ R.T - found.source, axis=1) < 0.1
+    assert right.sum() > 60
+    unknown = describe("upright", *room(1), LANDMARKS, scale_policy="unknown")
+    assert unknown.layers["unlevelled:1"].unit_m == unknown.layers["landmarks:1"].unit_m
 
 
 def test_any_two_units_have_a_pair_of_levels_within_20_percent():

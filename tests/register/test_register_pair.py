@@ -9,6 +9,7 @@ from register_worlds import splat_world
 from gsmap.errors import ConfigError
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.register import Params, SceneView, register_pair
+from gsmap.register.candidates import candidate_pairs
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph, Sim3
 
 
@@ -40,6 +41,19 @@ def test_captures_trained_too_briefly_to_turn_opaque_still_register():
     found = register_pair(*views)
     assert found.status == "accepted"
     assert _error(world, found).centroid_m < 0.01
+
+
+def test_a_scene_whose_vertical_is_unknown_registers_with_one_that_knows_it():
+    world = splat_world(0, policy="known")
+    layer = world.target.graph.layers["landmarks"]
+    levelled = replace(layer, embeddings=layer.embeddings[::-1], method="levelled")
+    knows = replace(world.target.graph, layers={"landmarks": levelled, "unlevelled": layer})
+    target = replace(world.target, graph=knows)
+    source = replace(world.source, graph=replace(world.source.graph, up=None))
+    for pair in ((target, source), (source, target)):
+        assert register_pair(*pair).status == "accepted"
+    assert register_pair(target, world.source, Params(fallback="never")).status == "no_match"
+    assert candidate_pairs([knows, source.graph]) == [(knows.scene_id, source.id)]
 
 
 def test_the_answer_is_the_same_both_ways_and_twice():
