@@ -1,17 +1,14 @@
-// Consistency graphs of point correspondences, and their maximum clique.
+// The maximum clique of a graph.
 //
 // Graphs are symmetric bit matrices: row i holds ceil(n / 64) words of 64 bits, bit j set where i and j agree. Everything
 // is single-threaded and deterministic: the limit counts steps of work (words of bits touched), never time.
 #include "clique.h"
 
 #include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 
 #include <algorithm>
-#include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <optional>
 #include <stdexcept>
 #include <tuple>
 #include <vector>
@@ -291,90 +288,9 @@ static std::tuple<std::vector<int>, bool, long long> maximum_clique(const Word *
     return {best, exact, steps};
 }
 
-using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
-using Ids = nb::ndarray<const std::int32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Bits = nb::ndarray<const Word, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 
-// Bit rows of the graph in which correspondences i and j agree. See gsmap/register/consistency.py for the meaning.
-static void consistency_rows(int n, const double *target, const double *source, const std::int32_t *target_ids,
-                             const std::int32_t *source_ids, const double *target_heights,
-                             const double *source_heights, double scale, double slack, double relative_slack,
-                             double ratio, double min_distance, double height_slack, double height_slope, Word *out) {
-    int words = (n + 63) / 64;
-    std::memset(out, 0, std::size_t(n) * words * sizeof(Word));
-    std::vector<float> tx(n), ty(n), tz(n), sx(n), sy(n), sz(n), th(n, 0.f), sh(n, 0.f);
-    // Float keeps 1e-6 of the extent once the clouds are centred; the loop below then runs four lanes wide.
-    double ct[3] = {0, 0, 0}, cs[3] = {0, 0, 0};
-    for (int i = 0; i < n; ++i)
-        for (int k = 0; k < 3; ++k) ct[k] += target[3 * i + k] / n, cs[k] += source[3 * i + k] / n;
-    bool heights = target_heights && source_heights;
-    double mt = 0, ms = 0;
-    for (int i = 0; heights && i < n; ++i) mt += target_heights[i] / n, ms += source_heights[i] / n;
-    for (int i = 0; i < n; ++i) {
-        tx[i] = float(target[3 * i] - ct[0]), ty[i] = float(target[3 * i + 1] - ct[1]);
-        tz[i] = float(target[3 * i + 2] - ct[2]);
-        sx[i] = float(scale * (source[3 * i] - cs[0])), sy[i] = float(scale * (source[3 * i + 1] - cs[1]));
-        sz[i] = float(scale * (source[3 * i + 2] - cs[2]));
-        if (heights) th[i] = float(target_heights[i] - mt), sh[i] = float(scale * (source_heights[i] - ms));
-    }
-    const float slack_f = float(slack), rel_f = float(relative_slack), min_f = float(min_distance);
-    const float hs = float(height_slack), slope = float(height_slope), ratio_f = float(ratio);
-    std::vector<std::uint8_t> ok(words * 64 + 1, 0);  // of the pairs (i, j > i)
-    for (int i = 0; i < n; ++i) {
-        const float ax = tx[i], ay = ty[i], az = tz[i], bx = sx[i], by = sy[i], bz = sz[i], ah = th[i], bh = sh[i];
-        const std::int32_t it = target_ids[i], is = source_ids[i];
-        for (int j = i + 1; j < n; ++j) {
-            float x = ax - tx[j], y = ay - ty[j], z = az - tz[j];
-            float dt = std::sqrt(x * x + y * y + z * z);
-            x = bx - sx[j], y = by - sy[j], z = bz - sz[j];
-            float ds = std::sqrt(x * x + y * y + z * z);
-            float low = dt < ds ? dt : ds, high = dt < ds ? ds : dt;
-            float allowed = ratio_f > 0 ? ratio_f * high : slack_f + rel_f * low;
-            float dh = std::fabs((ah - th[j]) - (bh - sh[j]));
-            ok[j] = (high - low < allowed) & (low >= min_f) & (it != target_ids[j]) & (is != source_ids[j]) &
-                    ((!heights) | (dh < hs + slope * high));
-        }
-        Word *row = out + std::size_t(i) * words;
-        for (int w = (i + 1) / 64; w < words; ++w) {
-            Word bits = 0;
-            for (int k = 0; k < 8; ++k) {  // eight bytes of 0 or 1 to eight bits at a time
-                Word eight;
-                std::memcpy(&eight, &ok[w * 64 + k * 8], 8);
-                bits |= (eight * 0x0102040810204080u >> 56) << (k * 8);
-            }
-            row[w] |= bits;
-            for (; bits; bits &= bits - 1) set(out + std::size_t(w * 64 + lowest(bits)) * words, i);
-        }
-        ok[i + 1] = 0;
-    }
-}
-
 void bind_clique(nb::module_ &m) {
-    m.def(
-        "consistency_graph",
-        [](Points target, Points source, Ids target_ids, Ids source_ids, std::optional<Numbers> target_heights,
-           std::optional<Numbers> source_heights, double scale, double slack, double relative_slack, double ratio,
-           double min_distance, double height_slack, double height_slope) {
-            std::size_t n = target.shape(0), words = (n + 63) / 64;
-            if (source.shape(0) != n || target_ids.shape(0) != n || source_ids.shape(0) != n ||
-                (target_heights && target_heights->shape(0) != n) || (source_heights && source_heights->shape(0) != n))
-                throw std::invalid_argument("consistency_graph needs arrays of one length");
-            auto *out = new Word[n * words + 1];
-            nb::capsule owner(out, [](void *p) noexcept { delete[] static_cast<Word *>(p); });
-            {
-                nb::gil_scoped_release release;
-                consistency_rows(int(n), target.data(), source.data(), target_ids.data(), source_ids.data(),
-                                 target_heights ? target_heights->data() : nullptr,
-                                 source_heights ? source_heights->data() : nullptr, scale, slack, relative_slack, ratio,
-                                 min_distance, height_slack, height_slope, out);
-            }
-            return nb::ndarray<nb::numpy, Word, nb::ndim<2>>(out, {n, words}, owner);
-        },
-        nb::arg("target"), nb::arg("source"), nb::arg("target_ids"), nb::arg("source_ids"),
-        nb::arg("target_heights").none(), nb::arg("source_heights").none(), nb::arg("scale"), nb::arg("slack"),
-        nb::arg("relative_slack"), nb::arg("ratio"), nb::arg("min_distance"), nb::arg("height_slack"),
-        nb::arg("height_slope"), "Bit rows (n, ceil(n / 64)) of the graph in which correspondences agree.");
     m.def(
         "maximum_clique",
         [](Bits bits, int floor, long long step_limit) {

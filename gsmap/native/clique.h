@@ -1,4 +1,4 @@
-// Bindings of the consistency graph and maximum clique kernels.
+// Bindings of the maximum clique.
 #pragma once
 #include <nanobind/nanobind.h>
 

@@ -3,6 +3,8 @@
 #pragma once
 #include <cstdint>
 
+#include "correspondences.h"
+
 namespace gsmap {
 
 constexpr int kTile = 32;        // pixels; larger tiles make fewer intersections, smaller ones cull better
@@ -104,6 +106,9 @@ struct Kernels {
     // Sum of the structural similarity over n values from blurred a, b, aa, bb, ab; overwrites the first three with the
     // derivatives of that sum with respect to blurred a, aa and ab, times mask[i] (or 1).
     float (*ssim)(float *a, const float *b, float *aa, const float *bb, float *ab, const float *mask, int n);
+    // One correspondence against those after it: which agree, and which bin of log scales each pair votes for (or -1).
+    void (*agree)(const Correspondences &, int i, const AgreeTest &, uint8_t *ok);
+    void (*vote)(const Correspondences &, int i, const VoteTest &, int32_t *bin);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

@@ -79,6 +79,26 @@ def test_consistency_graph_equals_its_definition(test, scale):
     assert expected.sum() > 500
 
 
+@pytest.mark.parametrize("name", ["avx2", "avx512"])
+def test_every_instruction_set_gives_the_same_graph_and_votes(name):
+    from gsmap import _native
+
+    matches = node_world(seed=10, wrong=700).matches
+    answers = {}
+    try:
+        for each in ("baseline", name):
+            if _native.use_instruction_set(each) != each:
+                pytest.skip(f"this machine has no {each}")
+            ids = matches.target_ids, matches.source_ids
+            votes = _native.ratio_histogram(matches.target, matches.source, *ids, None, None, 1.0, 0.1, 0.6, 120)
+            answers[each] = consistency_graph(matches), votes
+    finally:
+        _native.use_instruction_set("best")
+    for one, other in zip(*answers.values(), strict=True):
+        assert one.sum() > 0
+        assert np.array_equal(one, other)
+
+
 def test_clique_and_pose_recover_a_planted_transform():
     world = node_world(seed=4, shared=60, extra=100, noise_m=0.02, wrong=400)
     rows = consistency_graph(world.matches)
