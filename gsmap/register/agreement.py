@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmap.geometry.transforms import transform_cameras
+from gsmap.register.sight import Sight
 from gsmap.register.surface import Surface
-from gsmap.types import Cameras, Sim3
+from gsmap.render import Rendered, render
+from gsmap.types import Sim3
 
 
 @dataclass(frozen=True)
 class Params:
     """Args (metres, pixels):
     radius_m: surfaces closer than this coincide.
-    depth_tolerance_m: a point nearer than what a camera saw by more than this contradicts it.
+    depth_tolerance_m, depth_tolerance: depths that differ by more than this and this share of the depth disagree.
+    min_alpha: a pixel fainter than this shows nothing.
     num_cameras: cameras of each scene that are asked, chosen to see most of the other scene.
-    image_size_px: longer side of the depth images.
-    cell_m: colours are compared after their mean over cells of this size is removed.
-    max_points: points of each scene that are tested.
+    image_size_px: longer side of the renders.
+    patch_px: colours are compared after their mean over patches of this size is removed.
+    cell_m: the same for the surface cells of scenes without cameras.
+    min_seen: cameras of a scene that can judge fewer Gaussians of the other say nothing.
+    max_points: points of each scene that are tested for coinciding.
     """
 
     radius_m: float = 0.08
     depth_tolerance_m: float = 0.10
+    depth_tolerance: float = 0.02
+    min_alpha: float = 0.5
     num_cameras: int = 6
-    image_size_px: int = 96
+    image_size_px: int = 128
+    patch_px: int = 16
     cell_m: float = 0.4
+    min_seen: int = 100
     max_points: int = 12_000
 
 
@@ -36,128 +46,155 @@ class Agreement:
     Args:
         overlap: share of surface cells that coincide, the smaller of both directions.
         num_coinciding: source cells that coincide with the target.
-        contradiction: share of the points seen that stand in front of what the other scene's cameras saw; the larger of
-            both directions. NaN where no camera could be asked.
-        num_seen: points that cameras could judge, the smaller of both directions.
-        colour_correlation: correlation of colours between coinciding surfaces, differences within ``cell_m`` only, so
-            neither exposure nor "floors are dark, walls are bright" counts; mean over lightness and two chromas.
-        colour_t: its significance, in standard deviations over cells.
+        contradiction: of the surface Gaussians of one scene that the other's cameras could judge, the share that stands
+            in front of what these saw, and is on it in no view; the larger of both directions. NaN where no cameras
+            could judge. What lies behind is hidden, which proves nothing.
+        num_seen: Gaussians so judged, the smaller of both directions; 0 where one could not be asked.
+        colour_correlation: correlation of the colours of both scenes' renders where their depths agree, differences
+            within a patch only, so neither exposure nor "floors are dark, walls are bright" counts; mean over lightness
+            and two chromas, the smaller of both directions that could be asked. Where neither scene has cameras, that
+            of coinciding cells.
+        colour_t: its significance, in standard deviations over patches.
     """
 
-    overlap: float
-    num_coinciding: int
-    contradiction: float
-    num_seen: int
-    colour_correlation: float
-    colour_t: float
+    overlap: float = 0.0
+    num_coinciding: int = 0
+    contradiction: float = float("nan")
+    num_seen: int = 0
+    colour_correlation: float = 0.0
+    colour_t: float = 0.0
 
 
 def measure(
     target: Surface,
     source: Surface,
     pose: Sim3,
-    cameras: tuple[Cameras | None, Cameras | None] = (None, None),
+    sights: tuple[tuple[Sight, float] | None, tuple[Sight, float] | None] = (None, None),
     params: Params | None = None,
 ) -> Agreement:
-    """Compare two surfaces (metres) under ``S_target_source``; cameras are each scene's own, in metres too."""
+    """Compare two scenes under ``S_target_source``.
+
+    A few cameras of each scene render both: their own scene whole, as the trainer saw it, and of the other its surface
+    alone, for from where its own cameras never stood its haze and floaters hide everything.
+
+    Args:
+        target, source: surfaces, in metres; so is the pose.
+        sights: what each scene's own cameras see, and metres per unit of that scene; None for a scene without cameras.
+    """
     params = params or Params()
     rows_t, rows_s = target.sample(params.max_points), source.sample(params.max_points)
     forward, back = pose.apply(source.coarse[0][rows_s]), pose.inverse().apply(target.coarse[0][rows_t])
     distance, row = target.nearest(forward, params.radius_m)
     hit = np.isfinite(distance)
-    other, _ = source.nearest(back, params.radius_m)
-    overlap = min(float(hit.mean()), float(np.isfinite(other).mean())) if len(hit) and len(other) else 0.0
-    correlation, t = _colour_agreement(
-        target.coarse[1][row[hit]], source.coarse[1][rows_s[hit]], forward[hit], params.cell_m
+    other = np.isfinite(source.nearest(back, params.radius_m)[0])
+    overlap = min(float(hit.mean()), float(other.mean())) if len(hit) and len(other) else 0.0
+    looks = [
+        None if sight is None else _look(*sight, guest, guest_pose, points, params)
+        for sight, guest, guest_pose, points in (
+            (sights[0], source, pose, forward),
+            (sights[1], target, pose.inverse(), back),
+        )
+    ]
+    judges = [look for look in looks if look is not None and look.num_seen >= params.min_seen]
+    colours = [look.colour() for look in judges]
+    if sights == (None, None):
+        cells = np.floor(forward[hit] / params.cell_m).astype(int)
+        cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+        blind = _Look.of(0)
+        blind.compare(target.coarse[1][row[hit]], source.coarse[1][rows_s[hit]], cell)
+        colours = [blind.colour()]
+    return Agreement(
+        overlap,
+        int(hit.sum()),
+        max((look.contradiction for look in judges), default=float("nan")),
+        min(look.num_seen for look in judges) if len(judges) == 2 else 0,
+        min((correlation for correlation, _ in colours), default=0.0),
+        min((t for _, t in colours), default=0.0),
     )
-    ratios, seen = zip(
-        *(
-            _contradiction(surface, views, points, params)
-            for surface, views, points in ((target, cameras[0], forward), (source, cameras[1], back))
-        ),
-        strict=True,
-    )
-    known = [r for r in ratios if np.isfinite(r)]
-    return Agreement(overlap, int(hit.sum()), max(known) if known else float("nan"), min(seen), correlation, t)
 
 
-def _colour_agreement(a: np.ndarray, b: np.ndarray, points: np.ndarray, cell_m: float) -> tuple[float, float]:
-    """Correlation (mean of three channels) of local colour differences, and its t statistic over cells."""
-    if len(a) < 20:
-        return 0.0, 0.0
+@dataclass
+class _Look:
+    """What one scene's cameras say of the other: flags for each of its Gaussians, sums of colours over patches."""
+
+    in_front: np.ndarray
+    agrees: np.ndarray
+    products: list[np.ndarray] = field(default_factory=list)  # (patches, 3) each
+    squares: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
+
+    @classmethod
+    def of(cls, count: int) -> _Look:
+        return cls(np.zeros(count, bool), np.zeros(count, bool))
+
+    @property
+    def num_seen(self) -> int:
+        return int((self.in_front | self.agrees).sum())
+
+    @property
+    def contradiction(self) -> float:
+        return float((self.in_front & ~self.agrees).sum()) / self.num_seen
+
+    def compare(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
+        """Take colours (N, 3) of the same places into account, which lie in the patches of index ``patch`` (N,)."""
+        if not len(a):
+            return
+        a, b = _local(a, patch), _local(b, patch)
+        self.products.append(_sums(a * b, patch))
+        self.squares += (a**2).sum(0), (b**2).sum(0)
+
+    def colour(self) -> tuple[float, float]:
+        """Correlation, and its t statistic over patches; 0 and 0 where nothing was compared."""
+        norm = np.sqrt(self.squares.prod(0))
+        if not self.products or not norm.all():
+            return 0.0, 0.0
+        sums = (np.concatenate(self.products) / norm).mean(1)
+        return float(sums.sum()), float(sums.sum() / np.sqrt((sums**2).sum()))
+
+
+def _look(sight: Sight, unit_m: float, guest: Surface, pose: Sim3, points: np.ndarray, params: Params) -> _Look:
+    """The guest, laid into a scene by ``pose`` (metres), through that scene's cameras; ``points`` of it, so laid."""
+    if guest.splats is None or not len(guest):
+        return _Look.of(0)
+    look = _Look.of(len(guest))
+    into_guest = pose.inverse() @ Sim3(np.eye(3), np.zeros(3), unit_m)
+    for row in sight.choose(points / unit_m, params.num_cameras):
+        camera = transform_cameras(sight.cameras[[row]], into_guest)
+        other = render(guest.splats, camera, backend="native")  # as in `Sight`
+        _compare(look, sight.shot(row), unit_m, other, pose.scale, params)
+    return look
+
+
+def _compare(look: _Look, own: Rendered, unit_m: float, other: Rendered, scale: float, params: Params) -> None:
+    """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres."""
+    depth, guest_depth = own.depth[0] * unit_m, other.depth[0] * scale
+    solid = own.alpha[0] > params.min_alpha
+    near, far = _extremes(depth, solid)
+    tolerance = params.depth_tolerance_m + params.depth_tolerance * depth
+    both = solid & (other.alpha[0] > params.min_alpha)
+    in_front = both & (guest_depth < near - tolerance)
+    agrees = both & ~in_front & (guest_depth <= far + tolerance)
+    look.in_front[other.dominant_id[0][in_front]] = True
+    look.agrees[other.dominant_id[0][agrees]] = True
+    rows, columns = np.nonzero(agrees)
+    patch = rows // params.patch_px * -(-agrees.shape[1] // params.patch_px) + columns // params.patch_px
+    look.compare(own.colour[0][agrees], other.colour[0][agrees], patch)
+
+
+def _local(colours: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """(N, 3) lightness and two chromas, less their means over patches."""
     opponent = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T
-    _, cell, counts = np.unique(np.floor(points / cell_m).astype(int), axis=0, return_inverse=True, return_counts=True)
-    cell = cell.ravel()
-
-    def local(colours: np.ndarray) -> np.ndarray:
-        values = colours @ opponent
-        means = np.stack([np.bincount(cell, v) for v in values.T], 1) / counts[:, None]
-        values = values - means[cell]
-        return values / (np.sqrt((values**2).mean(0)) + 1e-9)
-
-    products = (local(a) * local(b)).mean(1)
-    sums = np.bincount(cell, products)
-    return float(products.mean()), float(sums.sum() / (np.sqrt((sums**2).sum()) + 1e-9))
+    values = np.clip(colours, 0.0, 1.0) @ opponent
+    means = _sums(values, patch) / np.maximum(np.bincount(patch), 1)[:, None]
+    return values - means[patch]
 
 
-def _contradiction(surface: Surface, cameras: Cameras | None, points: np.ndarray, params: Params) -> tuple[float, int]:
-    """Share of ``points`` in front of what the surface's own cameras saw of it, and how many could be judged."""
-    if cameras is None or not len(cameras) or not len(points) or not len(surface):
-        return float("nan"), 0
-    cameras = cameras.resized(params.image_size_px)
-    views = cameras.T_camera_frame
-    agree, contradict = np.zeros(len(points), bool), np.zeros(len(points), bool)
-    own = surface.points.astype(np.float32)
-    for c in choose_cameras(cameras, points, params.num_cameras):
-        width, height = cameras.sizes_px[c]
-        pixel, z, at = _project(own, views[c], cameras.intrinsics_px[c], width, height)
-        nearest = np.full(width * height, np.inf, np.float32)
-        np.minimum.at(nearest, pixel, z)
-        low, high = _extremes(nearest.reshape(height, width))
-        pixel, z, at = _project(points.astype(np.float32), views[c], cameras.intrinsics_px[c], width, height)
-        # Both bounds over 3 x 3 pixels: a pixel off at an edge, or a hole between points, is no contradiction.
-        near, far = low.ravel()[pixel], high.ravel()[pixel]
-        seen = np.isfinite(near)
-        contradict[at[seen & (z < near - params.depth_tolerance_m)]] = True
-        agree[at[seen & (z >= near - params.depth_tolerance_m) & (z <= far + params.depth_tolerance_m)]] = True
-    judged = int((agree | contradict).sum())
-    return (float((contradict & ~agree).sum()) / judged if judged else float("nan")), judged
+def _sums(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    return np.stack([np.bincount(group, v) for v in values.T], axis=1)
 
 
-def choose_cameras(cameras: Cameras, points: np.ndarray, count: int) -> list[int]:
-    """Greedy choice of the cameras with most of the points in front of them, each point counted once."""
-    sample = points[np.linspace(0, len(points) - 1, min(len(points), 400)).astype(int)].astype(np.float32)
-    inside = np.zeros((len(cameras), len(sample)), dtype=bool)
-    for c, view in enumerate(cameras.T_camera_frame):
-        inside[c, _project(sample, view, cameras.intrinsics_px[c], *cameras.sizes_px[c])[2]] = True
-    left, chosen = np.ones(len(sample), dtype=bool), []
-    for _ in range(min(count, len(cameras))):
-        gain = (inside & left).sum(1)
-        best = int(gain.argmax())
-        if not gain[best]:
-            break
-        chosen.append(best)
-        left &= ~inside[best]
-    return chosen
-
-
-def _project(
-    points: np.ndarray, view: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near_m: float = 0.15
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flat pixel index, depth and row of the points that fall into an image."""
-    local = points @ view[:3, :3].T.astype(np.float32) + view[:3, 3].astype(np.float32)
-    at = np.flatnonzero(local[:, 2] > near_m)
-    local = local[at]
-    z = local[:, 2]
-    u = np.floor(local[:, 0] / z * intrinsics[0] + intrinsics[2])
-    v = np.floor(local[:, 1] / z * intrinsics[1] + intrinsics[3])
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    return (v[inside] * width + u[inside]).astype(np.int64), z[inside], at[inside]
-
-
-def _extremes(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest depth over 3 x 3 pixels; pixels that saw nothing count as neither."""
+def _extremes(depth: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest depth over 3 x 3 pixels, so that a pixel off at an edge is no contradiction."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    low = minimum_filter(depth, 3, mode="nearest")
-    return low, maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3, mode="nearest")
+    low = minimum_filter(np.where(solid, depth, np.inf), 3, mode="nearest")
+    return low, maximum_filter(np.where(solid, depth, -np.inf), 3, mode="nearest")

@@ -18,9 +18,10 @@ from gsmap.register.agreement import Agreement
 from gsmap.register.propose import Proposal
 from gsmap.register.refiners import coloured, gicp
 from gsmap.register.scene_view import SceneView
-from gsmap.types import Cameras, Registration, Sim3
+from gsmap.register.sight import Sight
+from gsmap.types import Registration, Sim3
 
-METHOD_VERSION = 3
+METHOD_VERSION = 4
 
 Progress = Callable[[float, str], None]
 
@@ -182,7 +183,7 @@ class _Pair:
         """Refine a proposal and hold it against everything both scenes know."""
         params, S = self.params, proposal.S_target_source
         if proposal.flaw:
-            return _Judged(proposal, Agreement(0.0, 0, float("nan"), 0, 0.0, 0.0), None, proposal.flaw)
+            return _Judged(proposal, Agreement(), None, proposal.flaw)
         # Both surfaces go to target metres, the source with the proposed scale, so what remains is nearly rigid.
         unit_t = self._target_unit_m(proposal.with_scale)
         unit_s = unit_t * S.scale
@@ -193,8 +194,8 @@ class _Pair:
             if params.refiner != "none":
                 pose = coloured.refine(target, source, pose, params.coarse, with_scale=proposal.with_scale)
         with self.clock.step("verdict"):
-            cameras = _in_metres(self.target.cameras, unit_t), _in_metres(self.source.cameras, unit_s)
-            seen = agreement_.measure(target, source, pose, cameras, params.glance)
+            sights = self._sights(unit_t, unit_s)
+            seen = agreement_.measure(target, source, pose, sights, params.glance)
             flaw = verdict.hopeless(seen, params.verdict)
         covariance = sigmas = None
         if not flaw:
@@ -204,11 +205,11 @@ class _Pair:
                 elif params.refiner != "none":
                     pose = coloured.refine(target, source, pose, params.coloured, with_scale=proposal.with_scale)
             with self.clock.step("verdict"):
-                seen = agreement_.measure(target, source, pose, cameras, params.agreement)
-            if params.photometric and cameras[0] is not None:
+                seen = agreement_.measure(target, source, pose, sights, params.agreement)
+            if params.photometric and self.target.cameras:
                 with self.clock.step("photometric"):
                     tried = self._photometric(pose, S.scale, unit_t, proposal.with_scale)
-                    better = agreement_.measure(target, source, tried, cameras, params.agreement)
+                    better = agreement_.measure(target, source, tried, sights, params.agreement)
                     if better.colour_correlation > seen.colour_correlation:
                         pose, seen = tried, better
             with self.clock.step("verdict"):
@@ -222,6 +223,11 @@ class _Pair:
         )
         flaw = flaw or verdict.judge(proposal, seen, sigmas, params.verdict)
         return _Judged(proposal, seen, covariance, flaw)
+
+    def _sights(self, unit_t: float, unit_s: float) -> tuple[tuple[Sight, float] | None, tuple[Sight, float] | None]:
+        """What each scene's cameras see of it, with metres per unit."""
+        target, source = (view.sight(self.params.agreement.image_size_px) for view in (self.target, self.source))
+        return target and (target, unit_t), source and (source, unit_s)
 
     def _photometric(self, pose: Sim3, scale: float, unit_m: float, with_scale: bool) -> Sim3:
         """A pose between metres, refined on renders of the scenes in their own units."""
@@ -254,14 +260,6 @@ def _same_pose(a: Proposal, b: Proposal, centre: np.ndarray, unit_m: float) -> b
         and np.degrees(angle_between(S.rotation, Q.rotation)) < 3.0
         and np.linalg.norm(S.apply(centre) - Q.apply(centre)) * unit_m < 0.3
     )
-
-
-def _in_metres(cameras: Cameras | None, unit_m: float) -> Cameras | None:
-    if cameras is None or unit_m == 1.0:
-        return cameras
-    poses = cameras.T_frame_camera.copy()
-    poses[:, :3, 3] *= unit_m
-    return Cameras(poses, cameras.intrinsics_px, cameras.sizes_px, cameras.names, cameras.synthesised)
 
 
 def _conclude(pair: _Pair, judged: list[_Judged]) -> Registration:

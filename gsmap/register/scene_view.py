@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from gsmap.errors import ConfigError
 from gsmap.register import surface
+from gsmap.register.sight import Sight
 from gsmap.register.surface import Surface
 from gsmap.types import Cameras, Gaussians, SceneGraph
 from gsmap.types.scene import SCALE_POLICIES
@@ -28,6 +29,7 @@ class SceneView:
     graph: SceneGraph
     scale_policy: str = "auto"
     _surfaces: dict[tuple[float, surface.Params], Surface] = field(default_factory=dict, init=False, repr=False)
+    _sights: dict[int, Sight] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.scale_policy not in SCALE_POLICIES:
@@ -41,3 +43,12 @@ class SceneView:
                 self._surfaces.pop(next(iter(self._surfaces)))
             self._surfaces[key] = Surface.of(self.gaussians, unit_m, params)
         return self._surfaces[key]
+
+    def sight(self, size_px: int) -> Sight | None:
+        """What the scene's cameras see of it, and keep; None without cameras."""
+        if not self.cameras or not len(self.gaussians):
+            return None
+        if size_px not in self._sights:
+            self._sights.clear()
+            self._sights[size_px] = Sight(self.gaussians, self.cameras, size_px)
+        return self._sights[size_px]

@@ -41,11 +41,13 @@ class Surface:
         points: (N, 3) float64 in the scene's frame, scaled to metres.
         colours: (N, 3) float32 view-independent colour.
         resolution_m: cell size of the aligned cloud.
+        splats: the N Gaussians themselves, in metres, with their mean colour alone; None where only points are known.
     """
 
     points: np.ndarray
     colours: np.ndarray
     resolution_m: float
+    splats: Gaussians | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -65,7 +67,15 @@ class Surface:
             limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))
         keep = opaque & (largest <= limit)
         colours = np.clip(gaussians.sh[keep, 0] * _SH_C0 + 0.5, 0.0, 1.0)
-        return cls(gaussians.means[keep].astype(np.float64) * unit_m, colours, params.resolution_m)
+        points = gaussians.means[keep].astype(np.float64) * unit_m
+        splats = Gaussians(
+            points,
+            gaussians.quats[keep],
+            gaussians.log_scales[keep] + np.float32(np.log(unit_m)),
+            gaussians.logit_opacities[keep],
+            gaussians.sh[keep, :1],
+        )
+        return cls(points, colours, params.resolution_m, splats)
 
     def scaled(self, factor: float) -> Surface:
         """The same surface in a unit ``factor`` times smaller."""

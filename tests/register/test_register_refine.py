@@ -7,7 +7,6 @@ from register_worlds import node_world, splat_world
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
-from gsmap.register.agreement import measure
 from gsmap.register.correspondences import Correspondences
 from gsmap.register.covariance import in_scene_units, point_to_plane_jacobian, pose_covariance
 from gsmap.register.refiners import coloured, gicp
@@ -147,28 +146,6 @@ def test_a_small_overlap_knows_angles_and_scale_less_well(world, surfaces):
     _, little = pose_covariance(target, part, world.S_target_source, with_scale=True)
     assert little[0] > 2 * all_of_it[0]
     assert little[2] > 2 * all_of_it[2]
-
-
-def test_agreement_tells_right_from_wrong(world, surfaces):
-    cameras = world.target.cameras, world.source.cameras
-    right = measure(*surfaces, world.S_target_source, cameras)
-    assert right.contradiction < 0.02
-    assert right.colour_correlation > 0.5
-    assert right.colour_t > 5
-    assert right.num_seen > 500
-    # Half a turn about the vertical through the middle of the shared part.
-    turn = exp_so3([0, 0, np.pi])
-    middle = np.array([3.0, 2.0, 1.2])
-    wrong = measure(*surfaces, Sim3(turn, middle - turn @ middle) @ world.S_target_source, cameras)
-    assert wrong.colour_correlation < 0.1
-    assert wrong.contradiction > 5 * right.contradiction
-
-
-def test_colour_agreement_does_not_mind_exposure(world, surfaces):
-    target, source = surfaces
-    dim = Surface(source.points, 0.7 * source.colours + 0.05, source.resolution_m)
-    a, b = (measure(target, s, world.S_target_source) for s in (source, dim))
-    assert abs(a.colour_correlation - b.colour_correlation) < 0.02
 
 
 def test_surface_leaves_out_what_is_faint_or_huge():

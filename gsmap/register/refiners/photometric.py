@@ -129,7 +129,7 @@ def _exposed(colours: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 def _most_seeing(cameras: Cameras, source: Gaussians, pose: Sim3, count: int) -> Cameras:
     """The cameras with most of the source's surface in view, each part counted once."""
-    from gsmap.register.agreement import choose_cameras
+    from gsmap.register.sight import choose_cameras
 
     opaque = np.flatnonzero(source.opacities > 0.5)
     sample = opaque[:: max(1, len(opaque) // 2000)]

@@ -1,0 +1,227 @@
+"""What two scenes say of each other through their cameras, on walls placed for the purpose, and the verdict on it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from register_worlds import splat_world
+
+from gsmap.geometry.rotations import exp_so3
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.register import verdict
+from gsmap.register.agreement import Agreement, measure
+from gsmap.register.propose import Proposal
+from gsmap.register.sight import Sight
+from gsmap.register.surface import Surface
+from gsmap.types import Cameras, Gaussians, Sim3
+
+_RIGHT = Sim3.identity()
+
+
+def _wall(z, *, width=4.0, height=3.0, centre=(0.0, 0.0), step=0.03, seed=0, gain=1.0, offset=0.0) -> Gaussians:
+    """A textured wall across the z axis, as Gaussians on a jittered grid; the texture is a function of place."""
+    rng = np.random.default_rng([seed, int(100 * z)])
+    x, y = np.meshgrid(np.arange(-width / 2, width / 2, step), np.arange(-height / 2, height / 2, step))
+    points = np.c_[x.ravel() + centre[0], y.ravel() + centre[1], np.full(x.size, z)]
+    points[:, :2] += rng.uniform(-0.3, 0.3, (len(points), 2)) * step
+    paint = np.random.default_rng(seed)
+    waves, phases = paint.normal(size=(3, 8, 3)) * 6, paint.uniform(0, 6, (3, 8))
+    colours = np.stack([0.5 + 0.1 * np.sin(points @ w.T + p).sum(1) for w, p in zip(waves, phases, strict=True)], 1)
+    sh = (np.clip(colours, 0, 1) * gain + offset - 0.5)[:, None] / 0.28209479177387814
+    n = len(points)
+    return Gaussians(points, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), np.log(0.02)), np.full(n, 4.0), sh)
+
+
+def _cameras(*centres, turn=(0.0, 0.0, 0.0)) -> Cameras:
+    """Cameras that look along z."""
+    poses = np.tile(np.eye(4), (len(centres), 1, 1))
+    poses[:, :3, :3] = exp_so3(np.asarray(turn))
+    poses[:, :3, 3] = centres
+    return Cameras(poses, np.tile([120.0, 120, 80, 60], (len(poses), 1)), np.tile([160, 120], (len(poses), 1)))
+
+
+_HERE = _cameras((0.0, 0, 0), (0.3, 0, 0), (-0.3, 0.1, 0))
+
+
+def _measured(target, source, pose=_RIGHT, cameras=(_HERE, _HERE), unit_s=1.0) -> Agreement:
+    """The agreement of two scenes; the target is in metres, the source in units of ``unit_s``."""
+    sights = [
+        None if c is None else (Sight(g, c, 128), unit)
+        for g, c, unit in ((target, cameras[0], 1.0), (source, cameras[1], unit_s))
+    ]
+    return measure(Surface.of(target), Surface.of(source, unit_s), pose, tuple(sights))
+
+
+def test_two_captures_of_one_wall_agree():
+    found = _measured(_wall(3.0), _wall(3.0))
+    assert found.contradiction == 0.0
+    assert found.colour_correlation > 0.95
+    assert found.colour_t > 4
+    assert found.num_seen > 2000
+
+
+def test_what_stands_in_front_contradicts_and_what_lies_behind_does_not():
+    bare, screened = _wall(3.0), Gaussians.concatenate([_wall(3.0), _wall(1.5, width=0.8, height=2.0)])
+    # To the cameras of the bare wall the screen stands in the way; to the others the wall behind it is hidden.
+    assert 0.1 < _measured(bare, screened, cameras=(_HERE, None)).contradiction < 0.6
+    assert _measured(screened, bare, cameras=(_HERE, None)).contradiction < 0.005
+    # Both ways together, the contradiction counts.
+    for pair in ((bare, screened), (screened, bare)):
+        assert 0.1 < _measured(*pair).contradiction < 0.6
+
+
+def test_a_wall_seen_past_the_edge_of_another_is_judged_where_both_see():
+    # The source's wall is set back by half a metre: before the target's cameras it lies behind, and proves nothing;
+    # the source's cameras saw through the target's.
+    target, source = _wall(3.0), _wall(3.5)
+    one_sided = [_measured(target, source, cameras=c) for c in ((_HERE, None), (None, _HERE))]
+    assert np.isnan(one_sided[0].contradiction)
+    assert one_sided[1].contradiction > 0.95
+    assert _measured(target, source).contradiction > 0.95
+
+
+def test_exposure_does_not_matter_and_another_texture_does():
+    target = _wall(3.0)
+    same, dim, other = (
+        _measured(target, s) for s in (_wall(3.0), _wall(3.0, gain=0.6, offset=0.1), _wall(3.0, seed=5))
+    )
+    assert abs(same.colour_correlation - dim.colour_correlation) < 0.02
+    assert abs(other.colour_correlation) < 0.15
+    assert abs(other.colour_t) < 3
+    assert other.contradiction == 0.0  # the shape is right
+
+
+def test_a_pose_a_little_off_agrees_less():
+    target, source = _wall(3.0), _wall(3.0)
+    right, near, far = (_measured(target, source, Sim3(np.eye(3), [x, 0, 0])) for x in (0.0, 0.05, 0.3))
+    assert right.colour_correlation > near.colour_correlation + 0.02
+    assert near.colour_correlation > far.colour_correlation + 0.3
+
+
+def test_rooms_half_a_turn_off_contradict_each_other():
+    world = splat_world(0, points=30_000)
+    surfaces = Surface.of(world.target.gaussians), Surface.of(world.source.gaussians)
+    sights = (world.target.sight(128), 1.0), (world.source.sight(128), 1.0)
+    right = measure(*surfaces, world.S_target_source, sights)
+    assert right.contradiction < 0.01
+    assert right.colour_correlation > 0.6
+    assert right.colour_t > 5
+    assert right.num_seen > 500
+    # About the vertical through the middle of the shared part.
+    turn = exp_so3([0, 0, np.pi])
+    middle = np.array([3.0, 2.0, 1.2])
+    wrong = measure(*surfaces, Sim3(turn, middle - turn @ middle) @ world.S_target_source, sights)
+    assert wrong.colour_correlation < 0.1
+    assert wrong.contradiction > 0.1
+
+
+def test_units_and_frames_change_nothing():
+    target, source = Gaussians.concatenate([_wall(3.0), _wall(1.5, width=0.8)]), _wall(3.0)
+    expected = _measured(target, source)
+    move = Sim3(exp_so3([0.3, -1.0, 0.5]), [5.0, -2.0, 1.0], 4.0)  # the source's own unit is a quarter of a metre
+    moved, cameras = transform_gaussians(source, move), transform_cameras(_HERE, move)
+    pose = Sim3(move.rotation, move.translation * 0.25).inverse()
+    found = _measured(target, moved, pose, (_HERE, cameras), unit_s=0.25)
+    assert found.contradiction == pytest.approx(expected.contradiction, abs=0.01)
+    assert found.colour_correlation == pytest.approx(expected.colour_correlation, abs=0.01)
+    # A pose may scale by itself, too.
+    larger = Sim3(np.eye(3), np.zeros(3), 1.2)
+    grown, cameras = transform_gaussians(source, larger), transform_cameras(_HERE, larger)
+    found = _measured(target, grown, larger.inverse(), (_HERE, cameras))
+    assert found.contradiction == pytest.approx(expected.contradiction, abs=0.02)
+    assert found.colour_correlation == pytest.approx(expected.colour_correlation, abs=0.02)
+
+
+def test_cameras_that_see_nothing_say_nothing():
+    wall = _wall(3.0)
+    away, inside = _cameras((0.0, 0, 0), turn=(0.0, np.pi, 0.0)), _cameras((0.0, 0, 3.0), (0.5, 0, 3.0))
+    for blind in (away, inside):
+        alone = _measured(wall, wall, cameras=(blind, blind))
+        assert np.isnan(alone.contradiction)
+        assert (alone.num_seen, alone.colour_correlation, alone.colour_t) == (0, 0.0, 0.0)
+        # The other scene's cameras are heard all the same.
+        helped = _measured(wall, wall, cameras=(blind, _HERE))
+        assert helped.contradiction == 0.0
+        assert helped.num_seen == 0
+        assert helped.colour_correlation > 0.95
+
+
+def test_without_cameras_the_colours_of_coinciding_cells_speak():
+    wall = _wall(3.0)
+    right, other = (_measured(wall, s, cameras=(None, None)) for s in (_wall(3.0), _wall(3.0, seed=5)))
+    assert np.isnan(right.contradiction)
+    assert right.colour_correlation > 0.9
+    assert right.colour_t > 4
+    assert abs(other.colour_correlation) < 0.15
+
+
+def test_haze_that_only_a_foreign_camera_meets_is_not_held_against_a_scene():
+    # Floaters between the camera and the wall: faint or huge, so no surface.
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.uniform(-1, 1, (600, 2)), rng.uniform(1, 2.5, 600)]
+    quats, sh = np.tile([1.0, 0, 0, 0], (600, 1)), np.zeros((600, 1, 3))
+    faint = Gaussians(points, quats, np.full((600, 3), np.log(0.1)), np.full(600, -2.5), sh)
+    huge = Gaussians(points, quats, np.full((600, 3), np.log(0.5)), np.full(600, 2.0), sh)
+    for haze in (faint, huge):
+        found = _measured(_wall(3.0), Gaussians.concatenate([_wall(3.0), haze]), cameras=(_HERE, None))
+        assert found.contradiction < 0.01
+        assert found.colour_correlation > 0.95
+
+
+def test_sight_renders_each_view_once_and_keeps_a_bounded_number():
+    wall, count = _wall(3.0, step=0.1), 80
+    sight = Sight(wall, _cameras(*[(0.01 * i, 0, 0) for i in range(count)]), 64)
+    first = sight.shot(0)
+    assert sight.shot(0) is first
+    assert first.colour.shape == (1, 48, 64, 3)
+    for row in range(count):
+        sight.shot(row)
+    assert len(sight._renders) < count
+    assert np.array_equal(sight.shot(0).colour, first.colour)
+
+
+def test_sight_prefers_cameras_that_nothing_hides_the_points_from():
+    # A screen before the first camera hides the wall from it.
+    scene = Gaussians.concatenate([_wall(3.0), _wall(0.5, width=0.8, height=0.7)])
+    sight = Sight(scene, _cameras((0.0, 0, 0), (0.0, 0, 0.8)), 128)
+    on_wall = _wall(3.0).means
+    assert sight.choose(on_wall, 1) == [1]
+    assert sight.choose(np.array([[0.0, 0, -5.0]]), 2) == []  # behind both
+
+
+_SURE = Proposal("landmarks", Sim3.identity(), with_scale=False, num_inliers=30, log_nfa=-20.0, runner_up=0.2)
+_UNSURE = replace(_SURE, log_nfa=-2.0)
+_GOOD = Agreement(0.4, 3000, 0.01, 2000, 0.7, 8.0)
+_SIGMAS = (0.003, 0.011, 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "proposal", "accepted"),
+    [
+        ({}, _SURE, True),
+        ({}, _UNSURE, True),
+        ({"contradiction": 0.05}, _SURE, True),
+        ({"contradiction": 0.12}, _SURE, True),  # a place that changed, its colours beyond doubt
+        ({"contradiction": 0.12, "colour_correlation": 0.4}, _SURE, False),
+        ({"contradiction": 0.25}, _SURE, False),
+        ({"contradiction": 0.05, "colour_correlation": 0.4}, _SURE, True),
+        ({"contradiction": 0.05, "colour_correlation": 0.4}, _UNSURE, False),
+        ({"contradiction": 0.015, "colour_correlation": 0.3}, _UNSURE, True),
+        ({"colour_correlation": 0.1}, _SURE, False),
+        ({"colour_t": 2.0}, _SURE, False),
+        ({"colour_correlation": 0.0, "colour_t": 0.0, "contradiction": np.nan, "num_seen": 0}, _SURE, False),
+        ({"contradiction": np.nan, "num_seen": 0}, _SURE, True),  # no cameras, but a clique beyond chance
+        ({"contradiction": np.nan, "num_seen": 0}, _UNSURE, False),
+        ({"overlap": 0.05}, _UNSURE, False),
+        ({"num_coinciding": 100}, _SURE, False),
+    ],
+)
+def test_verdict(change, proposal, accepted):
+    reason = verdict.judge(proposal, replace(_GOOD, **change), _SIGMAS)
+    assert (reason == "") == accepted
+
+
+def test_verdict_refuses_what_is_known_too_loosely():
+    assert "fixes the pose only" in verdict.judge(_SURE, _GOOD, (0.05, 0.011, 1e-6))
+    assert "too little surface" in verdict.judge(_SURE, _GOOD, None)
+    assert verdict.judge(replace(_SURE, flaw="mirrored"), _GOOD, _SIGMAS) == "mirrored"
