@@ -125,7 +125,7 @@ def register_pair(
         if any(not j.flaw for j in judged):
             break
     report(1.0, "done")
-    return _conclude(pair, judged)
+    return _conclude(pair, judged, centre)
 
 
 class _Pair:
@@ -262,9 +262,10 @@ def _same_pose(a: Proposal, b: Proposal, centre: np.ndarray, unit_m: float) -> b
     )
 
 
-def _conclude(pair: _Pair, judged: list[_Judged]) -> Registration:
+def _conclude(pair: _Pair, judged: list[_Judged], centre: np.ndarray) -> Registration:
     """The answer: one accepted pose, the best one with what speaks against it, or nothing."""
     target, source = pair.target.id, pair.source.id
+    target_unit_m = pair.target.graph.unit_m
     if not judged:
         poor = min(_most_nodes(pair.target), _most_nodes(pair.source))
         reason = f"no pose that more nodes support than chance would (the poorer graph has {poor})"
@@ -273,7 +274,7 @@ def _conclude(pair: _Pair, judged: list[_Judged]) -> Registration:
     best = accepted[0] if accepted else min(judged, key=_rank)
     reason = best.flaw
     status = "accepted" if accepted else "rejected"
-    if len(accepted) > 1:
+    if any(not _same_pose(best.proposal, j.proposal, centre, target_unit_m) for j in accepted):
         status, reason = "no_match", "ambiguous: two different poses both fit"
     elif not accepted and not (best.proposal.log_nfa < pair.params.verdict.max_log_nfa):
         status, reason = "no_match", f"no match that chance would not explain ({reason})"

@@ -8,7 +8,8 @@ from register_worlds import splat_world
 
 from gsmap.errors import ConfigError
 from gsmap.evaluate.registration import pose_error, scene_centroid
-from gsmap.register import Params, SceneView, register_pair
+from gsmap.geometry.rotations import exp_so3
+from gsmap.register import Params, SceneView, propose, register_pair
 from gsmap.register.candidates import candidate_pairs
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph, Sim3
 
@@ -155,6 +156,20 @@ def test_surfaces_propose_where_graphs_are_poor():
 def _first(layer: NodeLayer, n: int) -> NodeLayer:
     names = ("positions", "embeddings", "types", "weights", "extents", "features", "num_views")
     return NodeLayer(*(getattr(layer, k)[:n] for k in names), method=layer.method, unit_m=layer.unit_m)
+
+
+def test_two_proposals_of_one_pose_are_not_ambiguous(monkeypatch):
+    world = splat_world(13)
+    centre = scene_centroid(world.source.gaussians)
+    found = []
+    for degrees in (2.0, -2.0):  # too far apart to be told for one before they are refined, too weak to end the search
+        turn = exp_so3(np.radians(degrees) * np.array([0.0, 0.6, 0.8]))
+        S = world.S_target_source @ Sim3(turn, centre - turn @ centre)
+        found.append(propose.Proposal("landmarks", S, with_scale=False, num_inliers=20, log_nfa=-1.0, runner_up=0.9))
+    monkeypatch.setattr(propose, "propose", lambda *args, **kwargs: found)
+    answer = register_pair(world.target, world.source, Params(kinds=("landmarks",), fallback="never"))
+    assert (answer.status, answer.reason) == ("accepted", "")
+    assert _error(world, answer).rre_deg < 0.1
 
 
 def test_scenes_with_nothing_in_them_do_not_match():

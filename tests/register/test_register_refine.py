@@ -45,6 +45,17 @@ def test_coloured_refiner_finds_the_scale(world, surfaces):
     assert pose_error(found, world.S_target_source, centre).rse < 0.002
 
 
+def test_scale_is_the_same_both_ways_on_rough_surfaces():
+    # Laying one scene's points on the other alone, either way shrinks what is laid: by 0.15 percent each here.
+    for seed in (1, 2):
+        rough = splat_world(seed, points=30_000, noise_m=0.04)
+        target, source = Surface.of(rough.target.gaussians), Surface.of(rough.source.gaussians)
+        there = coloured.refine(target, source, rough.S_target_source, with_scale=True)
+        back = coloured.refine(source, target, rough.S_target_source.inverse(), with_scale=True)
+        assert abs(np.log(there.scale * back.scale)) < 0.001
+        assert abs(np.log(there.scale)) < 0.003
+
+
 def test_gicp_refiner_agrees(world, surfaces):
     centre = scene_centroid(world.source.gaussians)
     found = gicp.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,8 @@ _COLOUR_RADIUS_M = 0.1  # farther away, lightness extrapolated in a tangent plan
 class Params:
     """Args (metres):
     radii_m: correspondence distances, coarse to fine.
-    iterations: Gauss-Newton steps at each.
+    iterations: Gauss-Newton steps at each ...
+    scale_iterations: ... and where the scale is free, which settles more slowly.
     colour_weight: metres of distance that one standard deviation of local colour counts for, at fine radii;
         0 leaves colour out.
     max_points: source cells that take part at each radius.
@@ -26,6 +28,7 @@ class Params:
 
     radii_m: tuple[float, ...] = (0.4, 0.15, 0.06)
     iterations: int = 10
+    scale_iterations: int = 20
     colour_weight: float = 0.01
     max_points: tuple[int, ...] = (3000, 6000, 20_000)
 
@@ -37,43 +40,40 @@ def refine(
 
     Iteratively reweighted Gauss-Newton (Geman-McClure over the radius) on the point-to-plane distance and, as in
     Park et al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane. The source's
-    exposure (gain and offset) is fitted along, so a change of it costs nothing.
+    exposure (gain and offset) is fitted along, so a change of it costs nothing. With scale the target's cells are laid
+    on the source's planes as well, half of ``max_points`` each way: one way alone prefers a source that is too small,
+    whose points all come nearer to some surface.
     """
     params = params or Params()
     pose = start
-    anchors = target.coarse[0]
     if len(source) < 10 or len(target) < 10:
         return start
+    iterations = params.scale_iterations if with_scale else params.iterations
     for radius, count in zip(params.radii_m, params.max_points, strict=True):
-        chosen = source.sample(count)
-        points, light = source.coarse[0][chosen], source.lightness[chosen]
-        for _ in range(params.iterations):
-            moved = pose.apply(points)
-            distance, row = target.nearest(moved, radius)
-            hit = np.flatnonzero(np.isfinite(distance))
-            if len(hit) < 10:
+        count = count // 2 if with_scale else count
+        chosen, chosen_back = source.sample(count), target.sample(count)
+        for _ in range(iterations):
+            pairs = _Pairs.of(target, source, pose, chosen, radius)
+            if len(pairs.points) < 10:
                 return pose
-            row, offset = row[hit], moved[hit] - anchors[row[hit]]
-            normals = target.normals[row]
-            plane = (normals * offset).sum(1)
-            weights = 1.0 / (1.0 + (plane / (0.3 * radius)) ** 2) ** 2
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
-            centre = points[hit].mean(0)
-            centred = pose @ Sim3(np.eye(3), centre)
-            jacobian = point_to_plane_jacobian(centred, points[hit] - centre, normals)
-            system = (jacobian * weights[:, None]).T @ jacobian
-            gradient = (jacobian * weights[:, None]).T @ plane
-            if params.colour_weight > 0 and radius <= _COLOUR_RADIUS_M:
-                gradients = target.lightness_gradients(row)
-                expected = target.lightness[row] + (gradients * offset).sum(1)
-                gain, bias = _exposure(expected, light[hit])
-                colour = expected - gain * light[hit] - bias
-                spread = 1.4826 * np.median(np.abs(colour)) + 1e-6
-                factor = params.colour_weight / spread
-                tint = weights / (1.0 + (colour / (2 * spread)) ** 2) ** 2
-                jacobian = point_to_plane_jacobian(centred, points[hit] - centre, gradients) * factor
-                system += (jacobian * tint[:, None]).T @ jacobian
-                gradient += (jacobian * tint[:, None]).T @ (colour * factor)
+            centre = pairs.points.mean(0)
+            centred, points = pose @ Sim3(np.eye(3), centre), pairs.points - centre
+            system, gradient = pairs.equations(
+                lambda along, c=centred, p=points: point_to_plane_jacobian(c, p, along), radius, params.colour_weight
+            )
+            if with_scale:
+                back = _Pairs.of(source, target, pose.inverse(), chosen_back, radius)
+                if len(back.points) < 10:
+                    return pose
+                # A step that moves the source forward moves what is laid on it back.
+                other = back.equations(
+                    lambda along, p=back.moved - centre: point_to_plane_jacobian(Sim3.identity(), p, -along),
+                    radius,
+                    params.colour_weight,
+                )
+                share = len(pairs.points) / len(back.points)
+                system, gradient = system + share * other[0], gradient + share * other[1]
             step = np.zeros(7)
             dim = 7 if with_scale else 6
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
@@ -84,9 +84,59 @@ def refine(
             pose = retract(centred, step if with_scale else step[:6]) @ Sim3(np.eye(3), -centre)
             if abs(np.log(pose.scale / start.scale)) > np.log(1.3):
                 return start
-            if np.linalg.norm(pose.apply(points[hit]) - moved[hit], axis=1).max() < 0.002 * radius:
+            if np.linalg.norm(pose.apply(pairs.points) - pairs.moved, axis=1).max() < 0.002 * radius:
                 break
     return pose
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """R cells of one surface that a pose brings near another, and the cells there that they fall on.
+
+    Args:
+        onto: the surface they are laid on.
+        rows: (R,) cells of it.
+        points, lightness: (R, 3), (R,) the cells that move, in their own frame.
+        moved: (R, 3) the same in the frame of ``onto``.
+    """
+
+    onto: Surface
+    rows: np.ndarray
+    points: np.ndarray
+    lightness: np.ndarray
+    moved: np.ndarray
+
+    @classmethod
+    def of(cls, onto: Surface, moving: Surface, pose: Sim3, chosen: np.ndarray, radius_m: float) -> _Pairs:
+        points = moving.coarse[0][chosen]
+        moved = pose.apply(points)
+        distance, rows = onto.nearest(moved, radius_m)
+        hit = np.flatnonzero(np.isfinite(distance))
+        return cls(onto, rows[hit], points[hit], moving.lightness[chosen[hit]], moved[hit])
+
+    def equations(
+        self, jacobian: Callable[[np.ndarray], np.ndarray], radius_m: float, colour_weight: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations (7, 7), (7,); ``jacobian`` of the moved points along given directions (R, 3)."""
+        offset = self.moved - self.onto.coarse[0][self.rows]
+        normals = self.onto.normals[self.rows]
+        plane = (normals * offset).sum(1)
+        weights = 1.0 / (1.0 + (plane / (0.3 * radius_m)) ** 2) ** 2
+        slope = jacobian(normals)
+        system = (slope * weights[:, None]).T @ slope
+        gradient = (slope * weights[:, None]).T @ plane
+        if colour_weight > 0 and radius_m <= _COLOUR_RADIUS_M:
+            gradients = self.onto.lightness_gradients(self.rows)
+            expected = self.onto.lightness[self.rows] + (gradients * offset).sum(1)
+            gain, bias = _exposure(expected, self.lightness)
+            colour = expected - gain * self.lightness - bias
+            spread = 1.4826 * np.median(np.abs(colour)) + 1e-6
+            factor = colour_weight / spread
+            tint = weights / (1.0 + (colour / (2 * spread)) ** 2) ** 2
+            slope = jacobian(gradients) * factor
+            system += (slope * tint[:, None]).T @ slope
+            gradient += (slope * tint[:, None]).T @ (colour * factor)
+        return system, gradient
 
 
 def _exposure(target: np.ndarray, source: np.ndarray) -> tuple[float, float]:
