@@ -19,12 +19,15 @@ class Params:
     floor_m: error of a cell that no residual shows (a trainer's bias, a sensor's distortion): many cells average it
         out, and over the overlap's radius it turns and scales the pose.
     factor: on the sandwich, from measured normalised errors and triangles (``tools/bench_register.py`` prints them).
+    scale_factor: on the scale's own variance, from measured errors of scales: those of a real sensor's captures differ
+        by up to a percent of themselves, which leaves no residual.
     """
 
     radius_m: float = 0.08
     cell_m: float = 1.0
     floor_m: float = 0.01
     factor: float = 2.0
+    scale_factor: float = 4.0
 
 
 # A rigid edge knows its scale: a row this stiff keeps the matrix 7 x 7 without letting the scale move.
@@ -75,6 +78,8 @@ def pose_covariance(
     floor = np.r_[np.full(3, turn), np.full(3, shift / pose.scale), turn]
     covariance = np.diag(np.r_[floor[:6], _RIGID_LOG_SCALE_SIGMA] ** 2)
     covariance[:dim, :dim] = params.factor * sandwich + np.diag(floor[:dim] ** 2)
+    if with_scale:
+        covariance[6, 6] *= params.scale_factor
     sigmas = (
         float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
         float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * pose.scale,

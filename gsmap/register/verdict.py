@@ -57,7 +57,7 @@ class Params:
     hopeless_contradiction: float = 0.3
     max_rotation_sigma_deg: float = 1.5
     max_translation_sigma_m: float = 0.05
-    max_scale_sigma: float = 0.02
+    max_scale_sigma: float = 0.025
 
 
 def is_significant(proposal: Proposal, params: Params | None = None) -> bool:

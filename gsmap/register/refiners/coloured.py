@@ -13,6 +13,7 @@ from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
 _COLOUR_RADIUS_M = 0.1  # farther away, lightness extrapolated in a tangent plane means nothing
+_OVERSTEP = 1.5  # pairs follow the pose only in part, so steps fall short, most of all along the scale
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,8 @@ def refine(
             dim = 7 if with_scale else 6
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
             step[:dim] = -np.linalg.solve((system + damping)[:dim, :dim], gradient[:dim])
+            if with_scale:
+                step *= _OVERSTEP
             # No single step goes farther than the correspondences reach.
             step *= min(1.0, 0.1 / max(np.abs(step[:3]).max(), 1e-12), radius / max(np.abs(step[3:6]).max(), 1e-12))
             step[6] = np.clip(step[6], -0.05, 0.05)
