@@ -21,7 +21,7 @@ from gsmap.register.scene_view import SceneView
 from gsmap.register.sight import Sight
 from gsmap.types import Registration, Sim3
 
-METHOD_VERSION = 4
+METHOD_VERSION = 5
 
 Progress = Callable[[float, str], None]
 
