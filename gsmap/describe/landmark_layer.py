@@ -13,7 +13,7 @@ from gsmap.describe.method import method_digest
 from gsmap.describe.surroundings import NUM_RINGS, NUM_SHELLS, cylinder_context, shell_context
 from gsmap.types import NodeLayer
 
-_VERSION = 5
+_VERSION = 6
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from gsmap.describe.models import ModelSpec
 from gsmap.describe.views import is_blocked, render_views, sample_cameras
 from gsmap.types import Cameras, Gaussians, NodeLayer
 
-_VERSION = 1
+_VERSION = 2
 _NEEDS = {"sam": ("sam-encoder", "sam-decoder"), "clip": ("clip",)}
 
 

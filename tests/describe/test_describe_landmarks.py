@@ -71,6 +71,26 @@ def test_another_white_balance_leaves_landmarks_alike():
     assert right.mean() > 0.3
 
 
+def test_floaters_of_any_colour_do_not_hide_the_landmarks():
+    layers = []
+    for seed in (1, 2):
+        g, cameras = room(seed)
+        rng = np.random.default_rng(seed)
+        n = len(g) // 3
+        stray = Gaussians(
+            rng.uniform([0, 0, 0], [6, 5, 2.5], (n, 3)),
+            np.tile([1.0, 0, 0, 0], (n, 1)),
+            np.full((n, 3), np.log(0.02)),
+            rng.uniform(-2, 2, n),
+            rng.uniform(-1.5, 1.5, (n, 1, 3)),
+        )
+        both = Gaussians.concatenate([g, stray])
+        layers.append(describe("room", both, cameras, LANDMARKS, scale_policy="known").layers["landmarks"])
+    found = correspondences(*layers)
+    right = np.linalg.norm(found.target - found.source, axis=1) < 0.1
+    assert right.sum() > 70
+
+
 def test_a_scene_that_knows_up_still_matches_one_that_does_not():
     graph = describe("upright", *room(1), LANDMARKS, scale_policy="known")
     R = Rotation.random(random_state=5).as_matrix()
