@@ -254,7 +254,7 @@ def _fpfh_matches(target: Capture, source: Capture, voxel_m: float) -> tuple[Cor
     return Correspondences(t + ca, s + cb, *ids, np.ones(len(rows), np.float32)), spent_a + spent_b
 
 
-def teaser_style(target: Capture, source: Capture, voxel_m: float = 0.15) -> Answer:
+def teaser_style(target: Capture, source: Capture, voxel_m: float = 0.2) -> Answer:
     """Mutual FPFH matches, absolute distance test, maximum clique, SVD, GICP."""
     m, spent = _fpfh_matches(target, source, voxel_m)
     clique = maximum_clique(consistency_graph(m, TestParams(sigma_m=FPFH_SIGMA_M)), STEP_LIMIT)
@@ -265,7 +265,7 @@ def teaser_style(target: Capture, source: Capture, voxel_m: float = 0.15) -> Ans
     return Answer(pose, f"w={len(clique)}", len(clique), shared_s=spent)
 
 
-def mac_style(target: Capture, source: Capture, voxel_m: float = 0.15) -> Answer:
+def mac_style(target: Capture, source: Capture, voxel_m: float = 0.2) -> Answer:
     """After MAC (Zhang et al. 2023): second-order weights, a maximal clique through each node, a pose by each clique.
 
     The pose under which the matches lie nearest (sum of ``1 - residual / tau``) wins, and goes to GICP. Cliques are
@@ -329,7 +329,7 @@ METHODS: dict[str, Method] = {
     "landmarks": gsmap(kinds=("landmarks",), fallback="never"),
     "objects": gsmap(kinds=("objects",), fallback="never"),
     "gicp": gsmap(refiner="gicp"),
-    "kiss-0.15": kiss_gicp(0.15),
+    "kiss-0.2": kiss_gicp(0.2),
     "kiss-0.1": kiss_gicp(0.1),
     "fpfh-ransac": fpfh_ransac_icp,
     "teaser-style": teaser_style,

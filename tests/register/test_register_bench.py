@@ -29,7 +29,7 @@ def test_ablations_propose(captures, name):
         _check(captures, answer.pose)
 
 
-@pytest.mark.parametrize("name", ["gsmap", "kiss-0.15", "teaser-style", "mac-style"])
+@pytest.mark.parametrize("name", ["gsmap", "kiss-0.2", "teaser-style", "mac-style"])
 def test_methods_find_an_easy_pair(captures, name):
     if name != "gsmap":
         pytest.importorskip("kiss_matcher" if "kiss" in name else "open3d")
