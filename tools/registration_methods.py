@@ -219,7 +219,7 @@ def _fpfh(capture: Capture, voxel_m: float) -> tuple[tuple[Any, Any, np.ndarray]
     return made, seconds if known else 0.0
 
 
-def fpfh_ransac_icp(target: Capture, source: Capture, voxel_m: float = 0.1) -> Answer:
+def fpfh_ransac_icp(target: Capture, source: Capture, voxel_m: float = 0.2) -> Answer:
     """Open3D's global registration as its tutorial has it, then point-to-plane ICP."""
     import open3d as o3d
 
