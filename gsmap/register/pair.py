@@ -21,7 +21,7 @@ from gsmap.register.scene_view import SceneView
 from gsmap.register.sight import Sight
 from gsmap.types import Registration, Sim3
 
-METHOD_VERSION = 5
+METHOD_VERSION = 6
 
 Progress = Callable[[float, str], None]
 
@@ -186,6 +186,8 @@ class _Pair:
             return _Judged(proposal, Agreement(), None, proposal.flaw)
         # Both surfaces go to target metres, the source with the proposed scale, so what remains is nearly rigid.
         unit_t = self._target_unit_m(proposal.with_scale)
+        if proposal.with_scale and self.source.scale_policy == "known":
+            unit_t = 1.0 / S.scale  # the source knows what a metre is, the target only guesses
         unit_s = unit_t * S.scale
         with self.clock.step("refine"):
             target = self.target.surface(unit_t, params.surface)

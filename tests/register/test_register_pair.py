@@ -81,6 +81,20 @@ def test_unknown_scale_is_found(scale):
     assert 1e-4 < np.sqrt(np.linalg.inv(found.information)[6, 6]) < 0.01
 
 
+def test_the_scene_that_knows_its_scale_says_what_a_metre_is():
+    world = splat_world(2, scale=0.27, policy="unknown")
+    metric = world.target.graph
+    layers = {"landmarks": replace(metric.layers["landmarks:0"], unit_m=1.0)}
+    source = replace(world.target, graph=replace(metric, layers=layers, unit_m=1.0), scale_policy="known")
+    answers = []
+    for wrong in (1.0, 0.4):
+        graph = replace(world.source.graph, unit_m=wrong * world.source.graph.unit_m)
+        answers.append(register_pair(replace(world.source, graph=graph), source))
+    assert [a.status for a in answers] == ["accepted", "accepted"]
+    assert np.array_equal(answers[0].S_target_source.matrix(), answers[1].S_target_source.matrix())
+    assert abs(answers[0].scale * 0.27 - 1) < 0.005
+
+
 def test_auto_snaps_to_rigid_only_when_the_scale_is_one():
     rigid = register_pair(*_views(splat_world(3)))
     assert rigid.S_target_source.is_rigid
