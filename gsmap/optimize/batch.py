@@ -100,8 +100,12 @@ def solve_batch(
         if _take_in_agreeing(m, state, params):
             _cut_weak_bridges(m, state)
             _refine(m, state, gate, 1.0)
-        elif not _join(m, state, params, single=True) and not _part_lookalikes(m, votes, state, gate):
+        elif _close_through_singles(m, state, params):
+            _refine(m, state, gate, 1.0)
+        elif not _part_lookalikes(m, votes, state, gate, params):
             break
+    while _join(m, state, params, single=True):
+        pass
     _forgive(m, state, gate)
     _check_confirmed(m, state, gate)
 
@@ -155,6 +159,22 @@ def take_in(m: Measurements, state: State, params: OptimizeParams) -> None:
         pass
 
 
+def _close_through_singles(m: Measurements, state: State, params: OptimizeParams) -> bool:
+    """Take in the cycles that close once single strong edges attach small islands.
+
+    The single edges that no cycle bears out are let go again, for a scene that rests on one edge must not vouch for
+    others; they come back when nothing else does.
+    """
+    accepted, poses = state.accepted.copy(), state.poses
+    while _join(m, state, params, single=True):
+        _close_loops(m, state, params)
+    state.accepted &= accepted | m.confirmed | ~bridges(m, state.accepted)
+    if (state.accepted & ~accepted).any():
+        return True
+    state.poses = poses
+    return False
+
+
 def _close_loops(m: Measurements, state: State, params: OptimizeParams) -> bool:
     """Take in the edges inside an island that agree with what the island predicts for them."""
     rows = state.open
@@ -191,9 +211,10 @@ def _join(m: Measurements, state: State, params: OptimizeParams, *, single: bool
     return True
 
 
-def _part_lookalikes(m: Measurements, votes: Vote, state: State, gate: float) -> bool:
+def _part_lookalikes(m: Measurements, votes: Vote, state: State, gate: float, params: OptimizeParams) -> bool:
     """Part islands where a group of edges contradicts them and is not clearly outweighed."""
-    wrong, right, unclear = undecided_groups(m, state.accepted, state.undecided | state.rejected, state.poses, votes)
+    settled = state.undecided | state.rejected
+    wrong, right, unclear = undecided_groups(m, state.accepted, settled, state.poses, votes, params.gate_probability)
     if len(state.terms):
         elsewhere, outweighed = contradicted_priors(m, state.accepted, state.poses, votes, state.terms)
         wrong |= elsewhere

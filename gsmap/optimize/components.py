@@ -164,7 +164,7 @@ def allowed(join: Join, edges: Measurements, sizes: np.ndarray) -> str:
         return "agreed"
     large = min(sizes[join.target], sizes[join.source]) >= SMALL_ISLAND
     # Chance never makes two wrong edges agree: a rival group of two is a place that looks like another.
-    if len(rows) <= join.rival or (large and join.rival >= 2):
+    if len(rows) <= join.rival or (large and join.rival >= 2 and len(rows) < 3 * join.rival):
         return f"{len(rows)} edges agree and {join.rival} others contradict them: undecided"
     low, high = (
         np.minimum(edges.targets[rows], edges.sources[rows]),
@@ -297,19 +297,12 @@ def _agreeing_pairs(
     edges: Measurements, rows: np.ndarray, walk: Walk, ends: np.ndarray, probability: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (positions in ``rows``) of edges between the same two islands that predict the same relative pose."""
-    poses, labels, dim = walk.poses, walk.labels, edges.dim
-    limit = chi2.ppf(probability, dim)
+    poses, labels = walk.poses, walk.labels
     # Direct every edge from the island of lower number.
-    a, b, measured = edges.targets[rows], edges.sources[rows], edges.measured[rows]
-    covariance = edges.covariance[rows].copy()
-    turned = labels[a] > labels[b]
-    adjoint = measured[turned].adjoint()[:, :dim, :dim]
-    covariance[turned] = adjoint @ covariance[turned] @ adjoint.transpose(0, 2, 1)
-    measured = measured.replaced(turned, measured[turned].inverse())
-    a, b = np.where(turned, b, a), np.where(turned, a, b)
-    landing = poses[a] @ measured @ poses[b].inverse()
-    flat = landing.rotations.reshape(-1, 9)
+    claims = Claims.of(edges, rows, labels[edges.targets[rows]] > labels[edges.sources[rows]])
+    flat = (poses[claims.near] @ claims.measured @ poses[claims.far].inverse()).rotations.reshape(-1, 9)
     spread = 2 * edges.covariance[rows][:, :3, :3].trace(axis1=1, axis2=2).max(initial=0)
+    limit = chi2.ppf(probability, edges.dim)
     firsts, seconds = [], []
     counts = ends - np.arange(len(rows)) - 1
     block = np.searchsorted(np.cumsum(counts), np.arange(0, counts.sum() + 1, 2_000_000), side="left")
@@ -319,23 +312,60 @@ def _agreeing_pairs(
         first = first + begin
         second = first + 1 + offset
         # Cheap first test: the two predictions of the other island's orientation.
-        hops = walk.bound(a[first], a[second]) + walk.bound(b[first], b[second])
+        hops = walk.bound(claims.near[first], claims.near[second]) + walk.bound(claims.far[first], claims.far[second])
         allowance = np.minimum(limit * (spread + 3 * walk.step[0] * hops), 8.0)
         chord = ((flat[first] - flat[second]) ** 2).sum(1) / 2
         near = chord < allowance
         firsts.append(first[near])
         seconds.append(second[near])
     first, second = np.concatenate(firsts), np.concatenate(seconds)
-    there = poses[b[second]].inverse() @ poses[b[first]]
-    around = measured[first].inverse() @ (poses[a[first]].inverse() @ poses[a[second]]) @ measured[second] @ there
-    r = around.log()[:, :dim]
-    carry = there.inverse().adjoint()[:, :dim, :dim]
-    noise = covariance[first] + carry @ covariance[second] @ carry.transpose(0, 2, 1)
-    for measure in (walk.bound, walk.hops):
-        hops = measure(a[first], a[second]) + measure(b[first], b[second])
-        keep = _chi2(noise, walk.variances(hops, b[first], dim), r) < limit
-        first, second, noise, r = first[keep], second[keep], noise[keep], r[keep]
-    return first, second
+    same = claims.agree(first, second, walk, probability)
+    return first[same], second[same]
+
+
+@dataclass(frozen=True, eq=False)
+class Claims:
+    """Edges read as claims of how the part of the map at their ``far`` end lies in that at their ``near`` end.
+
+    Args:
+        near, far: (K,) scenes.
+        measured: K similarities ``S_near_far``.
+        covariance: (K, D, D) on the far side.
+    """
+
+    near: np.ndarray
+    far: np.ndarray
+    measured: Similarities
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, edges: Measurements, rows: np.ndarray, turned: np.ndarray) -> Claims:
+        """Edges at ``rows``, read from source to target where ``turned``."""
+        a, b, measured, dim = edges.targets[rows], edges.sources[rows], edges.measured[rows], edges.dim
+        covariance = edges.covariance[rows].copy()
+        adjoint = measured[turned].adjoint()[:, :dim, :dim]
+        covariance[turned] = adjoint @ covariance[turned] @ adjoint.transpose(0, 2, 1)
+        measured = measured.replaced(turned, measured[turned].inverse())
+        return cls(np.where(turned, b, a), np.where(turned, a, b), measured, covariance)
+
+    def agree(self, first: np.ndarray, second: np.ndarray, walk: Walk, probability: float) -> np.ndarray:
+        """(P,) bool: claims ``first`` and ``second`` are the same, within their noise and that of the map between."""
+        poses, dim = walk.poses, self.covariance.shape[1]
+        a, b, measured, covariance = self.near, self.far, self.measured, self.covariance
+        limit = chi2.ppf(probability, dim)
+        there = poses[b[second]].inverse() @ poses[b[first]]
+        across = poses[a[first]].inverse() @ poses[a[second]]
+        r = (measured[first].inverse() @ across @ measured[second] @ there).log()[:, :dim]
+        carry = there.inverse().adjoint()[:, :dim, :dim]
+        noise = covariance[first] + carry @ covariance[second] @ carry.transpose(0, 2, 1)
+        left = np.arange(len(first))
+        for measure in (walk.bound, walk.hops):
+            f, s = first[left], second[left]
+            hops = measure(a[f], a[s]) + measure(b[f], b[s])
+            left = left[_chi2(noise[left], walk.variances(hops, b[f], dim), r[left]) < limit]
+        out = np.zeros(len(first), dtype=bool)
+        out[left] = True
+        return out
 
 
 def _chi2(covariance: np.ndarray, variances: np.ndarray, r: np.ndarray) -> np.ndarray:

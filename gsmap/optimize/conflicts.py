@@ -12,9 +12,10 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 from scipy.spatial import cKDTree
+from scipy.special import betaln
 
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.components import BRIDGE_EDGES
+from gsmap.optimize.components import BRIDGE_EDGES, Claims, Walk
 from gsmap.optimize.cycles import Vote
 from gsmap.optimize.gauge import far_off
 from gsmap.optimize.measurements import Measurements
@@ -27,37 +28,45 @@ MAX_WEIGHT = 20_000  # sums of weights must stay within 32 bits
 LINK_POWER = 3
 # A prior weighs as much as this many edges without a triangle.
 PRIOR_WEIGHT = 10.0
+# Of the links of a contradictory loop exactly one is taken to be wrong: named if this probable, spared if less than that.
+SURE, UNLIKELY = 0.9, 0.05
+# How likely a link is wrong before its density is looked at: one edge by itself may be any mistake, several that agree
+# only a place that looks like another.
+ALONE, ALIKE = 0.3, 0.01
+# How much the density of true links varies, as the weight of that many pairs; look-alikes are this many times sparser.
+
+SPREAD, SPARSER = 20.0, 3.0
 _GENERIC = np.array([0.8164, 0.5213, 0.2483])
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A set of edges that ties two parts of a map: its rows, the side that moves, and how dense it is.
+    """A set of edges that ties two parts of a map: its rows, the side that moves, and the log odds that it is wrong.
 
-    Density is the number of tied pairs among all pairs of its end scenes, one of either part, that lie near each
-    other: the places of a true link are tied as often as any, those of look-alikes only where the mistake was made.
-    ``low`` and ``high`` bound it (Wilson's interval, two sigmas).
+    The places of a true link are tied as often as any, those of look-alikes only where the mistake was made: of the
+    pairs of a link's end scenes, one of either part, that lie near each other, how many are tied? Under a true link the
+    share is Beta distributed about that of the whole map, under look-alikes about a third of it.
     """
 
     rows: np.ndarray
     moving: np.ndarray
-    low: float
-    high: float
-
-    @property
-    def middle(self) -> float:
-        return (self.low + self.high) / 2
+    doubt: float
 
 
 def undecided_groups(
-    edges: Measurements, accepted: np.ndarray, settled: np.ndarray, poses: Similarities, votes: Vote
+    edges: Measurements,
+    accepted: np.ndarray,
+    settled: np.ndarray,
+    poses: Similarities,
+    votes: Vote,
+    probability: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edges to let go, and the groups that contradict them.
 
     A group of edges asks for one part of an island to move against another. It and the accepted links on the way
-    round form a loop, and one link of the loop is wrong. The one that is clearly least dense is let go (the map stands
-    if it is the group); where none is, the group and all links that may be wrong are, and their parts become islands,
-    which is the truth about what is known.
+    round form a loop, and one link of the loop is wrong. The one that surely is is let go (the map stands if it is the
+    group); where none is sure, the group and all links that may be wrong are, and their parts become islands, which is
+    the truth about what is known.
 
     Args:
         settled: (E,) bool, edges that were let go before and have no say.
@@ -69,67 +78,123 @@ def undecided_groups(
     labels = islands(edges, np.flatnonzero(accepted))
     inside = labels[edges.targets] == labels[edges.sources]
     rows = np.flatnonzero(inside & ~accepted & ~settled)
-    length = typical_length(edges, poses) if len(rows) else 0.0
-    for group, near, far, motion in _groups(edges, rows, labels, poses, length):
+    if not len(rows):
+        return wrong, right, open_question
+    length = typical_length(edges, poses)
+    ties = _Ties.of(edges, accepted, labels, poses, 1.25 * length)
+    typical_share = 0.5 * np.median(votes.share[accepted])
+    walk = Walk.over(edges, np.flatnonzero(accepted), poses)
+    for group, near, far, motion in _groups(edges, rows, walk, length, probability):
         if len(np.unique(np.r_[near, far])) < 3 or wrong.any() or open_question.any():
             continue
-        links = _links(edges, accepted, votes, poses, near, far, length)
-        if not links:
-            continue
-        least = min(links, key=lambda link: link.high)
         ends = np.zeros(edges.num_scenes, dtype=bool)
         ends[far] = True
         moved = poses.replaced(far, motion[np.zeros(len(far), dtype=np.int64)] @ poses[far])
-        asking = _link(edges, group, ends, moved, length)
-        others = [link for link in links if link is not least]
-        if asking.high < min(link.middle for link in links):
+        asking = ties.link(edges, group, ends, moved)
+        # A torn place asks together with the look-alikes that tore it: its own edges are the better supported ones.
+        strong = votes.share[group] >= typical_share
+        if strong.sum() >= BRIDGE_EDGES:
+            group, near, far = group[strong], near[strong], far[strong]
+        links = _links(edges, accepted, votes, ties, poses, near, far)
+        if not links:
             continue
-        if len(group) >= BRIDGE_EDGES and least.high < min(link.middle for link in [asking, *others]):
-            wrong[least.rows] = True
+        doubts = np.array([link.doubt for link in [asking, *links]])
+        odds = np.exp(doubts - doubts.max())
+        odds /= odds.sum()
+        worst = int(odds.argmax())
+        if odds[worst] >= SURE:
+            if worst == 0:
+                continue
+            # What too few edges speak against is not called wrong; the parts that they tie stay apart.
+            least = links[worst - 1]
+            verdict = wrong if len(group) >= BRIDGE_EDGES or len(least.rows) == 1 else open_question
+            verdict[least.rows] = True
+            open_question |= accepted & _contested(edges, accepted, least.rows)
             right[group] = True
             continue
         open_question[group] = True
-        for link in links:
-            if link.middle <= least.high:
+        for link, chance in zip(links, odds[1:], strict=True):
+            if chance > UNLIKELY:
                 open_question[link.rows] = True
     return wrong, right, open_question
+
+
+def _contested(edges: Measurements, accepted: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """(E,) bool: edges of scenes that a cut leaves to one side by little more than chance; they go to neither."""
+    n = edges.num_scenes
+    across = np.bincount(np.r_[edges.targets[cut], edges.sources[cut]], minlength=n)
+    rows = np.flatnonzero(accepted)
+    whole = np.bincount(np.r_[edges.targets[rows], edges.sources[rows]], minlength=n)
+    contested = (across > 0) & (3 * across > whole)
+    return contested[edges.targets] | contested[edges.sources]
 
 
 def _links(
     edges: Measurements,
     accepted: np.ndarray,
     votes: Vote,
+    ties: _Ties,
     poses: Similarities,
     near: np.ndarray,
     far: np.ndarray,
-    length: float,
-    depth: int = 3,
+    depth: int = 5,
 ) -> list[Link]:
     """The weak links on the way between two sets of scenes: the lightest cut, and then those on either side of it."""
     parts = smallest_cut(edges, accepted, votes, near, far, LINK_POWER) if depth else None
     if parts is None:
         return []
     rows, moving = parts
+    if not len(rows):
+        return []
     ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
     beyond = moving[edges.targets] & moving[edges.sources]
     before = ~moving[edges.targets] & ~moving[edges.sources]
     still_end, moving_end = ends[~moving[ends]], ends[moving[ends]]
     return [
-        *_links(edges, accepted & before, votes, poses, near, still_end, length, depth - 1),
-        _link(edges, rows, moving, poses, length),
-        *_links(edges, accepted & beyond, votes, poses, moving_end, far, length, depth - 1),
+        *_links(edges, accepted & before, votes, ties, poses, near, still_end, depth - 1),
+        ties.link(edges, rows, moving, poses),
+        *_links(edges, accepted & beyond, votes, ties, poses, moving_end, far, depth - 1),
     ]
 
 
-def _link(edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities, length: float) -> Link:
-    ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
-    still = cKDTree(poses.translations[ends[~moving[ends]]])
-    pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), length))
-    a, b = poses.translations[edges.targets[rows]], poses.translations[edges.sources[rows]]
-    tied = min(pairs, int((np.linalg.norm(a - b, axis=1) <= length).sum()))
-    # Nothing near to count by: any density is possible.
-    middle, half = (tied + 2) / (pairs + 4), 2 * np.sqrt(tied * (pairs - tied) / max(pairs, 1) + 1) / (pairs + 4)
-    return Link(rows, moving, max(0.0, middle - half), min(1.0, middle + half))
+@dataclass(frozen=True)
+class _Ties:
+    """Up to which ``length`` scenes count as near each other, and the ``share`` of near pairs that is tied."""
+
+    length: float
+    share: float
+
+    @classmethod
+    def of(
+        cls, edges: Measurements, accepted: np.ndarray, labels: np.ndarray, poses: Similarities, length: float
+    ) -> _Ties:
+        near = cKDTree(poses.translations).query_pairs(length, output_type="ndarray")
+        near = near[labels[near[:, 0]] == labels[near[:, 1]]]
+        pairs = np.bincount(near.ravel(), minlength=edges.num_scenes)
+        tied = np.bincount(_tied(edges, np.flatnonzero(accepted), poses, length).ravel(), minlength=edges.num_scenes)
+        busy = pairs > 0
+        # The median scene's: where the map is folded, scenes that are not neighbours lie together.
+        share = np.median(tied[busy] / pairs[busy]) if busy.any() else 0.5
+        return cls(length, float(np.clip(share, 0.05, 0.9)))
+
+    def link(self, edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities) -> Link:
+        """A link by its rows, and how much speaks against it."""
+        ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
+        still = cKDTree(poses.translations[ends[~moving[ends]]])
+        pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), self.length))
+        tied = min(pairs, len(_tied(edges, rows, poses, self.length)))
+        true = SPREAD * self.share, SPREAD * (1 - self.share)
+        alike = 1.0, SPARSER / self.share - 1.0
+        wrong = ALONE if len(rows) == 1 else ALIKE
+        evidence = [betaln(a + tied, b + pairs - tied) - betaln(a, b) for a, b in (alike, true)]
+        return Link(rows, moving, float(evidence[0] - evidence[1] + np.log(wrong / (1 - wrong))))
+
+
+def _tied(edges: Measurements, rows: np.ndarray, poses: Similarities, length: float) -> np.ndarray:
+    """(P, 2) pairs of scenes that edges at ``rows`` tie and that lie near each other."""
+    ends = np.sort(np.stack([edges.targets[rows], edges.sources[rows]], axis=1), axis=1)
+    near = np.linalg.norm(poses.translations[ends[:, 0]] - poses.translations[ends[:, 1]], axis=1) <= length
+    return np.unique(ends[near], axis=0)
 
 
 def contradicted_priors(
@@ -167,11 +232,12 @@ def typical_length(edges: Measurements, poses: Similarities) -> float:
 
 
 def _groups(
-    edges: Measurements, rows: np.ndarray, labels: np.ndarray, poses: Similarities, length: float
+    edges: Measurements, rows: np.ndarray, walk: Walk, length: float, probability: float
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, Similarities]]:
     """Edges of one island that ask for the same motion; the scenes at their fixed and at their moving end; it."""
     if not len(rows):
         return []
+    poses, labels = walk.poses, walk.labels
     a, b = edges.targets[rows], edges.sources[rows]
     motion = poses[a] @ edges.measured[rows] @ poses[b].inverse()
     middle = poses.translations.mean(0)
@@ -179,20 +245,19 @@ def _groups(
     # The same disagreement, seen from its other end, is the inverse motion.
     turned = way @ _GENERIC < 0
     motion = motion.replaced(turned, motion[turned].inverse())
-    near, far = np.where(turned, b, a), np.where(turned, a, b)
+    claims = Claims.of(edges, rows, turned)
     corners = middle + 10 * length * np.eye(3)
     feature = np.concatenate([motion.apply(np.tile(c, (len(rows), 1))) - c for c in corners], axis=1)
-    off = np.flatnonzero(np.abs(feature).max(1) > 2 * length)
-    if not len(off):
-        return []
-    rows, near, far, feature, motion = rows[off], near[off], far[off], feature[off], motion[off]
+    off = np.abs(feature).max(1) > 2 * length
+    # Motions that are nearly alike, and then those that are the same within what the map knows.
     pairs = cKDTree(feature).query_pairs(length, p=np.inf, output_type="ndarray")
-    pairs = pairs[labels[near[pairs[:, 0]]] == labels[near[pairs[:, 1]]]]
+    pairs = pairs[off[pairs].all(1) & (labels[a[pairs[:, 0]]] == labels[a[pairs[:, 1]]])]
+    pairs = pairs[claims.agree(pairs[:, 0], pairs[:, 1], walk, probability)]
     graph = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
     which = connected_components(graph, directed=False)[1]
     order = np.argsort(which, kind="stable")
     return [
-        (rows[mine], near[mine], far[mine], motion[mine[:1]])
+        (rows[mine], claims.near[mine], claims.far[mine], motion[mine[:1]])
         for mine in np.split(order, np.flatnonzero(np.diff(which[order])) + 1)
         if len(mine) > 1
     ]
@@ -231,4 +296,24 @@ def smallest_cut(
     rest.eliminate_zeros()
     reached = np.zeros(n + 2, dtype=bool)
     reached[breadth_first_order(rest, n, return_predecessors=False)] = True
-    return rows[reached[a] != reached[b]], ~reached[:n]
+    side = _smoothed(reached[:n], a, b, np.r_[near, far])
+    return rows[side[a] != side[b]], ~side
+
+
+def _smoothed(side: np.ndarray, a: np.ndarray, b: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """The cut with scenes moved to the side that most of their edges go to, as long as fewer edges are cut.
+
+    Weights draw the cut between places; at its rim a scene of few and light edges may be left on the wrong side.
+    """
+    n, crossing = len(side), int((side[a] != side[b]).sum())
+    while True:
+        apart = side[a] != side[b]
+        across = np.bincount(np.r_[a[apart], b[apart]], minlength=n)
+        along = np.bincount(np.r_[a[~apart], b[~apart]], minlength=n)
+        move = across > along
+        move[held] = False
+        moved = side ^ move
+        left = int((moved[a] != moved[b]).sum())
+        if left >= crossing:
+            return side
+        side, crossing = moved, left
