@@ -12,7 +12,17 @@ from scipy.stats import chi2
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import clean
-from gsmap.optimize.components import SMALL_ISLAND, Walk, allowed, bridges, closes, forest, grow, joins, merge_islands
+from gsmap.optimize.components import (
+    SMALL_ISLAND,
+    Walk,
+    allowed,
+    bridges,
+    closes,
+    forest,
+    grow,
+    joins,
+    merge_islands,
+)
 from gsmap.optimize.conflicts import contradicted_priors, undecided_groups
 from gsmap.optimize.cycles import Vote, vote
 from gsmap.optimize.gauge import anchor_of, onto_anchor, onto_priors
@@ -117,9 +127,9 @@ def _begin(m: Measurements, votes: Vote, terms: PriorTerms, params: OptimizePara
     """Spread poses along the best supported edges; keep the supported edges that agree with them."""
     accepted = (votes.agree > 0) | m.confirmed
     rows = np.flatnonzero(accepted)
-    # A person's word first, then the share of agreeing triangles, then the more certain measurement.
+    # A person's word first, then what its neighbours support, then the more certain measurement.
     certainty = np.trace(m.covariance[rows], axis1=1, axis2=2)
-    order = np.lexsort((certainty, -votes.share[rows], ~m.confirmed[rows]))
+    order = np.lexsort((certainty, -votes.support[rows], ~m.confirmed[rows]))
     cost = np.empty(len(rows))
     cost[order] = np.arange(1, len(rows) + 1)
     poses = spread(m, rows, cost, Similarities.identity(m.num_scenes))

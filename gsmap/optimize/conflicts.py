@@ -12,11 +12,11 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 from scipy.spatial import cKDTree
-from scipy.special import betaln
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.components import BRIDGE_EDGES, Claims, Walk
 from gsmap.optimize.cycles import Vote
+from gsmap.optimize.density import Link, Ties, typical_length
 from gsmap.optimize.gauge import far_off
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.priors import PriorTerms
@@ -28,29 +28,11 @@ MAX_WEIGHT = 20_000  # sums of weights must stay within 32 bits
 LINK_POWER = 3
 # A prior weighs as much as this many edges without a triangle.
 PRIOR_WEIGHT = 10.0
-# Of the links of a contradictory loop exactly one is taken to be wrong: named if this probable, spared if less than that.
+# Of the links of a contradictory loop one is taken to be wrong: named if this probable, spared if less than that.
 SURE, UNLIKELY = 0.9, 0.05
-# How likely a link is wrong before its density is looked at: one edge by itself may be any mistake, several that agree
-# only a place that looks like another.
-ALONE, ALIKE = 0.3, 0.01
-# How much the density of true links varies, as the weight of that many pairs; look-alikes are this many times sparser.
-
-SPREAD, SPARSER = 20.0, 3.0
+# Edges with this share of the typical support are hardly ever look-alikes.
+WELL_SUPPORTED = 0.5
 _GENERIC = np.array([0.8164, 0.5213, 0.2483])
-
-
-@dataclass(frozen=True, eq=False)
-class Link:
-    """A set of edges that ties two parts of a map: its rows, the side that moves, and the log odds that it is wrong.
-
-    The places of a true link are tied as often as any, those of look-alikes only where the mistake was made: of the
-    pairs of a link's end scenes, one of either part, that lie near each other, how many are tied? Under a true link the
-    share is Beta distributed about that of the whole map, under look-alikes about a third of it.
-    """
-
-    rows: np.ndarray
-    moving: np.ndarray
-    doubt: float
 
 
 def undecided_groups(
@@ -81,59 +63,79 @@ def undecided_groups(
     if not len(rows):
         return wrong, right, open_question
     length = typical_length(edges, poses)
-    ties = _Ties.of(edges, accepted, labels, poses, 1.25 * length)
-    typical_share = 0.5 * np.median(votes.share[accepted])
+    ties = Ties.of(edges, accepted, labels, poses)
     walk = Walk.over(edges, np.flatnonzero(accepted), poses)
-    for group, near, far, motion in _groups(edges, rows, walk, length, probability):
-        if len(np.unique(np.r_[near, far])) < 3 or wrong.any() or open_question.any():
-            continue
-        ends = np.zeros(edges.num_scenes, dtype=bool)
-        ends[far] = True
-        moved = poses.replaced(far, motion[np.zeros(len(far), dtype=np.int64)] @ poses[far])
-        asking = ties.link(edges, group, ends, moved)
-        # A torn place asks together with the look-alikes that tore it: its own edges are the better supported ones.
-        strong = votes.share[group] >= typical_share
-        if strong.sum() >= BRIDGE_EDGES:
-            group, near, far = group[strong], near[strong], far[strong]
-        links = _links(edges, accepted, votes, ties, poses, near, far)
-        if not links:
-            continue
-        doubts = np.array([link.doubt for link in [asking, *links]])
-        odds = np.exp(doubts - doubts.max())
-        odds /= odds.sum()
-        worst = int(odds.argmax())
-        if odds[worst] >= SURE:
-            if worst == 0:
+    # Of a torn place and the look-alikes that tore it, which ask for one motion, the place's own edges are those that
+    # their neighbours support: they are heard first.
+    strong = votes.support >= WELL_SUPPORTED * np.median(votes.support[accepted])
+    for group in _groups(edges, rows, walk, length, probability):
+        for voice in (group[strong[group.rows]], group):
+            if wrong.any() or open_question.any() or len(np.unique(np.r_[voice.near, voice.far])) < 3:
                 continue
-            # What too few edges speak against is not called wrong; the parts that they tie stay apart.
-            least = links[worst - 1]
-            verdict = wrong if len(group) >= BRIDGE_EDGES or len(least.rows) == 1 else open_question
-            verdict[least.rows] = True
-            open_question |= accepted & _contested(edges, accepted, least.rows)
-            right[group] = True
-            continue
-        open_question[group] = True
-        for link, chance in zip(links, odds[1:], strict=True):
-            if chance > UNLIKELY:
-                open_question[link.rows] = True
+            links = _links(edges, accepted, votes, ties, poses, voice.near, voice.far)
+            if not links:
+                continue
+            doubts = np.array([link.doubt for link in [voice.link(edges, ties, poses), *links]])
+            odds = np.exp(doubts - doubts.max())
+            odds /= odds.sum()
+            worst = int(odds.argmax())
+            if odds[worst] >= SURE and worst > 0:
+                # What too few edges speak against is not called wrong; the parts that they tie stay apart.
+                least = links[worst - 1].rows
+                verdict = wrong if len(voice.rows) >= BRIDGE_EDGES or len(least) == 1 else open_question
+                verdict[least] = True
+                open_question |= _contested(edges, accepted, least)
+                right[voice.rows] = True
+            elif voice is not group:
+                continue
+            elif odds[worst] >= SURE:
+                open_question |= _contested(edges, accepted, group.rows)
+            else:
+                open_question[group.rows] = True
+                for link, chance in zip(links, odds[1:], strict=True):
+                    if chance > UNLIKELY:
+                        open_question[link.rows] = True
+                        open_question |= _contested(edges, accepted, link.rows)
     return wrong, right, open_question
 
 
-def _contested(edges: Measurements, accepted: np.ndarray, cut: np.ndarray) -> np.ndarray:
-    """(E,) bool: edges of scenes that a cut leaves to one side by little more than chance; they go to neither."""
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Edges (``rows``) that ask for one motion of the scenes at their ``far`` ends against those at their ``near``."""
+
+    rows: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+    motion: Similarities
+
+    def __getitem__(self, keep: np.ndarray) -> Group:
+        return Group(self.rows[keep], self.near[keep], self.far[keep], self.motion)
+
+    def link(self, edges: Measurements, ties: Ties, poses: Similarities) -> Link:
+        """The link that the group would be, once its scenes have moved."""
+        ends = np.zeros(edges.num_scenes, dtype=bool)
+        ends[self.far] = True
+        moved = self.motion[np.zeros(len(self.far), dtype=np.int64)] @ poses[self.far]
+        return ties.link(edges, self.rows, ends, poses.replaced(self.far, moved))
+
+
+def _contested(edges: Measurements, accepted: np.ndarray, link: np.ndarray) -> np.ndarray:
+    """(E,) bool: edges of scenes that a link leaves to one side by little more than chance; they go to neither."""
     n = edges.num_scenes
-    across = np.bincount(np.r_[edges.targets[cut], edges.sources[cut]], minlength=n)
-    rows = np.flatnonzero(accepted)
+    across = np.bincount(np.r_[edges.targets[link], edges.sources[link]], minlength=n)
+    rows = np.union1d(np.flatnonzero(accepted), link)
     whole = np.bincount(np.r_[edges.targets[rows], edges.sources[rows]], minlength=n)
     contested = (across > 0) & (3 * across > whole)
-    return contested[edges.targets] | contested[edges.sources]
+    out = np.zeros(len(edges), dtype=bool)
+    out[rows] = contested[edges.targets[rows]] | contested[edges.sources[rows]]
+    return out
 
 
 def _links(
     edges: Measurements,
     accepted: np.ndarray,
     votes: Vote,
-    ties: _Ties,
+    ties: Ties,
     poses: Similarities,
     near: np.ndarray,
     far: np.ndarray,
@@ -155,46 +157,6 @@ def _links(
         ties.link(edges, rows, moving, poses),
         *_links(edges, accepted & beyond, votes, ties, poses, moving_end, far, depth - 1),
     ]
-
-
-@dataclass(frozen=True)
-class _Ties:
-    """Up to which ``length`` scenes count as near each other, and the ``share`` of near pairs that is tied."""
-
-    length: float
-    share: float
-
-    @classmethod
-    def of(
-        cls, edges: Measurements, accepted: np.ndarray, labels: np.ndarray, poses: Similarities, length: float
-    ) -> _Ties:
-        near = cKDTree(poses.translations).query_pairs(length, output_type="ndarray")
-        near = near[labels[near[:, 0]] == labels[near[:, 1]]]
-        pairs = np.bincount(near.ravel(), minlength=edges.num_scenes)
-        tied = np.bincount(_tied(edges, np.flatnonzero(accepted), poses, length).ravel(), minlength=edges.num_scenes)
-        busy = pairs > 0
-        # The median scene's: where the map is folded, scenes that are not neighbours lie together.
-        share = np.median(tied[busy] / pairs[busy]) if busy.any() else 0.5
-        return cls(length, float(np.clip(share, 0.05, 0.9)))
-
-    def link(self, edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities) -> Link:
-        """A link by its rows, and how much speaks against it."""
-        ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
-        still = cKDTree(poses.translations[ends[~moving[ends]]])
-        pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), self.length))
-        tied = min(pairs, len(_tied(edges, rows, poses, self.length)))
-        true = SPREAD * self.share, SPREAD * (1 - self.share)
-        alike = 1.0, SPARSER / self.share - 1.0
-        wrong = ALONE if len(rows) == 1 else ALIKE
-        evidence = [betaln(a + tied, b + pairs - tied) - betaln(a, b) for a, b in (alike, true)]
-        return Link(rows, moving, float(evidence[0] - evidence[1] + np.log(wrong / (1 - wrong))))
-
-
-def _tied(edges: Measurements, rows: np.ndarray, poses: Similarities, length: float) -> np.ndarray:
-    """(P, 2) pairs of scenes that edges at ``rows`` tie and that lie near each other."""
-    ends = np.sort(np.stack([edges.targets[rows], edges.sources[rows]], axis=1), axis=1)
-    near = np.linalg.norm(poses.translations[ends[:, 0]] - poses.translations[ends[:, 1]], axis=1) <= length
-    return np.unique(ends[near], axis=0)
 
 
 def contradicted_priors(
@@ -225,16 +187,8 @@ def contradicted_priors(
     return cut, outweighed
 
 
-def typical_length(edges: Measurements, poses: Similarities) -> float:
-    """Median length of an edge in map units."""
-    unit = np.exp(poses.log_scales[edges.targets])
-    return float(np.median(np.linalg.norm(edges.measured.translations, axis=1) * unit))
-
-
-def _groups(
-    edges: Measurements, rows: np.ndarray, walk: Walk, length: float, probability: float
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, Similarities]]:
-    """Edges of one island that ask for the same motion; the scenes at their fixed and at their moving end; it."""
+def _groups(edges: Measurements, rows: np.ndarray, walk: Walk, length: float, probability: float) -> list[Group]:
+    """Edges of one island that ask for the same motion."""
     if not len(rows):
         return []
     poses, labels = walk.poses, walk.labels
@@ -257,7 +211,7 @@ def _groups(
     which = connected_components(graph, directed=False)[1]
     order = np.argsort(which, kind="stable")
     return [
-        (rows[mine], claims.near[mine], claims.far[mine], motion[mine[:1]])
+        Group(rows[mine], claims.near[mine], claims.far[mine], motion[mine[:1]])
         for mine in np.split(order, np.flatnonzero(np.diff(which[order])) + 1)
         if len(mine) > 1
     ]
@@ -279,8 +233,8 @@ def smallest_cut(
     if not len(near) or not len(far):
         return None
     n, rows = edges.num_scenes, np.flatnonzero(accepted)
-    good = votes.share[rows] / max(float(np.median(votes.share[rows])), 1e-9)
-    weight = 1 + np.round(np.minimum(100 * good**power, MAX_WEIGHT)).astype(np.int64)
+    good = votes.support[rows] / max(float(np.median(votes.support[rows])), 1e-9)
+    weight = 1 + np.round(np.minimum(500 * good**power, MAX_WEIGHT)).astype(np.int64)
     heavy = int(weight.sum()) + 1
     flow = np.where(edges.confirmed[rows], heavy, weight)
     a, b = edges.targets[rows], edges.sources[rows]
@@ -296,7 +250,8 @@ def smallest_cut(
     rest.eliminate_zeros()
     reached = np.zeros(n + 2, dtype=bool)
     reached[breadth_first_order(rest, n, return_predecessors=False)] = True
-    side = _smoothed(reached[:n], a, b, np.r_[near, far])
+    vouched = edges.confirmed[rows]
+    side = _smoothed(reached[:n], a, b, np.r_[near, far, a[vouched], b[vouched]])
     return rows[side[a] != side[b]], ~side
 
 

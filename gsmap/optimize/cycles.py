@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
@@ -13,23 +14,40 @@ from gsmap.optimize.measurements import Measurements
 
 @dataclass(frozen=True, eq=False)
 class Vote:
-    """What the triangles through each edge say.
+    """What the cycles through each edge say.
 
     Args:
         agree: (E,) number of triangles that agree.
-        share: (E,) agreeing triangles as a share of the neighbours of both ends (the Jaccard index). High inside a
-            place, whose scenes see the same neighbours; low for edges to a place that only looks the same, unless
-            every single pair there was mistaken.
+        support: (E,) of the pairs of a neighbour of one end and one of the other, the share that is tied as well (or is
+            one scene). High inside a place, whose scenes see the same neighbours; low for edges to a place that only
+            looks the same, unless every single pair there was mistaken. Neighbours are counted over edges that some
+            triangle bears out.
     """
 
     agree: np.ndarray
-    share: np.ndarray
+    support: np.ndarray
 
     @classmethod
     def of(cls, edges: Measurements, agree: np.ndarray) -> Vote:
-        degree = np.bincount(np.r_[edges.targets, edges.sources], minlength=edges.num_scenes)
-        either = degree[edges.targets] + degree[edges.sources] - 1 - agree
-        return cls(agree, agree / np.maximum(either, 1))
+        n, a, b = edges.num_scenes, edges.targets, edges.sources
+        good = np.flatnonzero(agree > 0)
+        tied = sp.coo_matrix((np.ones(len(good)), (a[good], b[good])), shape=(n, n)).tocsr()
+        tied = ((tied + tied.T) > 0).astype(np.float64)
+        own = np.asarray(tied[a, b]).ravel() if len(a) else np.zeros(0)
+        degree = np.asarray(tied.sum(1)).ravel()
+        two = tied @ tied
+        shared = np.asarray(two[a, b]).ravel() if len(a) else np.zeros(0)
+        three = np.concatenate(
+            [np.zeros(0)]
+            + [
+                np.asarray(tied[a[k : k + 20_000]].multiply(two[b[k : k + 20_000]]).sum(1)).ravel()
+                for k in range(0, len(a), 20_000)
+            ]
+        )
+        # Paths a - i - j - b, less those that walk the edge itself to and fro.
+        paths = three - own * (degree[a] + degree[b] - 1)
+        # Half a path of three is assumed, so that few neighbours say little.
+        return cls(agree, (paths + shared + 0.5) / ((degree[a] - own) * (degree[b] - own) + 3.0))
 
 
 def vote(edges: Measurements, probability: float) -> Vote:

@@ -27,16 +27,46 @@ def worst_island_error(world, answer):
     return worst
 
 
-# Known gap: these worlds do fold, or a scene of them goes to the wrong wing.
-_FOLDS = pytest.mark.xfail(reason="look-alikes denser than the true ties still win here", strict=False)
+# Known gap: here look-alikes still fold the map, or take single scenes to the wrong wing.
+_FOLDS = pytest.mark.xfail(reason="look-alikes tore a wing or the hall, and no single link stands out", strict=False)
 
 
+# In all of these the true edges lead round from one wing to the other over three or more edges everywhere.
 @pytest.mark.parametrize(
     ("door_m", "seed"),
-    [(None, 0), (None, 1), (8.0, 0), (8.0, 2), (4.0, 1), (4.0, 2), pytest.param(4.0, 0, marks=_FOLDS)],
+    [
+        (None, 0),
+        (None, 1),
+        (8.0, 0),
+        (8.0, 2),
+        (4.0, 1),
+        (4.0, 2),
+        pytest.param(None, 6, marks=_FOLDS),
+        pytest.param(None, 12, marks=_FOLDS),
+    ],
 )
 def test_a_duplicated_wing_folds_nothing(door_m, seed):
-    world = twin_wings(300, 0.03, seed, door_m)
+    check_unfolded(twin_wings(300, 0.03, seed, door_m))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("door_m", "seed"),
+    [(None, 0), (None, 6), (8.0, 2), (8.0, 3), (4.0, 1), pytest.param(8.0, 4, marks=_FOLDS)],
+)
+def test_a_large_duplicated_wing_folds_nothing(door_m, seed):
+    check_unfolded(twin_wings(1000, 0.03, seed, door_m))
+
+
+def test_two_edges_that_speak_against_a_fold_open_it():
+    """Too few to join a wing to the hall, but enough that it may not lie on the other one."""
+    world = twin_wings(1000, 0.03, 0, 4.0)
+    answer = optimize(world.ids, world.edges, params=QUICK)
+    assert worst_island_error(world, answer) < 0.5
+    assert answer.poses["s00700"].component != answer.poses["s00900"].component
+
+
+def check_unfolded(world):
     answer = optimize(world.ids, world.edges, params=QUICK)
     assert worst_island_error(world, answer) < 0.5
     assert not [key for key in world.wrong_keys if answer.used[key] is True]
@@ -45,7 +75,7 @@ def test_a_duplicated_wing_folds_nothing(door_m, seed):
     assert all(answer.reasons[key] for key in listed)
 
 
-@pytest.mark.parametrize("seed", [2, pytest.param(0, marks=_FOLDS), pytest.param(1, marks=_FOLDS)])
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_persons_word_opens_a_fold_that_nothing_else_shows(seed):
     """The second wing is reached by look-alike edges only, until someone vouches for one way in."""
     world = twin_wings(150, 0.06, seed)
