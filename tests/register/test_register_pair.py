@@ -176,7 +176,8 @@ def test_two_proposals_of_one_pose_are_not_ambiguous(monkeypatch):
     world = splat_world(13)
     centre = scene_centroid(world.source.gaussians)
     found = []
-    for degrees in (2.0, -2.0):  # too far apart to be told for one before they are refined, too weak to end the search
+    # The second is too far off to be told for the first until it is refined; neither is sure enough to end the search.
+    for degrees in (1.0, 4.5):
         turn = exp_so3(np.radians(degrees) * np.array([0.0, 0.6, 0.8]))
         S = world.S_target_source @ Sim3(turn, centre - turn @ centre)
         found.append(propose.Proposal("landmarks", S, with_scale=False, num_inliers=20, log_nfa=-1.0, runner_up=0.9))
