@@ -8,10 +8,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.describe.colour import srgb_to_lab
+from gsmap.geometry.strays import find_strays
 from gsmap.types import Gaussians
 
 _SH_C0 = 0.28209479177387814
-_STRAY_LAB = 20.0  # a Gaussian this unlike all but one of its neighbours is not part of what they show
+_STRAY_LAB = 20.0  # colours farther apart are unlike
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +39,8 @@ def surface_cloud(gaussians: Gaussians, *, min_opacity: float = 0.1) -> Cloud:
     """Centres of the Gaussians that make up the surface: opaque, not huge, not floating alone, not of a stray colour.
 
     "Huge" and "alone" are told from the capture itself, so that the cloud of a scene does not depend on its unit: a
-    Gaussian is dropped when its largest scale exceeds 3.5 times the median one, or its 8th neighbour lies farther than
-    4 times the median such distance. Floaters that touch a surface are told by their colour: at most one of the 8
-    neighbours has one like it. Colour is the view-independent part (SH degree 0).
+    Gaussian is dropped when its largest scale exceeds 3.5 times the median one, or it strays (`find_strays`). Colour is
+    the view-independent part (SH degree 0).
     """
     scale = gaussians.scales.max(1, initial=0)
     finite = np.isfinite(gaussians.means).all(1) & np.isfinite(scale) & np.isfinite(gaussians.sh[:, 0]).all(1)
@@ -49,14 +49,8 @@ def surface_cloud(gaussians: Gaussians, *, min_opacity: float = 0.1) -> Cloud:
         keep = keep[scale[keep] <= 3.5 * np.median(scale[keep])]
     points = gaussians.means[keep].astype(np.float64)
     lab = srgb_to_lab(np.clip(_SH_C0 * gaussians.sh[keep, 0] + 0.5, 0.0, 1.0))
-    spacing = np.zeros(len(keep))
-    if len(keep) > 8:
-        distances, neighbours = cKDTree(points).query(points, k=9)
-        spacing = distances[:, 8]
-        unlike = np.stack([np.linalg.norm(lab[column] - lab, axis=1) for column in neighbours[:, 1:].T])
-        part = (spacing <= 4.0 * np.median(spacing)) & (np.partition(unlike, 1, axis=0)[1] < _STRAY_LAB)
-        keep, points, spacing, lab = keep[part], points[part], spacing[part], lab[part]
-    return Cloud(points, lab, np.pi / 8 * spacing**2, keep)
+    stray, spacing = find_strays(points, lab, _STRAY_LAB)
+    return Cloud(points[~stray], lab[~stray], np.pi / 8 * spacing[~stray] ** 2, keep[~stray])
 
 
 def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:

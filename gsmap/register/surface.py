@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.geometry.strays import find_strays
 from gsmap.types import Gaussians
 
 _SH_C0 = 0.28209479177387814
@@ -21,6 +22,7 @@ class Params:
         min_opacity, max_scale_m: a surface Gaussian is opaque and not huge; floaters and sky are the rest.
         min_opaque_share, faintest_opacity: of a capture whose trainer left it fainter, this share of the Gaussians
             counts as opaque, down to the faintest of these opacities.
+        stray_colour: floaters are told from the surface they touch by colours (RGB in [0, 1]) this unlike.
         max_scale_quantile: of the opaque Gaussians at least this share is surface, however coarse the scene is.
         resolution_m: points are averaged over cells of this size before they are aligned.
     """
@@ -29,6 +31,7 @@ class Params:
     min_opaque_share: float = 0.4
     faintest_opacity: float = 0.1
     max_scale_m: float = 0.08
+    stray_colour: float = 0.3
     max_scale_quantile: float = 0.7
     resolution_m: float = 0.05
 
@@ -65,8 +68,10 @@ class Surface:
         limit = np.log(params.max_scale_m)
         if opaque.any():
             limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))
-        keep = opaque & (largest <= limit)
+        keep = np.flatnonzero(opaque & (largest <= limit))
         colours = np.clip(gaussians.sh[keep, 0] * _SH_C0 + 0.5, 0.0, 1.0)
+        stray, _ = find_strays(gaussians.means[keep], colours, params.stray_colour)
+        keep, colours = keep[~stray], colours[~stray]
         points = gaussians.means[keep].astype(np.float64) * unit_m
         splats = Gaussians(
             points,
