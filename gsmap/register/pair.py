@@ -198,7 +198,9 @@ class _Pair:
         with self.clock.step("verdict"):
             sights = self._sights(unit_t, unit_s)
             seen = agreement_.measure(target, source, pose, sights, params.glance)
-            flaw = verdict.hopeless(seen, params.verdict)
+            # A clique beyond chance is worth a full look, whatever three cameras say of a rough pose.
+            sure = verdict.is_significant(proposal, params.verdict)
+            flaw = "" if sure else verdict.hopeless(seen, params.verdict)
         covariance = sigmas = None
         if not flaw:
             with self.clock.step("refine"):
