@@ -22,6 +22,7 @@ VERBS = (
     "update",
     "confirm",
     "reject",
+    "prior",
     "export",
     "list",
     "show",

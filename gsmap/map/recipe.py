@@ -268,7 +268,8 @@ class Map(AbstractContextManager["Map"]):
         ]
         scenes, priors = [s.id for s in self.scenes()], self.store.priors.list()
         said = [f"{r.number} {r.verdict}" for r in usable]
-        return (scenes, edges, priors), _digest(*scenes, *said, repr([(p.scene, p.sigmas) for p in priors]))
+        told = [(p.scene, p.S_map_scene.matrix().tolist(), list(p.sigmas), p.up, p.up_sigma_rad) for p in priors]
+        return (scenes, edges, priors), _digest(*scenes, *said, repr(told))
 
     def update(self, *paths: str | os.PathLike[str]) -> list[Ingested]:
         """Ingest the files, then describe, register and optimize whatever is missing."""
@@ -284,6 +285,10 @@ class Map(AbstractContextManager["Map"]):
     def set_prior(self, prior: Prior) -> None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`."""
         self.store.priors.set(prior)
+
+    def remove_prior(self, scene: str) -> None:
+        """Take back what was told of where a scene lies."""
+        self.store.priors.remove(scene)
 
     # --- export ------------------------------------------------------------------------------------------------------
 

@@ -296,3 +296,27 @@ def _image_encoder() -> bytes:
         [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
     )
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
+
+
+def test_an_anchor_and_a_survey_hold_the_map(copy: Path) -> None:
+    with gsmap.open(copy) as m:
+        names = [row["name"] for row in m.scene_rows()]
+        before = {p.scene: p.S_map_scene for p in m.pose_graph().poses.values()}
+        ids = {s.name: s.id for s in m.scenes()}
+    cli("prior", copy, names[1], "--anchor")
+    cli("update", copy)
+    with gsmap.open(copy) as m:
+        after = {p.scene: p.S_map_scene for p in m.pose_graph().poses.values()}
+    assert np.allclose(after[ids[names[1]]].matrix(), np.eye(4), atol=1e-3)
+    relative = [poses[ids[names[0]]].inverse() @ poses[ids[names[1]]] for poses in (before, after)]
+    assert np.allclose(relative[0].matrix(), relative[1].matrix(), atol=5e-3)
+    # Another position of the same certainty is another input.
+    cli("prior", copy, names[1], "--position", 5, 6, 7, "--sigma", 0.01)
+    cli("update", copy)
+    cli("prior", copy, names[1], "--position", 8, 6, 7, "--sigma", 0.01)
+    cli("update", copy)
+    with gsmap.open(copy) as m:
+        assert np.allclose(m.pose_graph().poses[ids[names[1]]].S_map_scene.translation, [8, 6, 7], atol=0.02)
+    cli("prior", copy, names[1], "--remove")
+    with gsmap.open(copy) as m:
+        assert m.store.priors.list() == []

@@ -1,0 +1,65 @@
+"""gsmap prior: what is known of a scene's pose from outside."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import MapPath, say
+
+# An anchor gives way to nothing; a tape measures to a percent, a level to a degree.
+_ANCHOR_RAD, _ANCHOR_M, _SCALE_SIGMA, _UP_SIGMA_RAD = 1e-4, 1e-4, 0.01, 0.02
+
+
+def command(
+    map: MapPath,
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")],
+    position: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--position", metavar="X Y Z", help="Where the scene's origin lies in the map (GPS, survey)."),
+    ] = None,
+    sigma: Annotated[float, typer.Option("--sigma", help="Standard deviation of the position, per axis.")] = 1.0,
+    scale: Annotated[float | None, typer.Option("--scale", help="Map units per unit of the scene, to 1 %.")] = None,
+    up: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--up", metavar="X Y Z", help="The direction against gravity in the scene's frame."),
+    ] = None,
+    anchor: Annotated[bool, typer.Option("--anchor", help="The map's frame is this scene's own.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Take back what was said.")] = False,
+) -> None:
+    """Tell where a scene lies, in place of what was said of it before. The next optimize weighs it with the edges.
+
+    Example: `gsmap prior site.gsmap monday --position 12.5 3.0 0.8 --sigma 0.5`
+    """
+    import numpy as np
+
+    import gsmap
+    from gsmap.errors import ConfigError
+    from gsmap.types import Prior, Sim3
+
+    said = [position is not None or scale is not None or up is not None, anchor, remove]
+    if sum(said) != 1:
+        raise ConfigError("say where the scene lies (--position, --scale, --up), or --anchor, or --remove")
+    if not sigma > 0 or (scale is not None and not scale > 0):
+        raise ConfigError("--sigma and --scale must be positive")
+    sigmas = np.full(7, np.inf)
+    if anchor:
+        sigmas = np.r_[np.full(3, _ANCHOR_RAD), np.full(3, _ANCHOR_M), np.inf]
+    if position is not None:
+        # The residual is in the scene's unit: (t - t_hat) / s_hat.
+        sigmas[3:6] = sigma / (scale or 1.0)
+    if scale is not None:
+        sigmas[6] = _SCALE_SIGMA
+    if up is not None:
+        length = float(np.linalg.norm(up))
+        if not (np.isfinite(length) and length > 0):
+            raise ConfigError("--up must be a direction, not zero")
+        up = tuple(np.array(up) / length)
+    with gsmap.open(map) as m:
+        if remove:
+            m.remove_prior(scene)
+        else:
+            pose = Sim3(np.eye(3), np.array(position or (0.0, 0.0, 0.0)), scale or 1.0)
+            m.set_prior(Prior(scene, pose, sigmas, None if up is None else np.array(up), _UP_SIGMA_RAD))
+    say(f"noted; run: gsmap optimize {map}")
