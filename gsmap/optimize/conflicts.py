@@ -28,8 +28,9 @@ MAX_WEIGHT = 20_000  # sums of weights must stay within 32 bits
 LINK_POWER = 3
 # A prior weighs as much as this many edges without a triangle.
 PRIOR_WEIGHT = 10.0
-# Of the links of a contradictory loop one is taken to be wrong: named if this probable, spared if less than that.
-SURE, UNLIKELY = 0.9, 0.05
+# Of the links of a contradictory loop one is taken to be wrong: named if this probable, spared if this many times less
+# probable than the likeliest, or if more than so many are not.
+SURE, FAR_LESS, MANY = 0.9, 3.0, 4
 # Edges with this share of the typical support are hardly ever look-alikes.
 WELL_SUPPORTED = 0.5
 _GENERIC = np.array([0.8164, 0.5213, 0.2483])
@@ -92,10 +93,11 @@ def undecided_groups(
                 open_question |= _contested(edges, accepted, group.rows)
             else:
                 open_question[group.rows] = True
-                for link, chance in zip(links, odds[1:], strict=True):
-                    if chance > UNLIKELY:
-                        open_question[link.rows] = True
-                        open_question |= _contested(edges, accepted, link.rows)
+                suspects = [link for link, p in zip(links, odds[1:], strict=True) if p * FAR_LESS > odds[worst]]
+                # Where hardly any stands out the wrong one is not among them: parting all would lose what is known.
+                for link in suspects if len(suspects) <= MANY else []:
+                    open_question[link.rows] = True
+                    open_question |= _contested(edges, accepted, link.rows)
     return wrong, right, open_question
 
 
