@@ -136,6 +136,11 @@ def scene_facts(store: Store, scene: Scene, graph: SceneGraph | None) -> dict[st
         facts["rotation_sigma_deg"] = float(np.degrees(sigmas[:3].max()))
         facts["translation_sigma_m"] = float(sigmas[3:6].max() * pose.S_map_scene.scale)
         facts["covariance"] = pose.covariance.tolist()
+    for prior in store.priors.list():
+        if prior.scene == scene.id:
+            facts["prior"] = {"pose": prior.S_map_scene.matrix().tolist(), "sigmas": prior.sigmas.tolist()}
+            dropped = scene.id in (placed.parameters.get("contradicted_priors", ()) if placed else ())
+            facts["prior"]["verdict"] = "outweighed by the edges" if dropped else "used"
     if graph is not None:
         facts["up"] = None if graph.up is None else graph.up.tolist()
         facts["unit_m"] = graph.unit_m

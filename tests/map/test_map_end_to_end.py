@@ -317,6 +317,9 @@ def test_an_anchor_and_a_survey_hold_the_map(copy: Path) -> None:
     cli("update", copy)
     with gsmap.open(copy) as m:
         assert np.allclose(m.pose_graph().poses[ids[names[1]]].S_map_scene.translation, [8, 6, 7], atol=0.02)
+    shown = json.loads(cli("show", copy, names[1], "--json"))
+    assert shown["prior"]["pose"][0][3] == 8
+    assert shown["prior"]["verdict"] == "used"
     cli("prior", copy, names[1], "--remove")
     with gsmap.open(copy) as m:
         assert m.store.priors.list() == []
