@@ -80,7 +80,7 @@ def far_off(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarra
             motions.append(umeyama(priors.expected.translations[three], poses.translations[priors.scenes[three]]))
         except InputError:  # all three at one place
             continue
-    best = np.zeros(len(priors), dtype=bool)
+    best, most = np.zeros(len(priors), dtype=bool), 0.0
     for S in motions:
         moved = Similarities.stack([S] * len(priors)) @ poses[priors.scenes]
         shift = np.linalg.norm(moved.translations - priors.expected.translations, axis=1)
@@ -89,7 +89,9 @@ def far_off(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarra
             turn = np.maximum(np.radians(10), 5 / priors.root_weights[:, :3].min(1))
         angle = np.linalg.norm(rotation_vectors(priors.expected.rotations.transpose(0, 2, 1) @ moved.rotations), axis=1)
         good = (shift < allowed) & (angle < turn)
-        best = good if good.sum() > best.sum() else best
+        # Of motions that satisfy as many, the one that does it better: positions along a line allow two.
+        worth = good.sum() - 0.5 * float(((shift / allowed) ** 2)[good].mean()) if good.any() else 0.0
+        best, most = (good, worth) if worth > most else (best, most)
     return ~best if best.any() else best
 
 

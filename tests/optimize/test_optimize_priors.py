@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from made_worlds import STIFF, information, near_pairs, poses_at, true_edges, twin_wings
+from made_worlds import STIFF, city, information, near_pairs, poses_at, true_edges, twin_wings
 
 from gsmap.geometry import similarities
 from gsmap.geometry.rotations import angle_between
@@ -160,3 +160,18 @@ def test_position_priors_part_a_fold_that_edges_alone_support():
     answer = optimize(world.ids, edges, gps)
     assert not [key for key in world.wrong_keys if key in answer.used and answer.used[key] is True]
     assert error_m(answer, world.ids, world.truth)[[k % 3 == 0 for k in range(150)]].max() < 1.0
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_one_wrong_position_is_outweighed(seed):
+    """Another scene's position was noted; in the first world the four right ones nearly lie along a line."""
+    world = city(100, 0.1, seed)
+
+    def gps(k, off=0.0):
+        position = world.truth.translations[k] + [off, 0, 0]
+        return Prior(world.ids[k], Sim3(np.eye(3), position), np.r_[[INF] * 3, [0.5] * 3, INF])
+
+    answer = optimize(world.ids, world.edges, [gps(3), gps(40), gps(77), gps(90), gps(60, off=25)])
+    assert answer.parameters["contradicted_priors"] == [world.ids[60]]
+    assert answer.poses[world.ids[60]].component == answer.poses[world.ids[3]].component
+    assert error_m(answer, world.ids, world.truth)[[3, 40, 60, 77, 90]].max() < 0.5
