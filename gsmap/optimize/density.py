@@ -75,6 +75,8 @@ def _tied(edges: Measurements, rows: np.ndarray, poses: Similarities, length: fl
 
 
 def typical_length(edges: Measurements, poses: Similarities) -> float:
-    """Median length of an edge in map units."""
+    """Median length of an edge in map units; 0 where there is none."""
+    if not len(edges):
+        return 0.0
     unit = np.exp(poses.log_scales[edges.targets])
     return float(np.median(np.linalg.norm(edges.measured.translations, axis=1) * unit))
