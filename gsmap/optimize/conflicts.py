@@ -92,12 +92,16 @@ def undecided_groups(
             elif odds[worst] >= SURE:
                 open_question |= _contested(edges, accepted, group.rows)
             else:
-                open_question[group.rows] = True
                 suspects = [link for link, p in zip(links, odds[1:], strict=True) if p * FAR_LESS > odds[worst]]
                 # Where hardly any stands out the wrong one is not among them: parting all would lose what is known.
-                for link in suspects if len(suspects) <= MANY else []:
+                suspects = suspects if len(suspects) <= MANY else []
+                for link in suspects:
                     open_question[link.rows] = True
                     open_question |= _contested(edges, accepted, link.rows)
+                # A link deep in the loop may leave other ways round: then the group asks again.
+                parts = islands(edges, np.flatnonzero(accepted & ~open_question))
+                if not suspects or (parts[group.near] != parts[group.far]).all():
+                    open_question[group.rows] = True
     return wrong, right, open_question
 
 
