@@ -27,6 +27,18 @@ class World:
     def wrong_keys(self) -> set[tuple[str, str]]:
         return {(e.target, e.source) for e, bad in zip(self.edges, self.wrong, strict=True) if bad}
 
+    def worst_island_m(self, answer: PoseGraph) -> float:
+        """Largest RMSE in metres over islands of at least 10 placed scenes, each aligned by itself; large if folded."""
+        worst = 0.0
+        for island in {p.component for p in answer.poses.values()}:
+            rows = [k for k, s in enumerate(self.ids) if _placed(answer, s, island)]
+            if len(rows) < 10:
+                continue
+            found = np.array([answer.poses[self.ids[k]].S_map_scene.translation for k in rows])
+            error = umeyama(self.truth.translations[rows], found).apply(found) - self.truth.translations[rows]
+            worst = max(worst, float(np.sqrt((error**2).sum(1).mean())))
+        return worst
+
     def ate(self, answer: PoseGraph, status: tuple[str, ...] = ("placed",)) -> float:
         """RMSE in metres of the placed scenes of the largest component, after rigid alignment."""
         rows = [
@@ -35,6 +47,10 @@ class World:
         found = np.array([answer.poses[self.ids[k]].S_map_scene.translation for k in rows])
         S = umeyama(self.truth.translations[rows], found)
         return float(np.sqrt(((S.apply(found) - self.truth.translations[rows]) ** 2).sum(1).mean()))
+
+
+def _placed(answer: PoseGraph, scene: str, island: int) -> bool:
+    return answer.poses[scene].component == island and answer.poses[scene].status == "placed"
 
 
 def information(rot_rad: float = ROT_RAD, trans_m: float = TRANS_M, log_scale: float | None = None) -> np.ndarray:
@@ -127,3 +143,18 @@ def twin_wings(
     mixed = mixed[np.sort(rng.permutation(len(mixed))[:keep])]
     wrong = true_edges(seems, mixed, rng, ids)
     return World(ids, edges + wrong, truth, np.arange(len(edges) + len(wrong)) >= len(edges))
+
+
+def ways_round(world: World) -> int:
+    """Number of true edges that must go before nothing ties the two wings of `twin_wings` but look-alikes."""
+    import networkx
+
+    wing = len(world.ids) // 5
+    first, second = len(world.ids) - 2 * wing, len(world.ids) - wing
+    graph = networkx.Graph()
+    for edge, wrong in zip(world.edges, world.wrong, strict=True):
+        rows = int(edge.target[1:]), int(edge.source[1:])
+        a, b = ("one" if first <= k < second else "two" if k >= second else k for k in rows)
+        if not wrong and a != b:
+            graph.add_edge(a, b, capacity=graph.edges[a, b]["capacity"] + 1 if graph.has_edge(a, b) else 1)
+    return networkx.maximum_flow_value(graph, "one", "two") if {"one", "two"} <= graph.nodes else 0

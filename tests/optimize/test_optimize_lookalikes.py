@@ -1,37 +1,21 @@
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from made_worlds import twin_wings
 
-from gsmap.geometry.umeyama import umeyama
 from gsmap.optimize import OptimizeParams, optimize
 
 QUICK = OptimizeParams(marginals=False)
 
 
-def worst_island_error(world, answer):
-    """Largest RMSE in metres over islands of at least 10 scenes, each aligned by itself: a folded one is metres off."""
-    worst = 0.0
-    for island in {p.component for p in answer.poses.values()}:
-        rows = [
-            k
-            for k, s in enumerate(world.ids)
-            if answer.poses[s].component == island and answer.poses[s].status == "placed"
-        ]
-        if len(rows) < 10:
-            continue
-        found = np.array([answer.poses[world.ids[k]].S_map_scene.translation for k in rows])
-        error = umeyama(world.truth.translations[rows], found).apply(found) - world.truth.translations[rows]
-        worst = max(worst, float(np.sqrt((error**2).sum(1).mean())))
-    return worst
-
-
 # Known gap: here look-alikes still fold the map, or take single scenes to the wrong wing.
-_FOLDS = pytest.mark.xfail(reason="a scene goes to the wrong wing, or the hall is torn as well and no link stands out", strict=False)
+_FOLDS = pytest.mark.xfail(
+    reason="a scene goes to the wrong wing, or the hall is torn as well and no link stands out", strict=False
+)
 
 
-# In all of these the true edges lead round from one wing to the other over three or more edges everywhere.
+# True edges lead round from one wing to the other; with seed 0 only two of them cross the middle of the hall, which is
+# too few to join its halves but enough to part them.
 @pytest.mark.parametrize(
     ("door_m", "seed"),
     [
@@ -63,13 +47,13 @@ def test_two_edges_that_speak_against_a_fold_open_it():
     """Too few to join a wing to the hall, but enough that it may not lie on the other one."""
     world = twin_wings(1000, 0.03, 0, 4.0)
     answer = optimize(world.ids, world.edges, params=QUICK)
-    assert worst_island_error(world, answer) < 0.5
+    assert world.worst_island_m(answer) < 0.5
     assert answer.poses["s00700"].component != answer.poses["s00900"].component
 
 
 def check_unfolded(world):
     answer = optimize(world.ids, world.edges, params=QUICK)
-    assert worst_island_error(world, answer) < 0.5
+    assert world.worst_island_m(answer) < 0.5
     assert not [key for key in world.wrong_keys if answer.used[key] is True]
     listed = set(answer.undecided) & world.wrong_keys
     assert len(listed) >= 5
@@ -83,10 +67,10 @@ def test_a_persons_word_opens_a_fold_that_nothing_else_shows(seed):
     into = [(e.target < "s00090" or e.source < "s00090") and max(e.target, e.source) >= "s00120" for e in world.edges]
     edges = [e for e, way in zip(world.edges, into, strict=True) if not way]
     folded = optimize(world.ids, edges, params=QUICK)
-    assert worst_island_error(world, folded) > 5
+    assert world.worst_island_m(folded) > 5
     word = next(e for e, way in zip(world.edges, into, strict=True) if way)
     sure = optimize(world.ids, [*edges, replace(word, confirmed=True)], params=QUICK)
     assert sure.used[word.target, word.source] is True
     assert sure.poses[word.source].component == sure.poses[word.target].component
     assert not [key for key in world.wrong_keys if sure.used[key] is True]
-    assert worst_island_error(world, sure) < 0.5
+    assert world.worst_island_m(sure) < 0.5
