@@ -108,6 +108,7 @@ def report(scenes: int, share: float, found: dict[str, list[dict]]) -> None:
 def run(task: dict) -> dict:
     from made_worlds import city
 
+    from gsmap.evaluate.registration import absolute_trajectory_error
     from gsmap.geometry.similarities import Similarities
     from gsmap.optimize import OptimizeParams, optimize
 
@@ -117,9 +118,7 @@ def run(task: dict) -> dict:
     if task["method"] == "gsmap":
         answer = optimize(world.ids, world.edges, params=OptimizeParams(marginals=task["marginals"]))
         seconds = time.process_time() - begin
-        rows = [
-            k for k, s in enumerate(world.ids) if answer.poses[s].component == 0 and answer.poses[s].status == "placed"
-        ]
+        rows = world.placed(answer)
         poses = Similarities.stack([answer.poses[s].S_map_scene for s in world.ids])
         used_wrong = sum(answer.used.get(key) is True for key in world.wrong_keys)
     else:
@@ -128,23 +127,15 @@ def run(task: dict) -> dict:
         used_wrong = int((used & world.wrong).sum())
     resource.setrlimit(resource.RLIMIT_CPU, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     best, _, _ = peer("oracle", world) if task["method"] != "oracle" else (poses, rows, None)
-    ate = aligned_error(poses, world.truth, rows)
+    truth = world.truth.translations[rows]
+    ate = absolute_trajectory_error(poses.translations[rows], truth)
     return {
         "ate_m": ate,
-        "ratio": ate / aligned_error(best, world.truth, rows),
+        "ratio": ate / absolute_trajectory_error(best.translations[rows], truth),
         "placed": len(rows) / len(world.ids),
         "used_wrong": used_wrong,
         "cpu_s": seconds,
     }
-
-
-def aligned_error(poses, truth, rows) -> float:
-    """RMSE in metres of the scenes at ``rows`` after rigid alignment."""
-    from gsmap.geometry.umeyama import umeyama
-
-    S = umeyama(truth.translations[rows], poses.translations[rows])
-    error = S.apply(poses.translations[rows]) - truth.translations[rows]
-    return float(np.sqrt((error**2).sum(1).mean()))
 
 
 def peer(method: str, world):
@@ -245,8 +236,7 @@ def run_twins(seeds: int) -> dict:
                 row["worlds"] += 1
                 row["folded"] += world.worst_island_m(answer) > 0.5
                 row["used_wrong"] += any(answer.used[key] is True for key in world.wrong_keys)
-                lead = [p.component == 0 and p.status == "placed" for p in answer.poses.values()]
-                row["placed"].append(float(np.mean(lead)))
+                row["placed"].append(len(world.placed(answer)) / scenes)
     row["placed"] = float(np.mean(row["placed"]))
     print(
         f"look-alike wings: {row['folded']} of {row['worlds']} worlds have an island off by more than 0.5 m, "

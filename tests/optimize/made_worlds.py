@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from gsmap.evaluate.registration import absolute_trajectory_error
 from gsmap.geometry import similarities
 from gsmap.geometry.similarities import Similarities
-from gsmap.geometry.umeyama import umeyama
 from gsmap.types import Edge, PoseGraph
 
 ROT_RAD, TRANS_M, STIFF = np.radians(0.5), 0.05, 1e10
@@ -28,29 +28,20 @@ class World:
         return {(e.target, e.source) for e, bad in zip(self.edges, self.wrong, strict=True) if bad}
 
     def worst_island_m(self, answer: PoseGraph) -> float:
-        """Largest RMSE in metres over islands of at least 10 placed scenes, each aligned by itself; large if folded."""
-        worst = 0.0
-        for island in {p.component for p in answer.poses.values()}:
-            rows = [k for k, s in enumerate(self.ids) if _placed(answer, s, island)]
-            if len(rows) < 10:
-                continue
-            found = np.array([answer.poses[self.ids[k]].S_map_scene.translation for k in rows])
-            error = umeyama(self.truth.translations[rows], found).apply(found) - self.truth.translations[rows]
-            worst = max(worst, float(np.sqrt((error**2).sum(1).mean())))
-        return worst
+        """Largest `ate` over islands of at least 10 placed scenes: large if one is folded."""
+        islands = {p.component for p in answer.poses.values()}
+        return max((self.ate(answer, k) for k in islands if len(self.placed(answer, k)) >= 10), default=0.0)
 
-    def ate(self, answer: PoseGraph, status: tuple[str, ...] = ("placed",)) -> float:
-        """RMSE in metres of the placed scenes of the largest component, after rigid alignment."""
-        rows = [
-            k for k, s in enumerate(self.ids) if answer.poses[s].component == 0 and answer.poses[s].status in status
-        ]
+    def ate(self, answer: PoseGraph, island: int = 0) -> float:
+        """ATE in metres of the placed scenes of an island."""
+        rows = self.placed(answer, island)
         found = np.array([answer.poses[self.ids[k]].S_map_scene.translation for k in rows])
-        S = umeyama(self.truth.translations[rows], found)
-        return float(np.sqrt(((S.apply(found) - self.truth.translations[rows]) ** 2).sum(1).mean()))
+        return absolute_trajectory_error(found, self.truth.translations[rows])
 
-
-def _placed(answer: PoseGraph, scene: str, island: int) -> bool:
-    return answer.poses[scene].component == island and answer.poses[scene].status == "placed"
+    def placed(self, answer: PoseGraph, island: int = 0) -> list[int]:
+        """Rows of the placed scenes of an island."""
+        poses = [answer.poses[s] for s in self.ids]
+        return [k for k, p in enumerate(poses) if p.component == island and p.status == "placed"]
 
 
 def information(rot_rad: float = ROT_RAD, trans_m: float = TRANS_M, log_scale: float | None = None) -> np.ndarray:
