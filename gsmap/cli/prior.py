@@ -8,8 +8,8 @@ import typer
 
 from gsmap.cli.console import MapPath, say
 
-# An anchor gives way to nothing; a tape measures to a percent, a level to a degree.
-_ANCHOR_RAD, _ANCHOR_M, _SCALE_SIGMA, _UP_SIGMA_RAD = 1e-4, 1e-4, 0.01, 0.02
+# An anchor gives way to nothing; a tape measures to a percent.
+_ANCHOR_RAD, _ANCHOR_M, _SCALE_SIGMA = 1e-4, 1e-4, 0.01
 
 
 def command(
@@ -51,15 +51,10 @@ def command(
         sigmas[3:6] = sigma / (scale or 1.0)
     if scale is not None:
         sigmas[6] = _SCALE_SIGMA
-    if up is not None:
-        length = float(np.linalg.norm(up))
-        if not (np.isfinite(length) and length > 0):
-            raise ConfigError("--up must be a direction, not zero")
-        up = tuple(np.array(up) / length)
     with gsmap.open(map) as m:
         if remove:
             m.remove_prior(scene)
         else:
             pose = Sim3(np.eye(3), np.array(position or (0.0, 0.0, 0.0)), scale or 1.0)
-            m.set_prior(Prior(scene, pose, sigmas, None if up is None else np.array(up), _UP_SIGMA_RAD))
+            m.set_prior(Prior(scene, pose, sigmas, None if up is None else np.array(up)))
     say(f"noted; run: gsmap optimize {map}")

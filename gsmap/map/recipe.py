@@ -283,7 +283,14 @@ class Map(AbstractContextManager["Map"]):
             self.optimize()  # scenes that now turn out to be neighbours are registered in the next round
 
     def set_prior(self, prior: Prior) -> None:
-        """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`."""
+        """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
+
+        Raises:
+            InputError: what `optimize` could not use; nothing is noted.
+        """
+        from gsmap.optimize.measurements import check_priors
+
+        check_priors([prior.scene], [prior])
         self.store.priors.set(prior)
 
     def remove_prior(self, scene: str) -> None:

@@ -17,6 +17,7 @@ import gsmap.map
 from gsmap import demo, formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.export.manifest import FILE_NAME
+from gsmap.types import Prior, Sim3
 
 
 @pytest.fixture(scope="module")
@@ -303,6 +304,9 @@ def test_an_anchor_and_a_survey_hold_the_map(copy: Path) -> None:
         names = [row["name"] for row in m.scene_rows()]
         before = {p.scene: p.S_map_scene for p in m.pose_graph().poses.values()}
         ids = {s.name: s.id for s in m.scenes()}
+        with pytest.raises(InputError, match="up direction"):
+            m.set_prior(Prior(names[1], Sim3.identity(), np.full(7, np.inf), np.zeros(3)))
+        assert m.store.priors.list() == []
     cli("prior", copy, names[1], "--anchor")
     cli("update", copy)
     with gsmap.open(copy) as m:
