@@ -70,7 +70,8 @@ def undecided_groups(
     # their neighbours support: they are heard first.
     strong = votes.support >= WELL_SUPPORTED * np.median(votes.support[accepted])
     for group in _groups(edges, rows, walk, length, probability):
-        for voice in (group[strong[group.rows]], group):
+        sure = strong[group.rows]
+        for voice in (group,) if sure.all() else (group[sure], group):
             if wrong.any() or open_question.any() or len(np.unique(np.r_[voice.near, voice.far])) < 3:
                 continue
             links = _links(edges, accepted, votes, ties, poses, voice.near, voice.far)
@@ -195,8 +196,6 @@ def contradicted_priors(
 
 def _groups(edges: Measurements, rows: np.ndarray, walk: Walk, length: float, probability: float) -> list[Group]:
     """Edges of one island that ask for the same motion."""
-    if not len(rows):
-        return []
     poses, labels = walk.poses, walk.labels
     a, b = edges.targets[rows], edges.sources[rows]
     motion = poses[a] @ edges.measured[rows] @ poses[b].inverse()
