@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from gsmap.describe import describe
-from gsmap.evaluate.registration import pose_error, scene_centroid
+from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import read_captures
 from gsmap.register import SceneView, register_pair
-from gsmap.types import Sim3
+from gsmap.types import Registration, Sim3
 
 pytestmark = pytest.mark.slow
 
@@ -24,23 +24,26 @@ def _capture(house, name: str, unit: float = 1.0, policy: str = "auto") -> tuple
     return SceneView(name, gaussians, cameras, graph, policy), S @ truth
 
 
+def _error(target: tuple[SceneView, Sim3], source: tuple[SceneView, Sim3]) -> tuple[Registration, PoseError]:
+    """The accepted registration of two captures, and how far it is off."""
+    found = register_pair(target[0], source[0])
+    assert found.status == "accepted"
+    truth = target[1] @ source[1].inverse()
+    return found, pose_error(found.S_target_source, truth, scene_centroid(source[0].gaussians))
+
+
 def test_a_quarter_of_overlap_is_enough_and_none_is_not(shared_data):
     house = shared_data / "house"
-    (c0, _), (c3, S3), (c5, S5) = (_capture(house, name) for name in ("c0", "c3", "c5"))
-    found = register_pair(c3, c5)
-    assert found.status == "accepted"
-    error = pose_error(found.S_target_source, S3 @ S5.inverse(), scene_centroid(c5.gaussians))
+    c0, c3, c5 = (_capture(house, name) for name in ("c0", "c3", "c5"))
+    _, error = _error(c3, c5)
     assert error.rre_deg < 0.1
     assert error.centroid_m < 0.01
-    assert register_pair(c0, c5).status != "accepted"
+    assert register_pair(c0[0], c5[0]).status != "accepted"
 
 
 def test_an_unknown_unit_is_found(shared_data):
     house = shared_data / "house"
-    (c0, S0), (c2, S2) = _capture(house, "c0", 0.3, "unknown"), _capture(house, "c2", 4.0, "unknown")
-    found = register_pair(c0, c2)
-    assert found.status == "accepted"
-    error = pose_error(found.S_target_source, S0 @ S2.inverse(), scene_centroid(c2.gaussians))
+    _, error = _error(_capture(house, "c0", 0.3, "unknown"), _capture(house, "c2", 4.0, "unknown"))
     assert error.rse < 0.005
     assert error.rre_deg < 0.3
     assert error.centroid_m / 0.3 < 0.02
@@ -48,10 +51,7 @@ def test_an_unknown_unit_is_found(shared_data):
 
 def test_unknown_units_of_a_real_sensor_are_found_and_said_no_surer_than_they_are(shared_data):
     kitchen = shared_data / "kitchen_splats"
-    (k0, S0), (k5, S5) = _capture(kitchen, "k0", 4.0, "unknown"), _capture(kitchen, "k5", 0.3, "unknown")
-    found = register_pair(k0, k5)
-    assert found.status == "accepted"
-    error = pose_error(found.S_target_source, S0 @ S5.inverse(), scene_centroid(k5.gaussians))
+    found, error = _error(_capture(kitchen, "k0", 4.0, "unknown"), _capture(kitchen, "k5", 0.3, "unknown"))
     assert error.rse < 0.02  # against the depth sensor, these captures are 0.3 and 1 percent too small
     assert error.rre_deg < 2
     assert error.centroid_m / 4.0 < 0.05
