@@ -2,7 +2,7 @@
 
 from gsmap.types.cameras import Cameras
 from gsmap.types.gaussians import Gaussians
-from gsmap.types.pose_graph import Edge, PoseGraph, Prior, ScenePose
+from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Registration
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph
@@ -12,10 +12,12 @@ from gsmap.types.tile import Tile
 __all__ = [
     "Cameras",
     "Edge",
+    "EdgeOutcome",
     "Gaussians",
     "NodeLayer",
     "PoseGraph",
     "Prior",
+    "Provenance",
     "Registration",
     "Scene",
     "SceneGraph",

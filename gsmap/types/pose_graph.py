@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from gsmap.errors import InputError
 from gsmap.types.sim3 import Sim3
 
 
@@ -61,7 +63,7 @@ class ScenePose:
     Args:
         scene: scene id.
         S_map_scene: the pose in the frame of its component; an isolated scene is its own frame.
-        component: index of its island, largest first; islands share no frame.
+        component: index of its connected component, largest first; components share no frame.
         status: ``placed``, ``tentative`` (placed by edges in no agreeing cycle), or ``isolated``.
         covariance: (7, 7) marginal over [rot_rad, trans, log_scale] on the scene side, or None.
     """
@@ -73,22 +75,71 @@ class ScenePose:
     covariance: np.ndarray | None = None
 
 
+EDGE_USES = ("used", "tentative", "unused")
+
+
+@dataclass(frozen=True)
+class EdgeOutcome:
+    """What an optimisation made of one edge.
+
+    Args:
+        use: ``used``, ``tentative`` (no agreeing cycle confirms it) or ``unused``.
+        residual_chi2: chi-square of the edge under the answer (7 dof), None where it could not be computed.
+        reason: why it is not used, or why it is tentative; empty where it is used.
+        undecided: nothing could decide whether it is right: another group of edges contradicts it.
+    """
+
+    use: str
+    residual_chi2: float | None = None
+    reason: str = ""
+    undecided: bool = False
+
+    def __post_init__(self) -> None:
+        if self.use not in EDGE_USES:
+            raise InputError(f"an edge outcome must be one of {', '.join(EDGE_USES)}, got {self.use!r}")
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """How a pose graph came about.
+
+    Args:
+        method: ``batch`` (everything solved anew) or ``incremental`` (new scenes placed in the last answer).
+        batch_scenes: how many scenes the last batch solve had.
+        measured: fingerprint of the edges and priors that the answer rests on (`gsmap.optimize`); empty where unknown.
+        contradicted_priors: scenes whose prior the edges outweighed.
+    """
+
+    method: str = "batch"
+    batch_scenes: int = 0
+    measured: str = ""
+    contradicted_priors: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
     """The answer of one optimisation.
 
     Args:
         poses: by scene id.
-        used: by (target, source): True, False or ``"tentative"``.
-        residuals: by (target, source): chi-square of the edge under the answer (7 dof), where it could be computed.
-        reasons: by (target, source): why an edge was not used, or why it is tentative.
-        undecided: (target, source) of the edges that nothing could decide.
-        parameters: what it was computed with, and how (``method`` ``batch`` or ``incremental``, ``batch_scenes``).
+        outcomes: by (target, source), of every edge that was given.
+        settings: the parameters it was computed with, as plain values.
+        provenance: how it came about.
+        notes: what a person should know (covariances that could not be computed, ...).
     """
 
     poses: dict[str, ScenePose]
-    used: dict[tuple[str, str], bool | str] = field(default_factory=dict)
-    residuals: dict[tuple[str, str], float] = field(default_factory=dict)
-    reasons: dict[tuple[str, str], str] = field(default_factory=dict)
-    undecided: tuple[tuple[str, str], ...] = ()
-    parameters: dict[str, object] = field(default_factory=dict)
+    outcomes: dict[tuple[str, str], EdgeOutcome] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
+    notes: tuple[str, ...] = ()
+
+    def use(self, target: str, source: str) -> str:
+        """How an edge was used; ``unused`` where it was not given."""
+        outcome = self.outcomes.get((target, source))
+        return "unused" if outcome is None else outcome.use
+
+    @property
+    def undecided(self) -> tuple[tuple[str, str], ...]:
+        """(target, source) of the edges that nothing could decide."""
+        return tuple(pair for pair, outcome in self.outcomes.items() if outcome.undecided)

@@ -1,0 +1,28 @@
+"""Cells of a regular grid: which points share one, and their means."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows of integer cell coordinates (N, 3) are equal.
+
+    Returns:
+        (N,) int64 label of each, counted from 0 in the order of the cells (x, then y, then z); and how many rows each
+        label has.
+    """
+    cells = np.asarray(cells).astype(np.int64)
+    if not len(cells):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    cells = cells - cells.min(0)
+    sides = cells.max(0) + 1
+    key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
+    _, label, counts = np.unique(key, return_inverse=True, return_counts=True)
+    return label.reshape(-1), counts
+
+
+def group_means(values: np.ndarray, labels: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(M, F) float64 means of the rows (N, F) of each of M labels; see `cell_labels`."""
+    sums = [np.bincount(labels, column, len(counts)) for column in values.T]
+    return np.stack(sums, axis=1) / counts[:, None] if len(values) else np.zeros((0, values.shape[1]))

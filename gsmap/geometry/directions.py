@@ -1,0 +1,31 @@
+"""Directions: turning one to the vertical, and spreading many over a sphere."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def rotation_to_z(up: np.ndarray) -> np.ndarray:
+    """The shortest rotation (3, 3) that takes a unit vector (3,) to +z."""
+    x, y, z = up
+    if z < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    k = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    return np.eye(3) + k + k @ k / (1 + z)
+
+
+def fibonacci_sphere(count: int) -> np.ndarray:
+    """(count, 3) unit vectors spread evenly over the sphere (golden spiral), from +z down."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    turn = np.pi * (1 + np.sqrt(5)) * k
+    ring = np.sqrt(1 - z**2)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+
+
+def level_frame(up: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) that takes ``up`` (3,) to +z; the turn about z is arbitrary but depends on ``up`` alone."""
+    z = np.asarray(up, float) / np.linalg.norm(up)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])

@@ -1,0 +1,31 @@
+"""Pinhole projection: the one place where points become pixels (the rasteriser's kernels have their own)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where points fall in an image.
+
+    Args:
+        points: (N, 3), in any floating type; the answer has the same.
+        T_camera_frame: (4, 4) frame-to-camera (OpenCV axes: x right, y down, z forward).
+        intrinsics_px: (4,) ``fx fy cx cy``.
+
+    Returns:
+        (N, 2) pixel coordinates ``column row`` (the first pixel's centre is 0.5 0.5), which mean nothing where the
+        depth is not positive; and (N,) depth along the camera's axis.
+    """
+    view = np.asarray(T_camera_frame).astype(points.dtype, copy=False)
+    fx, fy, cx, cy = (points.dtype.type(value) for value in intrinsics_px)
+    local = points @ view[:3, :3].T + view[:3, 3]
+    z = local[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return np.stack([fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy], axis=1), z
+
+
+def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: float = 0.0) -> np.ndarray:
+    """(N,) bool: beyond ``near`` (the points' unit) and inside an image of ``size_px`` = ``width height``."""
+    with np.errstate(invalid="ignore"):
+        return (depth > near) & (pixels >= 0).all(1) & (pixels < np.asarray(size_px)).all(1)

@@ -1,0 +1,33 @@
+"""The families of methods, their contracts, and what names a result.
+
+Each family has its contract, a ``Protocol`` with the shapes and units of every argument, in a module of its name. This
+room names the folders in which built-in methods lie, and imports none of them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from gsmap.methods.family import Family, MethodParams
+from gsmap.methods.recipe_key import RecipeKey, text_digest
+
+__all__ = ["Family", "MethodParams", "RecipeKey", "families", "family", "text_digest"]
+
+
+@lru_cache(maxsize=1)
+def families() -> dict[str, Family]:
+    """All families by name."""
+    found = (
+        Family("segmenter", "gsmap.describe.segmenters", ("MODELS", "make")),
+        Family("embedder", "gsmap.describe.embedders", ("MODELS", "make")),
+        Family("proposer", "gsmap.register.proposers", ("propose",)),
+        Family("refiner", "gsmap.register.refiners", ("SCALES", "refine")),
+        Family("merger", "gsmap.merge.mergers", ("merge", "reach_m", "reading_m", "uses_dates")),
+        Family("executor", "gsmap.engine.executors", ("run_jobs",)),
+    )
+    return {family.name: family for family in found}
+
+
+def family(name: str) -> Family:
+    """One family by name."""
+    return families()[name]

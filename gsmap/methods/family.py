@@ -1,0 +1,171 @@
+"""Families of methods: what is built in, what other packages add, and the parameters of each."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+import pkgutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, is_dataclass
+from functools import lru_cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from gsmap.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Family:
+    """Interchangeable ways of doing one thing.
+
+    A method is a module, or any object, with
+
+    - ``Params``: a frozen dataclass of its settings, all with defaults, each explained under ``Args:``;
+    - ``VERSION``: an int, raised whenever its output changes for the same input;
+    - what the family's contract asks for (`gsmap.methods.<family>`).
+
+    Built-in methods are the modules of one folder: a new file there is a new method. Another package adds one by an
+    entry point in the group ``gsmap.<family>s``, such as::
+
+        [project.entry-points."gsmap.mergers"]
+        nearest = "my_package.nearest_merger"
+
+    Args:
+        name: in the singular.
+        folder: dotted name of the package that holds the built-in ones; its modules with a leading underscore, or
+            called ``base``, are not methods.
+        contract: names that a method must have beside ``Params`` and ``VERSION``.
+        table: built-in ones by name (dotted module names) where a folder holds other things too.
+    """
+
+    name: str
+    folder: str
+    contract: tuple[str, ...]
+    table: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def group(self) -> str:
+        """The entry point group."""
+        return f"gsmap.{self.name}s"
+
+    def names(self) -> tuple[str, ...]:
+        """All methods of the family that can be asked for, in alphabetical order."""
+        return tuple(sorted({**self._added(), **self._built_in()}))
+
+    def get(self, name: str) -> Any:
+        """A method by name.
+
+        Raises:
+            ConfigError: no such method, or one that does not keep the contract.
+        """
+        return _loaded(self, name)
+
+    def params_type(self, name: str) -> type:
+        """The ``Params`` of a method."""
+        found: type = self.get(name).Params
+        return found
+
+    def version(self, name: str) -> dict[str, int]:
+        """``{"<family>.<name>": VERSION}``, as `RecipeKey.version` wants it."""
+        return {f"{self.name}.{name}": int(self.get(name).VERSION)}
+
+    def _built_in(self) -> dict[str, str]:
+        if self.table:
+            return dict(self.table)
+        spec = importlib.util.find_spec(self.folder)
+        places = (spec.submodule_search_locations if spec else None) or []
+        found = [module.name for module in pkgutil.iter_modules(list(places))]
+        return {name: f"{self.folder}.{name}" for name in found if not name.startswith("_") and name != "base"}
+
+    def _added(self) -> dict[str, EntryPoint]:
+        return {point.name: point for point in entry_points(group=self.group)}
+
+    def _load(self, name: str) -> Any:
+        built_in, added = self._built_in(), self._added()
+        if name in built_in:
+            method = importlib.import_module(built_in[name])
+        elif name in added:
+            try:
+                method = added[name].load()
+            except Exception as error:  # another package's code may fail in any way
+                raise ConfigError(
+                    f"{self.name} {name!r} of the package {_package(added[name])} cannot be loaded "
+                    f"({type(error).__name__}: {error}): mend or uninstall that package"
+                ) from error
+        else:
+            known = self.names()
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise ConfigError(f"there is no {self.name} {name!r}{hint}: choose one of {', '.join(known)}")
+        missing = [part for part in ("Params", "VERSION", *self.contract) if not hasattr(method, part)]
+        if missing:
+            raise ConfigError(
+                f"{self.name} {name!r} lacks {', '.join(missing)}: see the contract in gsmap.methods.{self.name}"
+            )
+        if not is_dataclass(method.Params) or not method.Params.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+            raise ConfigError(f"{self.name} {name!r}: its Params must be a frozen dataclass")
+        return method
+
+
+@dataclass(frozen=True)
+class MethodParams(Mapping[str, Any]):
+    """The parameters of every method of a family, by the method's name: a node of the settings tree.
+
+    Methods that nobody changed have their defaults, and are not even imported before they are asked for.
+
+    Args:
+        family: its name.
+        changed: (method, params) of those that differ from their defaults, sorted.
+    """
+
+    family: str
+    changed: tuple[tuple[str, Any], ...] = ()
+
+    def __getitem__(self, name: str) -> Any:
+        for method, params in self.changed:
+            if method == name:
+                return params
+        return _family(self.family).params_type(name)()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_family(self.family).names())
+
+    def __len__(self) -> int:
+        return len(_family(self.family).names())
+
+    def __hash__(self) -> int:
+        return hash((self.family, self.changed))
+
+    def with_params(self, name: str, params: Any) -> MethodParams:
+        """The same with other parameters for one method.
+
+        Raises:
+            ConfigError: no such method, or the parameters of another.
+        """
+        wanted = _family(self.family).params_type(name)
+        if not isinstance(params, wanted):
+            raise ConfigError(
+                f"{self.family} {name!r} takes {wanted.__module__}.Params, got {type(params).__module__}."
+                f"{type(params).__name__}"
+            )
+        kept = dict(self.changed) | {name: params}
+        return MethodParams(self.family, tuple(sorted((n, p) for n, p in kept.items() if p != self._default(n))))
+
+    def _default(self, name: str) -> Any:
+        return _family(self.family).params_type(name)()
+
+
+@lru_cache(maxsize=256)
+def _loaded(family: Family, name: str) -> Any:
+    return family._load(name)
+
+
+def _family(name: str) -> Family:
+    from gsmap.methods import families
+
+    return families()[name]
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else point.value

@@ -1,0 +1,65 @@
+"""What names a stored result: everything that made it, and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+from gsmap.types.plain import canonical, plain
+
+
+@dataclass(frozen=True, eq=False)
+class RecipeKey:
+    """The recipe of a result, and what it was made from.
+
+    Nothing else decides whether a result is made again: equal keys mean equal results, on any machine.
+
+    Args:
+        stage: ``describe``, ``register``, ``optimize`` or ``merge``.
+        method: which way of doing it, in the family's word (``graph``, ``tto``).
+        version: by name of every piece of code that takes part, its ``VERSION``: a number raised whenever its output
+            changes for the same input.
+        settings: the settings that can change this result, and no others (those of a refiner that is not used are not
+            among them).
+        backend: what computes, where that may change bits: ``native`` or ``gsplat``, a package that may be missing.
+        inputs: ids and digests of what it is made from; empty while only the recipe itself is meant.
+    """
+
+    stage: str
+    method: str
+    version: Mapping[str, int]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    backend: str = ""
+    inputs: tuple[str, ...] = ()
+
+    def of(self, *inputs: str) -> RecipeKey:
+        """The same recipe for these inputs."""
+        return replace(self, inputs=inputs)
+
+    def to_json(self) -> dict[str, Any]:
+        """The recipe without its inputs, as plain values."""
+        return {
+            "stage": self.stage,
+            "method": self.method,
+            "version": dict(self.version),
+            "settings": plain(self.settings),
+            "backend": self.backend,
+        }
+
+    @cached_property
+    def recipe(self) -> str:
+        """32 hex digits of the recipe without its inputs."""
+        return text_digest(canonical(self.to_json()))
+
+    @cached_property
+    def digest(self) -> str:
+        """32 hex digits of the recipe and its inputs: the name a result is kept under."""
+        return text_digest(canonical([self.recipe, list(self.inputs)]))
+
+
+def text_digest(text: str) -> str:
+    """32 hex digits (SHA-256) of a text."""
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

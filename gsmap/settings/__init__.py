@@ -1,0 +1,22 @@
+"""Settings: one frozen tree of all parameters, as dotted names, as TOML, and as ``--set`` on the command line.
+
+This room knows how any such tree is walked, changed and written; the tree itself is put together in `gsmap.map`, which
+knows all stages. Stages are handed their own ``Params``: nothing here is global.
+"""
+
+from gsmap.settings.docs import field_docs, unit_of
+from gsmap.settings.file import FILE_NAME, load, save
+from gsmap.settings.tree import Leaf, changed, differences, leaves, parse
+
+__all__ = [
+    "FILE_NAME",
+    "Leaf",
+    "changed",
+    "differences",
+    "field_docs",
+    "leaves",
+    "load",
+    "parse",
+    "save",
+    "unit_of",
+]

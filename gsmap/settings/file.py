@@ -1,0 +1,88 @@
+"""``settings.toml``: what a map changes of the defaults; a person may edit it, comments are kept."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gsmap.durable import write_whole
+from gsmap.errors import ConfigError
+from gsmap.types.plain import plain
+
+FILE_NAME = "settings.toml"
+PRESET = "preset"
+_HEADER = "Settings of this map that differ from the defaults; `gsmap settings MAP` lists all of them."
+
+
+def load(path: Path) -> dict[str, Any]:
+    """The settings of a file by dotted name (``preset`` among them); empty where there is no file.
+
+    Raises:
+        ConfigError: not TOML; the line is named.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return {}
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not a text file in UTF-8: mend or remove it") from error
+    try:
+        return dict(_flat(tomllib.loads(text)))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not TOML ({error}): mend or remove it") from error
+
+
+def save(path: Path, values: Mapping[str, Any], drop: tuple[str, ...] = ()) -> None:
+    """Set some settings in a file, and take others out; the rest of it, comments included, stays as it is.
+
+    Args:
+        values: by dotted name.
+        drop: dotted names that go back to their defaults.
+    """
+    import tomlkit
+
+    document = tomlkit.parse(path.read_text(encoding="utf-8")) if path.exists() else tomlkit.document()
+    if not path.exists():
+        document.add(tomlkit.comment(_HEADER))
+    for name in drop:
+        _drop(document, name.split("."))
+    for name, value in values.items():
+        table: Any = document
+        *above, last = name.split(".")
+        for part in above:
+            if part not in table:
+                table[part] = tomlkit.table(is_super_table=True)
+            table = table[part]
+        if value is None:
+            table[last] = "none"
+        else:
+            table[last] = plain(value)
+    text = tomlkit.dumps(document)
+    write_whole(path, lambda staged: _write(staged, text))
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    out: list[tuple[str, Any]] = []
+    for key, value in table.items():
+        if isinstance(value, dict):
+            out += _flat(value, f"{prefix}{key}.")
+        else:
+            out.append((f"{prefix}{key}", None if value == "none" else value))
+    return out
+
+
+def _drop(table: Any, path: list[str]) -> None:
+    if path[0] not in table:
+        return
+    if len(path) == 1:
+        del table[path[0]]
+        return
+    _drop(table[path[0]], path[1:])
+    if not len(table[path[0]]):
+        del table[path[0]]

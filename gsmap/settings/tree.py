@@ -1,0 +1,165 @@
+"""A tree of frozen settings: every leaf by its dotted name, and the tree with some leaves changed.
+
+The nodes are frozen dataclasses and `gsmap.methods.MethodParams`; a leaf is anything else: a number, a text, a switch,
+a tuple of them, or None where nothing is chosen.
+"""
+
+from __future__ import annotations
+
+import difflib
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from gsmap.errors import ConfigError
+from gsmap.methods import MethodParams
+from gsmap.settings.docs import field_docs, unit_of
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One setting.
+
+    Args:
+        name: dotted, such as ``register.verdict.max_log_nfa``.
+        value: as it is.
+        type: its annotation.
+        meaning: from the docstring of the dataclass that holds it.
+        unit: from its name; empty where it has none.
+    """
+
+    name: str
+    value: Any
+    type: Any
+    meaning: str
+    unit: str
+
+
+def leaves(tree: Any, prefix: str = "") -> Iterator[Leaf]:
+    """Every setting of a tree, in the order in which they are declared."""
+    for name, value, annotation, meaning in _children(tree):
+        path = f"{prefix}{name}"
+        if _is_node(value):
+            yield from leaves(value, f"{path}.")
+        else:
+            yield Leaf(path, value, annotation, meaning, unit_of(name))
+
+
+def changed(tree: Any, values: Mapping[str, Any]) -> Any:
+    """The tree with some leaves set; values are plain (as TOML or JSON hold them) or already of the leaf's type.
+
+    Raises:
+        ConfigError: an unknown name (the nearest known one is named), a value of another type, or one that the
+            settings themselves refuse.
+    """
+    for name, value in values.items():
+        tree = _set(tree, name.split("."), value, name, tree)
+    return tree
+
+
+def differences(tree: Any, base: Any) -> dict[str, Any]:
+    """The leaves of a tree that are not as in another one of the same shape."""
+    before = {leaf.name: leaf.value for leaf in leaves(base)}
+    return {
+        leaf.name: leaf.value for leaf in leaves(tree) if leaf.name not in before or before[leaf.name] != leaf.value
+    }
+
+
+def parse(text: str) -> tuple[str, Any]:
+    """Name and value of ``a.b=value``, as ``--set`` takes them; the value is TOML, or plain text.
+
+    Raises:
+        ConfigError: no ``=``, or nothing before it.
+    """
+    import tomllib
+
+    name, equals, value = text.partition("=")
+    name, value = name.strip(), value.strip()
+    if not equals or not name:
+        raise ConfigError(f"a setting is given as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}")
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, None if value.lower() == "none" else value
+
+
+def _is_node(value: Any) -> bool:
+    return isinstance(value, MethodParams) or (is_dataclass(value) and not isinstance(value, type))
+
+
+def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
+    """(name, value, annotation, meaning) of what hangs at a node."""
+    if isinstance(tree, MethodParams):
+        for name in tree:
+            yield name, tree[name], None, ""
+        return
+    docs, hints = field_docs(type(tree)), get_type_hints(type(tree))
+    for field in fields(tree):
+        if field.init:
+            yield field.name, getattr(tree, field.name), hints[field.name], docs.get(field.name, "")
+
+
+def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
+    found = {child: (below, annotation) for child, below, annotation, _ in _children(tree)}
+    if path[0] not in found:
+        raise _unknown(name, root)
+    below, annotation = found[path[0]]
+    if len(path) > 1:
+        if not _is_node(below):
+            raise _unknown(name, root)
+        new = _set(below, path[1:], value, name, root)
+    elif _is_node(below):
+        inside = ", ".join(leaf.name for leaf in list(leaves(below, f"{name}."))[:4])
+        raise ConfigError(f"{name} holds several settings: set one of them, such as {inside}")
+    else:
+        new = _of_type(value, annotation, name)
+    if isinstance(tree, MethodParams):
+        return tree.with_params(path[0], new)
+    return replace(tree, **{path[0]: new})
+
+
+def _unknown(name: str, root: Any) -> ConfigError:
+    known = [leaf.name for leaf in leaves(root)]
+    near = difflib.get_close_matches(name, known, 1, 0.5) or [k for k in known if k.endswith("." + name.split(".")[-1])]
+    hint = f": did you mean {near[0]}?" if near else ": gsmap settings MAP lists them all"
+    return ConfigError(f"there is no setting {name!r}{hint}")
+
+
+def _of_type(value: Any, annotation: Any, name: str) -> Any:
+    """The value as the leaf's type has it."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in inner:
+            return None
+        rest = [kind for kind in inner if kind is not type(None)]
+        for kind in rest:
+            try:
+                return _of_type(value, kind, name)
+            except ConfigError:
+                continue
+        raise _wrong(value, annotation, name)
+    if origin is Literal:
+        if value in inner:
+            return value
+        raise ConfigError(f"{name} must be one of {', '.join(map(str, inner))}, got {value!r}")
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise _wrong(value, annotation, name)
+        if len(inner) == 2 and inner[1] is Ellipsis:
+            return tuple(_of_type(item, inner[0], name) for item in value)
+        if len(value) != len(inner):
+            raise _wrong(value, annotation, name)
+        return tuple(_of_type(item, kind, name) for item, kind in zip(value, inner, strict=True))
+    if annotation is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if annotation is int and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if annotation in (str, bool) and isinstance(value, annotation):
+        return value
+    raise _wrong(value, annotation, name)
+
+
+def _wrong(value: Any, annotation: Any, name: str) -> ConfigError:
+    wanted = getattr(annotation, "__name__", str(annotation)) if not get_args(annotation) else str(annotation)
+    return ConfigError(f"{name} takes {wanted}, got {value!r}")
