@@ -13,7 +13,7 @@ depends_on = None
 _PROVENANCE = ("method", "batch_scenes", "measured", "contradicted_priors")
 _WITH_RECIPE = ("graphs", "registrations", "revisions", "tiles")
 # Old word, new word: of proposers, of evidence, of layers.
-_PROPOSERS = {"dense": "kiss_matcher"}
+_PROPOSERS = {"landmarks": "graph:landmarks", "objects": "graph:objects", "dense": "kiss_matcher"}
 _EVIDENCE = {"contradiction": "free_space_violation"}
 _LAYERS = {"unlevelled": "landmarks_gravity_free"}
 
