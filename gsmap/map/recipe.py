@@ -25,7 +25,7 @@ from gsmap.types import Cameras, Edge, Gaussians, PoseGraph, Prior, Registration
 
 if TYPE_CHECKING:
     from gsmap.export import ExportResult
-    from gsmap.register.candidates import Placed
+    from gsmap.retrieve.pairs import Placed
     from gsmap.store.integrity import Pruned
     from gsmap.view import ViewServer
 
@@ -180,7 +180,7 @@ class Map(AbstractContextManager["Map"]):
 
     def _pairs(self, pairs: str, methods: dict[str, str]) -> list[tuple[str, str]]:
         """The scene pairs that ``pairs`` asks for, each as (target, source), in a fixed order."""
-        from gsmap.register.candidates import candidate_pairs
+        from gsmap.retrieve.pairs import candidate_pairs
 
         described = [scene for scene, method in methods.items() if self.store.graphs.find(scene, method)]
         if pairs == "all":
@@ -196,7 +196,7 @@ class Map(AbstractContextManager["Map"]):
 
     def _placed(self) -> dict[str, Placed]:
         """Where scenes lie, for finding neighbours."""
-        from gsmap.register.candidates import Placed
+        from gsmap.retrieve.pairs import Placed
 
         bounds = {s.id: s.bounds for s in self.scenes()}
         graph = self.pose_graph()
