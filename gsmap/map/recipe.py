@@ -159,11 +159,11 @@ class Map(AbstractContextManager["Map"]):
     def register(self, pairs: str = "auto") -> list[Registration]:
         """Register pairs of described scenes that lack an edge: ``auto`` candidates, ``all``, or one pair ``A:B``."""
         from gsmap.map.jobs import register_scenes
-        from gsmap.register import METHOD_VERSION, Params
+        from gsmap.register import VERSION, Params
 
         methods = {s.id: self._method(s) for s in self.scenes()}
         wanted = self._pairs(pairs, methods)
-        how = f"{METHOD_VERSION} {Params()!r}"
+        how = f"{VERSION} {Params()!r}"
         keys = [_digest(a, methods[a], b, methods[b], how) for a, b in wanted]
         if pairs in ("auto", "all"):
             lacking = [i for i, key in enumerate(keys) if self.store.registrations.find(key) is None]

@@ -10,7 +10,6 @@ import numpy as np
 
 from gsmap.types import NodeLayer, SceneGraph
 
-
 VERSION = 1
 
 _MIN_NODES = 16  # of each scene, however many scenes share the budget
