@@ -183,7 +183,7 @@ def pair_facts(store: Store, a: Scene, b: Scene) -> dict[str, Any]:
     names = {a.id: a.name, b.id: b.name}
     facts = _edge_row(current, placed)
     facts |= {"target": names[edge.target], "source": names[edge.source]}
-    facts |= {"method": edge.method, "exact": edge.exact, "evidence": edge.evidence}
+    facts |= {"method": edge.proposer, "exact": edge.exact, "evidence": edge.evidence}
     facts["residual_chi2"] = placed.residuals.get((edge.target, edge.source)) if placed else None
     facts["history"] = [
         {"when": old.created_at, "what": old.registration.status, "reason": old.registration.reason}

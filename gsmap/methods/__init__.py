@@ -20,7 +20,7 @@ def families() -> dict[str, Family]:
     found = (
         Family("segmenter", "gsmap.describe.segmenters", ("MODELS", "make")),
         Family("embedder", "gsmap.describe.embedders", ("MODELS", "make")),
-        Family("proposer", "gsmap.register.proposers", ("propose",)),
+        Family("proposer", "gsmap.register.proposers", ("SCALES", "PACKAGES", "propose")),
         Family("refiner", "gsmap.register.refiners", ("SCALES", "refine")),
         Family("merger", "gsmap.merge.mergers", ("merge", "reach_m", "reading_m", "uses_dates")),
         Family("executor", "gsmap.engine.executors", ("run_jobs",)),

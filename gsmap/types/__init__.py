@@ -3,7 +3,7 @@
 from gsmap.types.cameras import Cameras
 from gsmap.types.gaussians import Gaussians
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose
-from gsmap.types.registration import Registration
+from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph
 from gsmap.types.sim3 import Sim3
@@ -17,6 +17,7 @@ __all__ = [
     "NodeLayer",
     "PoseGraph",
     "Prior",
+    "Proposal",
     "Provenance",
     "Registration",
     "Scene",
