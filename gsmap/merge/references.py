@@ -141,8 +141,11 @@ def _cropped(camera: Cameras, window: tuple[slice, slice]) -> Cameras:
 
 
 def _visible_pixels(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
-    """See `References.visible_pixels`. What no view saw shows nothing of a whole capture; of a piece of one, other views
-    may have seen it, so it goes after what is seen and yet dominates nothing."""
+    """See `References.visible_pixels`.
+
+    What no view saw shows nothing of a whole capture; of a piece of one, other views may have seen it, so it goes after
+    what is seen and yet dominates nothing.
+    """
     if not largest.any():
         return np.ones(len(pixels), dtype=np.float32)
     unseen = 0.0 if whole else 0.5

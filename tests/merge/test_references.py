@@ -83,7 +83,7 @@ def test_what_a_later_capture_looked_through_is_gone():
     assert remove_disappeared([PlacedScene(before, cameras, "x"), new])[1] == [0, 0]
 
 
-def test_what_came_later_is_not_asked_away_by_older_pictures():
+def test_newer_surfaces_are_not_asked_away_by_older_pictures():
     box = wall(5, -0.2, 0.2, z=-0.5, colour=lambda x, y: 1 - texture(x, y), half_height=0.15)
     cameras = cameras_facing(np.linspace(-0.6, 0.6, 7))
     old = PlacedScene(wall(1, -1.5, 1.5), cameras, "old", "2026-01-01T00:00:00+00:00")

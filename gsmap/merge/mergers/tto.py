@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import changes, exposure, references
 from gsmap.merge.changes import newer_surfaces, remove_disappeared
@@ -127,6 +128,19 @@ class Params:
     references: references.Params = field(default_factory=references.Params)
     changes: changes.Params = field(default_factory=changes.Params)
     exposure: exposure.Params = field(default_factory=exposure.Params)
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 0:
+            raise ConfigError(f"steps must not be negative, got {self.steps}")
+        for name in ("voxel_m", "cell_m", "longest_side_px"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("cover_m", "passes", "halo_m", "reach_m", "min_cameras", "min_weight"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("keep", "ssim_weight"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}")
 
 
 def reach_m(params: Params) -> float:
