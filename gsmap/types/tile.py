@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,19 +15,17 @@ class Tile:
     """A box of the map, what it was made from, and where it was written.
 
     Args:
-        key: digest of everything that decides its content but the poses (`gsmap.methods.RecipeKey.digest`); empty
-            where an older gsmap wrote it, which makes it dirty.
-        component: the component it belongs to.
+        key: digest of everything that decides its content but the poses.
+        component: connected component it belongs to.
         bounds: (2, 3) float64 lowest and highest corner, map frame; a Gaussian belongs where its mean is
             (``low <= x < high``).
         poses: the ``S_map_scene`` it was made with, by scene id.
         num_gaussians: how many it holds.
-        recipe: how it was merged, as plain values (`gsmap.methods.RecipeKey.to_json`: stage, method, version,
-            settings, backend).
+        recipe: `gsmap.methods.RecipeKey.to_json` of what made it; ``{"method": text}`` in maps of schema 0001.
         truncated: a time budget cut its optimisation short.
-        path: relative to the export's folder; empty where it holds no Gaussians and so has no file.
+        path: relative to the export's folder.
         sha256: of the file written.
-        notes: what a person should know about how it was merged.
+        notes: what a person should know of how it was merged.
     """
 
     key: str
@@ -36,7 +33,7 @@ class Tile:
     bounds: np.ndarray
     poses: dict[str, Sim3] = field(default_factory=dict)
     num_gaussians: int = 0
-    recipe: Mapping[str, Any] = field(default_factory=dict)
+    recipe: dict[str, Any] = field(default_factory=dict)
     truncated: bool = False
     path: str = ""
     sha256: str = ""
