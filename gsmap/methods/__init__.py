@@ -22,7 +22,11 @@ def families() -> dict[str, Family]:
         Family("embedder", "gsmap.describe.embedders", ("MODELS", "make")),
         Family("proposer", "gsmap.register.proposers", ("SCALES", "PACKAGES", "propose")),
         Family("refiner", "gsmap.register.refiners", ("SCALES", "refine")),
-        Family("merger", "gsmap.merge.mergers", ("merge", "reach_m", "reading_m", "uses_dates")),
+        Family(
+            "merger",
+            "gsmap.merge.mergers",
+            ("STEPS", "RENDERS", "reach_m", "reading_m", "min_cameras", "uses_dates", "merge"),
+        ),
         Family("executor", "gsmap.engine.executors", ("run_jobs",)),
     )
     return {family.name: family for family in found}

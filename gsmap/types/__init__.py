@@ -2,6 +2,7 @@
 
 from gsmap.types.cameras import Cameras
 from gsmap.types.gaussians import Gaussians
+from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
@@ -14,7 +15,9 @@ __all__ = [
     "Edge",
     "EdgeOutcome",
     "Gaussians",
+    "MergeResult",
     "NodeLayer",
+    "PlacedScene",
     "PoseGraph",
     "Prior",
     "Proposal",
