@@ -2,7 +2,7 @@
 
 from gsmap.types.cameras import Cameras
 from gsmap.types.gaussians import Gaussians
-from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose
+from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Registration
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph
@@ -15,6 +15,7 @@ __all__ = [
     "EdgeOutcome",
     "Gaussians",
     "NodeLayer",
+    "PoseChange",
     "PoseGraph",
     "Prior",
     "Provenance",
