@@ -3,7 +3,7 @@
 from gsmap.types.cameras import Cameras
 from gsmap.types.gaussians import Gaussians
 from gsmap.types.merging import MergeResult, PlacedScene
-from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose
+from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph
@@ -18,6 +18,7 @@ __all__ = [
     "MergeResult",
     "NodeLayer",
     "PlacedScene",
+    "PoseChange",
     "PoseGraph",
     "Prior",
     "Proposal",
