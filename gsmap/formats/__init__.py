@@ -1,7 +1,7 @@
 """Files of Gaussians: one module per format, found by suffix.
 
 A module has ``read(path) -> Gaussians``, ``write(path, gaussians, **options)`` or both, and, where the format can say
-more, ``info(path) -> Info``. Modules are imported on first use.
+more, ``info(path) -> FileInfo``. Modules are imported on first use.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
 from gsmap.errors import InputError, NotFoundError
-from gsmap.types import Cameras, Gaussians
+from gsmap.types import Cameras, FileInfo, Gaussians
 
 # Suffix -> module of this package. The longest suffix wins, so `.compressed.ply` goes before `.ply`.
 MODULES: dict[str, str] = {
@@ -29,19 +28,6 @@ MODULES: dict[str, str] = {
     "tileset.json": "tiles3d",
 }
 _MAX_MESSAGE = 300
-
-
-@dataclass(frozen=True)
-class Info:
-    """What a file says about itself beside its Gaussians.
-
-    Args:
-        antialiased: trained with the 2D Mip filter.
-        notes: what a person should know about how it was read.
-    """
-
-    antialiased: bool = False
-    notes: tuple[str, ...] = ()
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
@@ -58,18 +44,18 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         InputError: unknown suffix, or a file that is not what its suffix says; values are checked by `gsmap.ingest`.
     """
     path = Path(path)
-    module = _module(path, "read")
+    suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return module.read(path)
+        return _load(_layout(path, suffix)).read(path)
 
 
-def info(path: str | os.PathLike[str]) -> Info:
-    """What the file says about itself beside its Gaussians; an empty `Info` where the format says nothing."""
+def info(path: str | os.PathLike[str]) -> FileInfo:
+    """What the file says about itself beside its Gaussians; an empty `FileInfo` where the format says nothing."""
     path = Path(path)
-    module = _module(path, "read")
+    module = _load(_suffix(path, "read"))
     with _explained(path, "read"):
-        return module.info(path) if hasattr(module, "info") else Info()
+        return module.info(path) if hasattr(module, "info") else FileInfo()
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object) -> None:
@@ -83,7 +69,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object)
         InputError: unknown suffix, a format that is only read, or a path that cannot be written.
     """
     path = Path(path)
-    module = _module(path, "write")
+    module = _load(_suffix(path, "write"))
     staged = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         with _explained(path, "write"):
@@ -111,15 +97,24 @@ def _load(suffix: str) -> ModuleType:
     return importlib.import_module(f"gsmap.formats.{MODULES[suffix]}")
 
 
-def _module(path: Path, verb: str) -> ModuleType:
+def _suffix(path: Path, verb: str) -> str:
+    """The suffix of a path that can be read or written."""
     suffix = suffix_of(path)
     if suffix is None:
         what = f"has the unknown suffix {path.suffix!r}" if path.suffix else "has no suffix"
         raise InputError(f"{path} {what}: gsmap can {verb} {', '.join(known(verb))}")
-    module = _load(suffix)
-    if not hasattr(module, verb):
+    if not hasattr(_load(suffix), verb):
         raise InputError(f"{path}: gsmap cannot {verb} {suffix} files; it can {verb} {', '.join(known(verb))}")
-    return module
+    return suffix
+
+
+def _layout(path: Path, suffix: str) -> str:
+    """The suffix that stands for what is in the file: some programs call a ``.compressed.ply`` a ``.ply``."""
+    if suffix != ".ply":
+        return suffix
+    from gsmap.formats import ply
+
+    return ".compressed.ply" if ply.is_compressed(ply.read_header(path)) else suffix
 
 
 @contextlib.contextmanager

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats import Info
-from gsmap.types import Gaussians
+from gsmap.types import FileInfo, Gaussians
 
 HEADER_LIMIT_BYTES = 64 * 1024
 SH_C0 = 0.28209479177387814  # Y_0^0: colour = 0.5 + SH_C0 * f_dc
@@ -77,9 +76,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """
     header = read_header(path)
     if is_compressed(header):
-        from gsmap.formats import compressed_ply
-
-        return compressed_ply.read(path)
+        raise InputError(f"{path} holds the layout of a .compressed.ply: read it with gsmap.formats.read, which looks")
     rows = read_element(path, header, "vertex")
     names = set(header.elements["vertex"].names)
     rest = _rest_names(path, names)
@@ -116,7 +113,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     return Gaussians(means, quats, log_scales, logits[:, 0], sh)
 
 
-def info(path: str | os.PathLike[str]) -> Info:
+def info(path: str | os.PathLike[str]) -> FileInfo:
     """Whether it was trained antialiased, and what reading it changed."""
     header = read_header(path)
     names = header.elements["vertex"].names if "vertex" in header.elements else ()
@@ -129,7 +126,7 @@ def info(path: str | os.PathLike[str]) -> Info:
     if names and "f_dc_0" not in names and "red" in names:
         notes.append("colours from red green blue: no view dependence")
     antialiased = "splatrendermode: mip" in text or "antialiased" in text or "filter_3D" in names
-    return Info(antialiased, tuple(notes))
+    return FileInfo(antialiased, tuple(notes))
 
 
 def write(

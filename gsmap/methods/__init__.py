@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from gsmap.methods.family import Family, MethodParams
+from gsmap.methods.family import Family, MethodParams, declare
 from gsmap.methods.recipe_key import RecipeKey, text_digest
 
 __all__ = ["Family", "MethodParams", "RecipeKey", "families", "family", "text_digest"]
@@ -31,3 +31,6 @@ def families() -> dict[str, Family]:
 def family(name: str) -> Family:
     """One family by name."""
     return families()[name]
+
+
+declare(families())

@@ -14,6 +14,8 @@ from typing import Any
 
 from gsmap.errors import ConfigError
 
+_DECLARED: dict[str, Family] = {}
+
 
 @dataclass(frozen=True)
 class Family:
@@ -161,10 +163,13 @@ def _loaded(family: Family, name: str) -> Any:
     return family._load(name)
 
 
-def _family(name: str) -> Family:
-    from gsmap.methods import families
+def declare(found: Mapping[str, Family]) -> None:
+    """Say which families there are; `gsmap.methods` does, so that this module need not import it."""
+    _DECLARED.update(found)
 
-    return families()[name]
+
+def _family(name: str) -> Family:
+    return _DECLARED[name]
 
 
 def _package(point: EntryPoint) -> str:

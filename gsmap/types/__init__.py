@@ -1,6 +1,7 @@
 """The frozen nouns of gsmap. numpy only: they travel between stages, processes and machines."""
 
 from gsmap.types.cameras import Cameras
+from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Registration
@@ -13,6 +14,7 @@ __all__ = [
     "Cameras",
     "Edge",
     "EdgeOutcome",
+    "FileInfo",
     "Gaussians",
     "NodeLayer",
     "PoseGraph",
