@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.types import FileInfo, Gaussians
 
 HEADER_LIMIT_BYTES = 64 * 1024
-SH_C0 = 0.28209479177387814  # Y_0^0: colour = 0.5 + SH_C0 * f_dc
 
 _TYPES = {
     "char": "i1",
@@ -105,7 +105,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
             sh[block, 1:] = channel_major.reshape(len(part), 3, k - 1).transpose(0, 2, 1)
     if not has_dc:
         top = np.iinfo(rows.dtype["red"]).max if rows.dtype["red"].kind in "iu" else 1.0
-        sh[:, 0] = (sh[:, 0] / top - 0.5) / SH_C0
+        sh[:, 0] = sh0_of_rgb(sh[:, 0] / top)
     if flat:
         log_scales[:, 2] = log_scales[:, :2].min(1) + np.log(1e-3)
     if "filter_3D" in names:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,9 +14,8 @@ from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.synthesise import synthesise_cameras
 from gsmap.ingest.validate import validate
 from gsmap.types import Cameras, Gaussians
+from gsmap.types.progress import Progress
 from gsmap.types.scene import SCALE_POLICIES
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.geometry.strays import find_strays
+from gsmap.geometry.floaters import find_floaters
 from gsmap.types import Gaussians
 
 _SH_C0 = 0.28209479177387814
@@ -70,7 +70,7 @@ class Surface:
             limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))
         keep = np.flatnonzero(opaque & (largest <= limit))
         colours = np.clip(gaussians.sh[keep, 0] * _SH_C0 + 0.5, 0.0, 1.0)
-        stray, _ = find_strays(gaussians.means[keep], colours, params.stray_colour)
+        stray, _ = find_floaters(gaussians.means[keep], colours, params.stray_colour)
         keep, colours = keep[~stray], colours[~stray]
         points = gaussians.means[keep].astype(np.float64) * unit_m
         splats = Gaussians(

@@ -15,7 +15,7 @@ class Tile:
 
     Args:
         key: digest of everything that decides its content but the poses.
-        component: island it belongs to.
+        component: connected component it belongs to.
         bounds: (2, 3) float64 lowest and highest corner, map frame; a Gaussian belongs where its mean is
             (``low <= x < high``).
         poses: the ``S_map_scene`` it was made with, by scene id.
