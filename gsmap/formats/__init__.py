@@ -1,39 +1,32 @@
 """Files of Gaussians: one module per format, found by suffix.
 
-A module has ``read(path) -> Gaussians``, ``write(path, gaussians, **options)`` or both, and, where the format can say
-more, ``info(path) -> FileInfo``. Modules are imported on first use.
+The contract of a format is in `gsmap.methods.format`; another package adds one by an entry point in the group
+``gsmap.formats``, named by its suffix. Modules are imported on first use.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
+import sys
+from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 
-from gsmap.errors import InputError, NotFoundError
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.methods import family
 from gsmap.types import Cameras, FileInfo, Gaussians
 
-# Suffix -> module of this package. The longest suffix wins, so `.compressed.ply` goes before `.ply`.
-MODULES: dict[str, str] = {
-    ".compressed.ply": "compressed_ply",
-    ".glb": "glb",
-    ".ply": "ply",
-    ".sog": "sog",
-    ".splat": "splat",
-    ".spz": "spz",
-    "tileset.json": "tiles3d",
-}
 _MAX_MESSAGE = 300
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
-    """The registered suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None."""
+    """The longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None."""
     name = Path(path).name.lower()
-    return max((s for s in MODULES if name.endswith(s)), key=len, default=None)
+    return max((s for s in _suffixes(tuple(sys.path)) if name.endswith(s)), key=len, default=None)
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
@@ -47,7 +40,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return _load(_layout(path, suffix)).read(path)
+        found: Gaussians = _load(_layout(path, suffix)).read(path)
+        return found
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
@@ -90,11 +84,25 @@ def read_cameras(path: str | os.PathLike[str]) -> Cameras:
 
 def known(verb: str) -> list[str]:
     """The suffixes that can be read (``verb="read"``) or written (``"write"``)."""
-    return sorted(suffix for suffix in MODULES if hasattr(_load(suffix), verb))
+    return [suffix for suffix in _suffixes(tuple(sys.path)) if _can(suffix, verb)]
 
 
-def _load(suffix: str) -> ModuleType:
-    return importlib.import_module(f"gsmap.formats.{MODULES[suffix]}")
+@lru_cache(maxsize=4)
+def _suffixes(places: tuple[str, ...]) -> tuple[str, ...]:
+    """All suffixes; ``places`` (`sys.path`) are looked through for other packages' once, as that takes milliseconds."""
+    return family("format").names()
+
+
+def _load(suffix: str) -> Any:
+    return family("format").get(suffix)
+
+
+def _can(suffix: str, verb: str) -> bool:
+    """Whether a format reads or writes; another package's that cannot be loaded does neither."""
+    try:
+        return hasattr(_load(suffix), verb)
+    except ConfigError:
+        return False
 
 
 def _suffix(path: Path, verb: str) -> str:
@@ -118,7 +126,7 @@ def _layout(path: Path, suffix: str) -> str:
 
 
 @contextlib.contextmanager
-def _explained(path: Path, verb: str):
+def _explained(path: Path, verb: str) -> Iterator[None]:
     """Turn what the operating system says into one typed line, and keep what a damaged file says within one."""
     try:
         yield

@@ -23,6 +23,8 @@ from gsmap.geometry.morton import morton_order
 from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.types import Gaussians
 
+VERSION = 1
+
 _CHUNK = 256
 _BOUNDS = [f"{end}_{of}{axis}" for of in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 _COLOUR_BOUNDS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]

@@ -23,6 +23,8 @@ from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, Sim3
 
+VERSION = 1
+
 EXTENSION = "KHR_gaussian_splatting"
 _MAX_JSON_BYTES = 16 << 20
 _MAX_NODES = 10_000

@@ -17,6 +17,8 @@ from gsmap.errors import InputError
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.types import FileInfo, Gaussians
 
+VERSION = 1
+
 HEADER_LIMIT_BYTES = 64 * 1024
 
 _TYPES = {

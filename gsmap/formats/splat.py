@@ -15,6 +15,8 @@ from gsmap.formats.quantise import logits_of_bytes, opacity_bytes, require_writa
 from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.types import Gaussians
 
+VERSION = 1
+
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgb", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
 _TINY = np.finfo(np.float32).tiny
 

@@ -27,6 +27,8 @@ from gsmap.formats.quantise import (
 )
 from gsmap.types import FileInfo, Gaussians
 
+VERSION = 1
+
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
 _COLOUR_SCALE = 0.15  # of f_dc: wider than [0, 1], so that colours may lie a bit outside

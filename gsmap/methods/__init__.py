@@ -13,6 +13,17 @@ from gsmap.methods.recipe_key import RecipeKey, text_digest
 
 __all__ = ["Family", "MethodParams", "RecipeKey", "families", "family", "text_digest"]
 
+# A format's name is the suffix of its files.
+_FORMATS = (
+    (".compressed.ply", "gsmap.formats.compressed_ply"),
+    (".glb", "gsmap.formats.glb"),
+    (".ply", "gsmap.formats.ply"),
+    (".sog", "gsmap.formats.sog"),
+    (".splat", "gsmap.formats.splat"),
+    (".spz", "gsmap.formats.spz"),
+    ("tileset.json", "gsmap.formats.tiles3d"),
+)
+
 
 @lru_cache(maxsize=1)
 def families() -> dict[str, Family]:
@@ -24,6 +35,7 @@ def families() -> dict[str, Family]:
         Family("refiner", "gsmap.register.refiners", ("SCALES", "refine")),
         Family("merger", "gsmap.merge.mergers", ("merge", "reach_m", "reading_m", "uses_dates")),
         Family("executor", "gsmap.engine.executors", ("run_jobs",)),
+        Family("format", "gsmap.formats", (), _FORMATS, any_of=("read", "write"), has_params=False),
     )
     return {family.name: family for family in found}
 
