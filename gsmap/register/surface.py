@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
-from gsmap.geometry.strays import find_strays
 from gsmap.types import Cameras, Gaussians
 
 
@@ -82,7 +82,7 @@ class Surface:
             limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))
         keep = np.flatnonzero(opaque & (largest <= limit))
         colours = np.clip(rgb_of_sh0(gaussians.sh[keep, 0]), 0.0, 1.0)
-        stray, _ = find_strays(gaussians.means[keep], colours, params.stray_colour)
+        stray, _ = find_floaters(gaussians.means[keep], colours, params.stray_colour)
         keep, colours = keep[~stray], colours[~stray]
         points = gaussians.means[keep].astype(np.float64) * unit_m
         splats = Gaussians(

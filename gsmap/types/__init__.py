@@ -1,6 +1,7 @@
 """The frozen nouns of gsmap. numpy only: they travel between stages, processes and machines."""
 
 from gsmap.types.cameras import Cameras
+from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
 from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
@@ -14,6 +15,7 @@ __all__ = [
     "Cameras",
     "Edge",
     "EdgeOutcome",
+    "FileInfo",
     "Gaussians",
     "MergeResult",
     "NodeLayer",
