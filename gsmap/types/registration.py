@@ -27,10 +27,12 @@ class Registration:
         num_inliers: size of the accepted set of correspondences.
         num_correspondences: candidates it was chosen from.
         overlap: share of the smaller scene's surface that coincides, in [0, 1].
-        method: which proposal won (``landmarks``, ``objects``, ``dense``).
+        proposer: which proposal won (``landmarks``, ``objects``, ``kiss_matcher``), or ``manual``: a person's own
+            measurement.
         exact: whether the clique search proved its answer largest.
         seconds: wall seconds by step (``match``, ``refine``, ``verdict``).
         evidence: the figures the verdict rests on, by name (logNFA, runner-up ratio, ...).
+        notes: what a person should know (a package that was missing, a covariance that was guessed, ...).
     """
 
     target: str
@@ -42,10 +44,11 @@ class Registration:
     num_inliers: int = 0
     num_correspondences: int = 0
     overlap: float = 0.0
-    method: str = ""
+    proposer: str = ""
     exact: bool = True
     seconds: dict[str, float] = field(default_factory=dict)
     evidence: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.status not in STATUSES:
