@@ -20,6 +20,9 @@ import numpy as np
 from gsmap.types.plain import plain
 from gsmap.types.sim3 import Sim3
 
+SCHEMA = 1
+"""The number under ``schema`` in everything that ``--json`` prints; raised when a key goes or changes its meaning."""
+
 
 class Row:
     """What all rows and reports can do; each is a frozen dataclass, and two are equal where their JSON is."""
@@ -239,14 +242,16 @@ class FactRow(Row):
     Args:
         at: when it was said, ISO 8601 with zone.
         fact: ``name``, ``captured_at``, ``note``, ``tag`` or ``untag``.
-        value: what was said.
+        value: what was said; empty where a date was taken back.
+        author: who said it; empty where nobody is known.
     """
 
-    columns: ClassVar[Mapping[str, str]] = {"at": "said at", "fact": "fact", "value": "value"}
+    columns: ClassVar[Mapping[str, str]] = {"at": "said at", "fact": "fact", "value": "value", "author": "by"}
 
     at: str
     fact: str
     value: str
+    author: str = ""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -614,19 +619,19 @@ class PoseChangeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UpdateReport(Row):
-    """What an update did. The map as it is then: ``gsmap list``.
+    """What an update took in, and the map as it is then.
 
     Args:
         ingested: the captures given.
-        described: the graphs made.
-        registered: the edges made.
-        revisions: the revisions made.
+        scenes: all scenes of the map.
+        edges: the current edge of every pair that was tried.
+        revision: the newest revision; null where there is none.
     """
 
-    ingested: tuple[IngestRow, ...] = ()
-    described: tuple[GraphRow, ...] = ()
-    registered: tuple[EdgeRow, ...] = ()
-    revisions: tuple[RevisionRow, ...] = ()
+    ingested: tuple[IngestRow, ...]
+    scenes: tuple[SceneRow, ...]
+    edges: tuple[EdgeRow, ...]
+    revision: RevisionRow | None
 
 
 # --- exports ---------------------------------------------------------------------------------------------------------
@@ -644,7 +649,8 @@ class TileRow(Row):
         num_gaussians: how many Gaussians it holds.
         scenes: the scenes it was made from.
         merge: the merger.
-        recipe: merger and settings, for people.
+        recipe: how it was merged: ``stage``, ``method``, ``version`` of every piece that took part, ``settings``,
+            ``backend``.
         truncated: whether a time budget cut its optimisation short.
         sha256: of the file.
         notes: what a person should know of how it was made.
@@ -666,7 +672,7 @@ class TileRow(Row):
     num_gaussians: int
     scenes: tuple[SceneRef, ...]
     merge: str
-    recipe: str
+    recipe: Mapping[str, Any]
     truncated: bool
     sha256: str
     notes: tuple[str, ...] = ()
@@ -678,7 +684,6 @@ class ExportReport(Row):
 
     Args:
         out: the folder exported to.
-        revision: number of the revision whose poses it used.
         tiles: the tiles that are in the folder now.
         recomputed: how many of them were made.
         reused: how many were unchanged.
@@ -693,7 +698,6 @@ class ExportReport(Row):
     }
 
     out: str
-    revision: int | None
     tiles: tuple[TileRow, ...]
     recomputed: int
     reused: int
@@ -837,7 +841,7 @@ class PruneReport(Row):
 
     Args:
         dry_run: whether nothing was deleted.
-        scenes: removed scenes whose arrays go.
+        scene_names: names of removed scenes whose arrays go.
         revisions: numbers of revisions that can no longer be exported.
         num_graphs: graphs that go.
         num_orphans: folders left by interrupted work that go.
@@ -851,7 +855,7 @@ class PruneReport(Row):
     }
 
     dry_run: bool
-    scenes: tuple[SceneRef, ...]
+    scene_names: tuple[str, ...]
     revisions: tuple[int, ...]
     num_graphs: int
     num_orphans: int
