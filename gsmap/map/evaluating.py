@@ -53,26 +53,20 @@ def poses(store: Store, truth: str | os.PathLike[str]) -> EvaluationReport:
             if pose_a.component == pose_b.component:
                 estimated = pose_a.S_map_scene.inverse() @ pose_b.S_map_scene
                 pairs.append((a, b, error(a, b, estimated)))
+    of_edges, of_pairs = (summarise([e for *_, e in found]) if found else None for found in (edges, pairs))
     return EvaluationReport(
         edges=_rows(edges, scenes),
         pairs=_rows(pairs, scenes),
         ate_m=None if placed is None else _ate(store, placed, S_scene_world),
-        **_figures("edges", [e for *_, e in edges]),
-        **_figures("pairs", [e for *_, e in pairs]),
+        edges_median_rre_deg=of_edges and of_edges.median_rre_deg,
+        edges_median_centroid_m=of_edges and of_edges.median_centroid_m,
+        edges_worst_rre_deg=of_edges and of_edges.worst_rre_deg,
+        edges_worst_centroid_m=of_edges and of_edges.worst_centroid_m,
+        pairs_median_rre_deg=of_pairs and of_pairs.median_rre_deg,
+        pairs_median_centroid_m=of_pairs and of_pairs.median_centroid_m,
+        pairs_worst_rre_deg=of_pairs and of_pairs.worst_rre_deg,
+        pairs_worst_centroid_m=of_pairs and of_pairs.worst_centroid_m,
     )
-
-
-def _figures(of: str, errors: list[PoseError]) -> dict[str, float]:
-    """The figures that sum up some pairs, by field of `EvaluationReport`."""
-    if not errors:
-        return {}
-    figures = summarise(errors)
-    return {
-        f"{of}_median_rre_deg": figures.median_rre_deg,
-        f"{of}_median_centroid_m": figures.median_centroid_m,
-        f"{of}_worst_rre_deg": figures.worst_rre_deg,
-        f"{of}_worst_centroid_m": figures.worst_centroid_m,
-    }
 
 
 def _rows(found: list[tuple[str, str, PoseError]], scenes: dict[str, Scene]) -> tuple[PoseErrorRow, ...]:
@@ -134,7 +128,7 @@ def images(
     Raises:
         NotFoundError: no photograph is named like a camera.
     """
-    network = None if lpips is None else Lpips(lpips)
+    network = None if lpips is None else Lpips(Path(lpips))
     placed = store.revisions.get()
     poses = placed.poses if placed else {}
     scenes = store.scenes.list()

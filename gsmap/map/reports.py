@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -95,26 +95,22 @@ def scene_row(store: Store, scene: Scene) -> SceneRow:
 
 
 def _scene_row(store: Store, scene: Scene, placed: PoseGraph | None, num_nodes: int | None) -> SceneRow:
-    return SceneRow(**_scene_facts(store, scene, placed, num_nodes))
-
-
-def _scene_facts(store: Store, scene: Scene, placed: PoseGraph | None, num_nodes: int | None) -> Mapping[str, Any]:
     pose = placed.poses.get(scene.id) if placed else None
     said = [fact.value for fact in store.scenes.facts(scene.id) if fact.kind == "note"]
-    return {
-        "name": scene.name,
-        "id": scene.id,
-        "num_gaussians": scene.num_gaussians,
-        "num_nodes": num_nodes,
-        "component": pose.component if pose else None,
-        "S_map_scene": pose.S_map_scene if pose else None,
-        "captured_at": scene.captured_at,
-        "status": pose.status if pose else ("ingested" if num_nodes is None else "described"),
-        "ingested_at": scene.ingested_at,
-        "scale_policy": scene.scale_policy,
-        "tags": scene.tags,
-        "note": said[-1] if said else "",
-    }
+    return SceneRow(
+        name=scene.name,
+        id=scene.id,
+        num_gaussians=scene.num_gaussians,
+        num_nodes=num_nodes,
+        component=pose.component if pose else None,
+        S_map_scene=pose.S_map_scene if pose else None,
+        captured_at=scene.captured_at,
+        status=pose.status if pose else ("ingested" if num_nodes is None else "described"),
+        ingested_at=scene.ingested_at,
+        scale_policy=scene.scale_policy,
+        tags=scene.tags,
+        note=said[-1] if said else "",
+    )
 
 
 def scene_report(store: Store, scene: Scene, graph: SceneGraph | None) -> SceneReport:
@@ -127,7 +123,7 @@ def scene_report(store: Store, scene: Scene, graph: SceneGraph | None) -> SceneR
     pose = placed.poses.get(scene.id) if placed else None
     known = pose is not None and pose.covariance is not None
     return SceneReport(
-        **_scene_facts(store, scene, placed, graph.num_nodes if graph else None),
+        **vars(_scene_row(store, scene, placed, graph.num_nodes if graph else None)),
         origin=scene.source,
         sh_degree=scene.sh_degree,
         num_cameras=scene.num_cameras,
@@ -315,10 +311,10 @@ def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
 
 def _edge_rows(store: Store, edges: Iterable[StoredRegistration]) -> list[EdgeRow]:
     placed, name_of = store.revisions.get(), names(store)
-    return [EdgeRow(**_edge_facts(stored, placed, name_of)) for stored in edges]
+    return [_edge_row(stored, placed, name_of) for stored in edges]
 
 
-def _edge_facts(stored: StoredRegistration, placed: PoseGraph | None, name_of: Mapping[str, str]) -> dict[str, Any]:
+def _edge_row(stored: StoredRegistration, placed: PoseGraph | None, name_of: Mapping[str, str]) -> EdgeRow:
     edge = stored.registration
     outcome = placed.outcomes.get((edge.target, edge.source)) if placed else None
     status, reason = edge.status, edge.reason or (outcome.reason if outcome else "")
@@ -326,26 +322,26 @@ def _edge_facts(stored: StoredRegistration, placed: PoseGraph | None, name_of: M
         status, reason = "accepted", "confirmed by a person"
     elif stored.review == "reject":
         status, reason = "rejected", "rejected by a person"
-    return {
-        "target": edge.target,
-        "target_name": name_of[edge.target],
-        "source": edge.source,
-        "source_name": name_of[edge.source],
-        "status": status,
-        "reason": reason,
-        "S_target_source": edge.S_target_source,
-        "scale": edge.scale,
-        "information": edge.information,
-        "num_inliers": edge.num_inliers,
-        "num_correspondences": edge.num_correspondences,
-        "overlap": edge.overlap,
-        "seconds": {step: edge.seconds.get(step, 0.0) for step in ("match", "refine", "verdict")},
-        "used": _USED[outcome.use] if outcome else False,
-        "undecided": outcome is not None and outcome.undecided,
-        "review": stored.review,
-        "proposer": edge.proposer,
-        "registered_at": stored.created_at,
-    }
+    return EdgeRow(
+        target=edge.target,
+        target_name=name_of[edge.target],
+        source=edge.source,
+        source_name=name_of[edge.source],
+        status=status,
+        reason=reason,
+        S_target_source=edge.S_target_source,
+        scale=edge.scale,
+        information=edge.information,
+        num_inliers=edge.num_inliers,
+        num_correspondences=edge.num_correspondences,
+        overlap=edge.overlap,
+        seconds={step: edge.seconds.get(step, 0.0) for step in ("match", "refine", "verdict")},
+        used=_USED[outcome.use] if outcome else False,
+        undecided=outcome is not None and outcome.undecided,
+        review=stored.review,
+        proposer=edge.proposer,
+        registered_at=stored.created_at,
+    )
 
 
 _USED: dict[str, bool | str] = {"used": True, "tentative": "tentative", "unused": False}
@@ -354,7 +350,6 @@ _USED: dict[str, bool | str] = {"used": True, "tentative": "tentative", "unused"
 def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
     """Everything known of one pair: its current edge, the evidence it rests on, and all that was said before."""
     current = store.registrations.get(a.id, b.id)
-    name_of = names(store)
     if current is None:
         return _never_registered(a, b)
     placed, edge = store.revisions.get(), current.registration
@@ -368,7 +363,7 @@ def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
         for word in store.registrations.reviews(a.id, b.id)
     ]
     return PairReport(
-        **_edge_facts(current, placed, name_of),
+        **vars(_edge_row(current, placed, names(store))),
         exact=edge.exact,
         evidence=edge.evidence,
         residual_chi2=outcome.residual_chi2 if outcome else None,

@@ -935,8 +935,8 @@ class PoseErrorRow(PairRef):
 
     Args:
         rre_deg: relative rotation error.
-        centroid_m: distance between where the estimated and the true pose put the source's middle.
-        rte: relative translation error, in the truth's unit.
+        centroid_m: distance between where the estimated and the true pose put the source's middle, target's unit.
+        rte: relative translation error by the length of the true one, after GaussReg.
         rse: relative scale error.
     """
 
