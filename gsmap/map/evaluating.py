@@ -58,14 +58,14 @@ def poses(store: Store, truth: str | os.PathLike[str]) -> EvaluationReport:
         edges=_rows(edges, scenes),
         pairs=_rows(pairs, scenes),
         ate_m=None if placed is None else _ate(store, placed, S_scene_world),
-        edges_median_rre_deg=of_edges and of_edges.median_rre_deg,
-        edges_median_centroid_m=of_edges and of_edges.median_centroid_m,
-        edges_worst_rre_deg=of_edges and of_edges.worst_rre_deg,
-        edges_worst_centroid_m=of_edges and of_edges.worst_centroid_m,
-        pairs_median_rre_deg=of_pairs and of_pairs.median_rre_deg,
-        pairs_median_centroid_m=of_pairs and of_pairs.median_centroid_m,
-        pairs_worst_rre_deg=of_pairs and of_pairs.worst_rre_deg,
-        pairs_worst_centroid_m=of_pairs and of_pairs.worst_centroid_m,
+        edges_median_rre_deg=of_edges.median_rre_deg if of_edges else None,
+        edges_median_centroid_m=of_edges.median_centroid_m if of_edges else None,
+        edges_worst_rre_deg=of_edges.worst_rre_deg if of_edges else None,
+        edges_worst_centroid_m=of_edges.worst_centroid_m if of_edges else None,
+        pairs_median_rre_deg=of_pairs.median_rre_deg if of_pairs else None,
+        pairs_median_centroid_m=of_pairs.median_centroid_m if of_pairs else None,
+        pairs_worst_rre_deg=of_pairs.worst_rre_deg if of_pairs else None,
+        pairs_worst_centroid_m=of_pairs.worst_centroid_m if of_pairs else None,
     )
 
 

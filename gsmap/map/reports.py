@@ -403,6 +403,16 @@ def revision_rows(store: Store) -> list[RevisionRow]:
     ]
 
 
+def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionRow]:
+    """Those made after a date (ISO 8601); all where it is None.
+
+    Raises:
+        ConfigError: a date that is none.
+    """
+    since = _date(after)
+    return [row for row in rows if since is None or _is_after(row.created_at, since)]
+
+
 def revision_row(store: Store, number: int) -> RevisionRow:
     """One answer of the optimiser."""
     found = next(revision for revision in store.revisions.list() if revision.number == number)
