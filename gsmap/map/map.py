@@ -389,15 +389,21 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""
         return reports.pose_change_rows(self.store, before, after)
 
-    def evaluate(self, truth: str | os.PathLike[str], images: str | os.PathLike[str] | None = None) -> EvaluationReport:
+    def evaluate(
+        self,
+        truth: str | os.PathLike[str],
+        images: str | os.PathLike[str] | None = None,
+        *,
+        lpips: str | os.PathLike[str] | None = None,
+    ) -> EvaluationReport:
         """``gsmap evaluate MAP``: poses against ground truth, renders against the captures' own images."""
         from gsmap.map import evaluating
 
         report = evaluating.poses(self.store, truth)
         if images is None:
             return report
-        rows = evaluating.images(self.store, images, lambda f, text: self._progress("evaluate", f, text))
-        return replace(report, images=tuple(rows))
+        rows = evaluating.images(self.store, images, lambda f, text: self._progress("evaluate", f, text), lpips=lpips)
+        return replace(report, images=rows)
 
     def view(self, *, port: int = 0) -> ViewServer:
         """``gsmap view MAP``: a page of splats, graphs, cameras and edges, served on this machine only until closed."""
