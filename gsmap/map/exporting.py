@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
-from gsmap.export import ExportResult, PlannedTile, export_tiles, plan_tiles
+from gsmap.export import ExportResult, Params, PlannedTile, TileRecipe, export_tiles, plan_tiles
 from gsmap.export.tileset import FILE_NAME, write_tilesets
-from gsmap.formats import tiles3d
-from gsmap.merge import MergeResult, default_params, methods, reach_m
-from gsmap.merge.tile import Source, merge_tile
+from gsmap.merge import Params as MergeParams
+from gsmap.merge import reach_m, recipe_key, uses_dates, with_steps
+from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.store import Store
-from gsmap.types import Scene, ScenePose, Tile
+from gsmap.types import MergeResult, Scene, ScenePose, Tile
+from gsmap.types.progress import Progress
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of an export; see `gsmap.Map.export`."""
+    """What is asked of an export; see `gsmap.Map.export`.
+
+    Args:
+        merge: the merger; None takes the one of the settings.
+        steps: optimisation steps per tile; None takes what the merger's settings say.
+    """
 
     format: str = "ply"
     tile_size_m: float = 10.0
     bbox: Sequence[float] | None = None
-    merge: str = "tto"
+    merge: str | None = None
     revision: int | None = None
     component: int | None = None
     steps: int | None = None
@@ -37,43 +41,49 @@ class Request:
     provenance: bool = False
 
 
-def export(store: Store, out: Path, request: Request, progress: Callable[[float, str], None]) -> ExportResult:
+def export(
+    store: Store,
+    out: Path,
+    request: Request,
+    progress: Progress,
+    merging: MergeParams | None = None,
+    params: Params | None = None,
+) -> ExportResult:
     """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what."""
-    _check(request)
-    params = _params(request)
+    merging, params = merging or MergeParams(), params or Params()
+    method = request.merge or merging.method
+    how = merging.mergers[method]
+    if request.steps is not None:
+        how = with_steps(method, how, request.steps)
+    recipe = TileRecipe(recipe_key(method, how), request.format, request.provenance, request.budget_s)
+    _check(request, recipe)
     revision = request.revision or store.revisions.current()
     placed = _placed(store, revision, request.component)
     scenes = {scene: store.scenes.get(scene) for scene in placed}
+    if uses_dates(method, how):
+        recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
     plan = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
         {scene: found.bounds for scene, found in scenes.items()},
         tile_size_m=request.tile_size_m,
         components={scene: pose.component for scene, pose in placed.items()},
         bbox=None if request.bbox is None else np.reshape(np.asarray(request.bbox, float), (2, 3)),
-        reach_m=reach_m(request.merge, params),
+        reach_m=reach_m(method, how),
+        max_tiles=params.max_tiles,
     )
-    settings = {**asdict(request), "bbox": None if request.bbox is None else list(request.bbox)}
+    settings = {**asdict(request), "bbox": None if request.bbox is None else list(request.bbox), "merge": method}
     number: list[int] = []
 
-    def noted(tile: Tile, made: MergeResult) -> None:
+    def noted(tile: Tile) -> None:
         if not tile.path:  # nothing lies there
             return
         if not number:
             number.append(store.exports.begin(out, revision=revision, settings=settings))
         store.exports.add_tile(number[0], tile)
 
-    result = export_tiles(
-        plan,
-        partial(_make, store, scenes, request, params),
-        out,
-        map_id=store.id,
-        method=f"{request.merge} {json.dumps([asdict(params), request.budget_s, request.provenance])}",
-        format="glb" if request.format == "3dtiles" else request.format,
-        write=_writer(request, scenes),
-        made=noted,
-        progress=progress,
-    )
-    if request.format == "3dtiles" and (result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))):
+    make = partial(_make, store, scenes, request, method, how)
+    result = export_tiles(plan, make, out, map_id=store.id, recipe=recipe, params=params, made=noted, progress=progress)
+    if recipe.is_tileset and (result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))):
         write_tilesets(out, result.tiles, request.tile_size_m)
     kept = {tile.path for tile in result.tiles}
     gone = [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]
@@ -82,28 +92,12 @@ def export(store: Store, out: Path, request: Request, progress: Callable[[float,
     return result
 
 
-def _check(request: Request) -> None:
+def _check(request: Request, recipe: TileRecipe) -> None:
     """Refuse what makes no sense before anything is read."""
     if request.budget_s is not None and not request.budget_s > 0:
         raise ConfigError(f"the budget must be a positive number of seconds, got {request.budget_s}")
-    if request.format == "3dtiles" and not request.tile_size_m > 0:
+    if recipe.is_tileset and not request.tile_size_m > 0:
         raise ConfigError("3dtiles is a tree of tiles: give --tile-size in metres, or use glb for one file")
-    if request.provenance and request.format != "ply":
-        raise ConfigError(f"provenance is a property of .ply files, the format asked for is {request.format}")
-
-
-def _params(request: Request) -> Any:
-    """The merger's parameters with what was asked for put in."""
-    if request.merge not in methods():
-        raise ConfigError(f"unknown merge method {request.merge!r}: choose one of {', '.join(methods())}")
-    params: Any = default_params(request.merge)
-    if request.steps is None:
-        return params
-    if not hasattr(params, "steps"):
-        raise ConfigError(f"merge method {request.merge!r} takes no steps: leave --steps out, or use tto")
-    if request.steps < 0:
-        raise ConfigError(f"steps must not be negative, got {request.steps}")
-    return replace(params, steps=request.steps)
 
 
 def _placed(store: Store, revision: int | None, component: int | None) -> dict[str, ScenePose]:
@@ -117,7 +111,7 @@ def _placed(store: Store, revision: int | None, component: int | None) -> dict[s
         placed = {s: p for s, p in placed.items() if p.component == component}
         if not placed:
             known = sorted({p.component for p in graph.poses.values()})
-            raise NotFoundError(f"revision {revision} has no island {component}: it has {known}")
+            raise NotFoundError(f"revision {revision} has no component {component}: it has {known}")
     if not placed:
         raise InputError("nothing to export: no scene has a place in the map yet; run gsmap update first")
     return placed
@@ -127,13 +121,14 @@ def _make(
     store: Store,
     scenes: dict[str, Scene],
     request: Request,
+    method: str,
     params: Any,
     tile: PlannedTile,
-    progress: Callable[[float, str], None],
+    progress: Progress,
 ) -> MergeResult:
     """The merged content of one tile."""
-    sources = [
-        Source(
+    lazy = [
+        LazyScene(
             scene,
             pose,
             partial(store.scenes.gaussians, scene),
@@ -143,17 +138,4 @@ def _make(
         for scene, pose in tile.poses.items()
     ]
     bounds = None if request.tile_size_m == 0 and request.bbox is None else tile.bounds
-    return merge_tile(sources, request.merge, params, bounds=bounds, budget_s=request.budget_s, progress=progress)
-
-
-def _writer(request: Request, scenes: dict[str, Scene]) -> Callable[[Path, MergeResult], None] | None:
-    """How a tile's file is written, where it is not just its Gaussians."""
-    if request.format == "3dtiles":
-        return _write_content
-    if not request.provenance:
-        return None
-    return lambda path, made: formats.write(path, made.gaussians, extra={"scene": made.origin.astype(np.float32)})
-
-
-def _write_content(path: Path, made: MergeResult) -> None:
-    tiles3d.write_content(path, made.gaussians)
+    return merge_tile(lazy, method, params, bounds=bounds, budget_s=request.budget_s, progress=progress)

@@ -1,4 +1,4 @@
-"""Points that do not belong to the surface around them."""
+"""Floaters: points that do not belong to the surface around them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 _FAR = 4.0  # times the median distance to the 8th neighbour
 
 
-def find_strays(points: np.ndarray, colours: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which points float alone or have a stray colour, and how far apart points lie.
+def find_floaters(points: np.ndarray, colours: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which points float alone or have a foreign colour, and how far apart points lie.
 
     A point floats alone when its 8th neighbour lies farther than 4 times the median such distance. Floaters that touch
     a surface are told by their colour: at most one of the 8 neighbours has one like it.
@@ -20,7 +20,7 @@ def find_strays(points: np.ndarray, colours: np.ndarray, max_difference: float) 
         max_difference: colours farther apart are unlike.
 
     Returns:
-        (N,) bool, and the distance to the 8th neighbour (N,); nothing strays and distances are 0 below 9 points.
+        (N,) bool, and the distance to the 8th neighbour (N,); nothing floats and distances are 0 below 9 points.
     """
     if len(points) < 9:
         return np.zeros(len(points), bool), np.zeros(len(points))

@@ -1,6 +1,8 @@
-"""Could chance have made this many correspondences agree? The a-contrario answer."""
+"""Could a background model have made this many correspondences agree? A-contrario: the number of false alarms."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,6 +10,20 @@ from gsmap.register.correspondences import Correspondences
 from gsmap.types import NodeLayer, Sim3
 
 _FAR_M = 1e4  # farther than any radius
+
+
+@dataclass(frozen=True)
+class Params:
+    """The background model.
+
+    Args:
+        cell_m: a node's context covers its neighbours', so near correspondences err together: cells of this size are
+            the independent trials, not nodes.
+        height_band_m: where gravity is known, partners are drawn from nodes within this of the candidate's height.
+    """
+
+    cell_m: float = 0.5
+    height_band_m: float = 0.5
 
 
 def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
@@ -26,14 +42,15 @@ def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarra
     return keep
 
 
-class Chance:
+class BackgroundModel:
     """How well poses do at candidate correspondences, against partners drawn at random.
 
-    Under the null each candidate's partner is any source node of its type (and of about its height, where gravity is
-    known). A node's context covers its neighbours', so near matches err together: cells of ``cell_m`` are the trials,
-    not nodes.
+    The background model (null hypothesis): each candidate's partner is any source node of its type (and of about its
+    height, where gravity is known), independently between cells. Rooms furnished alike repeat whole arrangements and
+    violate that independence, so the bar of the verdict lies lower than the theory's (`gsmap.register.verdict`).
 
     Args:
+        target, source: the two layers.
         source_points_m: (N, 3) positions of the source's nodes, in metres.
         matches: the candidates.
         source_heights: (N,) heights of the source's nodes in metres, or None.
@@ -45,21 +62,22 @@ class Chance:
         source: NodeLayer,
         source_points_m: np.ndarray,
         matches: Correspondences,
+        params: Params | None = None,
         *,
         source_heights: np.ndarray | None = None,
-        cell_m: float = 0.5,
-        height_band_m: float = 0.5,
     ) -> None:
         from scipy.spatial import cKDTree
 
+        params = params or Params()
+        cell_m, height_band_m = params.cell_m, params.height_band_m
         self.matches = matches
         kinds = target.types[matches.target_ids].astype(np.float64)
         # Nodes of another type lie in another layer of a fourth dimension, so one tree serves all.
         self._layer = kinds * _FAR_M
         self._tree = cKDTree(np.column_stack([source_points_m, source.types * _FAR_M]))
-        known = source_heights is not None and matches.source_heights is not None
-        theirs = source_heights if known else np.zeros(len(source))
-        own = matches.source_heights if known else np.zeros(len(matches))
+        theirs, own = np.zeros(len(source)), np.zeros(len(matches))
+        if source_heights is not None and matches.source_heights is not None:
+            theirs, own = source_heights, matches.source_heights
         apart, low = float(np.ptp(theirs)) + 4 * height_band_m, theirs.min()
         stacked = np.sort(source.types * apart + (theirs - low))
         own = kinds * apart + (own - low)
@@ -69,21 +87,21 @@ class Chance:
         self._cell = cell.ravel()
 
     def log10_nfa(self, pose: Sim3, radius_m: float = 0.15) -> float:
-        """log10 of the number of false alarms: how many poses this good to expect of chance.
+        """log10 of the number of false alarms: how many poses this good to expect of the background.
 
-        With n cells that could agree, mean chance p each, and k that do, every triple of candidates fixing a pose:
+        With n cells that could agree, mean probability p each, and k that do, every triple of candidates fixing a pose:
         ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000; the triple itself agrees
-        by construction). Below -2 chance is no explanation.
+        by construction). Below -2 the background model is no explanation; inf where too little could agree.
         """
         m, cell = len(self.matches), self._cell
         if m < 4:
             return np.inf
         predicted = np.column_stack([pose.inverse().apply(self.matches.target), self._layer])
         near = self._tree.query_ball_point(predicted, radius_m / pose.scale, return_length=True)
-        chance = np.minimum(1.0, near / self._pool)
+        probability = np.minimum(1.0, near / self._pool)
         hits = agreeing(self.matches, pose, radius_m)
-        missed = np.bincount(cell, np.log1p(-np.minimum(chance, 1 - 1e-9)))
-        possible = np.bincount(cell, chance > 0) > 0
+        missed = np.bincount(cell, np.log1p(-np.minimum(probability, 1 - 1e-9)))
+        possible = np.bincount(cell, probability > 0) > 0
         n, k = int(possible.sum()), int((np.bincount(cell, hits) > 0).sum())
         if n < 4 or k < 4:
             return np.inf

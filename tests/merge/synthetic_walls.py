@@ -1,8 +1,8 @@
-"""Small made places: a textured wall seen by captures that each know a stretch of it."""
+"""Small synthetic scenes: a textured wall seen by captures that each know a stretch of it."""
 
 import numpy as np
 
-from gsmap.merge import Part
+from gsmap.merge import PlacedScene
 from gsmap.types import Cameras, Gaussians
 
 
@@ -34,8 +34,8 @@ def cameras_facing(xs, distance=1.2, width=64, height=48):
     return Cameras(T, k, np.tile([width, height], (len(xs), 1)))
 
 
-def two_parts(grain=0.15):
+def two_scenes(grain=0.15):
     """Captures a and b, who share the middle of the wall; b stands 1 cm off."""
-    a = Part(wall(0, -1.5, 0.5, grain=grain), cameras_facing(np.linspace(-1.1, 0.1, 7)), "a")
-    b = Part(wall(1, -0.5, 1.5, z=0.01, grain=grain), cameras_facing(np.linspace(-0.1, 1.1, 7)), "b")
+    a = PlacedScene(wall(0, -1.5, 0.5, grain=grain), cameras_facing(np.linspace(-1.1, 0.1, 7)), "a")
+    b = PlacedScene(wall(1, -0.5, 1.5, z=0.01, grain=grain), cameras_facing(np.linspace(-0.1, 1.1, 7)), "b")
     return [a, b]

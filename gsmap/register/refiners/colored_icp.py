@@ -7,31 +7,50 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import retract
+from gsmap.methods.refiner import Surface
 from gsmap.register.covariance import point_to_plane_jacobian
-from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
-_COLOUR_RADIUS_M = 0.1  # farther away, lightness extrapolated in a tangent plane means nothing
-_OVERSTEP = 1.5  # pairs follow the pose only in part, so steps fall short, most of all along the scale
+VERSION = 1
+SCALES = True
+
+_FEWEST = 10  # cells and pairs; fewer tell nothing of a pose
 
 
 @dataclass(frozen=True)
 class Params:
-    """Args (metres):
-    radii_m: correspondence distances, coarse to fine.
-    iterations: Gauss-Newton steps at each ...
-    scale_iterations: ... and where the scale is free, which settles more slowly.
-    colour_weight: metres of distance that one standard deviation of local colour counts for, at fine radii;
-        0 leaves colour out.
-    max_points: source cells that take part at each radius.
+    """Colored ICP (after Park et al. 2017).
+
+    Args:
+        radii_m: correspondence distances, coarse to fine.
+        iterations: Gauss-Newton steps at each radius, where the pose is rigid.
+        scale_iterations: the same where the scale is free, which settles more slowly.
+        colour_weight: metres of distance that one standard deviation of local colour counts for, at fine radii;
+            0 leaves colour out.
+        colour_radius_m: at radii beyond this colour is left out: lightness extrapolated so far in a tangent plane means
+            nothing.
+        max_points: source cells that take part at each radius.
+        overstep: factor on steps where the scale is free: pairs follow the pose only in part, so steps fall short, most
+            of all along the scale.
+        max_scale_change: factor by which the scale may move away from the start's before the start is given back.
     """
 
     radii_m: tuple[float, ...] = (0.4, 0.15, 0.06)
     iterations: int = 10
     scale_iterations: int = 20
     colour_weight: float = 0.01
+    colour_radius_m: float = 0.1
     max_points: tuple[int, ...] = (3000, 6000, 20_000)
+    overstep: float = 1.5
+    max_scale_change: float = 1.3
+
+    def __post_init__(self) -> None:
+        if len(self.radii_m) != len(self.max_points):
+            raise ConfigError(
+                f"colored_icp needs as many max_points as radii_m, got {len(self.max_points)} and {len(self.radii_m)}"
+            )
 
 
 def refine(
@@ -47,7 +66,7 @@ def refine(
     """
     params = params or Params()
     pose = start
-    if len(source) < 10 or len(target) < 10:
+    if len(source) < _FEWEST or len(target) < _FEWEST:
         return start
     iterations = params.scale_iterations if with_scale else params.iterations
     for radius, count in zip(params.radii_m, params.max_points, strict=True):
@@ -55,23 +74,23 @@ def refine(
         chosen, chosen_back = source.sample(count), target.sample(count)
         for _ in range(iterations):
             pairs = _Pairs.of(target, source, pose, chosen, radius)
-            if len(pairs.points) < 10:
+            if len(pairs.points) < _FEWEST:
                 return pose
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
             centre = pairs.points.mean(0)
             centred, points = pose @ Sim3(np.eye(3), centre), pairs.points - centre
             system, gradient = pairs.equations(
-                lambda along, c=centred, p=points: point_to_plane_jacobian(c, p, along), radius, params.colour_weight
+                lambda along, c=centred, p=points: point_to_plane_jacobian(c, p, along), radius, params
             )
             if with_scale:
                 back = _Pairs.of(source, target, pose.inverse(), chosen_back, radius)
-                if len(back.points) < 10:
+                if len(back.points) < _FEWEST:
                     return pose
                 # A step that moves the source forward moves what is laid on it back.
                 other = back.equations(
                     lambda along, p=back.moved - centre: point_to_plane_jacobian(Sim3.identity(), p, -along),
                     radius,
-                    params.colour_weight,
+                    params,
                 )
                 share = len(pairs.points) / len(back.points)
                 system, gradient = system + share * other[0], gradient + share * other[1]
@@ -80,12 +99,12 @@ def refine(
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
             step[:dim] = -np.linalg.solve((system + damping)[:dim, :dim], gradient[:dim])
             if with_scale:
-                step *= _OVERSTEP
+                step *= params.overstep
             # No single step goes farther than the correspondences reach.
             step *= min(1.0, 0.1 / max(np.abs(step[:3]).max(), 1e-12), radius / max(np.abs(step[3:6]).max(), 1e-12))
             step[6] = np.clip(step[6], -0.05, 0.05)
             pose = retract(centred, step if with_scale else step[:6]) @ Sim3(np.eye(3), -centre)
-            if abs(np.log(pose.scale / start.scale)) > np.log(1.3):
+            if abs(np.log(pose.scale / start.scale)) > np.log(params.max_scale_change):
                 return start
             if np.linalg.norm(pose.apply(pairs.points) - pairs.moved, axis=1).max() < 0.002 * radius:
                 break
@@ -118,7 +137,7 @@ class _Pairs:
         return cls(onto, rows[hit], points[hit], moving.lightness[chosen[hit]], moved[hit])
 
     def equations(
-        self, jacobian: Callable[[np.ndarray], np.ndarray], radius_m: float, colour_weight: float
+        self, jacobian: Callable[[np.ndarray], np.ndarray], radius_m: float, params: Params
     ) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations (7, 7), (7,); ``jacobian`` of the moved points along given directions (R, 3)."""
         offset = self.moved - self.onto.coarse[0][self.rows]
@@ -128,13 +147,13 @@ class _Pairs:
         slope = jacobian(normals)
         system = (slope * weights[:, None]).T @ slope
         gradient = (slope * weights[:, None]).T @ plane
-        if colour_weight > 0 and radius_m <= _COLOUR_RADIUS_M:
+        if params.colour_weight > 0 and radius_m <= params.colour_radius_m:
             gradients = self.onto.lightness_gradients(self.rows)
             expected = self.onto.lightness[self.rows] + (gradients * offset).sum(1)
             gain, bias = _exposure(expected, self.lightness)
             colour = expected - gain * self.lightness - bias
             spread = 1.4826 * np.median(np.abs(colour)) + 1e-6
-            factor = colour_weight / spread
+            factor = params.colour_weight / spread
             tint = weights / (1.0 + (colour / (2 * spread)) ** 2) ** 2
             slope = jacobian(gradients) * factor
             system += (slope * tint[:, None]).T @ slope
