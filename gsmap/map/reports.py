@@ -462,7 +462,7 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
             scene_name=known[change.scene].name,
             change=change.kind,
             rotation_deg=change.rotation_deg,
-            translation_m=change.translation_m,
+            translation_m=change.translation,
             scale_ratio=change.scale_ratio,
             component_before=change.components[0],
             component_after=change.components[1],
