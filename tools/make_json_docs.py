@@ -27,16 +27,16 @@ HEAD = f"""# What `--json` prints
 
 <!-- Written by tools/make_json_docs.py from gsmap/types/rows.py: change the rows, then run it. -->
 
-Every verb takes `--json`: one JSON object on stdout, `"schema": {SCHEMA}` first; progress and remarks stay on stderr, and
-the exit code is that of the verb without it. Keys are added as gsmap grows; where one goes or changes its meaning, the
-number under `schema` is raised. In Python the verbs are methods of `gsmap.Map` that return the same rows, as frozen
+Every verb takes `--json`: one JSON object on stdout, `"schema": {SCHEMA}` first; progress and remarks stay on stderr,
+and the exit code is that of the verb without it. Keys are added as gsmap grows; where one goes or changes its meaning,
+the number under `schema` is raised. In Python the verbs are methods of `gsmap.Map` that return the same rows, as frozen
 dataclasses of `gsmap.types.rows` with the same names.
 
-- Ids and names go together: `scene` and `scene_name`, `target` and `target_name`, `source` and `source_name`. An id is a
-  digest of content; a scene, which is its own row, calls them `id` and `name`.
-- A pose is a 4x4 matrix, `S_a_b` maps points from frame b to frame a. Arrays are lists of lists, with their shape below.
+- Ids and names go together: `scene` and `scene_name`, `target` and `target_name`, `source` and `source_name`. An id is
+  a digest of content; a scene, which is its own row, calls them `id` and `name`.
+- A pose is a 4x4 matrix: `S_a_b` maps points from frame b to frame a. An array is a list of lists of the shape given.
 - Units are in the names: `_m`, `_rad`, `_deg`, `_s`, `_px`, `_db`. Dates are ISO 8601 with their zone.
-- A number that is not known, not a number or not finite is `null`; `null` is allowed where it is listed.
+- A number that is not known or not finite is `null`.
 """
 
 
