@@ -335,7 +335,7 @@ class Map(AbstractContextManager["Map"]):
         after: str | None = None,
         tag: str | None = None,
     ) -> list[SceneRow]:
-        """``gsmap list MAP scenes``: all, or those of one component, one status, captured after a date, or with a tag."""
+        """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date, or with a tag."""
         return reports.scene_rows(self.store, component=component, status=status, after=after, tag=tag)
 
     def edge_rows(

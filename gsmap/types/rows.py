@@ -713,9 +713,9 @@ class TodoRow(Row):
 
     Args:
         what: ``undescribed`` scenes; ``stale_graphs``, made by other settings or another version; ``unregistered``
-            scenes, never tried with another one; ``stale_edges``; ``unsolved_reviews``, newer than the poses;
-            ``unsolved`` (scenes, edges or priors are newer than the poses); ``stale_poses``; ``undecided`` edges;
-            ``tentative`` scenes; ``contradicted_priors``; ``isolated`` scenes; ``dirty_tiles`` of an export.
+            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews or priors are
+            newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes; ``undecided``
+            edges; ``contradicted_priors``; ``isolated`` scenes.
         count: how many; 1 for ``unsolved`` and ``stale_poses``.
         verb: the command that helps.
         meaning: the same in words.

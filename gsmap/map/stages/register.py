@@ -13,9 +13,9 @@ from gsmap.map.jobs import register_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
-from gsmap.register import MANUAL, recipe_key
+from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, candidate_pairs
-from gsmap.store import Store
+from gsmap.store import MANUAL, Store
 from gsmap.store.registrations import StoredRegistration
 from gsmap.types import PoseGraph, Registration, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
@@ -43,7 +43,7 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
             known, stands = store.registrations.find(key), current.get(frozenset(wanted[i]))
             if known is None:
                 todo.append(i)
-            elif stands is not None and stands.key != key.digest and stands.registration.proposer != MANUAL:
+            elif stands is not None and stands.key != key.digest and not stands.manual:
                 store.registrations.adopt(known.number)
     jobs = [
         (str(store.folder), (a, graphs[a].digest), (b, graphs[b].digest), settings.register)
@@ -70,7 +70,7 @@ def stale(store: Store, settings: Settings) -> list[StoredRegistration]:
     return [
         stored
         for stored in store.registrations.current()
-        if stored.registration.proposer != MANUAL and stored.review != "confirm" and stored.key != made_by(stored)
+        if not stored.manual and stored.review != "confirm" and stored.key != made_by(stored)
     ]
 
 

@@ -1,23 +1,24 @@
-"""Exporting: which scenes, with which poses, merged how; the tiles themselves are `gsmap.export` and `gsmap.merge`."""
+"""Export: which scenes, with which poses, merged how; the tiles themselves are `gsmap.export` and `gsmap.merge`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsmap.errors import ConfigError, InputError, NotFoundError
-from gsmap.export import ExportResult, Params, PlannedTile, TileRecipe, export_tiles, plan_tiles
+from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
+from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.tileset import FILE_NAME, write_tilesets
-from gsmap.merge import Params as MergeParams
+from gsmap.map.settings import Settings
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_steps
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.store import Store
 from gsmap.types import MergeResult, Scene, ScenePose, Tile
+from gsmap.types.plain import plain
 from gsmap.types.progress import Progress
 
 
@@ -41,55 +42,108 @@ class Request:
     provenance: bool = False
 
 
-def export(
-    store: Store,
-    out: Path,
-    request: Request,
-    progress: Progress,
-    merging: MergeParams | None = None,
-    params: Params | None = None,
-) -> ExportResult:
-    """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what."""
-    merging, params = merging or MergeParams(), params or Params()
-    method = request.merge or merging.method
-    how = merging.mergers[method]
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """The tiles of an export, and how each is made.
+
+    Args:
+        revision: whose poses.
+        scenes: those that are exported, by id.
+        method, params: the merger and its settings.
+        recipe: how every tile is made.
+        tiles: what the folder is to hold.
+    """
+
+    revision: int | None
+    scenes: dict[str, Scene]
+    method: str
+    params: Any
+    recipe: TileRecipe
+    tiles: list[PlannedTile]
+
+
+def plan(store: Store, request: Request, settings: Settings) -> Planned:
+    """Which tiles an export consists of; nothing is read but the catalog."""
+    method = request.merge or settings.merge.method
+    params = settings.merge.mergers[method]
     if request.steps is not None:
-        how = with_steps(method, how, request.steps)
-    recipe = TileRecipe(recipe_key(method, how), request.format, request.provenance, request.budget_s)
+        params = with_steps(method, params, request.steps)
+    recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
     _check(request, recipe)
     revision = request.revision or store.revisions.current()
     placed = _placed(store, revision, request.component)
     scenes = {scene: store.scenes.get(scene) for scene in placed}
-    if uses_dates(method, how):
+    if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
-    plan = plan_tiles(
+    tiles = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
         {scene: found.bounds for scene, found in scenes.items()},
         tile_size_m=request.tile_size_m,
         components={scene: pose.component for scene, pose in placed.items()},
         bbox=None if request.bbox is None else np.reshape(np.asarray(request.bbox, float), (2, 3)),
-        reach_m=reach_m(method, how),
-        max_tiles=params.max_tiles,
+        reach_m=reach_m(method, params),
+        max_tiles=settings.export.max_tiles,
     )
-    settings = {**asdict(request), "bbox": None if request.bbox is None else list(request.bbox), "merge": method}
+    return Planned(revision, scenes, method, params, recipe, tiles)
+
+
+def export(store: Store, out: Path, request: Request, settings: Settings, progress: Progress) -> ExportResult:
+    """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what."""
+    planned = plan(store, request, settings)
+    asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
 
     def noted(tile: Tile) -> None:
         if not tile.path:  # nothing lies there
             return
         if not number:
-            number.append(store.exports.begin(out, revision=revision, settings=settings))
+            number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
         store.exports.add_tile(number[0], tile)
 
-    make = partial(_make, store, scenes, request, method, how)
-    result = export_tiles(plan, make, out, map_id=store.id, recipe=recipe, params=params, made=noted, progress=progress)
-    if recipe.is_tileset and (result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))):
+    result = export_tiles(
+        planned.tiles,
+        partial(_make, store, planned, request),
+        out,
+        map_id=store.id,
+        recipe=planned.recipe,
+        params=settings.export,
+        made=noted,
+        progress=progress,
+    )
+    is_new = result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))
+    if planned.recipe.is_tileset and is_new:
         write_tilesets(out, result.tiles, request.tile_size_m)
     kept = {tile.path for tile in result.tiles}
     gone = [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]
     if gone:
         store.exports.forget(out, gone)
     return result
+
+
+def dirty_tiles(store: Store, settings: Settings) -> dict[str, int]:
+    """Tiles that the same export would make again now or take away, by the folder exported to; from the catalog alone.
+
+    A folder whose export named a revision stays as it is, whatever the map does.
+    """
+    newest = {export.target: export for export in store.exports.list()}
+    found = {}
+    for target in store.exports.targets():
+        asked = newest[target].settings
+        known = {field.name for field in fields(Request)}
+        try:
+            planned = plan(store, Request(**{key: value for key, value in asked.items() if key in known}), settings)
+        except GsmapError:
+            continue  # what was exported then cannot be now: its verb will say why
+        old = {(tile.component, Path(tile.path).name.partition(".")[0]): tile for tile in store.exports.tiles(target)}
+        again = [
+            tile
+            for tile in planned.tiles
+            if (made := old.get((tile.component, tile.name))) is not None
+            and dirty_reason(tile, made, planned.recipe, settings.export.moved_m)
+        ]
+        gone = set(old) - {(tile.component, tile.name) for tile in planned.tiles}
+        found[target] = len(again) + len(gone)
+    return {target: count for target, count in found.items() if count}
 
 
 def _check(request: Request, recipe: TileRecipe) -> None:
@@ -117,15 +171,7 @@ def _placed(store: Store, revision: int | None, component: int | None) -> dict[s
     return placed
 
 
-def _make(
-    store: Store,
-    scenes: dict[str, Scene],
-    request: Request,
-    method: str,
-    params: Any,
-    tile: PlannedTile,
-    progress: Progress,
-) -> MergeResult:
+def _make(store: Store, planned: Planned, request: Request, tile: PlannedTile, progress: Progress) -> MergeResult:
     """The merged content of one tile."""
     lazy = [
         LazyScene(
@@ -133,9 +179,9 @@ def _make(
             pose,
             partial(store.scenes.gaussians, scene),
             store.scenes.cameras(scene),
-            scenes[scene].captured_at,
+            planned.scenes[scene].captured_at,
         )
         for scene, pose in tile.poses.items()
     ]
     bounds = None if request.tile_size_m == 0 and request.bbox is None else tile.bounds
-    return merge_tile(lazy, method, params, bounds=bounds, budget_s=request.budget_s, progress=progress)
+    return merge_tile(lazy, planned.method, planned.params, bounds=bounds, budget_s=request.budget_s, progress=progress)
