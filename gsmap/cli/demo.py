@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gsmap.cli.console import AsJson, print_rows, print_table, progress_bars, say
+from gsmap.errors import MissingDependencyError
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -23,16 +25,16 @@ def command(
     Example: `gsmap demo`
     """
     import gsmap.map
-    from gsmap import demo
     from gsmap.cli.update import print_map
     from gsmap.types.rows import DemoReport
 
+    synthetic = _synthetic()
     root = Path(folder)
     map_path = root / "demo.gsmap"
     with progress_bars() as progress:
         draw = progress or (lambda stage, fraction, text: None)
-        captures = demo.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))
-        demo.write_captures(root / "captures", captures)
+        captures = synthetic.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))
+        synthetic.write_captures(root / "captures", captures)
         with gsmap.map.open_or_create(map_path, progress=progress) as m:
             updated = m.update(root / "captures")
             exported = m.export(root / "tiles", tile_size_m=0)
@@ -58,11 +60,26 @@ def command(
     say(f"look around: gsmap view {map_path}")
 
 
+def _synthetic() -> ModuleType:
+    """The maker of synthetic scenes, a distribution of its own: maps of real captures need none of it."""
+    try:
+        import gsmap_synthetic
+    except ModuleNotFoundError as error:
+        if error.name != "gsmap_synthetic":
+            raise
+        raise MissingDependencyError(
+            "gsmap demo makes its captures with gsmap-synthetic, which is not installed: "
+            "pip install the folder synthetic/ of gsmap's source, or run tools/setup.sh there"
+        ) from error
+    module: ModuleType = gsmap_synthetic
+    return module
+
+
 def _draw(m: Map, path: Path) -> None:
     """The map's picture: every placed scene, what ties it to which, and where the cameras went."""
     from PIL import Image
 
-    from gsmap.demo.picture import map_picture
+    from gsmap.view.map_picture import map_picture
 
     parts = [(scene.name, *m.read(scene.name, frame="map")) for scene in m.scenes()]
     edges = [(row.target_name, row.source_name) for row in m.edge_rows() if row.used]

@@ -14,17 +14,18 @@ import pytest
 
 import gsmap
 import gsmap.map
-from gsmap import demo, formats
+from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.export.manifest import FILE_NAME
 from gsmap.types import Prior, Sim3
+from gsmap_synthetic import make_captures, write_captures
 
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures")
-    made = demo.make_captures(0, 3, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
-    demo.write_captures(folder, made)
+    made = make_captures(0, 3, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
+    write_captures(folder, made)
     return folder
 
 

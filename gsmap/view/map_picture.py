@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.types import Cameras, Gaussians, Sim3
@@ -160,7 +161,7 @@ def _render(parts: Sequence[Part], view: Cameras, low: np.ndarray, high: np.ndar
     paper = tuple(c / 255 for c in _PAPER)
     image = render(Gaussians.concatenate(kept), big, background=paper, depth=False, dominant_id=False).colour[0]
     image = Image.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8))
-    return np.asarray(image.resize(tuple(view.sizes_px[0]), Image.LANCZOS))
+    return np.asarray(image.resize(tuple(view.sizes_px[0]), Image.Resampling.LANCZOS))
 
 
 def _faces(gaussians: Gaussians, cameras: Cameras, eye: np.ndarray) -> np.ndarray:
@@ -185,9 +186,7 @@ def _faces(gaussians: Gaussians, cameras: Cameras, eye: np.ndarray) -> np.ndarra
 
 def _project(points: np.ndarray, view: Cameras, corner: tuple[int, int]) -> np.ndarray:
     """(n, 2) page positions of map points drawn in a panel."""
-    local = points @ view.T_camera_frame[0, :3, :3].T + view.T_camera_frame[0, :3, 3]
-    fx, fy, cx, cy = view.intrinsics_px[0]
-    return np.stack([fx * local[:, 0] / local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy], 1) + corner
+    return project(points, view.T_camera_frame[0], view.intrinsics_px[0])[0] + corner
 
 
 def _draw_walks(draw, parts: Sequence[Part], view: Cameras, corner, unit: float, full: bool) -> None:

@@ -1,11 +1,11 @@
-"""A made place: the same from the same seed, another from another, and geometrically what its plan says."""
+"""A synthetic place: the same from the same seed, another from another, and geometrically what its plan says."""
 
 import numpy as np
 import pytest
 
-from gsmap.demo import film, make_place, walk
-from gsmap.demo.place import CEILING_M
 from gsmap.errors import ConfigError
+from gsmap_synthetic import film, make_place, walk
+from gsmap_synthetic.place import CEILING_M
 
 
 def test_same_seed_same_place_other_seed_another(place):

@@ -1,4 +1,4 @@
-"""Captures of a made place: true to the place, overlapping, and written so that gsmap reads them back."""
+"""Captures of a synthetic place: true to the place, overlapping, and written so that gsmap reads them back."""
 
 import json
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gsmap.demo import make_captures, write_captures
 from gsmap.types import Sim3
+from gsmap_synthetic import make_captures, write_captures
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Procedural materials: what every surface of a made place looks like.
+"""Procedural materials: what every surface of a synthetic place looks like.
 
 A material maps positions on a surface to linear-light albedo: ``material(u_m, v_m, size_m) -> (..., 3) in [0, 1]`` with
 ``u_m, v_m`` metres from the surface's corner and ``size_m`` its extent. Nothing here has state: one seed paints the
@@ -39,7 +39,8 @@ def noise(u: np.ndarray, v: np.ndarray, cell_m: float, seed: int) -> np.ndarray:
 
 def _fractal(u: np.ndarray, v: np.ndarray, cell_m: float, seed: int, octaves: int = 3) -> np.ndarray:
     """Sum of octaves of `noise`, centred at 0, roughly in [-0.5, 0.5]."""
-    total = sum(0.5**k * (noise(u, v, cell_m / 2**k, seed + k) - 0.5) for k in range(octaves))
+    octave = [0.5**k * (noise(u, v, cell_m / 2**k, seed + k) - 0.5) for k in range(octaves)]
+    total = np.add.reduce(octave)
     return total / (2 - 0.5 ** (octaves - 1)) * 1.6
 
 

@@ -1,28 +1,27 @@
-"""Make captures of a made place, each trained alone and in its own frame, and write them as people keep them."""
+"""Make captures of a synthetic place, each trained alone and in its own frame, and write them as people keep them."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gsmap.demo.capture import Frames, default_routes, film, unused_doors, walk
-from gsmap.demo.initialise import from_depth
-from gsmap.demo.place import Place, make_place
-from gsmap.demo.train import Params, train
 from gsmap.errors import ConfigError
 from gsmap.types import Cameras, Gaussians, Sim3
-
-Progress = Callable[[float, str], None]
+from gsmap.types.progress import Progress, silent
+from gsmap_synthetic.capture import Frames, default_routes, film, unused_doors, walk
+from gsmap_synthetic.initialise import from_depth
+from gsmap_synthetic.place import Place, make_place
+from gsmap_synthetic.train import Params, train
 
 
 @dataclass(frozen=True, eq=False)
 class DemoCapture:
-    """One capture of a made place and what is true about it.
+    """One capture of a synthetic place and what is true about it.
 
     Args:
         gaussians, cameras: in the capture's own frame (and unit, where it has its own scale).
@@ -70,13 +69,13 @@ def make_captures(
         shut_doors: shut the doors a capture's route does not pass, so that captures see only the rooms they walk
             through; with open doors they glimpse most of the rooms next to those, too.
         vary_exposure: give each capture its own exposure (gain 0.85 to 1.15, gamma 0.9 to 1.15).
-        hold_out: every so manieth frame is not trained on (see `shown`); it stays among the images and cameras.
+        hold_out: every ``hold_out``-th frame is not trained on (see `shown`); it stays among the images and cameras.
         place: a place already built, instead of the one of ``seed``.
 
     Raises:
         ConfigError: counts that do not fit together, or a route without doorways.
     """
-    report = progress or (lambda fraction, text: None)
+    report = progress or silent
     report(0.0, "building a place")
     place = place or make_place(seed, rooms=rooms, twin=twin)
     routes = routes or default_routes(place, num_captures)
@@ -96,8 +95,8 @@ def make_captures(
 
         poses = walk(place, route, num_frames, seed=i)
         shut = unused_doors(place, route) if shut_doors else ()
-        look = {"size_px": size_px, "shut": shut, "gain": gain, "gamma": gamma, "name": name}
-        frames = film(place, poses, **look, progress=_part(step, 0.0, 0.3))
+        filming = _part(step, 0.0, 0.3)
+        frames = film(place, poses, size_px=size_px, shut=shut, gain=gain, gamma=gamma, name=name, progress=filming)
         known = frames[shown(len(frames), hold_out)]
         gaussians = fit_frames(known, steps=steps, num_gaussians=num_gaussians, seed=i, progress=_part(step, 0.3, 1.0))
         out.append(put_in_own_frame(gaussians, frames, name, rng, scale))

@@ -1,4 +1,4 @@
-"""Film a made place: walks at head height, and colour and depth frames along them by ray casting."""
+"""Film a synthetic place: walks at head height, and colour and depth frames along them by ray casting."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.demo.bake import Skin
-from gsmap.demo.place import Door, Place, Room
 from gsmap.errors import ConfigError, InputError
 from gsmap.types import Cameras
+from gsmap_synthetic.bake import Skin
+from gsmap_synthetic.place import Door, Place, Room
 
 _HEAD_M = 1.5
 _FOCAL = 0.62  # Focal length over image width: 78 degrees across, what a phone's wide lens sees.
@@ -23,7 +23,7 @@ class Frames:
 
     Args:
         images: (C, H, W, 3) uint8 display colours.
-        cameras: C cameras in the frame of the walk (a made place's own frame, or whatever the poses came in).
+        cameras: C cameras in the frame of the walk (a synthetic place's own frame, or whatever the poses came in).
         depths_m: (C, H, W) float32 depth along the optical axis, 0 where unknown; None without depth.
     """
 
@@ -124,6 +124,7 @@ def _look_around(room: Room, door: Door | None, count: int, rng: np.random.Gener
 def _pass_door(place: Place, a: int, b: int, count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Through the doorway from room a to b, looking ahead and once back."""
     door = place.door_between(a, b)
+    assert door is not None  # Routes are checked before they are walked.
     normal = np.array([0.0, 1.0]) if door.along_x else np.array([1.0, 0.0])
     if normal @ (place.rooms[b].center - door.xy) < 0:
         normal = -normal

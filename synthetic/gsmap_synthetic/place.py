@@ -1,4 +1,4 @@
-"""A made place: a furnished flat built from a seed.
+"""A synthetic place: a furnished flat built from a seed.
 
 The plan is a rectangle cut into rooms; every two rooms that share enough wall get a doorway, so the first three form a
 cycle. Each room is decorated and furnished from its own seed: two seeds give two clearly different places, one seed
@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsmap.demo import textures as tx
-from gsmap.demo.bake import Skin, bake
-from gsmap.demo.furniture import PIECES, ROOMS, colour, palette, timber
-from gsmap.demo.surfaces import Surfaces
 from gsmap.errors import ConfigError
+from gsmap_synthetic import textures as tx
+from gsmap_synthetic.bake import Skin, bake
+from gsmap_synthetic.furniture import PIECES, ROOMS, colour, palette, timber
+from gsmap_synthetic.surfaces import Surfaces
 
 CEILING_M = 2.55
 _DOOR_HEIGHT_M = 2.05
@@ -53,7 +53,7 @@ class Room:
     def is_free(self, xy: np.ndarray, margin_m: float = 0.4) -> np.ndarray:
         """(n,) whether a head at the points (n, 2) stays clear of walls and tall furniture."""
         low, high = self.rect_m[:2] + margin_m, self.rect_m[2:] - margin_m
-        free = ((xy >= low) & (xy <= high)).all(1)
+        free = np.asarray(((xy >= low) & (xy <= high)).all(1))
         for rect in self.obstacles_m:
             free &= ~((xy > rect[:2] - margin_m) & (xy < rect[2:] + margin_m)).all(1)
         return free
@@ -103,7 +103,7 @@ def make_place(
         ConfigError: fewer than 3 rooms.
     """
     if rooms < 3:
-        raise ConfigError(f"a made place has at least 3 rooms, got rooms={rooms}")
+        raise ConfigError(f"a synthetic place has at least 3 rooms, got rooms={rooms}")
     plan, doors = _plan(np.random.default_rng([seed, 1]), rooms)
     if twin:
         plan, doors = _with_twin(plan, doors, seed)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from gsmap.demo.capture import Frames
 from gsmap.types import Gaussians
+from gsmap.types.progress import Progress
+from gsmap_synthetic.capture import Frames
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def train(
     params: Params | None = None,
     *,
     seed: int = 0,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Gaussians:
     """Fit Gaussians to frames.
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from gsmap.demo import film, walk
-from gsmap.demo.initialise import from_colour, from_depth
-from gsmap.demo.train import Params, train
 from gsmap.errors import InputError
 from gsmap.evaluate.images import psnr
 from gsmap.render import render
 from gsmap.types import Gaussians
+from gsmap_synthetic import film, walk
+from gsmap_synthetic.initialise import from_colour, from_depth
+from gsmap_synthetic.train import Params, train
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap.demo.capture import Frames
 from gsmap.errors import InputError
 from gsmap.geometry.rotations import matrices_to_quats
+from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.types import Gaussians
+from gsmap_synthetic.capture import Frames
 
-_SH0 = 0.28209479177387814
 _EVEN = 0.02  # Weight of a blank surface against one of that contrast per pixel.
 _REACH = 0.6
 
@@ -49,7 +49,7 @@ def from_depth(frames: Frames, count: int, seed: int = 0) -> Gaussians:
         matrices_to_quats(_frames_of_normals(normals[chosen])),
         np.log(scales),
         np.full(n, np.log(0.9 / 0.1)),
-        ((mean_colours - 0.5) / _SH0)[:, None, :],
+        sh0_of_rgb(mean_colours)[:, None, :],
     )
 
 
@@ -65,7 +65,7 @@ def from_colour(frames: Frames, count: int, near: float, far: float, seed: int =
     means = np.einsum("nij,nj->ni", pose[:, :3, :3], local) + pose[:, :3, 3]
     scales = np.repeat((2.0 * depth / fx * np.sqrt(c * h * w / count) * 0.25)[:, None], 3, axis=1)
     quats = np.tile([1.0, 0, 0, 0], (count, 1))
-    sh = ((frames.images[view, y, x] / 255.0 - 0.5) / _SH0)[:, None, :]
+    sh = sh0_of_rgb(frames.images[view, y, x] / 255.0)[:, None, :]
     return Gaussians(means, quats, np.log(scales), np.full(count, np.log(0.1 / 0.9)), sh)
 
 

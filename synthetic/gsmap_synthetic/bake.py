@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from gsmap.demo.surfaces import Surfaces
+from gsmap_synthetic.surfaces import Surfaces
 
 _LEVELS = 4
 _LIGHT_STEP_M = 0.15
@@ -83,13 +84,20 @@ class Skin:
         return out / np.float32(255)
 
 
+def _open3d() -> Any:
+    """The ray caster, loaded by those who bake alone; its type stubs do not know numpy."""
+    import open3d
+
+    return open3d
+
+
 def _triangles(count: int) -> np.ndarray:
     base = 4 * np.arange(count, dtype=np.uint32)[:, None]
     return (base[:, :, None] + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
 
 
-def _ray_scene(corners: np.ndarray):
-    import open3d as o3d
+def _ray_scene(corners: np.ndarray) -> Any:
+    o3d = _open3d()
 
     scene = o3d.t.geometry.RaycastingScene()
     vertices = o3d.core.Tensor(corners.reshape(-1, 3).astype(np.float32))
@@ -97,9 +105,8 @@ def _ray_scene(corners: np.ndarray):
     return scene
 
 
-def _rays_tensor(origins: np.ndarray, directions: np.ndarray):
-    import open3d as o3d
-
+def _rays_tensor(origins: np.ndarray, directions: np.ndarray) -> Any:
+    o3d = _open3d()
     return o3d.core.Tensor(np.concatenate([origins, directions], axis=1).astype(np.float32))
 
 
@@ -126,7 +133,8 @@ def bake(
         lit = _enlarge(light[ends[q] - nu * nv : ends[q]].reshape(nv, nu, 3), *paint.shape[:2])
         glow = surfaces.glows[q]
         images.append(_display(paint * (lit * (1 - glow) + 1.1 * glow)))
-    return Skin(corners, *_pack(images), texel_m, leaves)
+    texels, offsets, widths, heights = _pack(images)
+    return Skin(corners, texels, offsets, widths, heights, texel_m, leaves)
 
 
 def _paint(surfaces: Surfaces, q: int, texel_m: float) -> np.ndarray:
@@ -144,15 +152,14 @@ def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
     standing = np.flatnonzero(np.array(surfaces.leaves) < 0)  # Doors stand open while the lamps shine.
     scene = _ray_scene(corners[standing])
     grids = np.clip(np.ceil(sizes / _LIGHT_STEP_M).astype(int) + 1, 2, 64)
-    points, normals, owner = [], [], []
+    at, facing = [], []
     for q, (nu, nv) in enumerate(grids):
         s, t = (a[..., None] for a in np.meshgrid(np.linspace(0.03, 0.97, nu), np.linspace(0.03, 0.97, nv)))
         p00, p10, p11, p01 = corners[q]
-        points.append(((1 - s) * (1 - t) * p00 + s * (1 - t) * p10 + s * t * p11 + (1 - s) * t * p01).reshape(-1, 3))
+        at.append(((1 - s) * (1 - t) * p00 + s * (1 - t) * p10 + s * t * p11 + (1 - s) * t * p01).reshape(-1, 3))
         normal = np.cross(p11 - p00, p01 - p10)
-        normals.append(np.broadcast_to(normal / max(np.linalg.norm(normal), 1e-12), points[-1].shape))
-        owner.append(np.full(len(points[-1]), q))
-    points, normals, owner = np.concatenate(points), np.concatenate(normals), np.concatenate(owner)
+        facing.append(np.broadcast_to(normal / max(np.linalg.norm(normal), 1e-12), at[-1].shape))
+    points, normals = np.concatenate(at), np.concatenate(facing)
     points = points + 0.004 * normals
     light = _direct(scene, surfaces.lamps, points, normals)
 

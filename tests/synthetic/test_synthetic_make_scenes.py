@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsmap.demo import make_captures, write_captures
 from gsmap.errors import InputError
 from gsmap.ingest import read_captures
+from gsmap_synthetic import make_captures, write_captures
 
 
 @pytest.fixture(scope="module")

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from gsmap.demo import make_captures
-from gsmap.demo.picture import _find_up, map_picture
 from gsmap.errors import InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.types import Sim3
+from gsmap.view.map_picture import _find_up, map_picture
+from gsmap_synthetic import make_captures, make_place
 
 
 @pytest.fixture(scope="module")
-def parts(place):
+def parts():
+    place = make_place(3, texel_m=0.08)
     made = make_captures(3, 2, steps=0, place=place, num_frames=24, num_gaussians=8000, size_px=(96, 72))
     poses = [Sim3.from_matrix(c.T_scene_world) for c in made]
     first = poses[0]

@@ -1,4 +1,4 @@
-"""The one primitive made places are built from: textured quadrilaterals, gathered under nested local frames."""
+"""The one primitive synthetic places are built from: textured quadrilaterals, gathered under nested local frames."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap.demo.textures import Material
+from gsmap_synthetic.textures import Material
 
 
 @dataclass

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.demo import textures as tx
-from gsmap.demo.surfaces import Surfaces
+from gsmap_synthetic import textures as tx
+from gsmap_synthetic.surfaces import Surfaces
 
 
 def colour(rng, hue=(0.0, 1.0), saturation=(0.2, 0.8), value=(0.2, 0.8)) -> np.ndarray:
