@@ -120,7 +120,7 @@ def run(task: dict) -> dict:
         seconds = time.process_time() - begin
         rows = world.placed(answer)
         poses = Similarities.stack([answer.poses[s].S_map_scene for s in world.ids])
-        used_wrong = sum(answer.used.get(key) is True for key in world.wrong_keys)
+        used_wrong = sum(answer.use(*key) == "used" for key in world.wrong_keys)
     else:
         poses, rows, used = peer(task["method"], world)
         seconds = time.process_time() - begin
@@ -208,7 +208,7 @@ def run_place(task: dict) -> dict:
         begin = time.process_time()
         answer = optimize(world.ids[:count], edges, previous=answer)
         seconds.append(time.process_time() - begin)
-        full += answer.parameters["method"] == "batch"
+        full += answer.provenance.method == "batch"
     return {
         "median_ms": 1e3 * float(np.median(seconds)),
         "p90_ms": 1e3 * float(np.percentile(seconds, 90)),
@@ -235,7 +235,7 @@ def run_twins(seeds: int) -> dict:
                 answer = optimize(world.ids, world.edges, params=OptimizeParams(marginals=False))
                 row["worlds"] += 1
                 row["folded"] += world.worst_island_m(answer) > 0.5
-                row["used_wrong"] += any(answer.used[key] is True for key in world.wrong_keys)
+                row["used_wrong"] += any(answer.outcomes[key].use == "used" for key in world.wrong_keys)
                 row["placed"].append(len(world.placed(answer)) / scenes)
     row["placed"] = float(np.mean(row["placed"]))
     print(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.describe.colour import srgb_to_lab
-from gsmap.geometry.strays import find_strays
+from gsmap.geometry.floaters import find_floaters
 from gsmap.types import Gaussians
 
 _SH_C0 = 0.28209479177387814
@@ -36,11 +36,11 @@ class Cloud:
 
 
 def surface_cloud(gaussians: Gaussians, *, min_opacity: float = 0.1) -> Cloud:
-    """Centres of the Gaussians that make up the surface: opaque, not huge, not floating alone, not of a stray colour.
+    """Centres of the Gaussians that make up the surface: opaque, not huge, not floating alone, not of a foreign colour.
 
     "Huge" and "alone" are told from the capture itself, so that the cloud of a scene does not depend on its unit: a
-    Gaussian is dropped when its largest scale exceeds 3.5 times the median one, or it strays (`find_strays`). Colour is
-    the view-independent part (SH degree 0).
+    Gaussian is dropped when its largest scale exceeds 3.5 times the median one, or it floats (`find_floaters`).
+    Colour is the view-independent part (SH degree 0).
     """
     scale = gaussians.scales.max(1, initial=0)
     finite = np.isfinite(gaussians.means).all(1) & np.isfinite(scale) & np.isfinite(gaussians.sh[:, 0]).all(1)
@@ -49,7 +49,7 @@ def surface_cloud(gaussians: Gaussians, *, min_opacity: float = 0.1) -> Cloud:
         keep = keep[scale[keep] <= 3.5 * np.median(scale[keep])]
     points = gaussians.means[keep].astype(np.float64)
     lab = srgb_to_lab(np.clip(_SH_C0 * gaussians.sh[keep, 0] + 0.5, 0.0, 1.0))
-    stray, spacing = find_strays(points, lab, _STRAY_LAB)
+    stray, spacing = find_floaters(points, lab, _STRAY_LAB)
     return Cloud(points[~stray], lab[~stray], np.pi / 8 * spacing[~stray] ** 2, keep[~stray])
 
 

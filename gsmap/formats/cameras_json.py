@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats.cameras import unique
+from gsmap.formats.camera_files import unique
 from gsmap.types import Cameras
 
 

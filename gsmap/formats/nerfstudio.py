@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats.cameras import load_json, unique
+from gsmap.formats.camera_files import load_json, unique
 from gsmap.types import Cameras, Sim3
 
 DATAPARSER = "dataparser_transforms.json"

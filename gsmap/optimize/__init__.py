@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gsmap.optimize.changes import Change, diff, motion, moved
-from gsmap.types import Edge, PoseGraph, Prior
+from gsmap.optimize.changes import diff, motion, moved
+from gsmap.types import Edge, PoseChange, PoseGraph, Prior
 
 if TYPE_CHECKING:
     from gsmap.optimize.batch import OptimizeParams
 
-__all__ = ["Change", "OptimizeParams", "diff", "motion", "moved", "optimize"]
+__all__ = ["OptimizeParams", "PoseChange", "diff", "motion", "moved", "optimize"]
 
 
 def optimize(
@@ -37,7 +37,7 @@ def optimize(
         edges: the measurements to consider; leave out what a person rejected.
         priors: outside knowledge. A component whose priors leave a freedom open is held there by its anchor scene.
         previous: the last answer. Its largest component's frame survives, so that maps do not jump. If only few
-            scenes are new, they are placed in it (``parameters["method"] == "incremental"``); see `OptimizeParams`.
+            scenes are new, they are placed in it (``provenance.method == "incremental"``); see `OptimizeParams`.
         params: see `OptimizeParams`.
         progress: called with a fraction and a short text.
 
@@ -55,7 +55,8 @@ def optimize(
         if placed is not None:
             return placed
     answer = solve_batch(scene_ids, edges, priors, previous, params, progress)
-    return replace(answer, parameters={**answer.parameters, "measured": f"{fingerprint(edges, priors):016x}"})
+    measured = f"{fingerprint(edges, priors):016x}"
+    return replace(answer, provenance=replace(answer.provenance, measured=measured))
 
 
 def __getattr__(name: str) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import networkx
 import numpy as np
@@ -29,7 +29,8 @@ from gsmap.optimize.gauge import anchor_of, onto_anchor, onto_priors
 from gsmap.optimize.measurements import Measurements, check_priors, measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import Descent, chi_squares, chordal, islands, roots, spread
-from gsmap.types import Edge, PoseGraph, Prior, ScenePose, Sim3
+from gsmap.types import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose, Sim3
+from gsmap.types.plain import plain
 
 MAX_ROUNDS = 30
 # A person's edges contradict each other if one is off by more than this many gates after giving way to the others.
@@ -164,13 +165,13 @@ def _take_in_agreeing(m: Measurements, state: State, params: OptimizeParams) -> 
 
 
 def take_in(m: Measurements, state: State, params: OptimizeParams) -> None:
-    """Take in what agrees, and then what single strong edges attach."""
+    """Take in what agrees, and then what single edges attach."""
     while _take_in_agreeing(m, state, params) or _join(m, state, params, single=True):
         pass
 
 
 def _close_through_singles(m: Measurements, state: State, params: OptimizeParams) -> bool:
-    """Take in the cycles that close once single strong edges attach small islands.
+    """Take in the cycles that close once single edges attach small islands.
 
     The single edges that no cycle bears out are let go again, for a scene that rests on one edge must not vouch for
     others; they come back when nothing else does.
@@ -197,7 +198,7 @@ def _close_loops(m: Measurements, state: State, params: OptimizeParams) -> bool:
 
 
 def _join(m: Measurements, state: State, params: OptimizeParams, *, single: bool) -> bool:
-    """Join islands where edges agree, or, with ``single``, where one strong edge attaches a small island."""
+    """Join islands where edges agree, or, with ``single``, where one edge attaches a small island."""
     rows = state.open
     if not len(rows):
         return False
@@ -337,8 +338,8 @@ def _answer(
     _, component = np.unique(component, return_inverse=True)
     answer = answer_of(m, poses, component, covariances, state, votes, params)
     known = {m.scene_ids[k] for k in terms.scenes.tolist()}
-    dropped = [p.scene for p in priors if p.scene not in known]
-    return replace(answer, parameters={**answer.parameters, "contradicted_priors": dropped})
+    dropped = tuple(p.scene for p in priors if p.scene not in known)
+    return replace(answer, provenance=replace(answer.provenance, contradicted_priors=dropped))
 
 
 def answer_of(
@@ -358,33 +359,29 @@ def answer_of(
     firm = state.accepted & (~single | m.confirmed)
     status = _statuses(m, state.accepted, firm)
 
-    used: dict[tuple[str, str], bool | str] = {}
-    residual: dict[tuple[str, str], float] = {}
-    reasons: dict[tuple[str, str], str] = {}
-    undecided = []
+    outcomes: dict[tuple[str, str], EdgeOutcome] = {}
     for k, key in enumerate(m.keys):
-        used[key] = True if firm[k] else "tentative" if state.accepted[k] else False
-        if together[k]:
-            residual[key] = float(chi[k])
+        residual = float(chi[k]) if together[k] else None
         if firm[k]:
-            continue
-        if state.accepted[k]:
-            reasons[key] = "in no agreeing cycle: rests on its own verdict alone"
+            outcomes[key] = EdgeOutcome("used", residual)
+        elif state.accepted[k]:
+            reason = "in no agreeing cycle: rests on its own verdict alone"
+            outcomes[key] = EdgeOutcome("tentative", residual, reason)
         elif not together[k]:
             open_question = "edges that agree among themselves contradict each other here: places that look alike?"
-            reasons[key] = (
+            reason = (
                 open_question
                 if state.undecided[k]
-                else state.pending.get(k, "contradicts what else is known of the two islands")
+                else state.pending.get(k, "contradicts what else is known of the two components")
             )
-            undecided.append(key)
+            outcomes[key] = EdgeOutcome("unused", None, reason, undecided=True)
         else:
-            reasons[key] = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
+            reason = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
             doubtful = status[m.targets[k]] == "tentative" or status[m.sources[k]] == "tentative"
             if votes.agree[k] > 0:
-                reasons[key] += "; it agrees with others that do too (a place that looks alike?)"
-            if votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k]:
-                undecided.append(key)
+                reason += "; it agrees with others that do too (a place that looks alike?)"
+            undecided = bool(votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
+            outcomes[key] = EdgeOutcome("unused", residual, reason, undecided)
     return PoseGraph(
         poses={
             scene: ScenePose(
@@ -396,11 +393,9 @@ def answer_of(
             )
             for k, scene in enumerate(m.scene_ids)
         },
-        used=used,
-        residuals=residual,
-        reasons=reasons,
-        undecided=tuple(undecided),
-        parameters={**asdict(params), "method": "batch", "batch_scenes": m.num_scenes},
+        outcomes=outcomes,
+        settings=plain(params),
+        provenance=Provenance("batch", batch_scenes=m.num_scenes),
     )
 
 

@@ -15,7 +15,7 @@ from gsmap.optimize.cycles import _ranges
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.robust import islands, residuals, roots
 
-SMALL_ISLAND = 3  # below this many scenes a single strong edge may join
+SMALL_ISLAND = 3  # below this many scenes a single edge may join
 BRIDGE_EDGES = 3  # two islands that are not small need this many agreeing edges over as many scene pairs
 MAX_EXACT_HOPS = 20_000_000  # scenes x sources of shortest paths; beyond it hops are estimated from distances
 
@@ -180,9 +180,7 @@ def allowed(join: Join, edges: Measurements, sizes: np.ndarray) -> str:
         )
     if pairs >= 2:
         return "agreed"
-    if edges.strong[rows].any():
-        return "single"
-    return "the only tie to the rest, and its own verdict is not strong enough to attach by itself"
+    return "single"
 
 
 def bridges(edges: Measurements, accepted: np.ndarray) -> np.ndarray:

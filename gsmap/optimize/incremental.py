@@ -15,7 +15,7 @@ from gsmap.optimize.cycles import Vote
 from gsmap.optimize.measurements import measurements
 from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.robust import Descent, chi_squares, islands
-from gsmap.types import Edge, PoseGraph, Prior, ScenePose, Sim3
+from gsmap.types import Edge, EdgeOutcome, PoseGraph, Prior, ScenePose, Sim3
 
 RING = 2  # hops of surroundings that are looked at; the outermost scenes stay where they are
 
@@ -26,7 +26,7 @@ def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = ()) -> int:
     Independent of their order, and that of two sets is the sum of both (modulo 2^64). Meant to notice change, not to
     resist an attacker.
     """
-    flat = [(e.S_target_source, e.information, f"{e.target}\0{e.source}", e.confirmed + 2 * e.strong) for e in edges]
+    flat = [(e.S_target_source, e.information, f"{e.target}\0{e.source}", 2 + e.confirmed) for e in edges]
     flat += [(p.S_map_scene, np.diag(p.sigmas), f"{p.scene}\0{p.up!r}{p.up_sigma_rad!r}", 4) for p in priors]
     n = len(flat)
     values = np.empty((n, 64))
@@ -57,7 +57,7 @@ def place_new(
     """
     known = set(previous.poses)
     new = [scene for scene in scene_ids if scene not in known]
-    solved = previous.parameters.get("batch_scenes", 0)
+    solved = previous.provenance.batch_scenes
     if not new or len(known) + len(new) != len(scene_ids) or len(set(scene_ids)) != len(scene_ids):
         return None
     if len(scene_ids) > (1 + params.growth) * solved or any(p.scene not in known for p in priors):
@@ -65,11 +65,11 @@ def place_new(
     fresh = set(new)
     old = [e for e in edges if e.target not in fresh and e.source not in fresh]
     measured = fingerprint(old, priors)
-    if f"{measured:016x}" != previous.parameters.get("measured"):
+    if f"{measured:016x}" != previous.provenance.measured:
         return None
     measured += fingerprint([e for e in edges if e.target in fresh or e.source in fresh])
     answer = previous
-    taken = [e for e in old if previous.used[e.target, e.source]]
+    taken = [e for e in old if previous.use(e.target, e.source) != "unused"]
     for scene in new:
         own = [
             e
@@ -80,9 +80,9 @@ def place_new(
         if placed is None:
             return None
         answer = placed
-        taken += [e for e in own if answer.used[e.target, e.source]]
-    parameters = {**previous.parameters, "method": "incremental", "measured": f"{measured % 2**64:016x}"}
-    return replace(answer, poses={s: answer.poses[s] for s in scene_ids}, parameters=parameters)
+        taken += [e for e in own if answer.use(e.target, e.source) != "unused"]
+    provenance = replace(previous.provenance, method="incremental", measured=f"{measured % 2**64:016x}")
+    return replace(answer, poses={s: answer.poses[s] for s in scene_ids}, provenance=provenance)
 
 
 def _place(
@@ -133,13 +133,16 @@ def _place(
             pose = previous.poses[s].S_map_scene if fixed[k] else local.poses[s].S_map_scene
             poses_now[s] = replace(previous.poses[s], S_map_scene=pose, status=status)
     poses_now[scene] = local.poses[scene]
-    used = {**previous.used, **{k: v for k, v in local.used.items() if k in own_keys or v is True}}
-    reasons = {k: v for k, v in previous.reasons.items() if used[k] is not True}
-    reasons.update({k: v for k, v in local.reasons.items() if k in own_keys})
-    undecided = [k for k in previous.undecided if used[k] is not True] + [k for k in local.undecided if k in own_keys]
-    return PoseGraph(
-        poses_now, used, {**previous.residuals, **local.residuals}, reasons, tuple(undecided), previous.parameters
-    )
+    outcomes = dict(previous.outcomes)
+    for key, outcome in local.outcomes.items():
+        outcomes[key] = outcome if key in own_keys else _updated(previous.outcomes[key], outcome)
+    return replace(previous, poses=poses_now, outcomes=outcomes)
+
+
+def _updated(old: EdgeOutcome, new: EdgeOutcome) -> EdgeOutcome:
+    """An edge between old scenes after a scene was placed beside it: it may only gain."""
+    residual = old.residual_chi2 if new.residual_chi2 is None else new.residual_chi2
+    return EdgeOutcome("used", residual) if new.use == "used" else replace(old, residual_chi2=residual)
 
 
 def _surroundings(scene: str, own: list[Edge], taken: list[Edge]) -> tuple[list[str], set[str], list[Edge]]:

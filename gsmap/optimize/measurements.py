@@ -22,7 +22,7 @@ class Measurements:
         targets, sources: (E,) rows of ``scene_ids``.
         measured: E measured ``S_target_source``.
         information: (E, D, D); D is 6 where every edge is rigid (a stiff scale row says nothing then), else 7.
-        confirmed, strong: (E,) bool.
+        confirmed: (E,) bool.
     """
 
     scene_ids: tuple[str, ...]
@@ -31,7 +31,6 @@ class Measurements:
     measured: Similarities
     information: np.ndarray
     confirmed: np.ndarray
-    strong: np.ndarray
 
     @property
     def num_scenes(self) -> int:
@@ -64,7 +63,6 @@ class Measurements:
             self.measured[rows],
             self.information[rows],
             self.confirmed[rows],
-            self.strong[rows],
         )
 
 
@@ -111,7 +109,6 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
         measured,
         np.ascontiguousarray(information),
         np.array([e.confirmed for e in edges], dtype=bool),
-        np.array([e.strong for e in edges], dtype=bool),
     )
 
 

@@ -2,25 +2,27 @@
 
 from gsmap.store.arrays import digest
 from gsmap.store.exports import Export
-from gsmap.store.graphs import StoredGraph, graph_key
+from gsmap.store.facts import SceneFact
+from gsmap.store.graphs import StoredGraph
 from gsmap.store.integrity import Check, Pruned
 from gsmap.store.models import Model
-from gsmap.store.registrations import StoredRegistration, Verdict
+from gsmap.store.registrations import MANUAL, Review, StoredRegistration
 from gsmap.store.revisions import Revision
 from gsmap.store.scenes import scene_id
 from gsmap.store.store import Store
 
 __all__ = [
+    "MANUAL",
     "Check",
     "Export",
     "Model",
     "Pruned",
+    "Review",
     "Revision",
+    "SceneFact",
     "Store",
     "StoredGraph",
     "StoredRegistration",
-    "Verdict",
     "digest",
-    "graph_key",
     "scene_id",
 ]

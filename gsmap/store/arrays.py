@@ -18,9 +18,11 @@ import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gsmap.durable import sync_folder
 from gsmap.errors import CorruptError
 
 CHUNK_ROWS = 16_384
@@ -204,7 +206,7 @@ def _write(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
             made[...] = array
 
 
-def _rows(array, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:
+def _rows(array: Any, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:
     if rows is None:
         return np.asarray(array[...])
     parts = [np.asarray(array[start:stop]) for start, stop in rows]
@@ -222,15 +224,6 @@ def _synchronise(folder: Path) -> tuple[StoredFile, ...]:
     for path in [*(p for p in folder.rglob("*") if p.is_dir()), folder]:
         sync_folder(path)
     return tuple(out)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _sha256(path: Path) -> str:

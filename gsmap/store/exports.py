@@ -11,10 +11,13 @@ from typing import Any
 from sqlalchemy import Row, func, insert, select, update
 
 from gsmap.errors import NotFoundError
+from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.matrices import from_array, from_pose, plain, to_array, to_pose
+from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
 from gsmap.store.schema import exports, tiles
+from gsmap.store.schema import recipes as recipe_rows
 from gsmap.types import Tile
+from gsmap.types.plain import plain
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,14 @@ class Exports:
         row = {"target": _target(target), "revision": revision, "settings": plain(dict(settings or {}))}
         with self._catalog.write() as connection:
             query = insert(exports).returning(exports.c.number)
-            return connection.execute(query, row | {"created_at": now()}).scalar_one()
+            return int(connection.execute(query, row | {"created_at": now()}).scalar_one())
 
     def add_tile(self, export: int, tile: Tile) -> None:
-        """Note a tile that was just written (so that an interrupted export goes on where it stopped)."""
+        """Note a tile that was just written (so that an interrupted export goes on where it stopped).
+
+        Raises:
+            InputError: its recipe is neither empty nor a `RecipeKey.to_json`.
+        """
         row = {
             "export": export,
             "key": tile.key,
@@ -61,16 +68,16 @@ class Exports:
             "bounds": from_array(tile.bounds),
             "poses": {scene: from_pose(pose) for scene, pose in tile.poses.items()},
             "num_gaussians": int(tile.num_gaussians),
-            "method": tile.method,
             "truncated": int(tile.truncated),
             "path": tile.path,
             "sha256": tile.sha256,
+            "notes": list(tile.notes),
             "created_at": now(),
         }
         with self._catalog.write() as connection:
             if connection.execute(select(exports.c.number).where(exports.c.number == export)).first() is None:
                 raise NotFoundError(f"no export {export}: begin one first")
-            connection.execute(insert(tiles), row)
+            connection.execute(insert(tiles), row | {"recipe": recipes.keep(connection, tile.recipe)})
 
     def forget(self, target: str | os.PathLike[str], paths: Iterable[str]) -> None:
         """Note that tiles (by path) are no longer part of a target; their rows stay as history."""
@@ -82,8 +89,9 @@ class Exports:
     def tiles(self, target: str | os.PathLike[str]) -> list[Tile]:
         """The tiles that a target should hold now, by path."""
         query = (
-            select(tiles)
+            select(tiles, *(column for column in recipe_rows.c if column.name in recipes.PARTS))
             .join(exports, exports.c.number == tiles.c.export)
+            .outerjoin(recipe_rows, recipe_rows.c.digest == tiles.c.recipe)
             .where(exports.c.target == _target(target), tiles.c.removed_at.is_(None))
             .order_by(tiles.c.number)
         )
@@ -112,15 +120,17 @@ def _target(path: str | os.PathLike[str]) -> str:
     return str(Path(path).resolve())
 
 
-def _tile(row: Row) -> Tile:
+def _tile(row: Row[Any]) -> Tile:
+    older = {"method": row.older_recipe} if row.older_recipe else {}
     return Tile(
         key=row.key,
         component=row.component,
         bounds=to_array(row.bounds),
         poses={scene: to_pose(pose) for scene, pose in row.poses.items()},
         num_gaussians=row.num_gaussians,
-        method=row.method,
+        recipe=older if row.recipe is None else recipes.recipe_json(row),
         truncated=bool(row.truncated),
         path=row.path,
         sha256=row.sha256,
+        notes=tuple(row.notes),
     )

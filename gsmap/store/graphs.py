@@ -1,4 +1,4 @@
-"""Scene graphs, kept under what they were made from: scene and method."""
+"""Scene graphs, kept under what they were made from and how (`RecipeKey`)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Row, delete, insert, select
 
+from gsmap.errors import InputError
+from gsmap.methods import RecipeKey
+from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.groups import has_group, manifest, publish
-from gsmap.store.matrices import from_array, plain, to_array
+from gsmap.store.matrices import from_array, to_array
 from gsmap.store.scenes import resolve
 from gsmap.store.schema import graphs, scenes
 from gsmap.types import NodeLayer, SceneGraph
+from gsmap.types.plain import plain
 
 KIND = "graphs"
 
@@ -24,42 +28,45 @@ class StoredGraph:
     """What the catalog knows of a graph without reading it.
 
     Args:
-        key: digest of scene and method; registrations are keyed by it.
+        key: `RecipeKey.digest`; the keys of registrations name it.
         scene: scene id.
-        method: as given to `Graphs.save`.
         layers: number of nodes by layer.
         up: (3,) against gravity in the scene's frame, or None.
+        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in maps that schema 0001 wrote.
     """
 
     key: str
     scene: str
-    method: str
     layers: dict[str, int]
     created_at: str
     up: tuple[float, ...] | None = None
+    recipe: str | None = None
 
     @property
     def num_nodes(self) -> int:
         return sum(self.layers.values())
 
 
-def graph_key(scene_id: str, method: str) -> str:
-    """The digest a graph is kept under."""
-    return digest(text=f"{scene_id}\n{method}")
-
-
 class Graphs:
-    """The scene graphs of a map; ``method`` is any text that decides the result (a digest of segmenter, ...)."""
+    """The scene graphs of a map, of each scene one for every key that it was described under."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
 
-    def save(self, graph: SceneGraph, method: str) -> StoredGraph:
-        """Keep a graph; the same again changes nothing, another one under the same key takes its place."""
-        key = graph_key(graph.scene_id, method)
+    def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
+        """Keep a graph; the same again changes nothing, another one under the same key takes its place.
+
+        Args:
+            key: its recipe; among its inputs is the scene.
+
+        Raises:
+            InputError: the key does not name the scene, so another scene's graph would have the same.
+        """
+        if graph.scene_id not in key.inputs:
+            raise InputError(f"the key of a graph must name its scene {graph.scene_id} among its inputs")
         arrays: dict[str, np.ndarray] = {}
-        layers: dict[str, dict] = {}
+        layers: dict[str, dict[str, Any]] = {}
         for i, (name, nodes) in enumerate(graph.layers.items()):
             parts = {field.name: getattr(nodes, field.name) for field in fields(nodes)}
             arrays |= {f"{i}.{part}": value for part, value in parts.items() if isinstance(value, np.ndarray)}
@@ -71,48 +78,49 @@ class Graphs:
             "notes": list(graph.notes),
             "layers": layers,
         }
-        group_id = digest(*arrays.values(), text=f"{key}{about}")
-        row = {"key": key, "scene": graph.scene_id, "method": method, "num_nodes": graph.num_nodes, "about": about}
+        group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
+        row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
+        mine = graphs.c.key == key.digest
         staging = self._arrays.stage(arrays)
         with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
-            old = connection.execute(select(graphs).where(graphs.c.key == key)).first()
+            old = connection.execute(select(graphs).where(mine)).first()
             if old is not None and old.group_id == group_id:
                 return _stored(old)
             resolve(connection, graph.scene_id)
             if not has_group(connection, group_id):
                 publish(connection, self._arrays, staged, KIND, group_id)
-            connection.execute(delete(graphs).where(graphs.c.key == key))
-            connection.execute(insert(graphs), row | {"group_id": group_id, "created_at": now()})
-            return _stored(connection.execute(select(graphs).where(graphs.c.key == key)).one())
+            connection.execute(delete(graphs).where(mine))
+            made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": now()}
+            connection.execute(insert(graphs), row | made)
+            return _stored(connection.execute(select(graphs).where(mine)).one())
 
-    def find(self, ref: str, method: str) -> StoredGraph | None:
-        """The graph of a scene by a method, if it was made."""
+    def find(self, key: RecipeKey | str) -> StoredGraph | None:
+        """The graph that is kept under a key (or its digest), without reading it; None where there is none."""
         with self._catalog.read() as connection:
-            key = graph_key(resolve(connection, ref), method)
-            row = connection.execute(select(graphs).where(graphs.c.key == key)).first()
+            row = connection.execute(select(graphs).where(graphs.c.key == recipes.digest_of(key))).first()
         return None if row is None else _stored(row)
 
-    def load(self, ref: str, method: str | None = None) -> SceneGraph | None:
-        """Read the graph of a scene by a method, or the newest one; None where there is none.
+    def load(self, ref: str, key: RecipeKey | str | None = None) -> SceneGraph | None:
+        """Read the graph of a scene under a key (or its digest), or the newest one; None where there is none.
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
         """
         with self._catalog.read() as connection:
-            query = (
-                select(graphs).where(graphs.c.scene == resolve(connection, ref)).order_by(graphs.c.created_at.desc())
-            )
-            row = connection.execute(query if method is None else query.where(graphs.c.method == method)).first()
+            query = select(graphs).where(graphs.c.scene == resolve(connection, ref))
+            if key is not None:
+                query = query.where(graphs.c.key == recipes.digest_of(key))
+            row = connection.execute(query.order_by(graphs.c.created_at.desc()).limit(1)).first()
             if row is None:
                 return None
             files = manifest(connection, row.group_id)
         arrays = self._arrays.read(KIND, row.group_id, files)
         layers = {}
         for i, (name, layer) in enumerate(row.about["layers"].items()):
-            mine: dict[str, Any] = {
-                key.split(".", 1)[1]: array for key, array in arrays.items() if key.startswith(f"{i}.")
+            own: dict[str, Any] = {
+                part.split(".", 1)[1]: array for part, array in arrays.items() if part.startswith(f"{i}.")
             }
-            layers[name] = NodeLayer(**mine, **layer["rest"])
+            layers[name] = NodeLayer(**own, **layer["rest"])
         return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
 
     def list(self) -> list[StoredGraph]:
@@ -122,7 +130,8 @@ class Graphs:
             return [_stored(row) for row in connection.execute(query.order_by(graphs.c.created_at))]
 
 
-def _stored(row: Row) -> StoredGraph:
+def _stored(row: Row[Any]) -> StoredGraph:
     counts = {name: layer["count"] for name, layer in row.about["layers"].items()}
     up = row.about["up"]
-    return StoredGraph(row.key, row.scene, row.method, counts, row.created_at, None if up is None else tuple(up))
+    known_up = None if up is None else tuple(up)
+    return StoredGraph(row.key, row.scene, counts, row.created_at, known_up, row.recipe)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,8 +15,7 @@ from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.groups import manifest
 from gsmap.store.models import FOLDER
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
-
-Progress = Callable[[float, str], None]
+from gsmap.types.progress import Progress
 
 
 @dataclass(frozen=True)

@@ -37,16 +37,3 @@ def to_array(value: list[Any]) -> np.ndarray: ...
 def to_array(value: None) -> None: ...
 def to_array(value: list[Any] | None) -> np.ndarray | None:
     return None if value is None else np.array(value, np.float64)
-
-
-def plain(value: Any) -> Any:
-    """Parameters as JSON can hold them: numpy scalars and arrays become numbers and lists, the unknown becomes text."""
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

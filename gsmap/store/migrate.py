@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Engine, inspect, text
 
-import gsmap
 from gsmap.errors import CorruptError, SchemaVersionError, StoreError
 from gsmap.store import schema, sqlite
 from gsmap.store.catalog import Catalog, explained
+from gsmap.version import __version__
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -36,7 +36,7 @@ def require_current(engine: Engine, folder: Path) -> None:
         raise CorruptError(f"{folder}: its catalog holds no gsmap tables; restore it from a backup")
     if found > schema.HEAD:
         raise SchemaVersionError(
-            f"{folder} was written by a newer gsmap (schema {found}, this gsmap {gsmap.__version__} knows up to "
+            f"{folder} was written by a newer gsmap (schema {found}, this gsmap {__version__} knows up to "
             f"{schema.HEAD}): upgrade gsmap"
         )
     if found < schema.HEAD:
@@ -87,7 +87,7 @@ def config() -> Config:
 
 def folder() -> Path:
     """Where the migrations lie: inside the installed package, or beside it in a checkout."""
-    package = Path(gsmap.__file__).parent
+    package = Path(__file__).resolve().parents[1]
     for place in (package / "migrations", package.parent / "migrations"):
         if (place / "env.py").is_file():
             return place

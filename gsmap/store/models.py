@@ -5,19 +5,19 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Row, insert, select, update
 
+from gsmap.durable import write_whole
 from gsmap.errors import InputError, NotFoundError
-from gsmap.store.arrays import sync_folder
 from gsmap.store.catalog import Catalog, explained, now
-from gsmap.store.matrices import plain
 from gsmap.store.schema import models
+from gsmap.types.plain import plain
 
 FOLDER = "models"
 
@@ -110,7 +110,7 @@ class Models:
         with self._catalog.write() as connection:
             connection.execute(update(models).where(standing).values(removed_at=now()))
 
-    def _model(self, row: Row) -> Model:
+    def _model(self, row: Row[Any]) -> Model:
         path = self._catalog.folder / row.path if row.copied else Path(row.path)
         return Model(
             row.name, row.kind, path, bool(row.copied), row.sha256, row.size_bytes, row.created_at, row.options
@@ -120,13 +120,9 @@ class Models:
 def _copy(source: Path, target: Path) -> None:
     """Copy a file durably; it appears whole or not at all."""
     target.parent.mkdir(exist_ok=True)
-    staged = target.with_name(f".{uuid.uuid4().hex}")
     with explained(target.parent):
-        try:
-            shutil.copyfile(source, staged)
-            with open(staged, "rb") as file:
-                os.fsync(file.fileno())
-            os.replace(staged, target)
-        finally:
-            staged.unlink(missing_ok=True)
-        sync_folder(target.parent)
+        write_whole(target, partial(_fill, source))
+
+
+def _fill(source: Path, target: Path) -> None:
+    shutil.copyfile(source, target)

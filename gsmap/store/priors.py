@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from sqlalchemy import insert, select, update
+from sqlalchemy import Connection, insert, select, update
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.store.catalog import Catalog, now
@@ -57,6 +57,6 @@ class Priors:
             if not self._retire(connection, resolve(connection, ref)):
                 raise NotFoundError(f"scene {ref!r} has no prior")
 
-    def _retire(self, connection, scene: str) -> int:
+    def _retire(self, connection: Connection, scene: str) -> int:
         standing = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
-        return connection.execute(update(priors).where(standing).values(removed_at=now())).rowcount
+        return int(connection.execute(update(priors).where(standing).values(removed_at=now())).rowcount)

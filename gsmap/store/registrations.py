@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.methods import RecipeKey
+from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.matrices import from_array, from_pose, plain, to_array, to_pose
+from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
 from gsmap.store.scenes import living_ids, resolve
-from gsmap.store.schema import registrations, verdicts
+from gsmap.store.schema import registrations, reviews
 from gsmap.types import Registration
+from gsmap.types.plain import plain
 
-VERDICTS = ("confirm", "reject", "withdraw")
+REVIEWS = ("confirm", "reject", "withdraw")
+MANUAL = "manual"
+"""`Registration.proposer` of a person's own measurement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,43 +30,70 @@ class StoredRegistration:
 
     Args:
         number: unique in the map, growing.
-        key: digest of what it was computed from (graph keys and parameters), as given to `Registrations.save`.
-        verdict: a person's standing word on the pair: ``confirm``, ``reject`` or None.
+        key: `RecipeKey.digest` of what it was computed from; empty for a person's own measurement.
+        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None for a person's own measurement, and in
+            rows that schema 0001 wrote.
+        review: a person's standing word on the pair: ``confirm``, ``reject`` or None.
+        adopts: number of the earlier registration that this one makes current again, unchanged; None where it was
+            computed.
     """
 
     number: int
     registration: Registration
     key: str
     created_at: str
-    verdict: str | None = None
+    review: str | None = None
+    recipe: str | None = None
+    adopts: int | None = None
+
+    @property
+    def manual(self) -> bool:
+        """Whether a person measured it."""
+        return self.registration.proposer == MANUAL
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """A person's word on a pair, given when ``registration`` (a number) was current."""
+class Review:
+    """A person's word on a pair (``confirm``, ``reject``, ``withdraw``), given when ``registration`` was current."""
 
-    verdict: str
+    review: str
     registration: int
     note: str
     created_at: str
 
 
 class Registrations:
-    """The edges of a map. A pair is the same pair in either direction; a registration keeps its own."""
+    """The edges of a map. A pair is the same pair in either direction; a registration keeps its own.
+
+    A pair's *current* registration is, first of all, what a person said last: the pose that was confirmed, or that was
+    measured by hand (proposer ``manual``); else the newest. ``withdraw`` takes back the last word that stands: a
+    review, or else a measurement.
+    """
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
 
-    def save(self, registration: Registration, key: str = "") -> StoredRegistration:
-        """Add a registration to its pair's history; it is the pair's current one from now on (but see `current`)."""
+    def save(self, registration: Registration, key: RecipeKey | None = None) -> StoredRegistration:
+        """Add a registration to its pair's history; it is the pair's current one from now on, unless a person spoke.
+
+        Args:
+            key: its recipe and inputs; None for a person's own measurement only.
+
+        Raises:
+            InputError: a computed registration without a key, or a measurement with one or without a pose.
+        """
         r = registration
+        if (r.proposer == MANUAL) != (key is None):
+            raise InputError(f"a registration needs its recipe key, unless its proposer is {MANUAL!r}")
+        if r.proposer == MANUAL and r.status != "accepted":
+            raise InputError("a measured registration has status 'accepted', a pose and an information matrix")
         with self._catalog.write() as connection:
-            pair = _pair(connection, r.target, r.source)
             row = {
                 "target": r.target,
                 "source": r.source,
-                "pair": pair,
-                "key": key,
+                "pair": _pair(connection, r.target, r.source),
+                "key": "" if key is None else key.digest,
+                "recipe": recipes.keep(connection, key),
                 "status": r.status,
                 "reason": r.reason,
                 "S_target_source": from_pose(r.S_target_source),
@@ -66,83 +101,148 @@ class Registrations:
                 "num_inliers": int(r.num_inliers),
                 "num_correspondences": int(r.num_correspondences),
                 "overlap": float(r.overlap),
-                "method": r.method,
+                "proposer": r.proposer,
                 "exact": int(r.exact),
                 "seconds": plain(r.seconds),
                 "evidence": plain(r.evidence),
+                "notes": list(r.notes),
                 "created_at": now(),
             }
-            number = connection.execute(insert(registrations).returning(registrations.c.number), row).scalar_one()
-            stored = connection.execute(select(registrations).where(registrations.c.number == number)).one()
-            return _stored(stored, _standing(connection).get(pair))
+            return self._insert(connection, row)
+
+    def adopt(self, number: int) -> StoredRegistration:
+        """Make an earlier registration the newest of its pair again, as if it had just been computed.
+
+        So a map that goes back to older settings has its older edges again. Nothing is written where it is the newest.
+
+        Raises:
+            NotFoundError: no such registration.
+        """
+        with self._catalog.write() as connection:
+            row = connection.execute(select(registrations).where(registrations.c.number == number)).first()
+            if row is None:
+                raise NotFoundError(f"no registration {number} in this map")
+            if row.proposer == MANUAL:
+                raise InputError(f"registration {number} was measured by a person: save it again instead")
+            pair = _rows_of(connection, row.pair)
+            newest = [r for r in pair if r.proposer != MANUAL][-1]
+            original = row.number if row.adopts is None else row.adopts
+            if original in (newest.number, newest.adopts):
+                return _stored(newest, _decide(pair, _reviews_of(connection, row.pair)).word)
+            copied = {name: value for name, value in row._mapping.items() if name != "number"}
+            return self._insert(connection, copied | {"adopts": original, "created_at": now()})
 
     def current(self) -> list[StoredRegistration]:
-        """One registration for each pair of living scenes: the newest, or the one that a person confirmed."""
+        """The current registration of each pair of living scenes, by the pair's first registration."""
         with self._catalog.read() as connection:
-            alive, standing = living_ids(connection), _standing(connection)
+            alive = living_ids(connection)
             rows = connection.execute(select(registrations).order_by(registrations.c.number)).all()
-        chosen: dict[str, Row] = {}
+            said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all()
+        words = {pair: [_review(row) for row in mine] for pair, mine in groupby(said, lambda row: str(row.pair))}
+        pairs: dict[str, list[Row[Any]]] = {}
         for row in rows:
-            word = standing.get(row.pair)
-            superseded = word is not None and word.verdict == "confirm" and row.number > word.registration
-            if row.target in alive and row.source in alive and not superseded:
-                chosen[row.pair] = row
-        return [_stored(row, standing.get(row.pair)) for row in chosen.values()]
+            if row.target in alive and row.source in alive:
+                pairs.setdefault(row.pair, []).append(row)
+        chosen = [_decide(mine, words.get(pair, [])) for pair, mine in pairs.items()]
+        return [_stored(choice.row, choice.word) for choice in chosen if choice.row is not None]
 
     def get(self, a: str, b: str) -> StoredRegistration | None:
-        """The current registration of a pair (scene refs, either direction); None where there was none."""
-        history = self.history(a, b)
-        if not history:
-            return None
-        words = self.verdicts(a, b)
-        if words and words[-1].verdict == "confirm":
-            return next(r for r in history if r.number == words[-1].registration)
-        return history[-1]
-
-    def find(self, key: str) -> StoredRegistration | None:
-        """The newest registration that was computed from exactly this; None where none was."""
-        query = select(registrations).where(registrations.c.key == key).order_by(registrations.c.number.desc())
+        """The current registration of a pair (scene refs, either direction); None where there is none."""
         with self._catalog.read() as connection:
-            row = connection.execute(query).first()
-            return None if row is None else _stored(row, _standing(connection).get(row.pair))
+            pair = _pair(connection, a, b)
+            choice = _decide(_rows_of(connection, pair), _reviews_of(connection, pair))
+        return None if choice.row is None else _stored(choice.row, choice.word)
+
+    def find(self, key: RecipeKey | str) -> StoredRegistration | None:
+        """The newest registration that is kept under a key (or its digest); None where there is none."""
+        digest = recipes.digest_of(key)
+        if not digest:
+            return None
+        query = select(registrations).where(registrations.c.key == digest).order_by(registrations.c.number.desc())
+        with self._catalog.read() as connection:
+            row = connection.execute(query.limit(1)).first()
+            if row is None:
+                return None
+            choice = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
+        return _stored(row, choice.word)
 
     def history(self, a: str, b: str) -> list[StoredRegistration]:
         """Every registration of a pair, oldest first."""
         with self._catalog.read() as connection:
             pair = _pair(connection, a, b)
-            query = select(registrations).where(registrations.c.pair == pair).order_by(registrations.c.number)
-            word = _standing(connection).get(pair)
-            return [_stored(row, word) for row in connection.execute(query)]
+            rows = _rows_of(connection, pair)
+            choice = _decide(rows, _reviews_of(connection, pair))
+        return [_stored(row, choice.word) for row in rows]
 
-    def judge(self, a: str, b: str, verdict: str, note: str = "") -> StoredRegistration:
-        """Write down a person's word on a pair: ``confirm`` its current pose, ``reject`` it, or ``withdraw`` the word.
+    def review(self, a: str, b: str, review: str, note: str = "") -> StoredRegistration | None:
+        """Write down a person's word on a pair: ``confirm`` its current pose, ``reject`` it, or ``withdraw`` the last.
+
+        Returns:
+            The pair's current registration; None where its only one was a measurement that is now withdrawn.
 
         Raises:
             NotFoundError: the pair was never registered.
-            InputError: there is no pose to confirm.
+            InputError: there is no pose to confirm, or nothing to withdraw.
             ConfigError: another word.
         """
-        if verdict not in VERDICTS:
-            raise ConfigError(f"a verdict is one of {', '.join(VERDICTS)}, got {verdict!r}")
+        if review not in REVIEWS:
+            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}")
         with self._catalog.write() as connection:
             found = self.get(a, b)
             if found is None:
                 raise NotFoundError(f"{a} and {b} were never registered: gsmap register MAP --pairs {a}:{b}")
-            if verdict == "confirm" and found.registration.S_target_source is None:
+            if review == "confirm" and found.registration.S_target_source is None:
                 raise InputError(
                     f"{a} and {b} have no pose to confirm: {found.registration.reason or 'none was found'}"
                 )
-            row = {"verdict": verdict, "registration": found.number, "note": note, "created_at": now()}
-            connection.execute(insert(verdicts), row | {"pair": _pair(connection, a, b)})
-            judged = self.get(a, b)
-        assert judged is not None
-        return judged
+            if review == "withdraw" and found.review is None and not found.manual:
+                raise InputError(f"nobody has reviewed {a} and {b}: there is nothing to withdraw")
+            row = {"review": review, "registration": found.number, "note": note, "created_at": now()}
+            connection.execute(insert(reviews), row | {"pair": _pair(connection, a, b)})
+            return self.get(a, b)
 
-    def verdicts(self, a: str, b: str) -> list[Verdict]:
+    def reviews(self, a: str, b: str) -> list[Review]:
         """Everything people said of a pair, oldest first."""
         with self._catalog.read() as connection:
-            query = select(verdicts).where(verdicts.c.pair == _pair(connection, a, b)).order_by(verdicts.c.number)
-            return [_verdict(row) for row in connection.execute(query)]
+            return _reviews_of(connection, _pair(connection, a, b))
+
+    def _insert(self, connection: Connection, row: dict[str, Any]) -> StoredRegistration:
+        number = connection.execute(insert(registrations).returning(registrations.c.number), row).scalar_one()
+        stored = connection.execute(select(registrations).where(registrations.c.number == number)).one()
+        choice = _decide(_rows_of(connection, stored.pair), _reviews_of(connection, stored.pair))
+        return _stored(stored, choice.word)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A pair's current row, and the review that stands on it."""
+
+    row: Row[Any] | None
+    word: Review | None
+
+
+def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> _Choice:
+    """What counts of a pair: its rows and reviews, both oldest first. See `Registrations`."""
+    measured = {row.number for row in rows if row.proposer == MANUAL}
+    word: Review | None = None
+    withdrawn: set[int] = set()
+    for review in said:
+        if review.review != "withdraw":
+            word = review
+        elif review.registration in measured and (word is None or word.registration != review.registration):
+            withdrawn.add(review.registration)  # no review stood on it: the measurement itself is taken back
+        else:
+            word = None
+    standing = max(measured - withdrawn, default=None)
+    if standing is not None and (word is None or word.registration <= standing):
+        if word is not None and word.registration < standing:
+            word = None  # said before it was measured
+        chosen: int | None = standing
+    elif word is not None and word.review == "confirm":
+        chosen = word.registration
+    else:
+        chosen = max((row.number for row in rows if row.proposer != MANUAL), default=None)
+    return _Choice(next((row for row in rows if row.number == chosen), None), word)
 
 
 def _pair(connection: Connection, a: str, b: str) -> str:
@@ -152,17 +252,21 @@ def _pair(connection: Connection, a: str, b: str) -> str:
     return f"{first}:{second}"
 
 
-def _standing(connection: Connection) -> dict[str, Verdict]:
-    """The last word on each pair, unless it was withdrawn."""
-    last = {row.pair: _verdict(row) for row in connection.execute(select(verdicts).order_by(verdicts.c.number))}
-    return {pair: word for pair, word in last.items() if word.verdict != "withdraw"}
+def _rows_of(connection: Connection, pair: str) -> Sequence[Row[Any]]:
+    query = select(registrations).where(registrations.c.pair == pair).order_by(registrations.c.number)
+    return connection.execute(query).all()
 
 
-def _verdict(row: Row) -> Verdict:
-    return Verdict(row.verdict, row.registration, row.note, row.created_at)
+def _reviews_of(connection: Connection, pair: str) -> list[Review]:
+    query = select(reviews).where(reviews.c.pair == pair).order_by(reviews.c.number)
+    return [_review(row) for row in connection.execute(query)]
 
 
-def _stored(row: Row, word: Verdict | None) -> StoredRegistration:
+def _review(row: Row[Any]) -> Review:
+    return Review(row.review, row.registration, row.note, row.created_at)
+
+
+def _stored(row: Row[Any], word: Review | None) -> StoredRegistration:
     registration = Registration(
         target=row.target,
         source=row.source,
@@ -173,9 +277,11 @@ def _stored(row: Row, word: Verdict | None) -> StoredRegistration:
         num_inliers=row.num_inliers,
         num_correspondences=row.num_correspondences,
         overlap=row.overlap,
-        method=row.method,
+        proposer=row.proposer,
         exact=bool(row.exact),
         seconds=row.seconds,
         evidence=row.evidence,
+        notes=tuple(row.notes),
     )
-    return StoredRegistration(row.number, registration, row.key, row.created_at, word.verdict if word else None)
+    review = None if word is None else word.review
+    return StoredRegistration(row.number, registration, row.key, row.created_at, review, row.recipe, row.adopts)

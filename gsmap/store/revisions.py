@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
-from sqlalchemy import Connection, Row, func, insert, select
+from sqlalchemy import Connection, Row, Select, case, func, insert, select
 
 from gsmap.errors import NotFoundError
+from gsmap.methods import RecipeKey
+from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.matrices import from_array, from_pose, plain, to_array, to_pose
+from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
 from gsmap.store.schema import edges, poses, revisions
-from gsmap.types import PoseGraph, ScenePose
+from gsmap.types import EdgeOutcome, PoseGraph, Provenance, ScenePose
+from gsmap.types.plain import plain
 
 
 @dataclass(frozen=True)
@@ -19,9 +23,12 @@ class Revision:
 
     Args:
         number: from 1.
-        num_scenes, num_placed, num_components: scenes it knows, those with a pose, islands.
+        num_scenes, num_placed, num_components: scenes it knows, those with a pose, connected components.
+        num_used, num_tentative, num_unused, num_undecided: edges by their outcome (an undecided one counts twice).
         note: why it was made.
         dropped_at: when `prune` was allowed to reclaim what only it names; None while it is kept.
+        key: `RecipeKey.digest` of what it was solved from; one of its own kind in revisions that schema 0001 wrote.
+        recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in those.
     """
 
     number: int
@@ -29,8 +36,14 @@ class Revision:
     num_scenes: int
     num_placed: int
     num_components: int
+    num_used: int = 0
+    num_tentative: int = 0
+    num_unused: int = 0
+    num_undecided: int = 0
     note: str = ""
     dropped_at: str | None = None
+    key: str = ""
+    recipe: str | None = None
 
 
 class Revisions:
@@ -39,12 +52,26 @@ class Revisions:
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
 
-    def save(self, graph: PoseGraph, note: str = "") -> int:
-        """Add a revision; returns its number. All its scenes must be known."""
+    def save(self, graph: PoseGraph, key: RecipeKey | None = None, note: str = "") -> int:
+        """Add a revision; returns its number. All its scenes must be known.
+
+        Args:
+            key: its recipe, and all that it was solved from; None where it was not solved but made up.
+            note: why it was made.
+        """
         with self._catalog.write() as connection:
             number = 1 + (connection.execute(select(func.max(revisions.c.number))).scalar() or 0)
-            row = {"number": number, "parameters": plain(graph.parameters), "undecided": plain(graph.undecided)}
-            connection.execute(insert(revisions), row | {"note": note, "created_at": now()})
+            row = {
+                "number": number,
+                "key": "" if key is None else key.digest,
+                "recipe": recipes.keep(connection, key),
+                "settings": plain(graph.settings),
+                "provenance": plain(graph.provenance),
+                "notes": list(graph.notes),
+                "note": note,
+                "created_at": now(),
+            }
+            connection.execute(insert(revisions), row)
             pose_rows = [
                 {
                     "revision": number,
@@ -61,11 +88,12 @@ class Revisions:
                     "revision": number,
                     "target": target,
                     "source": source,
-                    "used": plain(graph.used.get((target, source))),
-                    "residual": _number(graph.residuals.get((target, source))),
-                    "reason": graph.reasons.get((target, source)),
+                    "use": outcome.use,
+                    "residual_chi2": None if outcome.residual_chi2 is None else float(outcome.residual_chi2),
+                    "reason": outcome.reason,
+                    "undecided": int(outcome.undecided),
                 }
-                for target, source in dict.fromkeys([*graph.used, *graph.residuals, *graph.reasons])
+                for (target, source), outcome in graph.outcomes.items()
             ]
             if pose_rows:
                 connection.execute(insert(poses), pose_rows)
@@ -76,7 +104,7 @@ class Revisions:
     def current(self) -> int | None:
         """The newest revision's number; None before the first."""
         with self._catalog.read() as connection:
-            return connection.execute(select(func.max(revisions.c.number))).scalar()
+            return _newest(connection)
 
     def get(self, number: int | None = None) -> PoseGraph | None:
         """The answer of a revision, or of the newest (None before the first).
@@ -85,15 +113,19 @@ class Revisions:
             NotFoundError: no such revision.
         """
         with self._catalog.read() as connection:
-            wanted = number
+            wanted = _newest(connection) if number is None else number
             if wanted is None:
-                wanted = connection.execute(select(func.max(revisions.c.number))).scalar()
-                if wanted is None:
-                    return None
+                return None
             row = connection.execute(select(revisions).where(revisions.c.number == wanted)).first()
             if row is None:
                 raise NotFoundError(f"no revision {number}: gsmap list MAP revisions shows what there is")
             return _pose_graph(connection, row)
+
+    def find(self, key: RecipeKey | str) -> int | None:
+        """Number of the newest revision that was solved from exactly this; None where there is none."""
+        same = revisions.c.key == recipes.digest_of(key)
+        with self._catalog.read() as connection:
+            return connection.execute(select(func.max(revisions.c.number)).where(same)).scalar()
 
     def list(self) -> list[Revision]:
         """All revisions, oldest first."""
@@ -109,27 +141,64 @@ class Revisions:
             .order_by(revisions.c.number)
         )
         with self._catalog.read() as connection:
-            return [
-                Revision(r.number, r.created_at, r.num_scenes, r.num_placed, r.num_components, r.note, r.dropped_at)
-                for r in connection.execute(query)
-            ]
+            counts: dict[int, Row[Any]] = {row.revision: row for row in connection.execute(_EDGE_COUNTS)}
+            return [_revision(row, counts.get(row.number)) for row in connection.execute(query)]
 
 
-def _number(value: float | None) -> float | None:
-    return None if value is None else float(value)
+def _is(condition: Any) -> Any:
+    return func.sum(case((condition, 1), else_=0))
 
 
-def _pose_graph(connection: Connection, row: Row) -> PoseGraph:
+_EDGE_COUNTS: Select[Any] = select(
+    edges.c.revision,
+    _is(edges.c.use == "used").label("num_used"),
+    _is(edges.c.use == "tentative").label("num_tentative"),
+    _is(edges.c.use == "unused").label("num_unused"),
+    func.sum(edges.c.undecided).label("num_undecided"),
+).group_by(edges.c.revision)
+
+
+def _newest(connection: Connection) -> int | None:
+    return connection.execute(select(func.max(revisions.c.number))).scalar()
+
+
+def _revision(row: Row[Any], count: Row[Any] | None) -> Revision:
+    return Revision(
+        number=row.number,
+        created_at=row.created_at,
+        num_scenes=row.num_scenes,
+        num_placed=row.num_placed,
+        num_components=row.num_components,
+        num_used=0 if count is None else int(count.num_used),
+        num_tentative=0 if count is None else int(count.num_tentative),
+        num_unused=0 if count is None else int(count.num_unused),
+        num_undecided=0 if count is None else int(count.num_undecided),
+        note=row.note,
+        dropped_at=row.dropped_at,
+        key=row.key,
+        recipe=row.recipe,
+    )
+
+
+def _pose_graph(connection: Connection, row: Row[Any]) -> PoseGraph:
     placed = {
         p.scene: ScenePose(p.scene, to_pose(p.S_map_scene), p.component, p.status, to_array(p.covariance))
         for p in connection.execute(select(poses).where(poses.c.revision == row.number))
     }
-    lines = connection.execute(select(edges).where(edges.c.revision == row.number)).all()
+    lines = connection.execute(select(edges).where(edges.c.revision == row.number))
     return PoseGraph(
         poses=placed,
-        used={(e.target, e.source): e.used for e in lines if e.used is not None},
-        residuals={(e.target, e.source): e.residual for e in lines if e.residual is not None},
-        reasons={(e.target, e.source): e.reason for e in lines if e.reason is not None},
-        undecided=tuple((a, b) for a, b in row.undecided),
-        parameters=row.parameters,
+        outcomes={(e.target, e.source): _outcome(e) for e in lines},
+        settings=row.settings,
+        provenance=_provenance(row.provenance),
+        notes=tuple(row.notes),
     )
+
+
+def _outcome(row: Row[Any]) -> EdgeOutcome:
+    return EdgeOutcome(row.use, row.residual_chi2, row.reason, bool(row.undecided))
+
+
+def _provenance(said: dict[str, Any]) -> Provenance:
+    known = {part.name: said[part.name] for part in fields(Provenance) if part.name in said}
+    return Provenance(**known | {"contradicted_priors": tuple(known.get("contradicted_priors", ()))})

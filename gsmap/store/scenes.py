@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,15 +10,17 @@ from sqlalchemy import Connection, Row, insert, select, text, update
 
 from gsmap.errors import InputError, NotFoundError, StoreError
 from gsmap.geometry.morton import morton_order
-from gsmap.store.arrays import CHUNK_ROWS, Arrays, digest
+from gsmap.store import facts
+from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes
 from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.facts import SceneFact
 from gsmap.store.groups import has_group, manifest, publish
 from gsmap.store.schema import CHUNK_BOXES, scenes
 from gsmap.types import Cameras, Gaussians, Scene
+from gsmap.types.progress import Progress
 
 KIND = "scenes"
-Progress = Callable[[float, str], None]
 
 _GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 _SIGMAS = 3.0
@@ -32,7 +34,11 @@ def scene_id(gaussians: Gaussians, cameras: Cameras) -> str:
 
 
 class Scenes:
-    """The scenes of a map. A *ref* is a scene's name, its id, or the beginning of its id where only one begins so."""
+    """The scenes of a map. A *ref* is a scene's name, its id, or the beginning of its id where only one begins so.
+
+    A name is unique among living scenes, not empty, and has no control characters. It may hold a colon: who reads
+    ``A:B`` must try every colon as the one between two scenes.
+    """
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
@@ -56,15 +62,19 @@ class Scenes:
 
         Args:
             gaussians, cameras: in the scene's own frame; validated before (`gsmap.ingest.validate`).
+            captured_at: ISO 8601; UTC where it has no zone.
             rename: where another scene has the name, take ``name-2`` and so on; else refuse.
 
         Returns:
-            The scene, and whether anything was written. Content that the map has already changes nothing (False);
-            content that was removed comes back under the new name, and content whose bytes were damaged is mended.
+            The scene, and whether its content was written. Content that the map has already is not (False), though a
+            date that is given becomes the scene's; content that was removed comes back under the new name, and content
+            whose bytes were damaged is mended.
 
         Raises:
-            InputError: no Gaussians, or the name is taken and ``rename`` is off.
+            InputError: no Gaussians, a name or date that cannot be, or the name is taken and ``rename`` is off.
         """
+        facts.checked_text("the name of a scene", name)
+        captured_at = None if captured_at is None else facts.checked_date(captured_at)
         if not len(gaussians):
             raise InputError(f"scene {name!r} has no Gaussians")
         new_id = scene_id(gaussians, cameras)
@@ -73,8 +83,8 @@ class Scenes:
             files = manifest(connection, new_id)
         stored = bool(files) and not self._arrays.problems(KIND, new_id, files)
         if row is not None and row.removed_at is None and stored:
-            return _scene(row), False
-        fields = {
+            return self._dated(row.id, captured_at), False
+        fields: dict[str, Any] = {
             "name": name,
             "num_gaussians": len(gaussians),
             "sh_degree": gaussians.sh_degree,
@@ -101,13 +111,15 @@ class Scenes:
         with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
             row = _by_id(connection, new_id)
             if row is not None and row.removed_at is None:
+                scene = self._dated(new_id, captured_at)
                 if manifest(connection, new_id) != files:  # another process was faster
-                    return _scene(row), False
-                scene = _scene(row)  # its bytes are damaged
+                    return scene, False
+                # else its bytes are damaged
             else:
                 scene = self._enter(connection, new_id, fields, rename)
             publish(connection, self._arrays, staged, KIND, new_id)
-            _put_boxes(connection, _by_id(connection, new_id).number, boxes)
+            number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
+            _put_boxes(connection, number, boxes)
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))
         return scene, True
 
@@ -115,7 +127,9 @@ class Scenes:
         """The living scenes (or the removed ones) in the order they came."""
         condition = scenes.c.removed_at.is_not(None) if removed else scenes.c.removed_at.is_(None)
         with self._catalog.read() as connection:
-            return [_scene(r) for r in connection.execute(select(scenes).where(condition).order_by(scenes.c.number))]
+            tags = facts.tags(connection)
+            rows = connection.execute(select(scenes).where(condition).order_by(scenes.c.number))
+            return [_scene(row, tags.get(row.id, ())) for row in rows]
 
     def get(self, ref: str) -> Scene:
         """One scene by name, id or the beginning of its id; a removed one by its id only.
@@ -124,7 +138,61 @@ class Scenes:
             NotFoundError: none, or several begin so.
         """
         with self._catalog.read() as connection:
-            return _scene(_find(connection, ref))
+            return _with_tags(connection, _find(connection, ref))
+
+    def edit(
+        self,
+        ref: str,
+        *,
+        name: str | None = None,
+        captured_at: str | None = None,
+        note: str | None = None,
+        tags_add: Iterable[str] = (),
+        tags_remove: Iterable[str] = (),
+        author: str = "",
+    ) -> Scene:
+        """Change what is said of a living scene; what was said before stays in its `facts`.
+
+        Args:
+            name: free among living scenes.
+            captured_at: ISO 8601, UTC where it has no zone; empty to take the date back.
+            note: added to the notes that there are.
+            tags_add, tags_remove: single words or short phrases.
+            author: who says so.
+
+        Raises:
+            NotFoundError: no such scene, it was removed, or it lacks a tag that is to go.
+            InputError: an empty text, one with control characters, no date, or a name that is taken.
+        """
+        new = [] if name is None else [("name", facts.checked_text("the name of a scene", name))]
+        if captured_at is not None:
+            new.append(("captured_at", captured_at and facts.checked_date(captured_at)))
+        if note is not None:
+            new.append(("note", facts.checked_text("a note", note, lines=True)))
+        new += [("tag", facts.checked_text("a tag", tag).strip()) for tag in tags_add]
+        new += [("untag", facts.checked_text("a tag", tag).strip()) for tag in tags_remove]
+        if author:
+            facts.checked_text("an author", author)
+        with self._catalog.write() as connection:
+            row = _alive(connection, ref)
+            tags = set(facts.tags(connection, row.id).get(row.id, ()))
+            same = {("name", row.name), ("captured_at", row.captured_at or ""), *(("tag", tag) for tag in tags)}
+            new = [fact for fact in dict.fromkeys(new) if fact not in same]
+            for kind, value in new:
+                if kind == "name" and _name_taken(connection, value):
+                    raise InputError(f"another scene is called {value!r}: choose another name, or rename that one")
+                if kind == "untag" and value not in tags:
+                    raise NotFoundError(f"scene {row.name!r} has no tag {value!r}: it has {sorted(tags) or 'none'}")
+            facts.say(connection, row.id, new, author)
+            columns = {kind: value or None for kind, value in new if kind in ("name", "captured_at")}
+            if columns:
+                connection.execute(update(scenes).where(scenes.c.id == row.id).values(**columns))
+            return _with_tags(connection, _find(connection, row.id))
+
+    def facts(self, ref: str) -> Sequence[SceneFact]:
+        """Everything people said of a scene since it was ingested, oldest first."""
+        with self._catalog.read() as connection:
+            return facts.said(connection, _find(connection, ref).id)
 
     def notes(self, ref: str) -> tuple[str, ...]:
         """What a person should know about how it was ingested."""
@@ -134,7 +202,8 @@ class Scenes:
     def removed_at(self, ref: str) -> str | None:
         """When it was removed; None while it lives."""
         with self._catalog.read() as connection:
-            return _find(connection, ref).removed_at
+            when: str | None = _find(connection, ref).removed_at
+            return when
 
     def gaussians(self, ref: str, bounds: np.ndarray | None = None) -> Gaussians:
         """Read a scene's Gaussians (Morton order).
@@ -176,17 +245,18 @@ class Scenes:
     def remove(self, ref: str) -> Scene:
         """Leave a tombstone: gone from lists and from the next revision, its bytes kept until they are pruned."""
         with self._catalog.write() as connection:
-            row = _find(connection, ref)
-            if row.removed_at is not None:
-                raise NotFoundError(f"scene {ref} was removed on {row.removed_at}")
+            row = _alive(connection, ref)
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
-        return _scene(row)
+            return _with_tags(connection, row)
 
-    def _enter(self, connection: Connection, new_id: str, fields: dict, rename: bool) -> Scene:
+    def _dated(self, known_id: str, captured_at: str | None) -> Scene:
+        """A living scene that was ingested again, with the date that was given this time."""
+        return self.get(known_id) if captured_at is None else self.edit(known_id, captured_at=captured_at)
+
+    def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool) -> Scene:
         """The row of a new or returning scene, under a name that is free."""
-        taken = set(connection.execute(select(scenes.c.name).where(scenes.c.removed_at.is_(None))).scalars())
         name, number = fields["name"], 2
-        while fields["name"] in taken:
+        while _name_taken(connection, fields["name"]):
             if not rename:
                 raise InputError(f"another scene is called {name!r}: choose another name, or remove that one first")
             fields = fields | {"name": f"{name}-{number}"}
@@ -196,7 +266,8 @@ class Scenes:
             connection.execute(insert(scenes), fields | {"id": new_id})
         else:
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(**fields))
-        return _scene(_by_id(connection, new_id))
+        facts.say(connection, new_id, [(kind, fields[kind]) for kind in ("name", "captured_at") if fields[kind]])
+        return _with_tags(connection, _find(connection, new_id))
 
 
 def living_ids(connection: Connection) -> set[str]:
@@ -205,15 +276,27 @@ def living_ids(connection: Connection) -> set[str]:
 
 def resolve(connection: Connection, ref: str) -> str:
     """The id that a ref means; see `Scenes.get`."""
-    return _find(connection, ref).id
+    return str(_find(connection, ref).id)
 
 
-def _find(connection: Connection, ref: str) -> Row:
+def _name_taken(connection: Connection, name: str) -> bool:
+    same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
+    return connection.execute(same).first() is not None
+
+
+def _alive(connection: Connection, ref: str) -> Row[Any]:
+    row = _find(connection, ref)
+    if row.removed_at is not None:
+        raise NotFoundError(f"scene {ref} was removed on {row.removed_at}")
+    return row
+
+
+def _find(connection: Connection, ref: str) -> Row[Any]:
     living = scenes.c.removed_at.is_(None)
     row = connection.execute(select(scenes).where(scenes.c.name == ref, living)).first() or _by_id(connection, ref)
     if row is not None:
         return row
-    rows: Sequence[Row] = []
+    rows: Sequence[Row[Any]] = []
     if ref and all(c in "0123456789abcdef" for c in ref):
         rows = connection.execute(select(scenes).where(scenes.c.id.startswith(ref), living).limit(3)).all()
     if len(rows) == 1:
@@ -224,17 +307,21 @@ def _find(connection: Connection, ref: str) -> Row:
     raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes shows what there is")
 
 
-def _by_id(connection: Connection, wanted: str) -> Any:
+def _by_id(connection: Connection, wanted: str) -> Row[Any] | None:
     return connection.execute(select(scenes).where(scenes.c.id == wanted)).first()
 
 
-def _manifest(connection: Connection, row: Row):
+def _manifest(connection: Connection, row: Row[Any]) -> tuple[StoredFile, ...]:
     if row.group_id is None:
         raise NotFoundError(f"scene {row.name!r} was removed and its arrays were pruned: ingest it again")
     return manifest(connection, row.group_id)
 
 
-def _scene(row: Row) -> Scene:
+def _with_tags(connection: Connection, row: Row[Any]) -> Scene:
+    return _scene(row, facts.tags(connection, row.id).get(row.id, ()))
+
+
+def _scene(row: Row[Any], tags: tuple[str, ...]) -> Scene:
     return Scene(
         id=row.id,
         name=row.name,
@@ -248,6 +335,7 @@ def _scene(row: Row) -> Scene:
         source=row.source,
         cameras_synthesised=bool(row.cameras_synthesised),
         antialiased=bool(row.antialiased),
+        tags=tags,
     )
 
 

@@ -21,7 +21,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeDecorator, TypeEngine
 
-HEAD = "0001"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0002"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
@@ -58,6 +58,11 @@ def _table(name: str, *parts: Any) -> Table:
 
 def _scene(name: str, **options: Any) -> Column[str]:
     return Column(name, Text, ForeignKey("scenes.id"), nullable=False, **options)
+
+
+def _recipe() -> Column[str]:
+    """Null in rows that schema 0001 wrote."""
+    return Column("recipe", Text, ForeignKey("recipes.digest"))
 
 
 about = _table(
@@ -110,15 +115,39 @@ Index(
     postgresql_where=text("removed_at IS NULL"),
 )
 
+# What people said of a scene, from its ingest on: nothing is overwritten. `scenes` holds the newest name and date.
+scene_facts = _table(
+    "scene_facts",
+    Column("number", Integer, primary_key=True),
+    _scene("scene", index=True),
+    Column("kind", Text, nullable=False),
+    Column("value", Text, nullable=False),  # empty: a date that was taken back
+    Column("author", Text, nullable=False),
+    Column("created_at", Text, nullable=False),
+    CheckConstraint("kind in ('name', 'captured_at', 'note', 'tag', 'untag')", name="kind"),
+)
+
 # `chunk_boxes` is an R*Tree on SQLite and a plain table elsewhere, so the migration makes it:
 # id, s0 = s1 = scene number, x0 x1 y0 y1 z0 z1, chunk.
 CHUNK_BOXES = "chunk_boxes"
 
+# How results were made: a `gsmap.methods.RecipeKey` without its inputs, once for all results that share it.
+recipes = _table(
+    "recipes",
+    Column("digest", Text, primary_key=True),  # RecipeKey.recipe
+    Column("stage", Text, nullable=False),
+    Column("method", Text, nullable=False),
+    Column("version", Json, nullable=False),
+    Column("settings", Json, nullable=False),
+    Column("backend", Text, nullable=False),
+    Column("created_at", Text, nullable=False),
+)
+
 graphs = _table(
     "graphs",
-    Column("key", Text, primary_key=True),  # digest of scene and method
+    Column("key", Text, primary_key=True),  # RecipeKey.digest
+    _recipe(),
     _scene("scene", index=True),
-    Column("method", Text, nullable=False),
     Column("num_nodes", Integer, nullable=False),
     Column("about", Json, nullable=False),  # up, unit_m, notes, layers
     Column("group_id", Text, ForeignKey("groups.id"), nullable=False),
@@ -131,7 +160,9 @@ registrations = _table(
     _scene("target"),
     _scene("source"),
     Column("pair", Text, nullable=False, index=True),  # both ids, sorted: the pair in either direction
-    Column("key", Text, nullable=False, index=True),
+    Column("key", Text, nullable=False, index=True),  # RecipeKey.digest; empty: a person's own measurement
+    _recipe(),
+    Column("adopts", Integer, ForeignKey("registrations.number")),  # the earlier row that this one makes current again
     Column("status", Text, nullable=False),
     Column("reason", Text, nullable=False),
     Column("S_target_source", Json),
@@ -139,29 +170,33 @@ registrations = _table(
     Column("num_inliers", Integer, nullable=False),
     Column("num_correspondences", Integer, nullable=False),
     Column("overlap", Real, nullable=False),
-    Column("method", Text, nullable=False),
+    Column("proposer", Text, nullable=False),
     Column("exact", Integer, nullable=False),
     Column("seconds", Json, nullable=False),
     Column("evidence", Json, nullable=False),
+    Column("notes", Json, nullable=False, server_default="[]"),
     Column("created_at", Text, nullable=False),
     CheckConstraint("status in ('accepted', 'rejected', 'no_match')", name="status"),
 )
-verdicts = _table(
-    "verdicts",
+reviews = _table(
+    "reviews",
     Column("number", Integer, primary_key=True),
     Column("pair", Text, nullable=False, index=True),
-    Column("verdict", Text, nullable=False),
+    Column("review", Text, nullable=False),
     Column("registration", Integer, ForeignKey("registrations.number"), nullable=False),
     Column("note", Text, nullable=False),
     Column("created_at", Text, nullable=False),
-    CheckConstraint("verdict in ('confirm', 'reject', 'withdraw')", name="verdict"),
+    CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),
 )
 
 revisions = _table(
     "revisions",
     Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("parameters", Json, nullable=False),
-    Column("undecided", Json, nullable=False),
+    Column("key", Text, nullable=False, server_default=""),  # RecipeKey.digest
+    _recipe(),
+    Column("settings", Json, nullable=False, server_default="{}"),
+    Column("provenance", Json, nullable=False, server_default="{}"),
+    Column("notes", Json, nullable=False, server_default="[]"),
     Column("note", Text, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("dropped_at", Text),  # prune may reclaim what only this revision names
@@ -180,9 +215,11 @@ edges = _table(
     Column("revision", Integer, ForeignKey("revisions.number"), primary_key=True),
     _scene("target", primary_key=True),
     _scene("source", primary_key=True),
-    Column("used", Json),  # true, false or "tentative"; null: only a residual or reason is known
-    Column("residual", Real),
-    Column("reason", Text),
+    Column("use", Text, nullable=False, server_default="unused"),
+    Column("residual_chi2", Real),
+    Column("reason", Text, nullable=False, server_default=""),
+    Column("undecided", Integer, nullable=False, server_default="0"),
+    CheckConstraint("use in ('used', 'tentative', 'unused')", name="use"),
 )
 
 priors = _table(
@@ -230,13 +267,15 @@ tiles = _table(
     "tiles",
     Column("number", Integer, primary_key=True),
     Column("export", Integer, ForeignKey("exports.number"), nullable=False),
-    Column("key", Text, nullable=False, index=True),
+    Column("key", Text, nullable=False, index=True),  # RecipeKey.digest
+    _recipe(),
+    Column("older_recipe", Text),  # of rows that schema 0001 wrote: merger and parameters as one text
     Column("component", Integer, nullable=False),
     Column("bounds", Json, nullable=False),
     Column("poses", Json, nullable=False),  # S_map_scene by scene id
     Column("num_gaussians", Integer, nullable=False),
-    Column("method", Text, nullable=False),
     Column("truncated", Integer, nullable=False),
+    Column("notes", Json, nullable=False, server_default="[]"),
     Column("path", Text, nullable=False),  # relative to the target
     Column("sha256", Text, nullable=False),
     Column("created_at", Text, nullable=False),

@@ -139,6 +139,6 @@ def _connect(uri: str) -> sqlite3.Connection:
 def _raw(engine: Engine, statement: str) -> list[Any]:
     connection = engine.raw_connection()  # a PRAGMA that must run outside any transaction
     try:
-        return _driver(connection).execute(statement).fetchall()
+        return list(_driver(connection).execute(statement).fetchall())
     finally:
         connection.close()

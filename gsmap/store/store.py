@@ -11,28 +11,32 @@ from pathlib import Path
 
 from sqlalchemy import insert, select
 
-import gsmap
+from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import catalog as _catalog
 from gsmap.store import integrity, migrate, schema, sqlite
-from gsmap.store.arrays import Arrays, sync_folder
+from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
-from gsmap.store.integrity import Check, Progress, Pruned
+from gsmap.store.integrity import Check, Pruned
 from gsmap.store.models import Models
 from gsmap.store.priors import Priors
+from gsmap.store.recipes import Recipes
 from gsmap.store.registrations import Registrations
 from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
+from gsmap.types.progress import Progress
+from gsmap.version import __version__
 
 
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
-    One attribute per noun: ``scenes``, ``graphs``, ``registrations``, ``revisions``, ``priors``, ``models`` and
-    ``exports``. Every method that changes something is one transaction, durable when it returns; `transaction` makes
-    several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes open their own.
+    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
+    ``models`` and ``exports``. Every method that changes something is one transaction, durable when it returns;
+    `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes
+    open their own.
 
     Example::
 
@@ -45,6 +49,7 @@ class Store:
         self.arrays = Arrays(folder / "arrays")
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
+        self.recipes = Recipes(catalog)
         self.graphs = Graphs(catalog, self.arrays)
         self.registrations = Registrations(catalog)
         self.revisions = Revisions(catalog)
@@ -144,7 +149,7 @@ class Store:
     def id(self) -> str:
         """The map's own random id."""
         with self.catalog.read() as connection:
-            return connection.execute(select(schema.about.c.id)).scalar_one()
+            return str(connection.execute(select(schema.about.c.id)).scalar_one())
 
     def check(self, progress: Progress | None = None) -> Check:
         """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`."""
@@ -184,6 +189,6 @@ def _make_catalog(folder: Path, url: str | None) -> None:
     made = Catalog(folder, engine, writable=True)
     migrate.upgrade(made)
     with made.write() as connection:
-        row = {"id": uuid.uuid4().hex, "created_at": _catalog.now(), "gsmap_version": gsmap.__version__}
+        row = {"id": uuid.uuid4().hex, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)
     made.close()

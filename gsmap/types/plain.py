@@ -15,7 +15,7 @@ def plain(value: Any) -> Any:
 
     Floats keep their bits; NaN and infinity stay what they are. What is unknown becomes its text.
     """
-    if value is None or isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic):
+    if value is None or (isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic)):
         return value
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}

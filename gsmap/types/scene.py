@@ -24,6 +24,7 @@ class Scene:
         source: where it was read from, for people.
         cameras_synthesised: true when the source had no cameras.
         antialiased: true when trained with the 2D Mip filter (noted, not yet rendered differently).
+        tags: words that people gave it, sorted.
     """
 
     id: str
@@ -38,3 +39,4 @@ class Scene:
     source: str = ""
     cameras_synthesised: bool = False
     antialiased: bool = False
+    tags: tuple[str, ...] = ()

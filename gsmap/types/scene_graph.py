@@ -21,7 +21,7 @@ class NodeLayer:
         extents: (M, 2, 3) float64 lowest and highest corner of the node's points, scene frame.
         features: (M, F) float32 the embedding's own part without context; for queries by feature.
         num_views: (M,) int32 how many rendered views saw the node; 0 where nothing was rendered.
-        method: digest of segmenter, embedder and parameters; layers of different methods are never compared.
+        descriptor_id: digest of segmenter, embedder and parameters; layers of different ones are never compared.
         unit_m: metres per scene unit that the layer was made under. ``positions * unit_m`` is in (assumed) metres, and
             all metric constants of a method hold there; two layers of one method may be compared whatever their units.
     """
@@ -33,7 +33,7 @@ class NodeLayer:
     extents: np.ndarray
     features: np.ndarray
     num_views: np.ndarray
-    method: str
+    descriptor_id: str
     unit_m: float = 1.0
 
     def __post_init__(self) -> None:
@@ -61,9 +61,9 @@ class NodeLayer:
         return len(self.positions)
 
     @classmethod
-    def empty(cls, method: str, dim: int = 1, unit_m: float = 1.0) -> NodeLayer:
+    def empty(cls, descriptor_id: str, dim: int = 1, unit_m: float = 1.0) -> NodeLayer:
         z = np.zeros
-        return cls(z((0, 3)), z((0, dim)), z(0), z(0), z((0, 2, 3)), z((0, dim)), z(0), method, unit_m)
+        return cls(z((0, 3)), z((0, dim)), z(0), z(0), z((0, 2, 3)), z((0, dim)), z(0), descriptor_id, unit_m)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +16,16 @@ class Tile:
 
     Args:
         key: digest of everything that decides its content but the poses.
-        component: island it belongs to.
+        component: connected component it belongs to.
         bounds: (2, 3) float64 lowest and highest corner, map frame; a Gaussian belongs where its mean is
             (``low <= x < high``).
         poses: the ``S_map_scene`` it was made with, by scene id.
         num_gaussians: how many it holds.
-        method: merger and parameters, for people.
+        recipe: `gsmap.methods.RecipeKey.to_json` of what made it; ``{"method": text}`` in maps of schema 0001.
         truncated: a time budget cut its optimisation short.
         path: relative to the export's folder.
         sha256: of the file written.
+        notes: what a person should know of how it was merged.
     """
 
     key: str
@@ -31,7 +33,8 @@ class Tile:
     bounds: np.ndarray
     poses: dict[str, Sim3] = field(default_factory=dict)
     num_gaussians: int = 0
-    method: str = ""
+    recipe: dict[str, Any] = field(default_factory=dict)
     truncated: bool = False
     path: str = ""
     sha256: str = ""
+    notes: tuple[str, ...] = ()

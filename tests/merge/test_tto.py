@@ -1,9 +1,9 @@
 import numpy as np
-from made_walls import cameras_facing, two_parts, wall
+from synthetic_walls import cameras_facing, two_scenes, wall
 
-from gsmap.merge import Part, default_params, merge
+from gsmap.merge import PlacedScene, default_params, merge
 from gsmap.merge.exposure import apply_gain
-from gsmap.merge.selection import most_shown, one_owner_per_cell
+from gsmap.merge.selection import most_visible, one_owner_per_cell
 from gsmap.render import render
 from gsmap.types import Gaussians
 
@@ -17,7 +17,7 @@ def likeness(merged, parts):
 
 
 def test_it_beats_the_closed_forms_with_fewer_gaussians():
-    parts = two_parts()
+    parts = two_scenes()
     others = [merge(parts, method) for method in ("union", "voxel", "distance")]
     tto = merge(parts, "tto", Params(keep=0.7, steps=250))
     assert likeness(tto.gaussians, parts) > max(likeness(r.gaussians, parts) for r in others) + 0.2
@@ -28,7 +28,7 @@ def test_it_beats_the_closed_forms_with_fewer_gaussians():
 
 
 def test_steps_help_and_are_repeatable():
-    parts = two_parts()
+    parts = two_scenes()
     few, many = (merge(parts, "tto", Params(steps=s)) for s in (0, 60))
     assert likeness(many.gaussians, parts) > likeness(few.gaussians, parts)
     again = merge(parts[::-1], "tto", Params(steps=60))
@@ -38,20 +38,22 @@ def test_steps_help_and_are_repeatable():
 
 def test_it_stops_when_it_no_longer_gains():
     g = wall(0, -1, 1)
-    result = merge([Part(g, cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")], "tto", Params(keep=1.0, passes=100))
+    result = merge(
+        [PlacedScene(g, cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")], "tto", Params(keep=1.0, passes=100)
+    )
     assert 10 <= result.steps < 2000
     assert not result.truncated
 
 
 def test_a_budget_is_a_ceiling_and_says_so():
-    result = merge(two_parts(), "tto", Params(steps=100_000), budget_s=0.5)
+    result = merge(two_scenes(), "tto", Params(steps=100_000), budget_s=0.5)
     assert result.truncated
     assert result.steps < 100_000
     assert len(result.gaussians)
 
 
 def test_without_cameras_it_still_merges():
-    parts = [Part(p.gaussians, None, p.scene_id) for p in two_parts()]
+    parts = [PlacedScene(p.gaussians, None, p.scene_id) for p in two_scenes()]
     result = merge(parts, "tto")
     assert result.steps == 0
     assert "no camera" in result.notes[0]
@@ -59,7 +61,7 @@ def test_without_cameras_it_still_merges():
 
 
 def test_tiles_fit_together_in_any_order():
-    parts = two_parts()
+    parts = two_scenes()
     params = Params(steps=80, keep=0.9)
     boxes = [np.array([[x, -2, -2], [x + 1.0, 2, 2]]) for x in (-2.0, -1, 0, 1)]
     tiles = [merge(parts, "tto", params, bounds=box) for box in boxes]
@@ -82,8 +84,8 @@ def test_tiles_fit_together_in_any_order():
 
 
 def test_differing_exposure_is_removed_when_asked_and_noted():
-    a, b = two_parts()
-    brighter = Part(apply_gain(b.gaussians, np.full(3, 1.4)), b.cameras, "b")
+    a, b = two_scenes()
+    brighter = PlacedScene(apply_gain(b.gaussians, np.full(3, 1.4)), b.cameras, "b")
     result = merge([a, brighter], "tto", Params(steps=5, balance_exposure=True))
     assert any("stops" in note for note in result.notes)
 
@@ -107,5 +109,5 @@ def test_a_cell_belongs_to_whoever_shows_most_of_it():
 def test_what_shows_least_goes_first():
     shown = np.array([3.0, 0.0, 5.0, 1.0, 4.0])
     among = np.array([True, True, False, True, True])
-    np.testing.assert_array_equal(most_shown(shown, among, 2), [True, False, False, False, True])
-    np.testing.assert_array_equal(most_shown(shown, among, 9), among)
+    np.testing.assert_array_equal(most_visible(shown, among, 2), [True, False, False, False, True])
+    np.testing.assert_array_equal(most_visible(shown, among, 9), among)

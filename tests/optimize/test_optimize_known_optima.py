@@ -26,4 +26,4 @@ def test_grid_without_triangles_is_found_by_longer_cycles(shared_data):
     """Nobody vouches for the edges, and a grid has no triangles: cycles of four must do."""
     graph = read_graph(shared_data / "pose_graphs" / "smallGrid3D.g2o", confirmed=False)
     answer = optimize(list(graph.poses), graph.edges, params=OptimizeParams(marginals=False))
-    assert np.mean([used is True for used in answer.used.values()]) > 0.98
+    assert np.mean([outcome.use == "used" for outcome in answer.outcomes.values()]) > 0.98

@@ -10,7 +10,7 @@ from gsmap.errors import ConfigError
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
 from gsmap.register import Params, SceneView, propose, register_pair
-from gsmap.register.candidates import candidate_pairs
+from gsmap.retrieve import candidate_pairs
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph, Sim3
 
 

@@ -1,0 +1,90 @@
+"""What people said of scenes: names, dates, notes and tags, each with when and by whom. Nothing is overwritten."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import Connection, Row, insert, select
+
+from gsmap.errors import InputError
+from gsmap.store.catalog import now
+from gsmap.store.schema import scene_facts
+
+
+@dataclass(frozen=True)
+class SceneFact:
+    """One thing that was said of a scene.
+
+    Args:
+        kind: ``name``, ``captured_at``, ``note``, ``tag`` or ``untag``.
+        value: the text; empty for a ``captured_at`` that was taken back.
+        author: who said it; empty where nobody was named (an ingest).
+        created_at: when it was said.
+    """
+
+    kind: str
+    value: str
+    author: str
+    created_at: str
+
+
+def say(connection: Connection, scene: str, facts: Iterable[tuple[str, str]], author: str = "") -> None:
+    """Write (kind, value) facts of a scene down."""
+    when = now()
+    rows = [
+        {"scene": scene, "kind": kind, "value": value, "author": author, "created_at": when} for kind, value in facts
+    ]
+    if rows:
+        connection.execute(insert(scene_facts), rows)
+
+
+def said(connection: Connection, scene: str) -> list[SceneFact]:
+    """All facts of a scene, oldest first."""
+    query = select(scene_facts).where(scene_facts.c.scene == scene).order_by(scene_facts.c.number)
+    return [SceneFact(row.kind, row.value, row.author, row.created_at) for row in connection.execute(query)]
+
+
+def tags(connection: Connection, scene: str | None = None) -> dict[str, tuple[str, ...]]:
+    """The tags that stand, sorted, by scene id; of one scene or of all that have any."""
+    query = select(scene_facts).where(scene_facts.c.kind.in_(("tag", "untag"))).order_by(scene_facts.c.number)
+    rows: Iterable[Row[Any]] = connection.execute(query if scene is None else query.where(scene_facts.c.scene == scene))
+    standing: dict[str, set[str]] = {}
+    for row in rows:
+        mine = standing.setdefault(row.scene, set())
+        (mine.add if row.kind == "tag" else mine.discard)(row.value)
+    return {known: tuple(sorted(mine)) for known, mine in standing.items() if mine}
+
+
+def checked_text(what: str, text: str, *, lines: bool = False) -> str:
+    """A text that may be shown on a terminal: not empty, without control characters.
+
+    Args:
+        what: how messages call it.
+        lines: it may have several lines.
+
+    Raises:
+        InputError: otherwise.
+    """
+    if not text.strip():
+        raise InputError(f"{what} must not be empty")
+    bad = [c for c in text if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and not (lines and c == "\n")]
+    if bad:
+        raise InputError(f"{what} {text!r} has a control character ({bad[0]!r}): leave it out")
+    return text
+
+
+def checked_date(when: str) -> str:
+    """A capture date as the catalog keeps it: ISO 8601 with its zone, UTC where it has none.
+
+    Raises:
+        InputError: not a date.
+    """
+    try:
+        parsed = datetime.fromisoformat(when)
+    except ValueError as error:
+        raise InputError(f"a capture date is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}") from error
+    return (parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)).isoformat()
