@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 from gsmap.describe import describe
-from gsmap.describe.models import ModelSpec
 from gsmap.register import Params as RegisterParams
 from gsmap.register import SceneView, register_pair
 from gsmap.store import Store
 from gsmap.types import Registration, SceneGraph
+from gsmap.types.model import ModelSpec
 
 
 @lru_cache(maxsize=1)

@@ -143,11 +143,10 @@ class Map(AbstractContextManager["Map"]):
 
     def _method(self, scene: Scene) -> str:
         """Text that decides a scene's graph beside its content: what is described, how, and under which scale."""
-        from gsmap.describe import methods
+        from gsmap.describe import recipe_key
         from gsmap.map import models as kept
 
-        how = methods(models=kept.specs(self.store))
-        return _digest(scene.scale_policy, *(f"{layer} {digest}" for layer, digest in sorted(how.items())))
+        return recipe_key(models=kept.specs(self.store)).of(scene.id, scene.scale_policy).digest
 
     def _graph(self, scene_id: str, method: str) -> SceneGraph:
         graph = self.store.graphs.load(scene_id, method)
@@ -406,7 +405,7 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap show MAP SCENE --picture``: the scene's graph over a render, for a person to judge."""
         from PIL import Image
 
-        from gsmap.describe.picture import draw_graph
+        from gsmap.view.graph_picture import draw_graph
 
         scene = self.store.scenes.get(ref)
         graph = self.store.graphs.load(scene.id, self._method(scene))

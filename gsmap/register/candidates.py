@@ -91,10 +91,10 @@ def _votes(graphs: Sequence[SceneGraph], asked: Sequence[int], params: Params) -
     for i, graph in enumerate(graphs):
         metric = {name for name in graph.layers if ":" not in name}
         for name, layer in sorted(graph.layers.items()):
-            if upright and name.startswith("unlevelled"):
+            if upright and name.startswith("landmarks_gravity_free"):
                 continue
             if len(layer) and (name in metric or name.split(":")[0] not in metric):
-                methods[layer.method].append((i, layer))
+                methods[layer.descriptor_id].append((i, layer))
     row_of = {scene: row for row, scene in enumerate(asked)}
     for layers in methods.values():
         rows = [np.argsort(-layer.weights, kind="stable")[:budget] for _, layer in layers]

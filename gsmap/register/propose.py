@@ -120,13 +120,13 @@ def _layers(target: SceneGraph, source: SceneGraph, kind: str, with_scale: bool)
 
     def of(graph: SceneGraph, other: SceneGraph) -> list[NodeLayer]:
         turned = kind == "landmarks" and graph.up is not None and other.up is None
-        own = "unlevelled" if turned else kind
+        own = "landmarks_gravity_free" if turned else kind
         guesses = [layer for name, layer in graph.layers.items() if name.startswith(f"{own}:")]
         plain = [graph.layers[own]] if own in graph.layers else []
         return (guesses or plain) if with_scale else plain
 
     compared = [(a, b) for a in of(target, source) for b in of(source, target)]
-    pairs = [(a, b) for a, b in compared if a.method == b.method and len(a) and len(b)]
+    pairs = [(a, b) for a, b in compared if a.descriptor_id == b.descriptor_id and len(a) and len(b)]
     if not with_scale:
         return pairs
     # Guesses come in fixed steps, so several pairs stand for one relative scale: keep the one with most nodes.

@@ -112,7 +112,8 @@ class Graphs:
             mine: dict[str, Any] = {
                 key.split(".", 1)[1]: array for key, array in arrays.items() if key.startswith(f"{i}.")
             }
-            layers[name] = NodeLayer(**mine, **layer["rest"])
+            rest = {"descriptor_id" if key == "method" else key: value for key, value in layer["rest"].items()}
+            layers[name] = NodeLayer(**mine, **rest)
         return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
 
     def list(self) -> list[StoredGraph]:
