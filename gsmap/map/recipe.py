@@ -234,14 +234,13 @@ class Map(AbstractContextManager["Map"]):
 
     def optimize(self) -> PoseGraph:
         """Solve for all scene poses and keep the answer as a new revision."""
-        from gsmap.optimize import optimize
-        from gsmap.optimize.level import leveled
+        from gsmap.optimize import gravity_align, optimize
 
         (scenes, edges, priors), digest = self._pose_inputs()
         self._progress("optimize", 0.0, "poses")
         answer = optimize(scenes, edges, priors, self.pose_graph())
         ups = {graph.scene: np.array(graph.up) for graph in self.store.graphs.list() if graph.up is not None}
-        answer = leveled(answer, ups, fixed={prior.scene for prior in priors})
+        answer = gravity_align(answer, ups, fixed={prior.scene for prior in priors})
         answer = replace(answer, parameters={**answer.parameters, "inputs": digest})
         number = self.store.revisions.save(answer)
         self._progress("optimize", 1.0, f"revision {number}")
@@ -288,7 +287,7 @@ class Map(AbstractContextManager["Map"]):
         Raises:
             InputError: what `optimize` could not use; nothing is noted.
         """
-        from gsmap.optimize.measurements import check_priors
+        from gsmap.optimize import check_priors
 
         check_priors([prior.scene], [prior])
         self.store.priors.set(prior)
