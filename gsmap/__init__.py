@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 from gsmap.version import __version__
 
-
 _HOME = {
     "Cameras": "gsmap.types",
     "Edge": "gsmap.types",

@@ -1,17 +1,67 @@
-"""Fixtures shared by all rooms."""
+"""Fixtures shared by all rooms; and that what is tested is this checkout as it lies."""
 
 from __future__ import annotations
 
+import fcntl
+import importlib.util
 import os
+import subprocess
+import sys
+import sysconfig
 from pathlib import Path
 
 import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_configure() -> None:
+    """Build the native module when a source is newer, before anything imports it.
+
+    GSMAP_TEST_INSTALLED=1 tests the package as it is installed instead: a wheel, say.
+    """
+    if os.environ.get("GSMAP_TEST_INSTALLED"):
+        return
+    found = importlib.util.find_spec("gsmap")
+    if found is None or found.origin is None or Path(found.origin).resolve() != ROOT / "gsmap" / "__init__.py":
+        raise pytest.UsageError(
+            f"these tests would test {found.origin if found else 'nothing'}, not this checkout: run tools/setup.sh "
+            "test, or say GSMAP_TEST_INSTALLED=1 if that is what you want"
+        )
+    if _native_is_old():
+        _build_native()
+
+
+def _native_is_old() -> bool:
+    module = ROOT / "gsmap" / f"_native{sysconfig.get_config_var('EXT_SUFFIX')}"
+    sources = [ROOT / "CMakeLists.txt", *(ROOT / "gsmap" / "native").iterdir()]
+    return not module.exists() or max(s.stat().st_mtime_ns for s in sources) > module.stat().st_mtime_ns
+
+
+def _build_native() -> None:
+    (ROOT / "build").mkdir(exist_ok=True)
+    with (ROOT / "build" / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # Of several test runs that start at once, one builds.
+        if not _native_is_old():
+            return
+        done = subprocess.run(
+            [ROOT / "tools" / "build_native.sh"],
+            env=os.environ | {"PYTHON": sys.executable},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+    if done.returncode:
+        raise pytest.UsageError(
+            f"{done.stdout}\nthe native module does not build (above): mend it, or run tools/setup.sh test if a tool "
+            "is missing"
+        )
 
 
 def _shared_data() -> Path | None:
     """Real captures beside the checkout (or at GSMAP_SHARED_DATA); never part of the project."""
     named = os.environ.get("GSMAP_SHARED_DATA")
-    root = Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
+    root = Path(named) if named else ROOT.parent / "shared" / "data"
     return root if (root / "house").is_dir() else None
 
 

@@ -23,9 +23,9 @@ from gsmap.evaluate.renders import compare_renders, find_images
 from gsmap.export import plan_tiles
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import Capture, read_captures
-from gsmap.merge import MergeResult, Part, default_params, merge, reach_m
-from gsmap.merge.tile import Source, merge_tile
-from gsmap.types import Gaussians, Sim3
+from gsmap.merge import default_params, merge, methods, reach_m
+from gsmap.merge.tile import LazyScene, merge_tile
+from gsmap.types import Gaussians, MergeResult, PlacedScene, Sim3
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["c0", "c1"], help="names of captures to merge")
     parser.add_argument("--images", type=Path, help="folder of pictures, CAPTURES/frames else")
     parser.add_argument("--map", type=Path, help="a map of the same captures, for rows under estimated poses")
-    parser.add_argument("--methods", nargs="*", default=["union", "distance", "voxel", "tto"])
+    parser.add_argument("--methods", nargs="*", choices=methods(), default=["union", "distance", "voxel", "tto"])
     parser.add_argument("--curve", nargs="*", type=float, default=[], help="tto at these sizes (share of the union)")
     parser.add_argument("--tiles", type=float, help="also merge in tiles of this edge (m) and compare with one tile")
     parser.add_argument("--json", type=Path, help="write all figures here")
@@ -103,8 +103,8 @@ def oracle_row(captures: list[Capture], images: Path) -> dict:
 
 
 def merge_row(captures, S_map_scene, images, method, params, name, *, run=None) -> dict:
-    parts = [
-        Part(
+    scenes = [
+        PlacedScene(
             transform_gaussians(c.gaussians, S_map_scene[c.name]),
             transform_cameras(c.cameras, S_map_scene[c.name]),
             c.name,
@@ -113,7 +113,7 @@ def merge_row(captures, S_map_scene, images, method, params, name, *, run=None) 
         for c in captures
     ]
     wall, cpu = time.perf_counter(), time.process_time()
-    result: MergeResult = (run or merge)(parts, method, params)
+    result: MergeResult = (run or merge)(scenes, method, params)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return {
         "name": name,
@@ -133,15 +133,15 @@ def tiled_row(captures, S_map_scene, images, tile_size_m, name) -> dict:
     bounds = {c.name: np.array([c.gaussians.means.min(0), c.gaussians.means.max(0)]) for c in captures}
     by_name = {c.name: c for c in captures}
 
-    def in_tiles(parts, method, params):
+    def in_tiles(scenes, method, params):
         plan = plan_tiles(S_map_scene, bounds, tile_size_m=tile_size_m, reach_m=reach_m(method, params))
         results = []
         for tile in plan:
-            sources = [
-                Source(n, pose, lambda box, n=n: by_name[n].gaussians, by_name[n].cameras)
+            lazy = [
+                LazyScene(n, pose, lambda box, n=n: by_name[n].gaussians, by_name[n].cameras)
                 for n, pose in tile.poses.items()
             ]
-            results.append(merge_tile(sources, method, params, bounds=tile.bounds))
+            results.append(merge_tile(lazy, method, params, bounds=tile.bounds))
         merged = Gaussians.concatenate([r.gaussians for r in results])
         made = sum(len(r.gaussians) > 0 for r in results)
         return MergeResult(

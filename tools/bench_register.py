@@ -124,7 +124,7 @@ def described(m, name: str, place: str, gaussians: Gaussians, cameras: Cameras, 
 
 
 def make_place(cache: Path, seed: int, count: int) -> Path:
-    from gsmap.demo import make_captures, write_captures
+    from gsmap_synthetic import make_captures, write_captures
 
     folder = cache / f"made_{seed}_{count}"
     if not folder.exists():

@@ -1,4 +1,4 @@
-"""Posed frames, or a made place, to trained splats as people keep them.
+"""Posed frames, or a synthetic place, to trained splats as people keep them.
 
     tools/make_scenes.py place OUT --seed 3 --captures 4
     tools/make_scenes.py frames FOLDER OUT --name kitchen --hold-out 4
@@ -20,20 +20,21 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gsmap import demo, formats
-from gsmap.demo.initialise import from_colour, from_depth
-from gsmap.demo.make import put_in_own_frame
-from gsmap.demo.train import Params, train
+import gsmap_synthetic as synthetic
+from gsmap import formats
 from gsmap.errors import GsmapError, InputError
 from gsmap.evaluate.images import psnr
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians
+from gsmap_synthetic.initialise import from_colour, from_depth
+from gsmap_synthetic.make import put_in_own_frame
+from gsmap_synthetic.train import Params, train
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    place = verbs.add_parser("place", help="capture a made place")
+    place = verbs.add_parser("place", help="capture a synthetic place")
     place.add_argument("out", type=Path)
     place.add_argument("--captures", type=int, default=3)
     place.add_argument("--rooms", type=int, default=3)
@@ -51,21 +52,23 @@ def main() -> int:
         verb.add_argument("--steps", type=int, default=600)
         verb.add_argument("--gaussians", type=int, default=50_000)
         verb.add_argument("--size", type=int, default=320, help="longer side of the pictures trained on, pixels")
-        verb.add_argument("--hold-out", type=int, default=0, help="keep every so manieth frame back and print its PSNR")
+        verb.add_argument(
+            "--hold-out", type=int, default=0, metavar="N", help="keep every N-th frame back and print its PSNR"
+        )
         verb.add_argument("--images", action="store_true", help="write the frames, too")
     args = parser.parse_args()
     try:
         captures = _from_place(args) if args.verb == "place" else [_from_folder(args)]
-        demo.write_captures(args.out, captures, images=args.images)
+        synthetic.write_captures(args.out, captures, images=args.images)
     except GsmapError as error:
         print(f"make_scenes: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _from_place(args: argparse.Namespace) -> list[demo.DemoCapture]:
+def _from_place(args: argparse.Namespace) -> list[synthetic.DemoCapture]:
     start = time.process_time()
-    captures = demo.make_captures(
+    captures = synthetic.make_captures(
         args.seed,
         args.captures,
         steps=args.steps,
@@ -80,13 +83,13 @@ def _from_place(args: argparse.Namespace) -> list[demo.DemoCapture]:
     )
     print(f"\n{args.captures} captures: {time.process_time() - start:.1f} CPU s", file=sys.stderr)
     for capture in captures:
-        _report(capture.name, capture.gaussians, demo.Frames(capture.images, capture.cameras), args.hold_out)
+        _report(capture.name, capture.gaussians, synthetic.Frames(capture.images, capture.cameras), args.hold_out)
     return captures
 
 
-def _from_folder(args: argparse.Namespace) -> demo.DemoCapture:
+def _from_folder(args: argparse.Namespace) -> synthetic.DemoCapture:
     frames = read_frames(args.folder, args.cameras, args.size)
-    shown = frames[demo.shown(len(frames), args.hold_out)]
+    shown = frames[synthetic.shown(len(frames), args.hold_out)]
     if frames.depths_m is not None:
         start, params = from_depth(shown, args.gaussians, args.seed), Params(steps=args.steps)
     else:
@@ -100,9 +103,9 @@ def _from_folder(args: argparse.Namespace) -> demo.DemoCapture:
     return put_in_own_frame(gaussians, frames, args.name, np.random.default_rng([args.seed, 8]))
 
 
-def _report(name: str, gaussians: Gaussians, frames: demo.Frames, hold_out: int) -> None:
+def _report(name: str, gaussians: Gaussians, frames: synthetic.Frames, hold_out: int) -> None:
     """Print PSNR of the frames trained on and of those held back."""
-    shown = demo.shown(len(frames), hold_out)
+    shown = synthetic.shown(len(frames), hold_out)
     record = {"name": name, "gaussians": len(gaussians)}
     for what, rows in (("psnr_trained", np.flatnonzero(shown)), ("psnr_held_out", np.flatnonzero(~shown))):
         if len(rows):
@@ -112,7 +115,7 @@ def _report(name: str, gaussians: Gaussians, frames: demo.Frames, hold_out: int)
     print(json.dumps(record))
 
 
-def read_frames(folder: Path, cameras: Path | None, longest_px: int) -> demo.Frames:
+def read_frames(folder: Path, cameras: Path | None, longest_px: int) -> synthetic.Frames:
     """Posed frames of a folder, shrunk so that the longer side has at most ``longest_px`` pixels.
 
     Raises:
@@ -132,10 +135,10 @@ def read_frames(folder: Path, cameras: Path | None, longest_px: int) -> demo.Fra
     images = [
         _read_image(found[Path(name).stem], tuple(size)) for name, size in zip(small.names, small.sizes_px, strict=True)
     ]
-    return demo.Frames(np.stack(images), small)
+    return synthetic.Frames(np.stack(images), small)
 
 
-def _read_recording(folder: Path, names: list[str], longest_px: int) -> demo.Frames:
+def _read_recording(folder: Path, names: list[str], longest_px: int) -> synthetic.Frames:
     """An RGB-D recording as 7-Scenes and 3DMatch lay it out; depth and colour are taken as registered."""
     K = np.loadtxt(folder / "camera-intrinsics.txt")
     pose = np.stack([np.loadtxt(folder / f"{name}.pose.txt") for name in names])
@@ -150,14 +153,15 @@ def _read_recording(folder: Path, names: list[str], longest_px: int) -> demo.Fra
     views = Cameras(pose, np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (count, 1)), np.tile(size, (count, 1)), names)
     small = views.resized(longest_px)
     small_size = tuple(small.sizes_px[0])
-    depths = [np.asarray(Image.open(folder / f"{name}.depth.png").resize(small_size, Image.NEAREST)) for name in names]
+    pictures = (Image.open(folder / f"{name}.depth.png") for name in names)
+    depths = [np.asarray(picture.resize(small_size, Image.Resampling.NEAREST)) for picture in pictures]
     depth_m = np.stack(depths).astype(np.float32) / 1000
     depth_m[depth_m > 20] = 0  # 65535 marks "no depth".
-    return demo.Frames(np.stack([_read_image(p, small_size) for p in colour]), small, depth_m)
+    return synthetic.Frames(np.stack([_read_image(p, small_size) for p in colour]), small, depth_m)
 
 
 def _read_image(path: Path, size: tuple[int, int]) -> np.ndarray:
-    return np.asarray(Image.open(path).convert("RGB").resize(size, Image.LANCZOS))
+    return np.asarray(Image.open(path).convert("RGB").resize(size, Image.Resampling.LANCZOS))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 # Sets gsmap up in .venv beside this checkout: system libraries, environment, native kernels, command line.
 #
 #   tools/setup.sh            what running gsmap needs
-#   tools/setup.sh test       the same, with what its tests and linters need
+#   tools/setup.sh test       what working on it needs: installed editable, so that tests test this checkout as it lies,
+#                             with what tests and linters need
 #
 # PYTHON=/path/to/python3.12     another interpreter (3.11 to 3.13)
 # GSMAP_VENV=/path/to/venv       another place for the environment
@@ -10,8 +11,6 @@
 set -eu
 cd "$(dirname "$0")/.."
 venv=${GSMAP_VENV:-.venv}
-extras=${1:+"[$1,lint]"}
-
 say() { printf 'gsmap setup: %s\n' "$*" >&2; }
 die() { say "$*"; exit 1; }
 
@@ -58,6 +57,14 @@ if [ -n "${GSMAP_TORCH_INDEX:-}" ]; then
 fi
 say "installing packages and building the native kernels (a few minutes)"
 # torch first and by itself: its pin must be settled before another package's open range can pull in a newer one.
-"$venv/bin/python" -m pip install -q -c constraints.txt torch
-"$venv/bin/python" -m pip install -q -c constraints.txt ".$extras"
+pip() { "$venv/bin/python" -m pip "$@"; }
+pip install -q -c constraints.txt torch
+if [ "${1:-}" = test ]; then
+    # Without isolation: the module is built by the tools that stay in the environment, again and again.
+    pip install -q -c constraints.txt scikit-build-core nanobind cmake ninja
+    pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint]" -e synthetic
+    PYTHON="$venv/bin/python" tools/build_native.sh >&2
+else
+    pip install -q -c constraints.txt . ./synthetic
+fi
 say "ready: $venv/bin/gsmap --help"

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import importlib
 import sys
+from typing import Annotated
 
 import typer
 
-import gsmap
+from gsmap.cli.console import start_logging
 from gsmap.errors import ConfigError, GsmapError
+from gsmap.version import __version__
 
 VERBS = (
     "init",
@@ -20,13 +22,18 @@ VERBS = (
     "register",
     "optimize",
     "update",
+    "status",
     "confirm",
     "reject",
+    "edge",
     "prior",
+    "edit",
     "export",
     "list",
     "show",
     "diff",
+    "poses",
+    "settings",
     "convert",
     "models",
     "evaluate",
@@ -42,8 +49,20 @@ VERBS = (
 
 def _version(value: bool) -> None:
     if value:
-        print(f"gsmap {gsmap.__version__}")
+        print(f"gsmap {__version__}")
         raise typer.Exit
+
+
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Errors only: no progress and no remarks.")] = False,
+    verbose: Annotated[
+        int, typer.Option("-v", "--verbose", count=True, help="Log what is done; -vv logs every detail.")
+    ] = 0,
+) -> None:
+    start_logging(verbose, quiet)
 
 
 def build() -> typer.Typer:
@@ -52,17 +71,11 @@ def build() -> typer.Typer:
         name="gsmap",
         help="The map-management database for 3D Gaussian Splatting: many captures in, one maintained map out.",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode="markdown",
+        context_settings={"help_option_names": ["-h", "--help"]},
     )
-
-    @app.callback()
-    def root(
-        version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
-    ) -> None:
-        pass
-
+    app.callback()(_root)
     for verb in VERBS:
         module = importlib.import_module(f"gsmap.cli.{verb}")
         if hasattr(module, "app"):
@@ -72,10 +85,14 @@ def build() -> typer.Typer:
     return app
 
 
-def run() -> None:
-    """Run the command line and exit with its code. typer itself exits with 2 on wrong usage."""
+def run(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit with its code. typer itself exits with 2 on wrong usage.
+
+    Args:
+        arguments: in place of those of the process.
+    """
     try:
-        build()()
+        build()(arguments)
     except ConfigError as error:
         code, message = 2, str(error)
     except GsmapError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_json, progress_bars, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 
 def command(map: MapPath, json: AsJson = False) -> None:
@@ -12,16 +12,15 @@ def command(map: MapPath, json: AsJson = False) -> None:
 
     Example: `gsmap check site.gsmap`
     """
-    import gsmap
-
-    with progress_bars() as progress, gsmap.open(map, progress=progress) as m:
-        problems = m.check()
+    with opened(map, bars=True) as m:
+        report = m.check()
     if json:
-        print_json(problems)
+        print_rows("check", report, json)
     else:
-        for problem in problems:
+        for problem in report.problems:
             print(problem)
-    if problems:
-        say(f"{len(problems)} problems in {map}: restore the files named from a backup, or ingest their scenes again")
+    if not report.ok:
+        count = len(report.problems)
+        say(f"{count} problems in {map}: restore the files named from a backup, or ingest their scenes again")
         raise typer.Exit(1)
     say(f"{map} is whole")

@@ -1,4 +1,4 @@
-"""gsmap confirm: a person's word on an edge."""
+"""gsmap confirm: a person's review of an edge."""
 
 from __future__ import annotations
 
@@ -6,20 +6,23 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 
 def command(
     map: MapPath,
     pair: Annotated[str, typer.Argument(metavar="A:B", help="The pair, by names or ids.")],
     note: Annotated[str, typer.Option("--note", help="Why, for whoever asks later.")] = "",
+    withdraw: Annotated[
+        bool, typer.Option("--withdraw", help="Take back the last review of the pair, or else its own measurement.")
+    ] = False,
+    json: AsJson = False,
 ) -> None:
     """Vouch for an edge, so that it is used whatever the votes say. Kept in history.
 
     Example: `gsmap confirm site.gsmap monday:tuesday`
     """
-    import gsmap
-
-    with gsmap.open(map) as m:
-        m.confirm(pair, note=note)
+    with opened(map) as m:
+        row = m.confirm(pair, note=note, withdraw=withdraw)
     say(f"noted; run: gsmap optimize {map}")
+    print_rows("confirm", row, json)

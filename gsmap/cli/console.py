@@ -2,74 +2,209 @@
 
 from __future__ import annotations
 
-import json
-import math
+import json as _json
+import logging
+import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from gsmap.map import Map
+    from gsmap.types.progress import StageProgress
+    from gsmap.types.rows import Row
 
 MapPath = Annotated[
     str, typer.Argument(metavar="MAP", help="The map's directory, such as site.gsmap.", show_default=False)
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; docs/json.md has its fields.")]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="A.B=VALUE", help="Change a setting for this run; `gsmap settings MAP` lists them."),
+]
+Preset = Annotated[
+    str | None, typer.Option("--preset", help="Start from this preset, for this run: `default` or `paper`.")
+]
+
+_DIGESTS = {"id", "scene", "target", "source", "sha256", "key", "descriptor_id"}
+_DIGEST = re.compile(r"[0-9a-f]{32,64}")
+_SHORT = 12  # digits of a digest that tell a map's things apart
+
+# --- remarks and logs ------------------------------------------------------------------------------------------------
+
+
+class _Stderr(logging.StreamHandler[Any]):
+    """Writes to whatever stderr is now: progress bars put themselves in its place while they are drawn."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.stream = sys.stderr
+        super().emit(record)
+
+
+def start_logging(verbose: int, quiet: bool) -> None:
+    """Send what the library logs (loggers ``gsmap.<room>``) to stderr: warnings, or as ``-q``, ``-v``, ``-vv`` ask."""
+    logger = logging.getLogger("gsmap")
+    logger.setLevel(logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)])
+    if not any(isinstance(handler, _Stderr) for handler in logger.handlers):
+        handler = _Stderr()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logger.addHandler(handler)
+        logger.propagate = False
 
 
 def say(text: str) -> None:
-    """A remark for the person, on stderr."""
-    print(text, file=sys.stderr)
+    """A remark for the person, on stderr; silent with ``-q``."""
+    if logging.getLogger("gsmap").isEnabledFor(logging.WARNING):
+        print(text, file=sys.stderr, flush=True)
 
 
-def print_json(data: Any) -> None:
-    """``data`` as JSON on stdout; arrays become lists, NaN becomes null."""
-    print(json.dumps(_plain(data), indent=1, allow_nan=False))
+# --- data ------------------------------------------------------------------------------------------------------------
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if hasattr(value, "tolist"):  # numpy arrays and scalars
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def print_rows(verb: str, rows: Row | Sequence[Row] | None, json: bool, title: str = "") -> None:
+    """What a verb answers, as one JSON object or as a table, on stdout.
+
+    Args:
+        verb: its key in `gsmap.cli.objects.OBJECTS`.
+        rows: the row or rows that are declared there.
+        title: of the table.
+    """
+    if json:
+        print(_json.dumps(json_object(verb, rows), indent=1, allow_nan=False), flush=True)
+        return
+    from gsmap.cli.objects import OBJECTS
+    from gsmap.types.rows import Row
+
+    many = [] if rows is None else [rows] if isinstance(rows, Row) else list(rows)
+    print_table(title or verb, OBJECTS[verb].type.columns, many)
 
 
-def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """A table on stdout; numbers are right-aligned. A pipe gets every column in full."""
+def json_object(verb: str, rows: Row | Sequence[Row] | None) -> dict[str, Any]:
+    """What a verb prints with ``--json``."""
+    from gsmap.cli.objects import OBJECTS, Many, Maybe
+    from gsmap.types.rows import SCHEMA, Row
+
+    shape = OBJECTS[verb]
+    for row in [rows] if isinstance(rows, Row) else rows or ():
+        if type(row) is not shape.type:
+            raise TypeError(f"{verb} prints {shape.type.__name__}, not {type(row).__name__}")
+    if isinstance(rows, Row):
+        data = rows.to_json()
+        return {"schema": SCHEMA, **({shape.key: data} if isinstance(shape, Maybe) else data)}
+    if isinstance(shape, Many):
+        return {"schema": SCHEMA, shape.key: [row.to_json() for row in rows or ()]}
+    if isinstance(shape, Maybe):
+        return {"schema": SCHEMA, shape.key: None}
+    raise TypeError(f"{verb} prints one {shape.type.__name__}")
+
+
+def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> None:
+    """The named fields of rows as a table on stdout; numbers are right-aligned. A pipe gets every column in full."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
-    for i, column in enumerate(columns):
-        numeric = any(isinstance(row[i], (int, float)) and not isinstance(row[i], bool) for row in rows)
-        table.add_column(column, justify="right" if numeric else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*[_cell(value) for value in row])
+    values = [[getattr(row, name) for name in columns] for row in rows]
+    for i, heading in enumerate(columns.values()):
+        numeric = any(isinstance(line[i], (int, float)) and not isinstance(line[i], bool) for line in values)
+        table.add_column(heading, justify="right" if numeric else "left", overflow="fold")
+    for line in values:
+        cells = zip(columns, line, strict=True)
+        table.add_row(*[_shown(short(value) if name in _DIGESTS else text(value)) for name, value in cells])
+    _print(table)
+
+
+def print_facts(title: str, facts: Mapping[str, Any]) -> None:
+    """Facts, one a line, on stdout; those that are None or empty are left out."""
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", box=None, show_header=False, padding=(0, 2, 0, 0))
+    table.add_column(overflow="fold")
+    table.add_column(overflow="fold")
+    for name, value in facts.items():
+        if value is not None and text(value) != "":
+            table.add_row(_shown(name), _shown(text(value)))
+    _print(table)
+
+
+def _print(table: Any) -> None:
+    from rich.console import Console
+
     Console(width=None if sys.stdout.isatty() else 200, highlight=False).print(table)
 
 
-def _cell(value: Any) -> str:
+def text(value: Any) -> str:
+    """A value as people read it in a table."""
     if value is None:
         return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
-    return str(value).replace("[", r"\[")
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {text(item)}" for name, item in value.items())
+    if hasattr(value, "tolist"):  # numpy arrays
+        return " ".join(text(item) for item in value.tolist())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(text(item) for item in value)
+    return str(value)
+
+
+def short(value: Any) -> str:
+    """As `text`, but of a content digest the first dozen digits."""
+    return value[:_SHORT] if isinstance(value, str) and _DIGEST.fullmatch(value) else text(value)
+
+
+def _shown(value: str) -> str:
+    return value.replace("[", r"\[")
+
+
+# --- maps ------------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
-def progress_bars() -> Iterator[Any]:
-    """Yields ``progress(stage, fraction, text)`` that draws one bar per stage on stderr (plain lines when piped)."""
+def opened(
+    path: str, *, create: bool = False, bars: bool = False, sets: Sequence[str] | None = None, preset: str | None = None
+) -> Iterator[Map]:
+    """A map, open until the verb is done.
+
+    Args:
+        create: make it where it is missing.
+        bars: show how far long work is.
+        sets, preset: settings for this run, as ``--set`` and ``--preset`` give them.
+    """
+    import gsmap.map
+    from gsmap.settings import parse
+
+    values = dict(parse(one) for one in sets or ())
+    open_map = gsmap.map.open_or_create if create else gsmap.map.open
+    with progress_bars() if bars else _no_bars() as progress, open_map(path, progress=progress) as m:
+        if values or preset is not None:
+            m.with_settings(values, preset)
+        yield m
+
+
+@contextmanager
+def _no_bars() -> Iterator[None]:
+    yield None
+
+
+@contextmanager
+def progress_bars() -> Iterator[StageProgress | None]:
+    """Yields what draws one bar per stage on stderr (plain lines when piped); None with ``-q``, and with ``-v``, when
+    the logs say as much.
+    """
+    if logging.getLogger("gsmap").getEffectiveLevel() != logging.WARNING:
+        yield None
+        return
     if not sys.stderr.isatty():
         yield _progress_lines()
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     with Progress(
         TextColumn("{task.fields[stage]:<10}"),
@@ -80,17 +215,17 @@ def progress_bars() -> Iterator[Any]:
         TextColumn("{task.description}"),
         console=Console(stderr=True),
     ) as bars:
-        tasks: dict[str, Any] = {}
+        tasks: dict[str, TaskID] = {}
 
         def progress(stage: str, fraction: float, text: str = "") -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task("", total=1.0, stage=stage)
-            bars.update(tasks[stage], completed=fraction, description=text)
+            bars.update(tasks[stage], completed=fraction, description=_shown(text))
 
         yield progress
 
 
-def _progress_lines() -> Any:
+def _progress_lines() -> StageProgress:
     """For logs: one line whenever what is being worked on changes, and at the end of each stage."""
     last: dict[str, str] = {}
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import print_table, progress_bars, say
+from gsmap.cli.console import AsJson, print_rows, print_table, progress_bars, say
+from gsmap.errors import MissingDependencyError
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -16,42 +18,69 @@ if TYPE_CHECKING:
 def command(
     folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Where to work; made if missing.")] = "gsmap-demo",
     seed: Annotated[int, typer.Option("--seed", help="Another flat, other walks through it.")] = 0,
+    json: AsJson = False,
 ) -> None:
     """Make three small captures of a furnished flat, map them, and show how close the map comes to the truth.
 
     Example: `gsmap demo`
     """
     import gsmap.map
-    from gsmap import demo
     from gsmap.cli.update import print_map
+    from gsmap.types.rows import DemoReport
 
+    synthetic = _synthetic()
     root = Path(folder)
     map_path = root / "demo.gsmap"
     with progress_bars() as progress:
-        captures = demo.make_captures(seed, progress=lambda fraction, text: progress("capture", fraction, text))
-        demo.write_captures(root / "captures", captures)
+        draw = progress or (lambda stage, fraction, text: None)
+        captures = synthetic.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))
+        synthetic.write_captures(root / "captures", captures)
         with gsmap.map.open_or_create(map_path, progress=progress) as m:
-            m.update(root / "captures")
-            report = m.export(root / "tiles", tile_size_m=0)
+            updated = m.update(root / "captures")
+            exported = m.export(root / "tiles", tile_size_m=0)
             _draw(m, root / "map.png")
-    with gsmap.open(map_path) as m:
-        print_map(m)
-        truth = m.evaluate(root / "captures" / "truth")
-    columns = ["pair", "rre_deg", "centroid_m"]
-    print_table("errors against the truth", columns, [[row[c] for c in columns] for row in truth["pairs"]])
+            truth = m.evaluate(root / "captures" / "truth")
+    report = DemoReport(
+        map=str(map_path),
+        picture=str(root / "map.png"),
+        scenes=updated.scenes,
+        edges=updated.edges,
+        tiles=exported.tiles,
+        truth=truth,
+    )
+    if json:
+        print_rows("demo", report, json)
+    else:
+        print_map(report.scenes, report.edges)
+        columns = {"pair": "pair", "rre_deg": "RRE, deg", "centroid_m": "centroid, m"}
+        print_table("errors against the truth", columns, truth.pairs)
     for tile in report.tiles:
         say(f"merged tile: {root / 'tiles' / tile.path} ({tile.num_gaussians} Gaussians; any 3DGS viewer opens it)")
-    say(f"picture: {root / 'map.png'}")
+    say(f"picture: {report.picture}")
     say(f"look around: gsmap view {map_path}")
+
+
+def _synthetic() -> ModuleType:
+    """The maker of synthetic scenes, a distribution of its own: maps of real captures need none of it."""
+    try:
+        import gsmap_synthetic
+    except ModuleNotFoundError as error:
+        if error.name != "gsmap_synthetic":
+            raise
+        raise MissingDependencyError(
+            "gsmap demo makes its captures with gsmap-synthetic, which is not installed: "
+            "pip install the folder synthetic/ of gsmap's source, or run tools/setup.sh there"
+        ) from error
+    module: ModuleType = gsmap_synthetic
+    return module
 
 
 def _draw(m: Map, path: Path) -> None:
     """The map's picture: every placed scene, what ties it to which, and where the cameras went."""
     from PIL import Image
 
-    from gsmap.demo.picture import map_picture
+    from gsmap.view.map_picture import map_picture
 
-    names = {scene.id: scene.name for scene in m.scenes()}
-    parts = [(name, *m.read(name, frame="map")) for name in names.values()]
-    edges = [(names[e["target"]], names[e["source"]]) for e in m.edge_rows() if e["used"]]
+    parts = [(scene.name, *m.read(scene.name, frame="map")) for scene in m.scenes()]
+    edges = [(row.target_name, row.source_name) for row in m.edge_rows() if row.used]
     Image.fromarray(map_picture(parts, edges)).save(path, optimize=True)

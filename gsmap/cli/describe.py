@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, progress_bars
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows
 
 
 def command(
@@ -14,18 +14,14 @@ def command(
     scenes: Annotated[
         list[str] | None, typer.Argument(metavar="[SCENE...]", help="Names or ids; all where none is given.")
     ] = None,
+    sets: Sets = None,
+    preset: Preset = None,
+    json: AsJson = False,
 ) -> None:
     """Make the scene graph of every scene that lacks one.
 
     Example: `gsmap describe site.gsmap`
     """
-    import gsmap
-
-    with progress_bars() as progress, gsmap.open(map, progress=progress) as m:
-        graphs = m.describe(*(scenes or ()))
-        names = {scene.id: scene.name for scene in m.scenes()}
-    for graph in graphs:
-        layers = ", ".join(f"{len(layer)} {name}" for name, layer in graph.layers.items()) or "no nodes"
-        print(f"{names[graph.scene_id]}\t{layers}")
-        for note in graph.notes:
-            print(f"{names[graph.scene_id]}\tnote: {note}")
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
+        rows = m.describe(*(scenes or ()))
+    print_rows("describe", rows, json, "graphs")

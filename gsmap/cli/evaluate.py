@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_json, print_table
+from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table
 
 
 def command(
@@ -15,21 +15,29 @@ def command(
     images: Annotated[
         str | None, typer.Option("--images", help="Folder of NAME_CAMERA.jpg frames to compare renders with.")
     ] = None,
+    lpips: Annotated[
+        str | None,
+        typer.Option("--lpips", metavar="FILE", help="Also compare images by this LPIPS network, an ONNX file."),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Compare poses with ground truth (and renders with the captures' own images).
 
     Example: `gsmap evaluate house.gsmap --truth captures/truth`
     """
-    import gsmap
+    from gsmap.errors import ConfigError
 
-    with gsmap.open(map) as m:
-        report = m.evaluate(truth, images=images)
+    if lpips is not None and images is None:
+        raise ConfigError("--lpips compares images: give --images too")
+    with opened(map, bars=images is not None) as m:
+        report = m.evaluate(truth, images=images, lpips=lpips)
     if json:
-        print_json(report)
+        print_rows("evaluate", report, json)
         return
-    for title, rows in report.items():
-        if isinstance(rows, list) and rows:
-            print_table(title, list(rows[0]), [list(row.values()) for row in rows])
-    summary = {k: v for k, v in report.items() if not isinstance(v, list)}
-    print_table("summary", ["metric", "value"], list(summary.items()))
+    if report.edges:
+        print_table("edges", report.edges[0].columns, report.edges)
+    if report.pairs:
+        print_table("pairs", report.pairs[0].columns, report.pairs)
+    if report.images:
+        print_table("images", report.images[0].columns, report.images)
+    print_facts("summary", {heading: getattr(report, name) for name, heading in report.columns.items()})

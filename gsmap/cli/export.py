@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, progress_bars, say
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
 
 
 def command(
@@ -18,9 +18,12 @@ def command(
         tuple[float, float, float, float, float, float] | None,
         typer.Option("--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only this box of the map."),
     ] = None,
-    merge: Annotated[str, typer.Option("--merge", help="tto, voxel, union or distance.")] = "tto",
+    merge: Annotated[
+        str | None,
+        typer.Option("--merge", help="tto, voxel, union or distance; what the setting merge.method says else."),
+    ] = None,
     revision: Annotated[int | None, typer.Option("--revision", help="Poses of this revision; the newest else.")] = None,
-    component: Annotated[int | None, typer.Option("--component", help="Only this island.")] = None,
+    component: Annotated[int | None, typer.Option("--component", help="Only this connected component.")] = None,
     steps: Annotated[
         int | None, typer.Option("--steps", help="Optimisation steps per tile; chosen by size else.")
     ] = None,
@@ -31,14 +34,15 @@ def command(
         bool,
         typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
     ] = False,
+    sets: Sets = None,
+    preset: Preset = None,
+    json: AsJson = False,
 ) -> None:
     """Write merged tiles; only what changed since the last export to OUT is computed.
 
     Example: `gsmap export site.gsmap tiles --format spz --tile-size 5`
     """
-    import gsmap
-
-    with progress_bars() as progress, gsmap.open(map, progress=progress) as m:
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.export(
             out,
             format=format,
@@ -51,6 +55,12 @@ def command(
             budget_s=budget,
             provenance=provenance,
         )
-    for tile in (t for t in report.tiles if t.path):
-        print(f"{tile.path}\t{tile.num_gaussians}{chr(9) + 'truncated' if tile.truncated else ''}")
+    for tile in report.tiles:
+        for note in tile.notes:
+            say(f"{tile.path}: {note}")
+    if json:
+        print_rows("export", report, json)
+    else:
+        columns = {"path": "file", "component": "component", "num_gaussians": "Gaussians", "truncated": "truncated"}
+        print_table(f"tiles in {out}", columns, report.tiles)
     say(f"{report.recomputed} tiles made, {report.reused} unchanged, {report.removed} removed")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, progress_bars, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 Paths = Annotated[list[str], typer.Argument(metavar="FILE_OR_FOLDER...", help="Captures: files or folders.")]
 CamerasFile = Annotated[str | None, typer.Option("--cameras", help="Cameras of the one capture given.")]
@@ -24,19 +24,15 @@ def command(
     name: Name = None,
     captured_at: CapturedAt = None,
     scale: Scale = "auto",
+    json: AsJson = False,
 ) -> None:
     """Add scenes: Gaussians with the cameras found beside them. The same content twice is a no-op that says so.
 
     Example: `gsmap ingest site.gsmap monday.ply tuesday/`
     """
-    import gsmap
-
-    with progress_bars() as progress, gsmap.open(map, progress=progress) as m:
-        results = m.ingest(*paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
-    for result in results:
-        for note in result.notes:
-            say(f"{result.scene.name}: {note}")
-        if result.new:
-            print(f"{result.scene.name}\t{result.scene.id}\t{result.scene.num_gaussians} Gaussians")
-        else:
-            print(f"{result.scene.name}\t{result.scene.id}\talready in the map, nothing changed")
+    with opened(map, bars=True) as m:
+        rows = m.ingest(*paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+    for row in rows:
+        for note in row.notes:
+            say(f"{row.scene_name}: {note}")
+    print_rows("ingest", rows, json)

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
-from gsmap.cli.console import MapPath, say
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, print_rows, say
 
 
-def command(map: MapPath) -> None:
+def command(
+    map: MapPath,
+    catalog: Annotated[
+        str | None,
+        typer.Option(
+            "--catalog",
+            metavar="URL",
+            help="Keep the catalog in this empty PostgreSQL database (an SQLAlchemy URL), for many writers.",
+        ),
+    ] = None,
+    json: AsJson = False,
+) -> None:
     """Make an empty map.
 
     Example: `gsmap init site.gsmap`
     """
     import gsmap.map
+    from gsmap.store.catalog import url_without_password
+    from gsmap.types.rows import InitReport
 
-    gsmap.map.create(map).close()
+    gsmap.map.create(map, catalog_url=catalog).close()
     say(f"made an empty map at {map}; next: gsmap update {map} CAPTURES...")
+    if json:
+        report = InitReport(map=map, catalog=None if catalog is None else url_without_password(catalog))
+        print_rows("init", report, json)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_json, print_table
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows
+
+if TYPE_CHECKING:
+    from gsmap.map import Map
+    from gsmap.types.rows import Row
 
 
 class What(StrEnum):
@@ -17,35 +22,55 @@ class What(StrEnum):
     tiles = "tiles"
 
 
-COLUMNS = {
-    What.scenes: ["name", "id", "num_gaussians", "num_nodes", "component", "captured_at", "status"],
-    What.edges: ["target", "source", "status", "used", "overlap", "num_inliers", "scale", "reason"],
-    What.revisions: ["number", "created_at", "scenes", "components", "edges_used", "edges_tentative", "edges_refused"],
-    What.tiles: ["out", "path", "component", "merge", "num_gaussians", "truncated"],
-}
-
-
-def command(map: MapPath, what: Annotated[What, typer.Argument(help="What to list.")], json: AsJson = False) -> None:
+def command(
+    map: MapPath,
+    what: Annotated[What, typer.Argument(help="What to list.")],
+    component: Annotated[
+        int | None,
+        typer.Option("--component", "--island", help="Only scenes, edges and tiles of this connected component."),
+    ] = None,
+    status: Annotated[str | None, typer.Option("--status", help="Only scenes or edges of this status.")] = None,
+    after: Annotated[
+        str | None,
+        typer.Option(
+            "--after",
+            metavar="DATE",
+            help="Only scenes captured, edges registered and revisions made after this, ISO 8601.",
+        ),
+    ] = None,
+    tag: Annotated[
+        str | None, typer.Option("--tag", help="Only scenes with this tag, and edges between such scenes.")
+    ] = None,
+    json: AsJson = False,
+) -> None:
     """List scenes, edges, revisions or tiles.
 
-    Example: `gsmap list site.gsmap edges --json`
+    Example: `gsmap list site.gsmap edges --status accepted --json`
     """
-    import gsmap
-
-    with gsmap.open(map) as m:
-        rows = {
-            What.scenes: m.scene_rows,
-            What.edges: m.edge_rows,
-            What.revisions: m.revision_rows,
-            What.tiles: m.tile_rows,
-        }[what]()
-    if json:
-        print_json(rows)
-        return
-    columns = COLUMNS[what]
-    print_table(what, columns, [[_short(c, row[c]) for c in columns] for row in rows])
+    with opened(map) as m:
+        rows = _rows(m, what, component, status, after, tag)
+    print_rows(f"list {what}", rows, json, what)
 
 
-def _short(column: str, value: object) -> object:
-    """Content digests are long; a dozen digits tell them apart."""
-    return value[:12] if column in {"id", "target", "source"} and isinstance(value, str) and len(value) >= 32 else value
+def _rows(
+    m: Map, what: What, component: int | None, status: str | None, after: str | None, tag: str | None
+) -> Sequence[Row]:
+    from gsmap.errors import ConfigError
+
+    if what is What.scenes:
+        return m.scene_rows(component=component, status=status, after=after, tag=tag)
+    if what is What.edges:
+        return m.edge_rows(component=component, status=status, after=after, tag=tag)
+    useless: dict[str, object]
+    if what is What.tiles:
+        useless = {"--status": status, "--after": after, "--tag": tag}
+    else:
+        useless = {"--status": status, "--component": component, "--tag": tag}
+    for option, value in useless.items():
+        if value is not None:
+            raise ConfigError(f"{what} are not chosen by {option}: leave it out")
+    if what is What.tiles:
+        return [row for row in m.tile_rows() if component is None or row.component == component]
+    from gsmap.map.reports import made_after
+
+    return made_after(m.revision_rows(), after)

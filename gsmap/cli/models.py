@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_json, print_table, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 app = typer.Typer(no_args_is_help=True, help="ONNX models for masks (`sam`) and image features (`clip`).")
 
@@ -23,16 +23,18 @@ def add(
     reference: Annotated[
         bool, typer.Option("--reference", help="Leave the file where it is; keep its digest.")
     ] = False,
+    json: AsJson = False,
 ) -> None:
     """Register a model: checked, copied into the map, and used by every later describe.
 
     Example: `gsmap models add site.gsmap clip mobilenet.onnx --preset imagenet`
     """
-    import gsmap
-
-    with gsmap.open(map) as m:
+    with opened(map) as m:
         m.add_model(kind, path, preset=preset, copy=not reference)
+        row = next(row for row in m.model_rows() if row.kind == kind)
     say(f"registered {kind}; run: gsmap update {map}")
+    if json:
+        print_rows("models add", row, json)
 
 
 @app.command(name="list")
@@ -41,12 +43,6 @@ def list_models(map: MapPath, json: AsJson = False) -> None:
 
     Example: `gsmap models list site.gsmap`
     """
-    import gsmap
-
-    with gsmap.open(map) as m:
+    with opened(map) as m:
         rows = m.model_rows()
-    if json:
-        print_json(rows)
-        return
-    columns = ["kind", "name", "sha256", "preset", "path"]
-    print_table("models", columns, [[row[c] for c in columns] for row in rows])
+    print_rows("models list", rows, json, "models")

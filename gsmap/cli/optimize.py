@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from gsmap.cli.console import MapPath, progress_bars
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, say
 
 
-def command(map: MapPath) -> None:
+def command(map: MapPath, sets: Sets = None, preset: Preset = None, json: AsJson = False) -> None:
     """Solve for all scene poses and keep them as a new revision.
 
     Example: `gsmap optimize site.gsmap`
     """
-    import gsmap
     from gsmap.cli.update import print_map
 
-    with progress_bars() as progress, gsmap.open(map, progress=progress) as m:
-        m.optimize()
-    with gsmap.open(map) as m:
-        print_map(m)
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
+        row = m.optimize()
+        scenes, edges = m.scene_rows(), m.edge_rows()
+    for note in row.notes:
+        say(f"revision {row.number}: {note}")
+    if json:
+        print_rows("optimize", row, json)
+    else:
+        print_map(scenes, edges)

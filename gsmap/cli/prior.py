@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 # An anchor gives way to nothing; a tape measures to a percent.
 _ANCHOR_RAD, _ANCHOR_M, _SCALE_SIGMA = 1e-4, 1e-4, 0.01
@@ -27,6 +27,7 @@ def command(
     ] = None,
     anchor: Annotated[bool, typer.Option("--anchor", help="The map's frame is this scene's own.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Take back what was said.")] = False,
+    json: AsJson = False,
 ) -> None:
     """Tell where a scene lies, in place of what was said of it before. The next optimize weighs it with the edges.
 
@@ -34,7 +35,6 @@ def command(
     """
     import numpy as np
 
-    import gsmap
     from gsmap.errors import ConfigError
     from gsmap.types import Prior, Sim3
 
@@ -51,10 +51,13 @@ def command(
         sigmas[3:6] = sigma / (scale or 1.0)
     if scale is not None:
         sigmas[6] = _SCALE_SIGMA
-    with gsmap.open(map) as m:
+    with opened(map) as m:
         if remove:
             m.remove_prior(scene)
         else:
             pose = Sim3(np.eye(3), np.array(position or (0.0, 0.0, 0.0)), scale or 1.0)
             m.set_prior(Prior(scene, pose, sigmas, None if up is None else np.array(up)))
+        row = m.show_scene(scene).prior
     say(f"noted; run: gsmap optimize {map}")
+    if json:
+        print_rows("prior", row, json)

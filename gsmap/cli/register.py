@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, progress_bars
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows
 
 
 def command(
     map: MapPath,
     pairs: Annotated[
-        str, typer.Option("--pairs", help="`auto` (candidates), `all`, or one pair as `A:B` (done again).")
+        str,
+        typer.Option(
+            "--pairs",
+            metavar="auto|all|A:B|FILE",
+            help="`auto` (candidates), `all`, one pair `A:B`, or a file with a pair a line, `A B` or `A:B`; "
+            "pairs that are named are done again.",
+        ),
     ] = "auto",
+    sets: Sets = None,
+    preset: Preset = None,
+    json: AsJson = False,
 ) -> None:
     """Register candidate pairs of scenes that lack an edge.
 
     Example: `gsmap register site.gsmap --pairs monday:tuesday`
     """
-    import gsmap
-
-    with progress_bars() as progress, gsmap.open(map, progress=progress) as m:
-        edges = m.register(pairs)
-        names = {scene.id: scene.name for scene in m.scenes()}
-    for edge in edges:
-        print(f"{names[edge.target]}:{names[edge.source]}\t{edge.status}\t{edge.reason}")
+    named = pairs in ("auto", "all") or (":" in pairs and not Path(pairs).is_file())
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
+        rows = m.register(pairs if named else Path(pairs))
+    print_rows("register", rows, json, "edges")

@@ -6,16 +6,20 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 
-def command(map: MapPath, scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")]) -> None:
+def command(
+    map: MapPath,
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")],
+    json: AsJson = False,
+) -> None:
     """Take a scene out of the map. Older revisions keep it; `gsmap prune` reclaims bytes nothing names.
 
     Example: `gsmap remove site.gsmap monday`
     """
-    import gsmap
-
-    with gsmap.open(map) as m:
-        removed = m.remove(scene)
-    say(f"removed {removed.name}; run: gsmap optimize {map}")
+    with opened(map) as m:
+        row = m.remove(scene)
+    say(f"removed {row.name}; run: gsmap optimize {map}")
+    if json:
+        print_rows("remove", row, json)

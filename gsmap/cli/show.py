@@ -2,47 +2,135 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_json, print_table, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table, say, text
+
+if TYPE_CHECKING:
+    from gsmap.map import Map
+    from gsmap.types import Sim3
+    from gsmap.types.rows import PairReport, SceneReport
+
+_SHOWN = 8  # edges, notes and events shown of many, so that everything fits a screen
 
 
 def command(
     map: MapPath,
-    thing: Annotated[str, typer.Argument(metavar="SCENE|A:B", help="A scene, or a pair of scenes.")],
-    json: AsJson = False,
+    thing: Annotated[
+        str,
+        typer.Argument(metavar="SCENE|A:B", help="A scene, or a pair of scenes; a scene whose name has a colon first."),
+    ],
+    nodes: Annotated[bool, typer.Option("--nodes", help="Also list the nodes of the scene's graph.")] = False,
     picture: Annotated[
         str | None, typer.Option("--picture", help="Also draw the scene's graph over a render, to this .png file.")
     ] = None,
+    json: AsJson = False,
 ) -> None:
     """Show everything known about one scene or one pair.
 
     Example: `gsmap show site.gsmap monday --picture monday.png`
     """
-    import gsmap
+    from gsmap.types.rows import SceneReport
 
-    with gsmap.open(map) as m:
-        facts = m.show_pair(thing) if ":" in thing else m.show_scene(thing)
+    with opened(map) as m:
+        report = _report(m, thing)
         if picture:
             m.draw_graph(thing, picture)
             say(f"wrote {picture}")
+    is_scene = isinstance(report, SceneReport)
     if json:
-        print_json(facts)
-        return
-    tables = {k: v for k, v in facts.items() if isinstance(v, list) and v and isinstance(v[0], dict)}
-    print_table(thing, ["what", "value"], [[k, _text(v)] for k, v in facts.items() if k not in tables])
-    for title, rows in tables.items():
-        columns = list(rows[0])
-        print_table(title, columns, [[_text(row.get(c)) for c in columns] for row in rows])
+        print_rows("show SCENE" if is_scene else "show A:B", report, json)
+    elif isinstance(report, SceneReport):
+        _print_scene(report, nodes)
+    else:
+        _print_pair(report)
 
 
-def _text(value: Any) -> Any:
-    if isinstance(value, dict):
-        return ", ".join(f"{k} {_text(v)}" for k, v in value.items())
-    if isinstance(value, (list, tuple)):
-        if value and isinstance(value[0], (list, tuple)):
-            return "\n".join(" ".join(f"{x: .5g}" for x in row) for row in value)
-        return ", ".join(str(_text(v)) for v in value)
-    return f"{value:.5g}" if isinstance(value, float) else value
+def _report(m: Map, thing: str) -> SceneReport | PairReport:
+    from gsmap.errors import NotFoundError
+
+    if ":" not in thing:
+        return m.show_scene(thing)
+    try:
+        return m.show_scene(thing)  # a name may hold a colon
+    except NotFoundError:
+        return m.show_pair(thing)
+
+
+def _print_scene(scene: SceneReport, nodes: bool) -> None:
+    size, prior, sigmas = scene.bounds[1] - scene.bounds[0], scene.prior, None
+    if scene.rotation_sigma_deg is not None:
+        sigmas = f"{text(scene.rotation_sigma_deg)} deg, {text(scene.translation_sigma_m)} m"
+    facts = {
+        "id": scene.id,
+        "status": scene.status,
+        "component": scene.component,
+        "pose in the map": _pose(scene.S_map_scene),
+        "its sigmas": sigmas,
+        "known from outside": prior and f"{_pose(prior.S_map_scene)}; {prior.outcome}",
+        "captured": scene.captured_at,
+        "ingested": scene.ingested_at,
+        "read from": scene.origin,
+        "tags": scene.tags,
+        "note": scene.note,
+        "Gaussians": f"{scene.num_gaussians}, SH degree {scene.sh_degree}" + ", antialiased" * scene.antialiased,
+        "cameras": f"{scene.num_cameras}" + ", synthesised" * scene.cameras_synthesised,
+        "size": f"{text(size)} units",
+        "scale": scene.scale_policy + ("" if scene.unit_m is None else f", about {text(scene.unit_m)} m a unit"),
+        "up": scene.up,
+        "nodes": None if scene.num_nodes is None else _layers(scene),
+        **{f"note {i}": note for i, note in enumerate(scene.notes[:_SHOWN], 1)},
+    }
+    print_facts(scene.name, facts)
+    if scene.edges:
+        print_table("edges", scene.edges[0].columns, scene.edges[:_SHOWN])
+    if len(scene.edges) > _SHOWN:
+        print(f"... and {len(scene.edges) - _SHOWN} more edges: gsmap list MAP edges")
+    if nodes and scene.nodes:
+        print_table("nodes", scene.nodes[0].columns, scene.nodes)
+
+
+def _print_pair(pair: PairReport) -> None:
+    facts = {
+        "target": f"{pair.target_name} ({pair.target})",
+        "source": f"{pair.source_name} ({pair.source})",
+        "status": pair.status,
+        "reason": pair.reason,
+        "used": pair.used,
+        "undecided": "yes: another group of edges contradicts it" if pair.undecided else None,
+        "review": pair.review,
+        "source in target": _pose(pair.S_target_source),
+        "overlap": pair.overlap,
+        "inliers": f"{pair.num_inliers} of {pair.num_correspondences} correspondences",
+        "proposer": pair.proposer,
+        "clique": None if pair.exact else "not proved largest",
+        "residual chi2": pair.residual_chi2,
+        "seconds": pair.seconds,
+        "evidence": pair.evidence,
+        **{f"note {i}": note for i, note in enumerate(pair.notes[:_SHOWN], 1)},
+    }
+    print_facts(pair.pair, facts)
+    if pair.history:
+        print_table("history", pair.history[0].columns, pair.history[-_SHOWN:])
+
+
+def _pose(pose: Sim3 | None) -> str | None:
+    """Where the origin lies, the angle and axis of the rotation, and the scale where there is one."""
+    if pose is None:
+        return None
+    import numpy as np
+
+    from gsmap.geometry.rotations import matrices_to_quats
+
+    w, *xyz = matrices_to_quats(pose.rotation[None])[0]
+    sine = float(np.linalg.norm(xyz))
+    angle = 2.0 * float(np.degrees(np.arctan2(sine, abs(w))))
+    axis = f" about {text(np.round(np.copysign(1.0, w) * np.array(xyz) / sine, 3))}" if sine > 1e-9 else ""
+    scale = "" if pose.is_rigid else f", scale {pose.scale:.5g}"
+    return f"at {text(np.round(pose.translation, 4))}, turned {angle:.2f} deg{axis}{scale}"
+
+
+def _layers(scene: SceneReport) -> str:
+    return ", ".join(f"{layer.num_nodes} {layer.layer}" for layer in scene.layers)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, print_table, progress_bars, say
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
 
 if TYPE_CHECKING:
-    from gsmap.map import Map
+    from gsmap.types.rows import EdgeRow, SceneRow
 
 
 def command(
@@ -17,52 +18,50 @@ def command(
     paths: Annotated[
         list[str] | None, typer.Argument(metavar="[FILE_OR_FOLDER...]", help="Captures to ingest first.")
     ] = None,
+    sets: Sets = None,
+    preset: Preset = None,
+    json: AsJson = False,
 ) -> None:
     """Make MAP if it is missing, ingest the files, then describe, register and optimize whatever is missing.
 
     Example: `gsmap update house.gsmap captures/*.ply`
     """
-    import gsmap.map
+    with opened(map, create=True, bars=True, sets=sets, preset=preset) as m:
+        report = m.update(*(paths or ()))
+    for row in report.ingested:
+        for note in row.notes:
+            say(f"{row.scene_name}: {note}")
+        if not row.new:
+            say(f"{row.scene_name}: {row.outcome}")
+    if json:
+        print_rows("update", report, json)
+    else:
+        print_map(report.scenes, report.edges)
 
-    with progress_bars() as progress, gsmap.map.open_or_create(map, progress=progress) as m:
-        for result in m.update(*(paths or ())):
-            for note in result.notes:
-                say(f"{result.scene.name}: {note}")
-            if not result.new:
-                say(f"{result.scene.name}: already in the map, nothing changed")
-    with gsmap.open(map) as m:
-        print_map(m)
 
-
-def print_map(m: Map) -> None:
-    """The closing table: scenes placed, edges with reasons, islands."""
-    rows = m.scene_rows()
-    print_table(
-        "scenes",
-        ["scene", "status", "island", "Gaussians", "nodes"],
-        [[r["name"], r["status"], r["component"], r["num_gaussians"], r["num_nodes"]] for r in rows],
-    )
-    names = {r["id"]: r["name"] for r in rows}
-    edges = m.edge_rows()
-    print_table(
-        "edges",
-        ["pair", "status", "used", "overlap", "inliers", "reason"],
-        [
-            [
-                f"{names[e['target']]}:{names[e['source']]}",
-                e["status"],
-                e["used"],
-                round(e["overlap"], 2),
-                e["num_inliers"],
-                e["reason"],
-            ]
-            for e in edges
-        ],
-    )
-    placed = [r for r in rows if r["S_map_scene"] is not None]
-    islands = {r["component"] for r in placed}
-    accepted = sum(e["status"] == "accepted" for e in edges)
+def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
+    """The closing tables: scenes placed, edges with reasons, and a line that sums them up."""
+    columns = {
+        "name": "scene",
+        "status": "status",
+        "component": "component",
+        "num_gaussians": "Gaussians",
+        "num_nodes": "nodes",
+    }
+    print_table("scenes", columns, scenes)
+    columns = {
+        "pair": "pair",
+        "status": "status",
+        "used": "used",
+        "overlap": "overlap",
+        "num_inliers": "inliers",
+        "reason": "reason",
+    }
+    print_table("edges", columns, edges)
+    placed = [row for row in scenes if row.S_map_scene is not None]
+    components = {row.component for row in placed}
+    accepted = sum(row.status == "accepted" for row in edges)
     print(
-        f"{len(placed)} of {len(rows)} scenes placed on {len(islands)} island{'s' * (len(islands) != 1)}; "
+        f"{len(placed)} of {len(scenes)} scenes placed in {len(components)} component{'s' * (len(components) != 1)}; "
         f"{accepted} edges accepted, {len(edges) - accepted} not"
     )

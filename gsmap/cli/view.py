@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import MapPath, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows
 
 
 def command(
     map: MapPath,
     port: Annotated[int, typer.Option("--port", help="Port on this machine; 0 takes a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+    json: AsJson = False,
 ) -> None:
     """Serve a page on this machine with the map's splats, graphs, poses and edges. Ctrl-C ends it.
 
     Example: `gsmap view site.gsmap`
     """
-    import gsmap
+    from gsmap.types.rows import ViewReport
 
-    with gsmap.open(map) as m, m.view(port=port) as server:
-        say(f"{server.url} (Ctrl-C ends it)")
+    with opened(map) as m, m.view(port=port) as server:
+        if json:
+            print_rows("view", ViewReport(url=server.url), json)
+        else:  # with -q too: without it nobody finds the page
+            print(f"{server.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
         if browser:
             import webbrowser
 

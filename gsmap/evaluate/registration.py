@@ -127,7 +127,7 @@ def absolute_trajectory_error(
     Args:
         estimated, true: (N, 3) positions in their own frames.
         align: ``rigid``, ``similarity`` or ``none``.
-        segments: index arrays to align one by one (islands share no frame); default all at once.
+        segments: index arrays to align one by one (components share no frame); default all at once.
     """
     estimated, true = np.asarray(estimated, float), np.asarray(true, float)
     if estimated.shape != true.shape or estimated.ndim != 2 or estimated.shape[1] != 3 or not len(true):

@@ -12,6 +12,7 @@ import numpy as np
 from gsmap.errors import InputError, NotFoundError
 from gsmap.evaluate.images import psnr, ssim
 from gsmap.types import Cameras, Gaussians
+from gsmap.types.progress import Progress
 
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
@@ -76,7 +77,7 @@ def compare_renders(
     images: Mapping[int, np.ndarray | Path],
     *,
     lpips: Callable[[np.ndarray, np.ndarray], float] | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Likeness:
     """Render the Gaussians at cameras and compare with pictures.
 

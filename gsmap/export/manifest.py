@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gsmap.durable import write_whole
 from gsmap.errors import ConfigError, InputError
 from gsmap.types import Sim3, Tile
+from gsmap.types.plain import plain
 
 FILE_NAME = "tiles.json"
-_VERSION = 1
+_VERSION = 2
+_NAMELESS = 1  # its tiles had a free text instead of a recipe, so that nobody knows what made them
 _SAVE_EVERY_S = 2.0
 
 
@@ -26,16 +30,20 @@ class Manifest:
         map_id: which map the folder belongs to.
         tiles: those that are finished.
         num_bytes: size of each tile's file, by path.
+        notes: what a person should know about the folder as it was found.
     """
 
     map_id: str
     tiles: dict[tuple[int, str], Tile] = field(default_factory=dict)
     num_bytes: dict[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
 
     @classmethod
     def load(cls, folder: Path, map_id: str) -> Manifest:
         """The folder's manifest; an empty one where the folder is empty or missing.
+
+        Tiles of version 1 have an empty key, which makes every one of them dirty.
 
         Raises:
             ConfigError: the folder holds another map's export, or files that are no export at all.
@@ -49,19 +57,29 @@ class Manifest:
                 raise ConfigError(f"{folder} holds files but no {FILE_NAME}: export to an empty or a new folder")
             return cls(map_id)
         try:
-            content = json.loads(path.read_text())
+            content = json.loads(path.read_text(encoding="utf-8"))
             version, owner = content["version"], content["map_id"]
-            entries = [(e["name"], _tile(e), int(e["num_bytes"])) for e in content["tiles"]]
+            if version not in (_NAMELESS, _VERSION):
+                raise ConfigError(
+                    f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
+                )
+            entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
         except (OSError, ValueError, KeyError, TypeError) as error:
+            if isinstance(error, ConfigError):
+                raise
             raise InputError(f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder") from error
-        if version != _VERSION:
-            raise ConfigError(f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder")
         if owner != map_id:
             raise ConfigError(f"{folder} holds the export of another map ({owner[:12]}): export to another folder")
+        notes: tuple[str, ...] = ()
+        if version == _NAMELESS and entries:
+            notes = (
+                f"{path} has version {version}, which does not say what made its tiles: all of them are made again",
+            )
         return cls(
             map_id,
             {(tile.component, name): tile for name, tile, _ in entries},
             {tile.path: size for _, tile, size in entries},
+            notes,
         )
 
     def has_file(self, folder: Path, tile: Tile) -> bool:
@@ -81,50 +99,46 @@ class Manifest:
     def save(self, folder: Path) -> None:
         """Replace the folder's manifest in one step."""
         entries = [
-            {
-                "name": name,
-                "component": tile.component,
-                "path": tile.path,
-                "bounds_m": tile.bounds.tolist(),
-                "num_gaussians": tile.num_gaussians,
-                "num_bytes": self.num_bytes.get(tile.path, 0),
-                "sha256": tile.sha256,
-                "method": tile.method,
-                "truncated": tile.truncated,
-                "key": tile.key,
-                "S_map_scene": {scene: pose.matrix().tolist() for scene, pose in sorted(tile.poses.items())},
-            }
-            for (_, name), tile in sorted(self.tiles.items())
+            _entry(name, tile, self.num_bytes.get(tile.path, 0)) for (_, name), tile in sorted(self.tiles.items())
         ]
-        content = {"version": _VERSION, "map_id": self.map_id, "tiles": entries}
-        staged = folder / f".{FILE_NAME}.partial"
-        with open(staged, "w") as file:
-            json.dump(content, file, indent=1)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(staged, folder / FILE_NAME)
-        sync_folder(folder)
+        text = json.dumps({"version": _VERSION, "map_id": self.map_id, "tiles": entries}, indent=1)
+        write_whole(folder / FILE_NAME, lambda staged: _write(staged, text))
         self._saved_at = time.monotonic()
 
 
-def sync_folder(folder: Path) -> None:
-    """Make the renames in a folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
-def _tile(entry: dict) -> Tile:
+def _entry(name: str, tile: Tile, num_bytes: int) -> dict[str, object]:
+    """A tile as ``tiles.json`` has it; docs/storage.md explains every field."""
+    return {
+        "name": name,
+        "component": tile.component,
+        "path": tile.path,
+        "bounds_m": tile.bounds.tolist(),
+        "num_gaussians": tile.num_gaussians,
+        "num_bytes": num_bytes,
+        "sha256": tile.sha256,
+        "key": tile.key,
+        "recipe": plain(tile.recipe),
+        "truncated": tile.truncated,
+        "notes": list(tile.notes),
+        "S_map_scene": {scene: pose.matrix().tolist() for scene, pose in sorted(tile.poses.items())},
+    }
+
+
+def _tile(entry: Mapping[str, Any], version: int) -> Tile:
+    known = version == _VERSION
     return Tile(
-        key=str(entry["key"]),
+        key=str(entry["key"]) if known else "",
         component=int(entry["component"]),
         bounds=np.array(entry["bounds_m"], dtype=np.float64),
         poses={scene: Sim3.from_matrix(np.array(matrix)) for scene, matrix in entry["S_map_scene"].items()},
         num_gaussians=int(entry["num_gaussians"]),
-        method=str(entry["method"]),
+        recipe=dict(entry["recipe"]) if known else {},
         truncated=bool(entry["truncated"]),
         path=str(entry["path"]),
         sha256=str(entry["sha256"]),
+        notes=tuple(str(note) for note in entry["notes"]) if known else (),
     )

@@ -1,19 +1,36 @@
-"""Which tiles an export consists of, and which of them an earlier export already made."""
+"""Which tiles an export consists of."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError
-from gsmap.types import Sim3, Tile
+from gsmap.types import Sim3
 
-DEFAULT_MOVED_M = 0.005
-_MAX_TILES = 1_000_000
+
+@dataclass(frozen=True)
+class Params:
+    """How a map is cut into tiles and kept up to date.
+
+    Args:
+        moved_m: a tile is made again when a scene moved farther than this within it.
+        max_tiles: an export of more tiles than this is refused.
+        workers: tiles that are merged at once, each in a thread of its own; memory grows with it.
+    """
+
+    moved_m: float = 0.005
+    max_tiles: int = 1_000_000
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise ConfigError(f"an export needs at least one worker, got {self.workers}")
+        if not self.moved_m >= 0:
+            raise ConfigError(f"moved_m must not be negative, got {self.moved_m}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +38,7 @@ class PlannedTile:
     """A tile to be exported.
 
     Args:
-        component: island it belongs to; each has its own frame and folder.
+        component: the component it belongs to; each has its own frame and folder.
         name: of its file, without suffix; unique in its component.
         bounds: (2, 3) float64 box in the component's map frame.
         poses: ``S_map_scene`` by scene id, of every scene that may reach into it.
@@ -34,11 +51,6 @@ class PlannedTile:
     poses: dict[str, Sim3]
     extent: str
 
-    def key(self, method: str) -> str:
-        """Digest of everything that decides the tile's content but the poses; scene ids are digests of content."""
-        text = json.dumps([method, self.component, self.extent, sorted(self.poses)])
-        return hashlib.sha256(text.encode()).hexdigest()
-
 
 def plan_tiles(
     poses: Mapping[str, Sim3],
@@ -48,6 +60,7 @@ def plan_tiles(
     components: Mapping[str, int] | None = None,
     bbox: np.ndarray | None = None,
     reach_m: float = 0.0,
+    max_tiles: int = Params.max_tiles,
 ) -> list[PlannedTile]:
     """Tiles of a grid through the map's origin that scenes reach into, in a fixed order.
 
@@ -55,12 +68,13 @@ def plan_tiles(
         poses: ``S_map_scene`` by scene id, of the scenes to export.
         scene_bounds: (2, 3) box of each scene's Gaussians in the scene's frame.
         tile_size_m: edge of a tile; 0 makes one tile of each component.
-        components: island of each scene; all 0 if None.
+        components: component of each scene; all 0 if None.
         bbox: (2, 3) only this box of the map; tiles are cut by it.
         reach_m: how far beyond its bounds a tile's content depends on scenes.
+        max_tiles: more tiles than this are refused.
 
     Raises:
-        ConfigError: a negative tile size, or one so small that there would be millions of tiles.
+        ConfigError: a negative tile size, or one so small that there would be too many tiles.
         InputError: no scenes, an empty box, or a box that no scene touches.
     """
     if not (np.isfinite(tile_size_m) and tile_size_m >= 0):
@@ -77,7 +91,9 @@ def plan_tiles(
             extent = np.array([np.maximum(extent[0], bbox[0]), np.minimum(extent[1], bbox[1])])
             if not (extent[1] > extent[0]).all():
                 continue
-        cells = _cells(extent, tile_size_m) if tile_size_m else [None]
+        cells: Sequence[tuple[int, int, int] | None] = [None]
+        if tile_size_m:
+            cells = _cells(extent, tile_size_m, max_tiles)
         for cell in cells:
             if cell is None:
                 bounds = extent if bbox is None else bbox
@@ -93,32 +109,12 @@ def plan_tiles(
             touching = {s: poses[s] for s, box in members.items() if box.touches(near)}
             place = json.dumps([tile_size_m, cell, None if bbox is None else bbox.tolist()])
             tiles.append(PlannedTile(component, name, bounds, touching, place))
-    if not tiles:
+    if not tiles and bbox is not None:
         whole = _around([_Box(poses[s], scene_bounds[s]).map_bounds for s in poses])
         raise InputError(
             f"the box {_text(bbox)} lies outside the map, which spans {_text(whole)}: choose a box that touches it"
         )
     return tiles
-
-
-def dirty_reason(planned: PlannedTile, tile: Tile | None, method: str, moved_m: float = DEFAULT_MOVED_M) -> str:
-    """Why a tile made earlier must be made again, in words; empty where it need not.
-
-    Poses are compared with those the tile was made with, not with the last revision, so slow drift cannot creep.
-    """
-    if tile is None:
-        return "new"
-    if tile.key != planned.key(method):
-        return "scenes, method or parameters changed"
-    low, high = planned.bounds
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    for scene, pose in planned.poses.items():
-        # How far the scene's content at the tile's corners has moved.
-        then = tile.poses[scene] @ pose.inverse()
-        moved = np.linalg.norm(then.apply(corners) - corners, axis=1).max()
-        if moved > moved_m:
-            return f"scene {scene[:12]} moved by {moved:.3g} m"
-    return ""
 
 
 class _Box:
@@ -142,11 +138,11 @@ class _Box:
         return bool((np.abs(offset) <= self.half + np.abs(self.axes.T) @ ((box[1] - box[0]) / 2) + 1e-5).all())
 
 
-def _cells(extent: np.ndarray, tile_size_m: float) -> list[tuple[int, int, int]]:
+def _cells(extent: np.ndarray, tile_size_m: float, max_tiles: int) -> list[tuple[int, int, int]]:
     first = np.floor(extent[0] / tile_size_m).astype(int)
     last = np.ceil(extent[1] / tile_size_m).astype(int)
     count = np.prod((last - first).astype(float))
-    if count > _MAX_TILES:
+    if count > max_tiles:
         raise ConfigError(
             f"tiles of {tile_size_m} m would be {count:.3g} over {_text(extent)}: use larger tiles or a box"
         )

@@ -8,11 +8,12 @@ import os
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from gsmap.export.manifest import sync_folder
+from gsmap.durable import write_whole
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
 from gsmap.types import Gaussians, Tile
@@ -58,13 +59,9 @@ def write_tilesets(out: Path, tiles: Sequence[Tile], tile_size_m: float) -> list
         while len(cells) > 1:
             cells = _one_level_up(folder, cells, known)
         (root,) = cells.values()
-        staged = folder / f".{FILE_NAME}.partial"
-        tiles3d.write_tileset(staged, root.node, transform=np.eye(4))  # the map's z is up where gsmap could tell
-        with open(staged, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(staged, folder / FILE_NAME)
+        # The map's z is up where gsmap could tell.
+        write_whole(folder / FILE_NAME, partial(tiles3d.write_tileset, root=root.node, transform=np.eye(4)))
         _remove_unnamed(folder, root.node)
-        sync_folder(folder)
         written.append(folder / FILE_NAME)
     return written
 

@@ -5,56 +5,59 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Protocol
 
 import numpy as np
 
 from gsmap import formats
-from gsmap.errors import ConfigError, GsmapError, StoreError
-from gsmap.export.manifest import Manifest, sync_folder
-from gsmap.export.plan import DEFAULT_MOVED_M, PlannedTile, dirty_reason
-from gsmap.types import Gaussians, Tile
+from gsmap.durable import sync_folder
+from gsmap.errors import GsmapError, StoreError
+from gsmap.export.manifest import Manifest
+from gsmap.export.plan import Params, PlannedTile
+from gsmap.export.recipe import TileRecipe, dirty_reason
+from gsmap.formats import tiles3d
+from gsmap.types import MergeResult, Tile
+from gsmap.types.progress import Progress, silent
 
 _STAGING = ".partial"
-
-
-class Made(Protocol):
-    """What making a tile returns; `gsmap.merge.MergeResult` is one."""
-
-    gaussians: Gaussians
-    origin: np.ndarray
-    truncated: bool
+Make = Callable[[PlannedTile, Progress], MergeResult]
+_At = tuple[int, str]  # component and name of a tile
 
 
 @dataclass(frozen=True, eq=False)
 class ExportResult:
-    """The tiles now in the folder, and how many of them were made, kept and removed by this export."""
+    """The tiles now in the folder, and what this export did.
+
+    Args:
+        tiles: all of them, in the plan's order.
+        recomputed: how many of them this export made.
+        reused: how many it found made.
+        removed: how many that are no longer in the plan it took away.
+        notes: what a person should know about the tiles that it made.
+    """
 
     tiles: list[Tile]
     recomputed: int
     reused: int
     removed: int
+    notes: tuple[str, ...] = ()
 
 
 def export_tiles(
     plan: Sequence[PlannedTile],
-    make: Callable[[PlannedTile, Callable[[float, str], None]], Made],
+    make: Make,
     out: str | os.PathLike[str],
     *,
     map_id: str,
-    method: str,
-    format: str = "ply",
-    write: Callable[[Path, Made], None] | None = None,
-    moved_m: float = DEFAULT_MOVED_M,
-    workers: int = 1,
-    made: Callable[[Tile, Made], None] | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    recipe: TileRecipe,
+    params: Params | None = None,
+    made: Callable[[Tile], None] | None = None,
+    progress: Progress | None = None,
 ) -> ExportResult:
     """Bring a folder to hold exactly the planned tiles, making only those that an earlier export did not.
 
@@ -63,46 +66,40 @@ def export_tiles(
 
     Args:
         plan: from `plan_tiles`.
-        make: makes one tile's content; called from ``workers`` threads.
+        make: makes one tile's content; called from ``params.workers`` threads.
         out: folder; made if missing; one folder per component inside.
         map_id: a folder keeps to one map.
-        method: text of merger and parameters; another text makes every tile dirty.
-        format: suffix of the tiles' files without the dot.
-        write: writes one tile's file; `gsmap.formats.write` if None.
-        moved_m: a tile is dirty when a scene moved farther than this within it.
-        made: told each new tile and its content once its file is in place (for provenance).
-        progress: told the fraction of tiles done and what is being done.
+        recipe: how tiles are made and written; where it differs from a tile's, that tile is made again.
+        params: from which movement on a tile is made again, and how many are made at once.
+        made: told each new tile once its file is in place; called from the calling thread.
+        progress: told the fraction of tiles done and what is being done; called from several threads, one at a time.
 
     Raises:
-        ConfigError: the folder belongs to another map or holds other files; an unknown format; no worker.
+        ConfigError: the folder belongs to another map or holds other files.
         StoreError: the folder cannot be written (read-only, full).
     """
-    if workers < 1:
-        raise ConfigError(f"an export needs at least one worker, got {workers}")
-    if write is None:
-        if f".{format}" not in formats.known("write"):
-            raise ConfigError(f"cannot write {format!r}: choose one of {', '.join(formats.known('write'))}")
-        write = _write_gaussians
+    params = params or Params()
     out = Path(out)
     manifest = Manifest.load(out, map_id)
-    signature = f"{method} {format}"
     old = manifest.tiles
-    todo = [t for t in plan if _must_make(t, old.get((t.component, t.name)), manifest, out, signature, moved_m)]
+    todo = [t for t in plan if _must_make(t, old.get((t.component, t.name)), manifest, out, recipe, params)]
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
     if not todo and not gone and out.exists():
         return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
 
-    report = _Report(progress, len(plan), reused)
+    report = _Report(progress or silent, len(plan), reused)
+    news: dict[_At, Tile] = {}
     try:
         (out / _STAGING).mkdir(parents=True, exist_ok=True)
-        with closing(
-            _finished(todo, lambda t: _make(t, make, write, out, signature, format, made, report), workers)
-        ) as news:
-            for at, tile, num_bytes in news:
+        with closing(_finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers)) as finished:
+            for at, tile, num_bytes in finished:
                 _remove(out, old.get(at), unless=tile.path)
                 manifest.tiles[at], manifest.num_bytes[tile.path] = tile, num_bytes
+                news[at] = tile
+                if made is not None:
+                    made(tile)
                 report.tile_done()
                 manifest.save_sometimes(out)
         manifest.tiles = {at: tile for at, tile in manifest.tiles.items() if at in planned}
@@ -120,33 +117,27 @@ def export_tiles(
         raise
     finally:
         shutil.rmtree(out / _STAGING, ignore_errors=True)
-    return ExportResult([manifest.tiles[at] for at in sorted(planned)], len(todo), reused, len(gone))
+    tiles = [manifest.tiles[at] for at in sorted(planned)]
+    return ExportResult(tiles, len(todo), reused, len(gone), manifest.notes + _told(news))
 
 
 def _must_make(
-    planned: PlannedTile, tile: Tile | None, manifest: Manifest, out: Path, signature: str, moved_m: float
+    planned: PlannedTile, tile: Tile | None, manifest: Manifest, out: Path, recipe: TileRecipe, params: Params
 ) -> bool:
-    return bool(dirty_reason(planned, tile, signature, moved_m)) or not manifest.has_file(out, tile)
+    if dirty_reason(planned, tile, recipe, params.moved_m):
+        return True
+    return tile is None or not manifest.has_file(out, tile)
 
 
-def _make(
-    planned: PlannedTile,
-    make: Callable[[PlannedTile, Callable[[float, str], None]], Made],
-    write: Callable[[Path, Made], None],
-    out: Path,
-    signature: str,
-    format: str,
-    made: Callable[[Tile, Made], None] | None,
-    report: _Report,
-) -> tuple[tuple[int, str], Tile, int]:
+def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, report: _Report) -> tuple[_At, Tile, int]:
     """Make one tile, put its file in place, and describe it."""
     content = make(planned, report.within_tile)
     path, digest, num_bytes = "", "", 0
     if len(content.gaussians):
-        path = f"component_{planned.component}/{planned.name}.{format}"
-        staged = out / _STAGING / f"component_{planned.component}_{planned.name}.{format}"
+        path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
+        staged = out / _STAGING / path.replace("/", "_")
         try:
-            write(staged, content)
+            _write(staged, content, recipe)
         except GsmapError as error:
             # A full disk is a matter of the folder, not of what was written.
             raise error.__cause__ if isinstance(error.__cause__, OSError) else error from None
@@ -155,23 +146,27 @@ def _make(
         os.replace(staged, out / path)
         sync_folder((out / path).parent)
     tile = Tile(
-        key=planned.key(signature),
+        key=recipe.key(planned),
         component=planned.component,
         bounds=planned.bounds,
         poses=dict(planned.poses),
         num_gaussians=len(content.gaussians),
-        method=signature,
+        recipe=recipe.merge.to_json(),
         truncated=content.truncated,
         path=path,
         sha256=digest,
+        notes=tuple(content.notes),
     )
-    if made is not None:
-        made(tile, content)
     return (planned.component, planned.name), tile, num_bytes
 
 
-def _write_gaussians(path: Path, content: Made) -> None:
-    formats.write(path, content.gaussians)
+def _write(path: Path, content: MergeResult, recipe: TileRecipe) -> None:
+    if recipe.is_tileset:
+        tiles3d.write_content(path, content.gaussians)
+    elif recipe.provenance:
+        formats.write(path, content.gaussians, extra={"scene": content.origin.astype(np.float32)})
+    else:
+        formats.write(path, content.gaussians)
 
 
 def _synced_digest(path: Path) -> tuple[str, int]:
@@ -190,7 +185,18 @@ def _remove(out: Path, tile: Tile | None, unless: str = "") -> None:
         (out / tile.path).parent.rmdir()
 
 
-def _finished(todo: Sequence[PlannedTile], make: Callable, workers: int) -> Iterator:
+def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
+    """The notes of new tiles, each once, with the tile it is about or how many tiles it is about."""
+    about: dict[str, list[str]] = {}
+    for (component, name), tile in sorted(news.items()):
+        for note in tile.notes:
+            about.setdefault(note, []).append(f"component_{component}/{name}")
+    return tuple(f"{at[0] if len(at) == 1 else f'{len(at)} tiles'}: {note}" for note, at in about.items())
+
+
+def _finished(
+    todo: Sequence[PlannedTile], make: Callable[[PlannedTile], tuple[_At, Tile, int]], workers: int
+) -> Generator[tuple[_At, Tile, int], None, None]:
     """Results of ``make`` as they come; the first error ends it, and what has not begun is never begun."""
     if workers == 1 or len(todo) < 2:
         yield from map(make, todo)
@@ -206,18 +212,16 @@ def _finished(todo: Sequence[PlannedTile], make: Callable, workers: int) -> Iter
 class _Report:
     """Progress over all tiles, from any thread."""
 
-    def __init__(self, progress: Callable[[float, str], None] | None, total: int, done: int) -> None:
+    def __init__(self, progress: Progress, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done
         self._lock = Lock()
 
     def within_tile(self, fraction: float, text: str) -> None:
-        if self._progress is not None:
-            with self._lock:
-                at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
-                self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")
+        with self._lock:
+            at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
+            self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")
 
     def tile_done(self) -> None:
-        if self._progress is not None:
-            with self._lock:
-                self._done += 1
-                self._progress(self._done / self._total, f"tile {self._done} of {self._total}")
+        with self._lock:
+            self._done += 1
+            self._progress(self._done / self._total, f"tile {self._done} of {self._total}")

@@ -1,53 +1,32 @@
 """Files of Gaussians: one module per format, found by suffix.
 
-A module has ``read(path) -> Gaussians``, ``write(path, gaussians, **options)`` or both, and, where the format can say
-more, ``info(path) -> Info``. Modules are imported on first use.
+The contract of a format is in `gsmap.methods.format`; another package adds one by an entry point in the group
+``gsmap.formats``, named by its suffix. Modules are imported on first use.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
-from dataclasses import dataclass
+import sys
+from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 
-from gsmap.errors import InputError, NotFoundError
-from gsmap.types import Cameras, Gaussians
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.methods import family
+from gsmap.types import Cameras, FileInfo, Gaussians
 
-# Suffix -> module of this package. The longest suffix wins, so `.compressed.ply` goes before `.ply`.
-MODULES: dict[str, str] = {
-    ".compressed.ply": "compressed_ply",
-    ".glb": "glb",
-    ".ply": "ply",
-    ".sog": "sog",
-    ".splat": "splat",
-    ".spz": "spz",
-    "tileset.json": "tiles3d",
-}
 _MAX_MESSAGE = 300
 
 
-@dataclass(frozen=True)
-class Info:
-    """What a file says about itself beside its Gaussians.
-
-    Args:
-        antialiased: trained with the 2D Mip filter.
-        notes: what a person should know about how it was read.
-    """
-
-    antialiased: bool = False
-    notes: tuple[str, ...] = ()
-
-
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
-    """The registered suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None."""
+    """The longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None."""
     name = Path(path).name.lower()
-    return max((s for s in MODULES if name.endswith(s)), key=len, default=None)
+    return max((s for s in _suffixes(tuple(sys.path)) if name.endswith(s)), key=len, default=None)
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
@@ -58,18 +37,19 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         InputError: unknown suffix, or a file that is not what its suffix says; values are checked by `gsmap.ingest`.
     """
     path = Path(path)
-    module = _module(path, "read")
+    suffix = _suffix(path, "read")
     # NaN and overflow in a damaged file are for `gsmap.ingest` to name, not for numpy to warn of.
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return module.read(path)
+        found: Gaussians = _load(_layout(path, suffix)).read(path)
+        return found
 
 
-def info(path: str | os.PathLike[str]) -> Info:
-    """What the file says about itself beside its Gaussians; an empty `Info` where the format says nothing."""
+def info(path: str | os.PathLike[str]) -> FileInfo:
+    """What the file says about itself beside its Gaussians; an empty `FileInfo` where the format says nothing."""
     path = Path(path)
-    module = _module(path, "read")
+    module = _load(_suffix(path, "read"))
     with _explained(path, "read"):
-        return module.info(path) if hasattr(module, "info") else Info()
+        return module.info(path) if hasattr(module, "info") else FileInfo()
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object) -> None:
@@ -83,7 +63,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object)
         InputError: unknown suffix, a format that is only read, or a path that cannot be written.
     """
     path = Path(path)
-    module = _module(path, "write")
+    module = _load(_suffix(path, "write"))
     staged = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         with _explained(path, "write"):
@@ -104,26 +84,49 @@ def read_cameras(path: str | os.PathLike[str]) -> Cameras:
 
 def known(verb: str) -> list[str]:
     """The suffixes that can be read (``verb="read"``) or written (``"write"``)."""
-    return sorted(suffix for suffix in MODULES if hasattr(_load(suffix), verb))
+    return [suffix for suffix in _suffixes(tuple(sys.path)) if _can(suffix, verb)]
 
 
-def _load(suffix: str) -> ModuleType:
-    return importlib.import_module(f"gsmap.formats.{MODULES[suffix]}")
+@lru_cache(maxsize=4)
+def _suffixes(places: tuple[str, ...]) -> tuple[str, ...]:
+    """All suffixes; ``places`` (`sys.path`) are looked through for other packages' once, as that takes milliseconds."""
+    return family("format").names()
 
 
-def _module(path: Path, verb: str) -> ModuleType:
+def _load(suffix: str) -> Any:
+    return family("format").get(suffix)
+
+
+def _can(suffix: str, verb: str) -> bool:
+    """Whether a format reads or writes; another package's that cannot be loaded does neither."""
+    try:
+        return hasattr(_load(suffix), verb)
+    except ConfigError:
+        return False
+
+
+def _suffix(path: Path, verb: str) -> str:
+    """The suffix of a path that can be read or written."""
     suffix = suffix_of(path)
     if suffix is None:
         what = f"has the unknown suffix {path.suffix!r}" if path.suffix else "has no suffix"
         raise InputError(f"{path} {what}: gsmap can {verb} {', '.join(known(verb))}")
-    module = _load(suffix)
-    if not hasattr(module, verb):
+    if not hasattr(_load(suffix), verb):
         raise InputError(f"{path}: gsmap cannot {verb} {suffix} files; it can {verb} {', '.join(known(verb))}")
-    return module
+    return suffix
+
+
+def _layout(path: Path, suffix: str) -> str:
+    """The suffix that stands for what is in the file: some programs call a ``.compressed.ply`` a ``.ply``."""
+    if suffix != ".ply":
+        return suffix
+    from gsmap.formats import ply
+
+    return ".compressed.ply" if ply.is_compressed(ply.read_header(path)) else suffix
 
 
 @contextlib.contextmanager
-def _explained(path: Path, verb: str):
+def _explained(path: Path, verb: str) -> Iterator[None]:
     """Turn what the operating system says into one typed line, and keep what a damaged file says within one."""
     try:
         yield

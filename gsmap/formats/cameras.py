@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
-from typing import Any
 
-from gsmap.errors import GsmapError, InputError, NotFoundError
+from gsmap.errors import GsmapError, InputError
+from gsmap.formats import cameras_json, colmap, nerfstudio
+from gsmap.formats.camera_files import load_json
 from gsmap.types import Cameras
 
 
@@ -21,8 +21,6 @@ def read(path: str | os.PathLike[str]) -> Cameras:
         NotFoundError: no such file or folder.
         InputError: neither of the three, or damaged.
     """
-    from gsmap.formats import cameras_json, colmap, nerfstudio
-
     path = Path(path)
     try:
         if path.is_dir():
@@ -41,22 +39,3 @@ def read(path: str | os.PathLike[str]) -> Cameras:
             raise
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"{path} does not hold cameras: {what}") from error
-
-
-def load_json(path: Path) -> Any:
-    if not path.exists():
-        raise NotFoundError(f"cannot read cameras from {path}: no such file")
-    try:
-        return json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON: {error}") from error
-
-
-def unique(names: list[str]) -> tuple[str, ...]:
-    """The names, with ``#2`` and so on where one comes again."""
-    seen: dict[str, int] = {}
-    out = []
-    for name in names:
-        seen[name] = seen.get(name, 0) + 1
-        out.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
-    return tuple(out)

@@ -12,7 +12,6 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.formats import ply
-from gsmap.formats.ply import SH_C0
 from gsmap.formats.quantise import (
     from_smallest_three,
     logits_of_bytes,
@@ -21,7 +20,10 @@ from gsmap.formats.quantise import (
     smallest_three,
 )
 from gsmap.geometry.morton import morton_order
+from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.types import Gaussians
+
+VERSION = 1
 
 _CHUNK = 256
 _BOUNDS = [f"{end}_{of}{axis}" for of in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
@@ -57,7 +59,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         rgb_low, rgb_high = (np.stack([chunks[f"{end}_{c}"] for c in "rgb"], 1) for end in ("min", "max"))
         rgb = _between(rgb, rgb_low, rgb_high)
     sh = np.empty((n, 1, 3), np.float32)
-    sh[:, 0] = (rgb - 0.5) / SH_C0
+    sh[:, 0] = sh0_of_rgb(rgb)
     if "sh" in header.elements:
         sh = np.concatenate([sh, _read_sh(path, header, n)], axis=1)
     return Gaussians(
@@ -77,7 +79,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     log_scales = np.clip(g.log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE)
     position, low, high = _within_chunks(g.means)
     scale, scale_low, scale_high = _within_chunks(log_scales)
-    rgb, rgb_low, rgb_high = _within_chunks(g.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5))
+    rgb, rgb_low, rgb_high = _within_chunks(rgb_of_sh0(g.sh[:, 0]))
     colour = np.concatenate([np.round(rgb * 255).astype(np.uint8), opacity_bytes(g.logit_opacities)[:, None]], axis=1)
     packed = np.empty((n, 4), "<u4")
     packed[:, 0] = _pack_11_10_11(position)

@@ -18,10 +18,12 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.formats.axes import GLTF, PLY, change_axes
-from gsmap.formats.ply import SH_C0
 from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
+from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, Sim3
+
+VERSION = 1
 
 EXTENSION = "KHR_gaussian_splatting"
 _MAX_JSON_BYTES = 16 << 20
@@ -134,7 +136,7 @@ def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.n
 
 def _point_colours(g: Gaussians) -> np.ndarray:
     """(N, 4) uint8 linear RGB and opacity, for viewers that draw the Gaussians as points."""
-    srgb = np.clip(g.sh[:, 0] * SH_C0 + 0.5, 0, 1)
+    srgb = np.clip(rgb_of_sh0(g.sh[:, 0]), 0, 1)
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     rgb = np.round(linear * 255).astype(np.uint8)
     return np.concatenate([rgb, opacity_bytes(g.logit_opacities)[:, None]], axis=1)

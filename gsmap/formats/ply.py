@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats import Info
-from gsmap.types import Gaussians
+from gsmap.geometry.sh import sh0_of_rgb
+from gsmap.types import FileInfo, Gaussians
+
+VERSION = 1
 
 HEADER_LIMIT_BYTES = 64 * 1024
-SH_C0 = 0.28209479177387814  # Y_0^0: colour = 0.5 + SH_C0 * f_dc
 
 _TYPES = {
     "char": "i1",
@@ -77,9 +78,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """
     header = read_header(path)
     if is_compressed(header):
-        from gsmap.formats import compressed_ply
-
-        return compressed_ply.read(path)
+        raise InputError(f"{path} holds the layout of a .compressed.ply: read it with gsmap.formats.read, which looks")
     rows = read_element(path, header, "vertex")
     names = set(header.elements["vertex"].names)
     rest = _rest_names(path, names)
@@ -108,7 +107,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
             sh[block, 1:] = channel_major.reshape(len(part), 3, k - 1).transpose(0, 2, 1)
     if not has_dc:
         top = np.iinfo(rows.dtype["red"]).max if rows.dtype["red"].kind in "iu" else 1.0
-        sh[:, 0] = (sh[:, 0] / top - 0.5) / SH_C0
+        sh[:, 0] = sh0_of_rgb(sh[:, 0] / top)
     if flat:
         log_scales[:, 2] = log_scales[:, :2].min(1) + np.log(1e-3)
     if "filter_3D" in names:
@@ -116,7 +115,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     return Gaussians(means, quats, log_scales, logits[:, 0], sh)
 
 
-def info(path: str | os.PathLike[str]) -> Info:
+def info(path: str | os.PathLike[str]) -> FileInfo:
     """Whether it was trained antialiased, and what reading it changed."""
     header = read_header(path)
     names = header.elements["vertex"].names if "vertex" in header.elements else ()
@@ -129,7 +128,7 @@ def info(path: str | os.PathLike[str]) -> Info:
     if names and "f_dc_0" not in names and "red" in names:
         notes.append("colours from red green blue: no view dependence")
     antialiased = "splatrendermode: mip" in text or "antialiased" in text or "filter_3D" in names
-    return Info(antialiased, tuple(notes))
+    return FileInfo(antialiased, tuple(notes))
 
 
 def write(

@@ -18,6 +18,8 @@ from gsmap.errors import InputError
 from gsmap.formats.quantise import from_smallest_three, logits_of_bytes
 from gsmap.types import Gaussians
 
+VERSION = 1
+
 _MAX_META_BYTES = 4 << 20
 _MAX_PIXELS = 1 << 26  # 64 million Gaussians, 256 MiB an image
 _SH_COEFFICIENTS = (0, 3, 8, 15)

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats.ply import SH_C0
 from gsmap.formats.quantise import logits_of_bytes, opacity_bytes, require_writable
+from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.types import Gaussians
+
+VERSION = 1
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgb", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
 _TINY = np.finfo(np.float32).tiny
@@ -34,7 +36,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     quats[~quats.any(1), 0] = 1
     with np.errstate(invalid="ignore"):  # a negative scale becomes NaN, which validation names
         log_scales = np.log(np.where(rows["scale"] == 0, _TINY, rows["scale"]))
-    sh = (rows["rgb"].astype(np.float32) / 255 - 0.5) / SH_C0
+    sh = sh0_of_rgb(rows["rgb"].astype(np.float32) / 255)
     return Gaussians(rows["mean"], quats, log_scales, logits_of_bytes(rows["opacity"]), sh[:, None])
 
 
@@ -44,7 +46,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     rows = np.empty(len(gaussians), _ROW)
     rows["mean"] = gaussians.means
     rows["scale"] = gaussians.scales
-    rows["rgb"] = np.round(np.clip(gaussians.sh[:, 0] * SH_C0 + 0.5, 0, 1) * 255)
+    rows["rgb"] = np.round(np.clip(rgb_of_sh0(gaussians.sh[:, 0]), 0, 1) * 255)
     rows["opacity"] = opacity_bytes(gaussians.logit_opacities)
     unit = gaussians.quats / np.maximum(np.linalg.norm(gaussians.quats, axis=1, keepdims=True), 1e-30)
     rows["quat"] = np.clip(np.round(unit * 128 + 128), 0, 255)

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError
-from gsmap.formats import Info
 from gsmap.formats.axes import PLY, SPZ, change_axes
 from gsmap.formats.quantise import (
     check_size,
@@ -26,7 +25,9 @@ from gsmap.formats.quantise import (
     require_writable,
     smallest_three,
 )
-from gsmap.types import Gaussians
+from gsmap.types import FileInfo, Gaussians
+
+VERSION = 1
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
@@ -75,7 +76,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     return change_axes(_decode(header, streams), PLY, axes)
 
 
-def info(path: str | os.PathLike[str]) -> Info:
+def info(path: str | os.PathLike[str]) -> FileInfo:
     """Whether it was trained antialiased, and what reading it leaves out."""
     with open(path, "rb") as file:
         head = file.read(32)
@@ -83,7 +84,7 @@ def info(path: str | os.PathLike[str]) -> Info:
             head = _Inflater(path, file).take(16)
     header = _parse_header(path, head)
     notes = ("SH of degree 4 was cut to degree 3",) if header.degree == 4 else ()
-    return Info(bool(header.flags & _ANTIALIASED), notes)
+    return FileInfo(bool(header.flags & _ANTIALIASED), notes)
 
 
 def write(

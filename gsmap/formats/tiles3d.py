@@ -28,6 +28,8 @@ from gsmap.formats.quantise import require_writable
 from gsmap.geometry.voxels import covariances, merge_groups, voxel_labels
 from gsmap.types import Gaussians
 
+VERSION = 1
+
 CONTENT_FOLDER = "tiles"
 _MAX_JSON_BYTES = 64 << 20
 _MAX_DEPTH = 64

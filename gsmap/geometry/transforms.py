@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.directions import fibonacci_sphere
 from gsmap.geometry.rotations import matrices_to_quats, multiply_quats
+from gsmap.geometry.sh import SH_C0
 from gsmap.types import Cameras, Gaussians, Sim3
 
 _MAX_SH_DEGREE = 3
@@ -52,7 +54,7 @@ def sh_rotation_matrix(rotation: np.ndarray, degree: int) -> np.ndarray:
     Each band is closed under rotation, so its block follows exactly from the basis at a set of fixed directions and at
     the same directions rotated back.
     """
-    directions = _fibonacci_sphere(4 * (degree + 1) ** 2)
+    directions = fibonacci_sphere(4 * (degree + 1) ** 2)
     basis = sh_basis(directions, degree)
     rotated = sh_basis(directions @ np.asarray(rotation, dtype=np.float64), degree)
     matrix = np.zeros((basis.shape[1],) * 2)
@@ -70,7 +72,7 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     x, y, z = np.asarray(directions, dtype=np.float64).T
     xx, yy, zz = x * x, y * y, z * z
     basis = [
-        np.full_like(x, 0.28209479177387814),
+        np.full_like(x, SH_C0),
         -0.4886025119029199 * y,
         0.4886025119029199 * z,
         -0.4886025119029199 * x,
@@ -88,12 +90,3 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
         -0.5900435899266435 * x * (xx - 3 * yy),
     ]
     return np.stack(basis[: (degree + 1) ** 2], axis=1)
-
-
-def _fibonacci_sphere(count: int) -> np.ndarray:
-    """Well spread unit directions (count, 3)."""
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    angle = np.pi * (1 + 5**0.5) * i
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

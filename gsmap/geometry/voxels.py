@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError
+from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.types import Gaussians
 
@@ -31,10 +32,7 @@ def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
     extent = cells.max(0) + 1
     if not np.isfinite(extent).all() or np.prod(extent) >= 2**63:
         raise InputError(f"points span {extent.max():.3g} voxels of {voxel_size}: remove outliers or use larger voxels")
-    cells = cells.astype(np.int64)
-    sides = extent.astype(np.int64)
-    key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-    return np.unique(key, return_inverse=True)[1].reshape(-1)
+    return cell_labels(cells)[0]
 
 
 def covariances(gaussians: Gaussians) -> np.ndarray:

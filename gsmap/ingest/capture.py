@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,9 +14,8 @@ from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.synthesise import synthesise_cameras
 from gsmap.ingest.validate import validate
 from gsmap.types import Cameras, Gaussians
+from gsmap.types.progress import Progress
 from gsmap.types.scene import SCALE_POLICIES
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,25 +82,57 @@ def read_capture(
     scale_policy: str = "auto",
 ) -> Capture:
     """Read and check one capture that `find_captures` found; see `read_captures`."""
-    if scale_policy not in SCALE_POLICIES:
-        raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
-    when = _iso(captured_at)
     gaussians = formats.read(found.path)
     about = formats.info(found.path)
-    notes = list(about.notes) + ([found.note] if found.note else [])
-    where = str(found.path)
-    notes += validate(gaussians, where=where)
     source = Path(cameras) if cameras is not None else found.cameras
-    if source is None:
-        views = synthesise_cameras(gaussians)
-        notes.append(f"no cameras were found beside it: {len(views)} were synthesised in its free space")
+    capture = take_capture(
+        gaussians,
+        None if source is None else formats.read_cameras(source),
+        name=name or found.name,
+        captured_at=captured_at,
+        scale_policy=scale_policy,
+        source=str(found.path),
+        cameras_source="" if source is None else str(source),
+    )
+    notes = (*about.notes, *([found.note] if found.note else []), *capture.notes)
+    return replace(capture, antialiased=about.antialiased, notes=notes)
+
+
+def take_capture(
+    gaussians: Gaussians,
+    cameras: Cameras | None = None,
+    *,
+    name: str,
+    captured_at: str | datetime | None = None,
+    scale_policy: str = "auto",
+    source: str = "",
+    cameras_source: str = "",
+) -> Capture:
+    """Check one capture that is in memory; cameras are synthesised where there are none.
+
+    Raises:
+        InputError: what makes no capture; see `gsmap.ingest.validate`.
+        ConfigError: an unknown scale policy, or a date that is none.
+    """
+    if scale_policy not in SCALE_POLICIES:
+        raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
+    when = parse_date(captured_at)
+    where = source or f"capture {name!r}"
+    notes = list(validate(gaussians, where=where))
+    if cameras is None:
+        cameras = synthesise_cameras(gaussians)
+        notes.append(f"no cameras were found beside it: {len(cameras)} were synthesised in its free space")
     else:
-        views = formats.read_cameras(source)
-        notes += validate(gaussians, views, where=f"{where} with {source}")
-    return Capture(gaussians, views, name or found.name, where, when, scale_policy, about.antialiased, tuple(notes))
+        notes += validate(gaussians, cameras, where=f"{where} with {cameras_source}" if cameras_source else where)
+    return Capture(gaussians, cameras, name, source, when, scale_policy, notes=tuple(notes))
 
 
-def _iso(when: str | datetime | None) -> str | None:
+def parse_date(when: str | datetime | None) -> str | None:
+    """ISO 8601 with its zone (UTC where it has none); None stays None.
+
+    Raises:
+        ConfigError: not a date.
+    """
     if when is None:
         return None
     try:

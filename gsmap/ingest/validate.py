@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras, Gaussians
 
 # A Gaussian this many times wider than the scene is not a background; it is a broken file.
@@ -50,14 +51,10 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
 def sees(cameras: Cameras, points: np.ndarray) -> np.ndarray:
     """(C,) whether any of the points (N, 3) lies before the camera and inside its image; occlusion is ignored."""
     out = np.zeros(len(cameras), bool)
-    for i, (view, (fx, fy, cx, cy), (width, height)) in enumerate(
+    for i, (view, intrinsics, size) in enumerate(
         zip(cameras.T_camera_frame, cameras.intrinsics_px, cameras.sizes_px, strict=True)
     ):
-        x, y, z = (points @ view[:3, :3].T.astype(np.float32) + view[:3, 3].astype(np.float32)).T
-        front = z > 0
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = fx * x / z + cx, fy * y / z + cy
-        out[i] = bool((front & (u >= 0) & (u < width) & (v >= 0) & (v < height)).any())
+        out[i] = bool(in_image(*project(points, view, intrinsics), size).any())
     return out
 
 

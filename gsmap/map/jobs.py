@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import lru_cache
 
-from gsmap.describe import describe
-from gsmap.describe.models import ModelSpec
-from gsmap.register import Params as RegisterParams
-from gsmap.register import SceneView, register_pair
+from gsmap import describe as describing
+from gsmap import register as registering
+from gsmap.register import SceneView
 from gsmap.store import Store
 from gsmap.types import Registration, SceneGraph
+from gsmap.types.model import ModelSpec
 
 
 @lru_cache(maxsize=1)
@@ -19,25 +19,25 @@ def _store(path: str) -> Store:
 
 
 @lru_cache(maxsize=4)
-def _view(path: str, scene_id: str, method: str) -> SceneView:
+def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
     """Pairs come ordered by scene, so a few views kept save most of the reading."""
     scenes, graphs = _store(path).scenes, _store(path).graphs
-    graph = graphs.load(scene_id, method)
+    graph = graphs.load(scene_id, graph_key)
     assert graph is not None, f"scene {scene_id} was to be registered before it was described"
     policy = scenes.get(scene_id).scale_policy
     return SceneView(scene_id, scenes.gaussians(scene_id), scenes.cameras(scene_id), graph, policy)
 
 
-def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec]) -> SceneGraph:
+def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params) -> SceneGraph:
     """The graph of one scene of the map at ``path``."""
     scenes = _store(path).scenes
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
-    return describe(scene_id, gaussians, cameras, models=models, scale_policy=policy)
+    return describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy)
 
 
 def register_scenes(
-    path: str, target: tuple[str, str], source: tuple[str, str], params: RegisterParams
+    path: str, target: tuple[str, str], source: tuple[str, str], params: registering.Params
 ) -> Registration:
-    """The registration of one pair of the map at ``path``; target and source are (scene id, method of its graph)."""
-    return register_pair(_view(path, *target), _view(path, *source), params)
+    """The registration of one pair of the map at ``path``; target and source are (scene id, key of its graph)."""
+    return registering.register_pair(_view(path, *target), _view(path, *source), params)

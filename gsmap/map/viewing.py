@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from gsmap.map import rows
+from gsmap.map import reports
 from gsmap.store import Store
 from gsmap.view import ViewEdge, ViewMap, ViewScene
 
@@ -25,14 +25,14 @@ def view_of(store: Store) -> ViewMap:
     ]
     edges = [
         ViewEdge(
-            row["target"],
-            row["source"],
-            row["status"],
-            row["reason"],
-            row["used"] if placed else None,
-            row["num_inliers"],
-            row["overlap"],
+            row.target,
+            row.source,
+            row.status,
+            row.reason,
+            row.used if placed else None,
+            row.num_inliers,
+            row.overlap,
         )
-        for row in rows.edge_rows(store)
+        for row in reports.edge_rows(store)
     ]
     return ViewMap(store.folder.name, scenes, edges)

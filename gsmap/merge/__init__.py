@@ -1,59 +1,154 @@
 """Many captures of one place into one set of Gaussians.
 
-``merge(parts, method)`` is pure: captures already in the map frame in, Gaussians out. Methods live in `mergers`.
+``merge(scenes, method)`` is pure: captures already in the map frame in, Gaussians out. Built-in methods live in
+`mergers`, other packages add theirs by entry point; all keep the contract in `gsmap.methods.merger`.
 """
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from types import ModuleType
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
+from gsmap import render
 from gsmap.errors import ConfigError, InputError
-from gsmap.merge import mergers
-from gsmap.merge.parts import MergeResult, Part, inside
+from gsmap.merge.placed import inside
+from gsmap.methods import MethodParams, RecipeKey, family
+from gsmap.methods.merger import Merger
+from gsmap.types import MergeResult, PlacedScene
+from gsmap.types.plain import plain
+from gsmap.types.progress import Progress, silent
 
-__all__ = ["MergeResult", "Part", "default_params", "merge", "methods", "reach_m", "reading_m"]
+VERSION = 1
+"""Of what is done around a merger: which pieces it is given, and what of its answer belongs to a tile."""
+
+__all__ = [
+    "VERSION",
+    "MergeResult",
+    "Params",
+    "PlacedScene",
+    "checked_params",
+    "default_params",
+    "merge",
+    "merger",
+    "methods",
+    "reach_m",
+    "recipe_key",
+    "uses_dates",
+    "with_steps",
+]
+
+
+@dataclass(frozen=True)
+class Params:
+    """How captures are merged.
+
+    Args:
+        method: the merger: ``tto``, ``voxel``, ``union``, ``distance``, or one that another package adds.
+        mergers: the settings of each merger.
+    """
+
+    method: str = "tto"
+    mergers: MethodParams = field(default_factory=lambda: MethodParams("merger"))
+
+    def chosen(self) -> Any:
+        """The settings of the merger that is used."""
+        return self.mergers[self.method]
 
 
 def methods() -> list[str]:
     """Names of the merging methods there are."""
-    return sorted(m.name for m in pkgutil.iter_modules(mergers.__path__))
+    return list(family("merger").names())
 
 
-def default_params(method: str) -> object:
+def merger(method: str) -> Merger:
+    """A merger by name.
+
+    Raises:
+        ConfigError: there is none of that name, or it does not keep the contract.
+    """
+    found: Merger = family("merger").get(method)
+    return found
+
+
+def default_params(method: str) -> Any:
     """The method's ``Params`` with their defaults."""
-    return _merger(method).Params()
+    return merger(method).Params()
 
 
-def reach_m(method: str, params: object | None = None) -> float:
+def checked_params(method: str, params: Any) -> Any:
+    """The params, or the method's defaults for None.
+
+    Raises:
+        ConfigError: unknown method, params of another method.
+    """
+    wanted = merger(method).Params
+    if params is None:
+        return wanted()
+    if not isinstance(params, wanted):
+        raise ConfigError(
+            f"merge method {method!r} takes {wanted.__module__}.Params, got {type(params).__module__}."
+            f"{type(params).__qualname__}"
+        )
+    return params
+
+
+def reach_m(method: str, params: Any = None) -> float:
     """How far beyond a tile's border the Gaussians of scenes decide what is in it, in metres."""
-    return _merger(method).reach_m(params or default_params(method))
+    return merger(method).reach_m(checked_params(method, params))
 
 
-def reading_m(method: str, params: object | None = None) -> float:
-    """How far beyond a tile's border the parts given to `merge` should reach: cameras may stand farther away."""
-    merger = _merger(method)
-    return getattr(merger, "reading_m", merger.reach_m)(params or default_params(method))
+def uses_dates(method: str, params: Any = None) -> bool:
+    """Whether the dates of the captures decide what a tile holds."""
+    return merger(method).uses_dates(checked_params(method, params))
+
+
+def with_steps(method: str, params: Any, steps: int) -> Any:
+    """The params with so many optimisation steps.
+
+    Raises:
+        ConfigError: a method that takes no steps, or a negative number of them.
+    """
+    params, name = checked_params(method, params), merger(method).STEPS
+    if name is None:
+        takes = [other for other in methods() if merger(other).STEPS is not None]
+        raise ConfigError(f"merge method {method!r} takes no steps: leave --steps out, or use {' or '.join(takes)}")
+    if steps < 0:
+        raise ConfigError(f"steps must not be negative, got {steps}")
+    return replace(params, **{name: steps})
+
+
+def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
+    """What names everything that is merged in this way; the inputs are added by whoever knows them.
+
+    Args:
+        method: one of `methods()`.
+        params: the method's ``Params``; None takes the defaults.
+
+    Raises:
+        ConfigError: unknown method, params of another method.
+    """
+    settings = plain(checked_params(method, params))
+    backend = render.backend() if merger(method).RENDERS else ""
+    return RecipeKey("merge", method, {"merge": VERSION} | family("merger").version(method), settings, backend)
 
 
 def merge(
-    parts: Sequence[Part],
+    scenes: Sequence[PlacedScene],
     method: str = "tto",
-    params: object | None = None,
+    params: Any = None,
     *,
     bounds: np.ndarray | None = None,
     budget_s: float | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> MergeResult:
-    """Merge parts that lie in one frame.
+    """Merge scenes that lie in one frame.
 
     Args:
-        parts: captures in the map frame. For a tile, all of their Gaussians within `reading_m` of the bounds.
+        scenes: captures in the map frame. For a tile, all of their Gaussians within the merger's ``reading_m`` of the
+            bounds (`gsmap.merge.tile.merge_tile` reads just that).
         method: one of `methods()`.
         params: the method's ``Params``; None takes the defaults.
         bounds: (2, 3) lowest and highest corner of a tile; the result holds the Gaussians whose mean lies in it, and
@@ -63,36 +158,25 @@ def merge(
 
     Raises:
         ConfigError: unknown method, params of another method, a budget that is not positive.
-        InputError: no parts, or bounds that are empty.
+        InputError: no scenes, or bounds that are empty.
     """
-    merger = _merger(method)
-    params = merger.Params() if params is None else params
-    if not isinstance(params, merger.Params):
-        raise ConfigError(f"merge method {method!r} takes {merger.__name__}.Params, got {type(params).__name__}")
+    params = checked_params(method, params)
     if budget_s is not None and not budget_s > 0:
         raise ConfigError(f"a merge budget must be a positive number of seconds, got {budget_s}")
-    if not parts:
-        raise InputError("nothing to merge: no parts given")
+    if not scenes:
+        raise InputError("nothing to merge: no scenes given")
     if bounds is not None:
         bounds = np.asarray(bounds, dtype=np.float64)
         if bounds.shape != (2, 3) or not (bounds[1] > bounds[0]).all():
             raise InputError(f"bounds must be a (2, 3) box with low < high on every axis, got {bounds.tolist()}")
 
-    # The result must not depend on the order of the parts.
-    order = sorted(range(len(parts)), key=lambda i: parts[i].scene_id)
-    result = merger.merge(
-        [parts[i] for i in order], params, bounds, budget_s, progress or (lambda fraction, text: None)
-    )
+    # The result must not depend on the order of the scenes.
+    order = sorted(range(len(scenes)), key=lambda i: scenes[i].scene_id)
+    result = merger(method).merge([scenes[i] for i in order], params, bounds, budget_s, progress or silent)
     keep = inside(result.gaussians.means, bounds)
     return replace(
         result,
         gaussians=result.gaussians if keep.all() else result.gaussians[keep],
         origin=np.asarray(order, dtype=np.int32)[result.origin[keep]],
-        num_input=sum(int(inside(part.gaussians.means, bounds).sum()) for part in parts),
+        num_input=sum(int(inside(scene.gaussians.means, bounds).sum()) for scene in scenes),
     )
-
-
-def _merger(method: str) -> ModuleType:
-    if method not in methods():
-        raise ConfigError(f"unknown merge method {method!r}: choose one of {', '.join(methods())}")
-    return importlib.import_module(f"gsmap.merge.mergers.{method}")

@@ -2,95 +2,116 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
 
-from gsmap.merge.parts import Part, overlapping
+from gsmap.geometry.projection import in_image, project
+from gsmap.merge.placed import overlapping
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians
-
-_LONGEST_SIDE_PX = 240
-_GAP = (0.1, 0.03)  # metres, and share of the depth: how far in front of a surface a thing must be to be gone
-_MIN_OPACITY = 0.9
-_MIN_VIEWS = 3
-_NEAREST_M = 0.2
-_MIN_SHARE = 0.6  # of the views that could see it
+from gsmap.types import Cameras, Gaussians, PlacedScene
 
 
-def drop_what_is_gone(parts: list[Part]) -> tuple[list[Part], list[int]]:
-    """The parts without the Gaussians that a later capture looked straight through, and how many each lost.
+@dataclass(frozen=True)
+class Params:
+    """What counts as evidence that a later capture looked through a place.
+
+    Args:
+        longest_side_px: size of the later capture's views that are rendered.
+        gap_m: a thing must be this far in front of the surface that the later capture shows to be gone, and
+        gap_share: this share of the surface's depth more.
+        min_opacity: alpha from which on a pixel shows a surface.
+        min_views: views of the later capture that must agree.
+        min_share: of the views that could see it, these must look through it.
+        nearest_m: what is nearer to a camera than this is not judged by it.
+    """
+
+    longest_side_px: int = 240
+    gap_m: float = 0.1
+    gap_share: float = 0.03
+    min_opacity: float = 0.9
+    min_views: int = 3
+    min_share: float = 0.6
+    nearest_m: float = 0.2
+
+
+def remove_disappeared(
+    scenes: Sequence[PlacedScene], params: Params | None = None
+) -> tuple[list[PlacedScene], list[int]]:
+    """The scenes without the Gaussians that a later capture looked straight through, and how many each lost.
 
     A Gaussian is gone when, in most of the later capture's own views that have it in frame and unoccluded, and in at
     least a few of them, the later capture shows an opaque surface clearly behind it. What the later capture never saw
     stays. Captures without a time, or of the same time, overrule nothing.
     """
+    params = params or Params()
     kept, lost = [], []
-    for part, later in zip(parts, _later(parts), strict=True):
-        gone = np.zeros(len(part.gaussians), dtype=bool)
-        for newer in later:
-            through, on_surface = _evidence(part.gaussians.means, newer)
-            gone |= (through >= _MIN_VIEWS) & (through >= _MIN_SHARE * (through + on_surface))
-        kept.append(replace(part, gaussians=part.gaussians[~gone]) if gone.any() else part)
+    for scene, newer in zip(scenes, _newer(scenes), strict=True):
+        gone = np.zeros(len(scene.gaussians), dtype=bool)
+        for other in newer:
+            through, on_surface = _evidence(scene.gaussians.means, other, params)
+            gone |= (through >= params.min_views) & (through >= params.min_share * (through + on_surface))
+        kept.append(replace(scene, gaussians=scene.gaussians[~gone]) if gone.any() else scene)
         lost.append(int(gone.sum()))
     return kept, lost
 
 
-def what_came_later(parts: list[Part]) -> list[list[Gaussians]]:
-    """For each part, what its later captures are sure of: the Gaussians their own views show as a surface."""
+def newer_surfaces(scenes: Sequence[PlacedScene], params: Params | None = None) -> list[list[Gaussians]]:
+    """For each scene, what its later captures are sure of: the Gaussians their own views show as a surface."""
+    params = params or Params()
+    newer = _newer(scenes)
     sure: dict[int, Gaussians] = {}
-    for newer in {id(p): p for later in _later(parts) for p in later}.values():
-        _, on_surface = _evidence(newer.gaussians.means, newer)
-        sure[id(newer)] = newer.gaussians[on_surface >= _MIN_VIEWS]
-    return [[sure[id(p)] for p in later] for later in _later(parts)]
+    for other in {id(s): s for others in newer for s in others}.values():
+        _, on_surface = _evidence(other.gaussians.means, other, params)
+        sure[id(other)] = other.gaussians[on_surface >= params.min_views]
+    return [[sure[id(s)] for s in others] for others in newer]
 
 
-def overruled_pixels(camera: Cameras, depth: np.ndarray, later: list[Gaussians]) -> np.ndarray:
+def overruled_pixels(
+    camera: Cameras, depth: np.ndarray, newer: Sequence[Gaussians], params: Params | None = None
+) -> np.ndarray:
     """(H, W) bool, where a later capture is sure of a surface clearly in front of the depth map of one camera."""
+    params = params or Params()
     overruled = np.zeros(depth.shape, dtype=bool)
-    for gaussians in later:
+    for gaussians in newer:
         seen = render(gaussians, camera)
-        clearly = seen.depth[0] < depth - (_GAP[0] + _GAP[1] * depth)
-        overruled |= (seen.alpha[0] > _MIN_OPACITY) & clearly
+        clearly = seen.depth[0] < depth - (params.gap_m + params.gap_share * depth)
+        overruled |= (seen.alpha[0] > params.min_opacity) & clearly
     return overruled
 
 
-def _later(parts: list[Part]) -> list[list[Part]]:
-    """For each part, the parts of the same place that were captured after it and have cameras."""
-    times = [_time(part.captured_at) for part in parts]
+def _newer(scenes: Sequence[PlacedScene]) -> list[list[PlacedScene]]:
+    """For each scene, the scenes of the same place that were captured after it and have cameras."""
+    times = [_time(scene.captured_at) for scene in scenes]
     return [
         [
             other
-            for other, then in zip(parts, times, strict=True)
-            if time and then and then > time and other.cameras is not None and overlapping(part, other)
+            for other, then in zip(scenes, times, strict=True)
+            if time and then and then > time and other.cameras is not None and overlapping(scene, other)
         ]
-        for part, time in zip(parts, times, strict=True)
+        for scene, time in zip(scenes, times, strict=True)
     ]
 
 
-def _evidence(means: np.ndarray, newer: Part) -> tuple[np.ndarray, np.ndarray]:
+def _evidence(means: np.ndarray, newer: PlacedScene, params: Params) -> tuple[np.ndarray, np.ndarray]:
     """How many views of a capture show an opaque surface (N,) clearly behind each point, and (N,) at it."""
     points = means.astype(np.float64)
     through, on_surface = np.zeros(len(points), dtype=np.int32), np.zeros(len(points), dtype=np.int32)
-    cameras = newer.cameras.resized(_LONGEST_SIDE_PX)
+    if newer.cameras is None:
+        return through, on_surface
+    cameras = newer.cameras.resized(params.longest_side_px)
     for c in range(len(cameras)):
-        T = cameras.T_camera_frame[c]
-        local = points @ T[:3, :3].T + T[:3, 3]
-        fx, fy, cx, cy = cameras.intrinsics_px[c]
-        width, height = cameras.sizes_px[c]
-        ahead = local[:, 2] > _NEAREST_M
-        z = np.where(ahead, local[:, 2], 1.0)
-        column = np.floor(fx * local[:, 0] / z + cx)
-        row = np.floor(fy * local[:, 1] / z + cy)
-        rows = np.flatnonzero(ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height))
+        pixels, z = project(points, cameras.T_camera_frame[c], cameras.intrinsics_px[c])
+        rows = np.flatnonzero(in_image(pixels, z, cameras.sizes_px[c], near=params.nearest_m))
         if len(rows) == 0:
             continue
         seen = render(newer.gaussians, cameras[c])
-        pixel = row[rows].astype(int), column[rows].astype(int)
-        surface, opaque = seen.depth[0][pixel], seen.alpha[0][pixel] > _MIN_OPACITY
+        column, row = pixels[rows].astype(int).T
+        surface, opaque = seen.depth[0][row, column], seen.alpha[0][row, column] > params.min_opacity
         behind = surface - z[rows]
-        gap = _GAP[0] + _GAP[1] * surface
+        gap = params.gap_m + params.gap_share * surface
         through[rows] += opaque & (behind > gap)
         on_surface[rows] += opaque & (np.abs(behind) <= gap)
     return through, on_surface

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.merge.changes import Params as ChangeParams
 from gsmap.merge.changes import overruled_pixels
-from gsmap.merge.parts import Part, inside, share_in_view
+from gsmap.merge.placed import inside, share_in_view
 from gsmap.render import Rendered, render
-from gsmap.types import Cameras, Gaussians
+from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types.progress import Progress
 
-_MIN_SEEN = 0.02  # share of a picture that must show the tile
-_ENOUGH_SEEN = 0.25
-_MARGIN_PX = 6
-WEIGHT_UNIT = 0.1  # of `References.shown`, for what dominates no pixel: always less than one pixel
+WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for what dominates no pixel: always less than one pixel
+
+
+@dataclass(frozen=True)
+class Params:
+    """Which views of the captures are reproduced, and how often.
+
+    Args:
+        min_share: a view counts when at least this share of its picture shows the tile.
+        enough_share: a view of which at least this share shows the tile is used once in every pass; one that shows
+            less, now and then.
+        margin_px: pictures are cropped to what counts and this much around it, for the windows of SSIM.
+    """
+
+    min_share: float = 0.02
+    enough_share: float = 0.25
+    margin_px: int = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,75 +42,79 @@ class References:
         images: V pictures (H, W, 3) uint8.
         weights: V maps (H, W) uint8, 255 where the picture is to be believed and 0 where it says nothing: where the
             capture saw nothing, and outside the tile.
-        part: (V,) which part each was rendered from.
-        share: (V,) how much of each camera's whole picture counts, in [0, 1].
-        shown: per part (N_part,) float32: in how many pixels of its own views each Gaussian dominates; where
+        scene: (V,) which scene each was rendered from.
+        view_weights: (V,) how often to use each view in one pass over all, in (0, 1].
+        visible_pixels: per scene (N,) float32: in how many pixels of its own views each Gaussian dominates; where
             it dominates none, `WEIGHT_UNIT` times its largest weight in any pixel; 1 for all where there are no views.
     """
 
     cameras: Cameras
     images: list[np.ndarray]
     weights: list[np.ndarray]
-    part: np.ndarray
-    share: np.ndarray
-    shown: list[np.ndarray]
+    scene: np.ndarray
+    view_weights: np.ndarray
+    visible_pixels: list[np.ndarray]
 
     def __len__(self) -> int:
         return len(self.images)
 
-    @property
-    def turns(self) -> np.ndarray:
-        """(V,) how often to use each view in one pass over all: once where it shows enough, else now and then."""
-        return np.minimum(1.0, self.share / _ENOUGH_SEEN)
-
 
 def render_references(
-    parts: list[Part],
+    scenes: Sequence[PlacedScene],
     bounds: np.ndarray | None,
     halo_m: float,
     longest_side_px: int,
-    later: list[list[Gaussians]] | None,
-    progress: Callable[[float, str], None],
+    newer: list[list[Gaussians]] | None,
+    progress: Progress,
+    params: Params | None = None,
+    changes: ChangeParams | None = None,
 ) -> References:
-    """Render each part from its own cameras; keep the views that show enough of the tile.
+    """Render each scene from its own cameras; keep the views that show enough of the tile.
 
     A camera of one capture says nothing about what that capture never saw: pixels count as far as the capture itself
     covers them. For a tile they count where the surface seen lies inside it or within half the halo, so that what is
     at the border is held from both sides, and they show what lies within the halo alone: what glimmers through from
-    beyond is not there when the tile is fitted, and must not be made up for. ``later`` (`gsmap.merge.changes`) holds
-    for each part what stands there by now.
+    beyond is not there when the tile is fitted, and must not be made up for. ``newer`` (`gsmap.merge.changes`) holds
+    for each scene what stands there by now.
     """
-    near = [inside(part.gaussians.means, bounds, halo_m) for part in parts]
-    pieces = [part.gaussians if n.all() else part.gaussians[n] for part, n in zip(parts, near, strict=True)]
+    params = params or Params()
+    near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
+    pieces = [scene.gaussians if n.all() else scene.gaussians[n] for scene, n in zip(scenes, near, strict=True)]
     todo = [
-        (i, c)
-        for i, (part, piece) in enumerate(zip(parts, pieces, strict=True))
-        if part.cameras is not None
-        for c in np.flatnonzero(share_in_view(part.cameras, piece.means) > 0)
+        (i, scene.cameras[int(c)].resized(longest_side_px))
+        for i, (scene, piece) in enumerate(zip(scenes, pieces, strict=True))
+        if scene.cameras is not None
+        for c in np.flatnonzero(share_in_view(scene.cameras, piece.means) > 0)
     ]
     cameras, images, weights, kept, shares = [], [], [], [], []
-    pixels = [np.zeros(len(part.gaussians), dtype=np.int64) for part in parts]
-    largest = [np.zeros(len(part.gaussians), dtype=np.float32) for part in parts]
-    for done, (i, c) in enumerate(todo):
-        camera = parts[i].cameras[c].resized(longest_side_px)
+    pixels = [np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes]
+    largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
+    for done, (i, camera) in enumerate(todo):
         progress(done / len(todo), "rendering the captures")
-        seen = render(parts[i].gaussians, camera, max_weight=True)
+        seen = render(scenes[i].gaussians, camera, max_weight=True)
         _count(seen, pixels[i], largest[i])
-        local = seen if pieces[i] is parts[i].gaussians else render(pieces[i], camera, depth=False, dominant_id=False)
+        whole = pieces[i] is scenes[i].gaussians
+        local = seen if whole else render(pieces[i], camera, depth=False, dominant_id=False)
         weight = local.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, halo_m / 2)
-        if later is not None and later[i]:
-            weight = weight * ~overruled_pixels(camera, seen.depth[0], later[i])
+        if newer is not None and newer[i]:
+            weight = weight * ~overruled_pixels(camera, seen.depth[0], newer[i], changes)
         share = float(weight.mean())
-        if share < _MIN_SEEN:
+        if share < params.min_share:
             continue
-        window = _window(weight)
+        window = _window(weight, params.margin_px)
         cameras.append(_cropped(camera, window))
         images.append(np.round(np.clip(local.colour[0][window], 0, 1) * 255).astype(np.uint8))
         weights.append(np.round(np.clip(weight[window], 0, 1) * 255).astype(np.uint8))
         kept.append(i)
         shares.append(share)
-    shown = [_shown(p, w, whole=bounds is None) for p, w in zip(pixels, largest, strict=True)]
-    return References(_joined(cameras), images, weights, np.array(kept, dtype=np.int64), np.array(shares), shown)
+    return References(
+        _joined(cameras),
+        images,
+        weights,
+        scene=np.array(kept, dtype=np.int64),
+        view_weights=np.minimum(1.0, np.array(shares) / params.enough_share),
+        visible_pixels=[_visible_pixels(p, w, whole=bounds is None) for p, w in zip(pixels, largest, strict=True)],
+    )
 
 
 def _count(seen: Rendered, pixels: np.ndarray, largest: np.ndarray) -> None:
@@ -104,12 +123,13 @@ def _count(seen: Rendered, pixels: np.ndarray, largest: np.ndarray) -> None:
     np.maximum(largest, seen.max_weight, out=largest)
 
 
-def _window(weight: np.ndarray) -> tuple[slice, slice]:
+def _window(weight: np.ndarray, margin_px: int) -> tuple[slice, slice]:
     """The part of a picture that counts, with a margin for windows of SSIM."""
     spans = []
     for axis in (1, 0):
         used = np.flatnonzero(weight.any(axis=axis))
-        spans.append(slice(max(0, used[0] - _MARGIN_PX), min(weight.shape[1 - axis], used[-1] + 1 + _MARGIN_PX)))
+        low, high = int(used[0]) - margin_px, int(used[-1]) + 1 + margin_px
+        spans.append(slice(max(0, low), min(weight.shape[1 - axis], high)))
     return spans[0], spans[1]
 
 
@@ -120,20 +140,23 @@ def _cropped(camera: Cameras, window: tuple[slice, slice]) -> Cameras:
     return Cameras(camera.T_frame_camera, intrinsics, np.array(size), camera.names)
 
 
-def _shown(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
-    """See `References.shown`. What no view saw shows nothing of a whole capture; of a piece of one, other views may
-    have seen it, so it goes after what is seen and yet dominates nothing."""
+def _visible_pixels(pixels: np.ndarray, largest: np.ndarray, whole: bool) -> np.ndarray:
+    """See `References.visible_pixels`.
+
+    What no view saw shows nothing of a whole capture; of a piece of one, other views may have seen it, so it goes after
+    what is seen and yet dominates nothing.
+    """
     if not largest.any():
         return np.ones(len(pixels), dtype=np.float32)
     unseen = 0.0 if whole else 0.5
     return np.where(pixels > 0, pixels, np.where(largest > 0, WEIGHT_UNIT * largest, unseen)).astype(np.float32)
 
 
-def order_of_views(turns: np.ndarray, steps: int, seed: int) -> np.ndarray:
-    """(steps,) which view to use at each step: each in proportion to its turns, spread evenly over time."""
+def view_schedule(view_weights: np.ndarray, steps: int, seed: int) -> np.ndarray:
+    """(steps,) which view to use at each step: each in proportion to its weight, spread evenly over time."""
     rng = np.random.default_rng(seed)
     times, views = [], []
-    for view, rate in enumerate(turns / turns.sum()):
+    for view, rate in enumerate(view_weights / view_weights.sum()):
         count = int(np.ceil(steps * rate)) + 1
         # Every view takes its turn once per 1/rate steps, at a phase of its own each time.
         times.append((np.arange(count) + rng.random(count)) / rate)
@@ -156,7 +179,8 @@ def surface_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:
     y = (np.arange(height) + 0.5 - cy) / fy
     rays = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones(depth.shape)], axis=-1)
     T = camera.T_frame_camera[0]
-    return (rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3]
+    points: np.ndarray = (rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3]
+    return points
 
 
 def _joined(cameras: list[Cameras]) -> Cameras:

@@ -8,7 +8,7 @@ from gsmap.types import Gaussians
 
 
 def one_owner_per_cell(
-    gaussians: Gaussians, origin: np.ndarray, shown: np.ndarray, cell_m: float, cover_m: float
+    gaussians: Gaussians, origin: np.ndarray, visible_pixels: np.ndarray, cell_m: float, cover_m: float
 ) -> np.ndarray:
     """(N,) which Gaussians stay when every cell of a grid belongs to the capture that shows most of it.
 
@@ -18,7 +18,7 @@ def one_owner_per_cell(
 
     Args:
         origin: (N,) capture each Gaussian came from.
-        shown: (N,) pixels that each Gaussian dominates in its own capture's views.
+        visible_pixels: (N,) pixels that each Gaussian dominates in its own capture's views.
         cell_m: side of a cell.
         cover_m: an owner's Gaussian this near covers another's.
     """
@@ -31,12 +31,12 @@ def one_owner_per_cell(
         return np.ones(len(gaussians), dtype=bool)
     cell = voxel_labels(gaussians.means, cell_m)
     count = int(cell.max()) + 1
-    votes = np.stack([np.bincount(cell, shown * (origin == c), count) for c in range(captures)])
+    votes = np.stack([np.bincount(cell, visible_pixels * (origin == c), count) for c in range(captures)])
     owner = votes.argmax(0)[cell]
     stays = owner == origin
     for c in range(captures):
         own = stays & (origin == c)
-        others = np.flatnonzero(~stays & (owner == c) & (shown > 0))
+        others = np.flatnonzero(~stays & (owner == c) & (visible_pixels > 0))
         if len(others) == 0 or not own.any():
             continue
         tree = cKDTree(gaussians.means[own])
@@ -45,9 +45,9 @@ def one_owner_per_cell(
     return stays
 
 
-def most_shown(shown: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
-    """(N,) the ``count`` Gaussians of a mask that show most; ties by row."""
-    order = np.argsort(np.where(among, -shown, np.inf), kind="stable")
-    stays = np.zeros(len(shown), dtype=bool)
+def most_visible(visible_pixels: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
+    """(N,) the ``count`` Gaussians of a mask that dominate most pixels; ties by row."""
+    order = np.argsort(np.where(among, -visible_pixels, np.inf), kind="stable")
+    stays = np.zeros(len(visible_pixels), dtype=bool)
     stays[order[: min(count, int(among.sum()))]] = True
     return stays

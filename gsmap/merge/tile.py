@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.merge import MergeResult, Part, merge, reading_m
-from gsmap.merge.parts import inside
-from gsmap.types import Cameras, Gaussians, Sim3
-
-# A tile that no camera stands in or near is refined from the nearest ones, wherever they stand.
-_MIN_CAMERAS = 12
+from gsmap.merge import checked_params, merge, merger
+from gsmap.merge.placed import inside
+from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
+from gsmap.types.progress import Progress
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class LazyScene:
     """A placed scene that can be read in pieces.
 
     Args:
@@ -35,49 +34,56 @@ class Source:
     cameras: Cameras | None = None
     captured_at: str | None = None
 
+    def centroid(self) -> np.ndarray | None:
+        """(3,) mean of all of its means, map frame; None where it holds nothing."""
+        means = self.load(None).means
+        return self.S_map_scene.apply(means.mean(0, dtype=np.float64)) if len(means) else None
+
 
 def merge_tile(
-    sources: Sequence[Source],
+    scenes: Sequence[LazyScene],
     method: str = "tto",
-    params: object | None = None,
+    params: Any = None,
     *,
     bounds: np.ndarray | None = None,
     budget_s: float | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> MergeResult:
     """Read what lies around a tile, bring it to the map frame and merge it; see `gsmap.merge.merge`.
 
-    Memory is bounded by what lies within `reading_m` of the tile. ``origin`` of the result counts in ``sources``.
+    Memory is bounded by what lies within the merger's ``reading_m`` of the tile. ``origin`` of the result counts in
+    ``scenes``.
     """
-    if not sources:
+    if not scenes:
         raise InputError("nothing to merge: no scene touches the tile")
-    reach = reading_m(method, params)
-    parts = [_read(source, bounds, reach) for source in sources]
-    if method == "distance" and bounds is not None:
-        parts = [replace(part, centroid=_centroid(source)) for part, source in zip(parts, sources, strict=True)]
-    return merge(parts, method, params, bounds=bounds, budget_s=budget_s, progress=progress)
+    how, params = merger(method), checked_params(method, params)
+    margin_m, min_cameras = how.reading_m(params), how.min_cameras(params)
+    placed = [_read(scene, bounds, margin_m, min_cameras) for scene in scenes]
+    return merge(placed, method, params, bounds=bounds, budget_s=budget_s, progress=progress)
 
 
-def _read(source: Source, bounds: np.ndarray | None, reach: float) -> Part:
-    S = source.S_map_scene
-    cameras = None if source.cameras is None else transform_cameras(source.cameras, S)
+def _read(scene: LazyScene, bounds: np.ndarray | None, margin_m: float, min_cameras: int) -> PlacedScene:
+    S = scene.S_map_scene
+    cameras = None if scene.cameras is None else transform_cameras(scene.cameras, S)
     if bounds is None:
-        return Part(transform_gaussians(source.load(None), S), cameras, source.scene_id, source.captured_at)
-    box = np.array([bounds[0] - reach, bounds[1] + reach])
-    if cameras is not None and reach > 0:
-        box = _with_cameras(box, cameras.centers)
+        return PlacedScene(transform_gaussians(scene.load(None), S), cameras, scene.scene_id, scene.captured_at)
+    box = np.array([bounds[0] - margin_m, bounds[1] + margin_m])
+    if cameras is not None and min_cameras > 0:
+        box = _with_cameras(box, cameras.centers, min_cameras)
+    if cameras is not None:
         cameras = cameras[inside(cameras.centers, box)]
-    gaussians = transform_gaussians(source.load(_box_in(S.inverse(), box)), S)
-    return Part(gaussians[inside(gaussians.means, box)], cameras, source.scene_id, source.captured_at)
+    gaussians = transform_gaussians(scene.load(_box_in(S.inverse(), box)), S)
+    near = gaussians[inside(gaussians.means, box)]
+    return PlacedScene(near, cameras, scene.scene_id, scene.captured_at, scene.centroid)
 
 
-def _with_cameras(box: np.ndarray, centers: np.ndarray) -> np.ndarray:
+def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarray:
     """The box, grown to hold at least the nearest few cameras.
 
     A box is convex: what a camera inside it sees of the tile is hidden by nothing outside it, so pieces suffice.
     """
     distance = np.linalg.norm(np.maximum(np.maximum(box[0] - centers, centers - box[1]), 0), axis=1)
-    nearest = centers[np.argsort(distance, kind="stable")[:_MIN_CAMERAS]]
+    nearest = centers[np.argsort(distance, kind="stable")[:count]]
     if len(nearest) == 0:
         return box
     return np.array([np.minimum(box[0], nearest.min(0) - 1e-6), np.maximum(box[1], nearest.max(0) + 1e-6)])
@@ -89,7 +95,3 @@ def _box_in(S_b_a: Sim3, box: np.ndarray) -> np.ndarray:
     moved = S_b_a.apply(corners)
     pad = 1e-5 * (1 + np.abs(moved).max())
     return np.array([moved.min(0) - pad, moved.max(0) + pad])
-
-
-def _centroid(source: Source) -> np.ndarray:
-    return source.S_map_scene.apply(source.load(None).means.mean(0, dtype=np.float64))

@@ -8,10 +8,21 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from gsmap.methods.family import Family, MethodParams
+from gsmap.methods.family import Family, MethodParams, declare
 from gsmap.methods.recipe_key import RecipeKey, text_digest
 
 __all__ = ["Family", "MethodParams", "RecipeKey", "families", "family", "text_digest"]
+
+# A format's name is the suffix of its files.
+_FORMATS = (
+    (".compressed.ply", "gsmap.formats.compressed_ply"),
+    (".glb", "gsmap.formats.glb"),
+    (".ply", "gsmap.formats.ply"),
+    (".sog", "gsmap.formats.sog"),
+    (".splat", "gsmap.formats.splat"),
+    (".spz", "gsmap.formats.spz"),
+    ("tileset.json", "gsmap.formats.tiles3d"),
+)
 
 
 @lru_cache(maxsize=1)
@@ -20,10 +31,15 @@ def families() -> dict[str, Family]:
     found = (
         Family("segmenter", "gsmap.describe.segmenters", ("MODELS", "make")),
         Family("embedder", "gsmap.describe.embedders", ("MODELS", "make")),
-        Family("proposer", "gsmap.register.proposers", ("propose",)),
+        Family("proposer", "gsmap.register.proposers", ("SCALES", "PACKAGES", "propose")),
         Family("refiner", "gsmap.register.refiners", ("SCALES", "refine")),
-        Family("merger", "gsmap.merge.mergers", ("merge", "reach_m", "reading_m", "uses_dates")),
+        Family(
+            "merger",
+            "gsmap.merge.mergers",
+            ("STEPS", "RENDERS", "reach_m", "reading_m", "min_cameras", "uses_dates", "merge"),
+        ),
         Family("executor", "gsmap.engine.executors", ("run_jobs",)),
+        Family("format", "gsmap.formats", (), _FORMATS, any_of=("read", "write"), has_params=False),
     )
     return {family.name: family for family in found}
 
@@ -31,3 +47,6 @@ def families() -> dict[str, Family]:
 def family(name: str) -> Family:
     """One family by name."""
     return families()[name]
+
+
+declare(families())

@@ -7,12 +7,14 @@ import importlib
 import importlib.util
 import pkgutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from gsmap.errors import ConfigError
+
+_DECLARED: dict[str, Family] = {}
 
 
 @dataclass(frozen=True)
@@ -37,12 +39,16 @@ class Family:
             called ``base``, are not methods.
         contract: names that a method must have beside ``Params`` and ``VERSION``.
         table: built-in ones by name (dotted module names) where a folder holds other things too.
+        any_of: names of which a method must have at least one.
+        has_params: false where a method's functions take their options themselves, so that it has no ``Params``.
     """
 
     name: str
     folder: str
     contract: tuple[str, ...]
     table: tuple[tuple[str, str], ...] = ()
+    any_of: tuple[str, ...] = ()
+    has_params: bool = True
 
     @property
     def group(self) -> str:
@@ -68,7 +74,7 @@ class Family:
 
     def version(self, name: str) -> dict[str, int]:
         """``{"<family>.<name>": VERSION}``, as `RecipeKey.version` wants it."""
-        return {f"{self.name}.{name}": int(self.get(name).VERSION)}
+        return {f"{self.name}.{name.lstrip('.')}": int(self.get(name).VERSION)}
 
     def _built_in(self) -> dict[str, str]:
         if self.table:
@@ -98,12 +104,15 @@ class Family:
             near = difflib.get_close_matches(name, known, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
             raise ConfigError(f"there is no {self.name} {name!r}{hint}: choose one of {', '.join(known)}")
-        missing = [part for part in ("Params", "VERSION", *self.contract) if not hasattr(method, part)]
+        wanted = (*(("Params",) if self.has_params else ()), "VERSION", *self.contract)
+        missing = [part for part in wanted if not hasattr(method, part)]
+        if self.any_of and not any(hasattr(method, part) for part in self.any_of):
+            missing.append(" or ".join(self.any_of))
         if missing:
             raise ConfigError(
                 f"{self.name} {name!r} lacks {', '.join(missing)}: see the contract in gsmap.methods.{self.name}"
             )
-        if not is_dataclass(method.Params) or not method.Params.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        if self.has_params and not _is_frozen(method.Params):
             raise ConfigError(f"{self.name} {name!r}: its Params must be a frozen dataclass")
         return method
 
@@ -156,15 +165,24 @@ class MethodParams(Mapping[str, Any]):
         return _family(self.family).params_type(name)()
 
 
+def _is_frozen(params: Any) -> bool:
+    """Whether it is a frozen dataclass."""
+    shape = getattr(params, "__dataclass_params__", None)
+    return shape is not None and bool(shape.frozen)
+
+
 @lru_cache(maxsize=256)
 def _loaded(family: Family, name: str) -> Any:
     return family._load(name)
 
 
-def _family(name: str) -> Family:
-    from gsmap.methods import families
+def declare(found: Mapping[str, Family]) -> None:
+    """Say which families there are; `gsmap.methods` does, so that this module need not import it."""
+    _DECLARED.update(found)
 
-    return families()[name]
+
+def _family(name: str) -> Family:
+    return _DECLARED[name]
 
 
 def _package(point: EntryPoint) -> str:

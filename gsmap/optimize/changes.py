@@ -3,38 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.geometry.rotations import angle_between
-from gsmap.types import PoseGraph, Sim3
+from gsmap.types import PoseChange, PoseGraph, Sim3
 
 
-@dataclass(frozen=True)
-class Change:
-    """How one scene differs between two answers.
-
-    Args:
-        scene: scene id.
-        kind: ``added``, ``removed``, ``moved`` or ``same`` (pose and component both as before).
-        rotation_deg: angle turned; NaN where the scene is in only one of the two.
-        translation_m: how far the scene's centroid went, in map units; NaN as above.
-        scale_ratio: new scale by old; NaN as above.
-        components: its component before and after, None where it is absent.
-        statuses: its status before and after, None where it is absent.
-    """
-
-    scene: str
-    kind: str
-    rotation_deg: float
-    translation_m: float
-    scale_ratio: float
-    components: tuple[int | None, int | None]
-    statuses: tuple[str | None, str | None]
-
-
-def diff(before: PoseGraph, after: PoseGraph, centroids: Mapping[str, np.ndarray] | None = None) -> dict[str, Change]:
+def diff(
+    before: PoseGraph, after: PoseGraph, centroids: Mapping[str, np.ndarray] | None = None
+) -> dict[str, PoseChange]:
     """What moved by how much, by scene id, in the order of ``after`` and then what was removed.
 
     Args:
@@ -45,13 +23,15 @@ def diff(before: PoseGraph, after: PoseGraph, centroids: Mapping[str, np.ndarray
     out = {}
     for scene in [*after.poses, *(s for s in before.poses if s not in after.poses)]:
         old, new = before.poses.get(scene), after.poses.get(scene)
-        rotation = translation = ratio = float("nan")
+        rotation: float | None = None
+        translation: float | None = None
+        ratio: float | None = None
         kind = "added" if old is None else "removed"
         if old is not None and new is not None:
             rotation, translation, ratio = motion(old.S_map_scene, new.S_map_scene, centroids.get(scene))
             same = rotation == 0 and translation == 0 and ratio == 1 and old.component == new.component
             kind = "same" if same else "moved"
-        out[scene] = Change(
+        out[scene] = PoseChange(
             scene,
             kind,
             rotation,

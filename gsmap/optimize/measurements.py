@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
-from gsmap.types import Edge, Prior
+from gsmap.types import Edge, PoseGraph, Prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Measurements:
         targets, sources: (E,) rows of ``scene_ids``.
         measured: E measured ``S_target_source``.
         information: (E, D, D); D is 6 where every edge is rigid (a stiff scale row says nothing then), else 7.
-        confirmed, strong: (E,) bool.
+        confirmed: (E,) bool.
     """
 
     scene_ids: tuple[str, ...]
@@ -31,7 +31,6 @@ class Measurements:
     measured: Similarities
     information: np.ndarray
     confirmed: np.ndarray
-    strong: np.ndarray
 
     @property
     def num_scenes(self) -> int:
@@ -64,7 +63,6 @@ class Measurements:
             self.measured[rows],
             self.information[rows],
             self.confirmed[rows],
-            self.strong[rows],
         )
 
 
@@ -111,7 +109,15 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
         measured,
         np.ascontiguousarray(information),
         np.array([e.confirmed for e in edges], dtype=bool),
-        np.array([e.strong for e in edges], dtype=bool),
+    )
+
+
+def all_rigid(edges: Sequence[Edge], priors: Sequence[Prior], previous: PoseGraph | None) -> bool:
+    """Whether scale can be left out: nothing has one, so six dimensions suffice."""
+    return (
+        all(e.S_target_source.is_rigid for e in edges)
+        and all(p.S_map_scene.is_rigid for p in priors)
+        and (previous is None or all(p.S_map_scene.is_rigid for p in previous.poses.values()))
     )
 
 

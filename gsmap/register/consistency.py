@@ -1,32 +1,34 @@
-"""Which correspondences agree: the compatibility graph of a pair of scenes."""
+"""The compatibility graph of a pair of scenes: which correspondences one similarity could explain together."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
 from gsmap.errors import ConfigError
 from gsmap.register.correspondences import Correspondences
 
-TESTS = ("absolute", "ratio")
+Test = Literal["absolute", "ratio"]
 
 
 @dataclass(frozen=True)
 class Params:
-    """How two correspondences are tested against each other (metres).
+    """How two correspondences are tested against each other.
 
     Args:
-        test: ``absolute`` (below) or ``ratio``, the paper's ``| |dq| - s|dp| | < ratio * max``.
-        sigma_m: standard deviation of a node's position; distances may differ by ``2 * 3 * sigma_m`` ...
-        relative: ... plus this share of the smaller distance.
-        ratio: tolerance of the paper's test.
-        min_distance_m: nodes closer than this say nothing about the pose.
+        test: ``absolute`` (distances may differ by ``6 sigma_m + relative * distance``) or ``ratio`` (Graph-GSReg's
+            relative test, ``| |dq| - s|dp| | < ratio * max``).
+        sigma_m: standard deviation of a node's position, for the absolute test.
+        relative: share of the smaller distance that the absolute test allows on top.
+        ratio: tolerance of the relative test.
+        min_distance_m: nodes closer than this tell nothing about the pose.
         height_slope: allowed height difference per metre of distance where both scenes know gravity (the sine of
             twice the error of an up vector); inf switches the height test off.
     """
 
-    test: str = "absolute"
+    test: Test = "absolute"
     sigma_m: float = 0.03
     relative: float = 0.01
     ratio: float = 0.1
@@ -34,8 +36,8 @@ class Params:
     height_slope: float = 0.05
 
     def __post_init__(self) -> None:
-        if self.test not in TESTS:
-            raise ConfigError(f"the consistency test must be one of {', '.join(TESTS)}, got {self.test!r}")
+        if self.test not in get_args(Test):
+            raise ConfigError(f"the consistency test must be one of {', '.join(get_args(Test))}, got {self.test!r}")
 
 
 def consistency_graph(matches: Correspondences, params: Params | None = None, *, scale: float = 1.0) -> np.ndarray:
@@ -53,7 +55,7 @@ def consistency_graph(matches: Correspondences, params: Params | None = None, *,
 
     params = params or Params()
     heights = matches.target_heights is not None and np.isfinite(params.height_slope)
-    return _native.consistency_graph(
+    rows: np.ndarray = _native.consistency_graph(
         target=matches.target,
         source=matches.source,
         target_ids=matches.target_ids,
@@ -68,6 +70,7 @@ def consistency_graph(matches: Correspondences, params: Params | None = None, *,
         height_slack=6.0 * params.sigma_m,
         height_slope=float(params.height_slope) if heights else 0.0,
     )
+    return rows
 
 
 def unpack(rows: np.ndarray) -> np.ndarray:

@@ -47,16 +47,14 @@ class Correspondences:
         return len(self.target)
 
     def __getitem__(self, index: np.ndarray) -> Correspondences:
-        heights = (None, None)
-        if self.target_heights is not None:
-            heights = self.target_heights[index], self.source_heights[index]
         return Correspondences(
-            self.target[index],
-            self.source[index],
-            self.target_ids[index],
-            self.source_ids[index],
-            self.similarity[index],
-            *heights,
+            target=self.target[index],
+            source=self.source[index],
+            target_ids=self.target_ids[index],
+            source_ids=self.source_ids[index],
+            similarity=self.similarity[index],
+            target_heights=None if self.target_heights is None else self.target_heights[index],
+            source_heights=None if self.source_heights is None else self.source_heights[index],
         )
 
 
@@ -71,7 +69,7 @@ def correspondences(
     """Pairs of nodes of one type whose embeddings are alike: each node's ``top_k``, from both sides.
 
     Args:
-        target, source: one layer of each scene, made by the same method.
+        target, source: one layer of each scene, made by the same descriptor.
         units_m: metres per unit of the target's and of the source's frame.
         ups: unit vectors against gravity, or None.
     """
@@ -82,25 +80,30 @@ def correspondences(
     embeddings_t, embeddings_s = target.embeddings[order_t], source.embeddings[order_s]
     kinds = np.intersect1d(types_t, types_s)
     bounds = (np.searchsorted(t, kinds, side) for t in (types_t, types_s) for side in ("left", "right"))
-    t, s, similarity = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0, np.float32)]
+    found_t, found_s = [np.zeros(0, int)], [np.zeros(0, int)]
+    found = [np.zeros(0, np.float32)]
     for t0, t1, s0, s1 in zip(*bounds, strict=True):
         block = embeddings_t[t0:t1] @ embeddings_s[s0:s1].T
         rows, columns = _alike(block, params)
-        t.append(order_t[t0 + rows])
-        s.append(order_s[s0 + columns])
-        similarity.append(block[rows, columns])
-    t, s, similarity = np.concatenate(t), np.concatenate(s), np.concatenate(similarity)
+        found_t.append(order_t[t0 + rows])
+        found_s.append(order_s[s0 + columns])
+        found.append(block[rows, columns])
+    t, s, similarity = np.concatenate(found_t), np.concatenate(found_s), np.concatenate(found)
     if len(t) > params.max_correspondences:
         least = np.partition(similarity, -params.max_correspondences)[-params.max_correspondences]
         t, s, similarity = t[similarity >= least], s[similarity >= least], similarity[similarity >= least]
     order = np.lexsort((s, t, -similarity))[: params.max_correspondences]
     t, s = t[order], s[order]
     points_t, points_s = target.positions[t] * units_m[0], source.positions[s] * units_m[1]
-    heights = (None, None)
-    if ups[0] is not None and ups[1] is not None:
-        heights = points_t @ ups[0], points_s @ ups[1]
+    level = ups[0] is not None and ups[1] is not None
     return Correspondences(
-        points_t, points_s, t.astype(np.int32), s.astype(np.int32), similarity[order].astype(np.float32), *heights
+        target=points_t,
+        source=points_s,
+        target_ids=t.astype(np.int32),
+        source_ids=s.astype(np.int32),
+        similarity=similarity[order].astype(np.float32),
+        target_heights=points_t @ ups[0] if level else None,
+        source_heights=points_s @ ups[1] if level else None,
     )
 
 

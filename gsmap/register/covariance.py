@@ -13,14 +13,17 @@ from gsmap.types import Sim3
 
 @dataclass(frozen=True)
 class Params:
-    """Args (metres, degrees):
-    radius_m: pairs farther apart than this are not counted.
-    cell_m: residuals within a cell of this size are taken to share their error; cells are independent.
-    floor_m: error of a cell that no residual shows (a trainer's bias, a sensor's distortion): many cells average it
-        out, and over the overlap's radius it turns and scales the pose.
-    factor: on the sandwich, from measured normalised errors and triangles (``tools/bench_register.py`` prints them).
-    scale_factor: on the scale's own variance, from measured errors of scales: those of a real sensor's captures differ
-        by up to a percent of themselves, which leaves no residual.
+    """How well a refined pose is known.
+
+    Args:
+        radius_m: pairs farther apart than this are not counted.
+        cell_m: residuals within a cell of this size are taken to share their error; cells are independent.
+        floor_m: error of a cell that no residual shows (a trainer's bias, a sensor's distortion): many cells average
+            it out, and over the overlap's radius it turns and scales the pose.
+        factor: on the sandwich, from measured normalised errors and triangles (``tools/bench_register.py`` prints
+            them).
+        scale_factor: on the scale's own variance, from measured errors of scales: those of a real sensor's captures
+            differ by up to a percent of themselves, which leaves no residual.
     """
 
     radius_m: float = 0.08

@@ -11,14 +11,16 @@ from gsmap.register.correspondences import Correspondences
 
 @dataclass(frozen=True)
 class Params:
-    """Args:
-    max_factor: largest scale between the two layers once both are in (guessed) metres; graphs hold a layer for
-        every 1.45, so that some two are always nearer than this.
-    bin_width: of the histogram over the logarithm of the ratio.
-    min_distance_m: closer pairs say too little of the scale.
-    max_correspondences: most similar candidates that vote.
-    rise_tolerance: difference of the two slopes of a pair of nodes, where gravity is known.
-    num_peaks: scales that are tried.
+    """How scales are voted for.
+
+    Args:
+        max_factor: largest scale between the two layers once both are in (guessed) metres; graphs hold a layer for
+            every 1.45, so that some two are always nearer than this.
+        bin_width: of the histogram over the logarithm of the ratio.
+        min_distance_m: closer pairs tell too little of the scale.
+        max_correspondences: most similar candidates that vote.
+        rise_tolerance: difference of the two slopes of a pair of nodes, where gravity is known.
+        num_peaks: scales that one pair of layers proposes.
     """
 
     max_factor: float = 1.35

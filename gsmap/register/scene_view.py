@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
 
 from gsmap.errors import ConfigError
 from gsmap.register import surface
-from gsmap.register.sight import Sight
 from gsmap.register.surface import Surface
+from gsmap.register.view_cache import Params as ViewParams
+from gsmap.register.view_cache import ViewCache
 from gsmap.types import Cameras, Gaussians, SceneGraph
 from gsmap.types.scene import SCALE_POLICIES
 
@@ -29,26 +33,33 @@ class SceneView:
     graph: SceneGraph
     scale_policy: str = "auto"
     _surfaces: dict[tuple[float, surface.Params], Surface] = field(default_factory=dict, init=False, repr=False)
-    _sights: dict[int, Sight] = field(default_factory=dict, init=False, repr=False)
+    _views: dict[ViewParams, ViewCache] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.scale_policy not in SCALE_POLICIES:
             raise ConfigError(f"scale policy must be one of {', '.join(SCALE_POLICIES)}, got {self.scale_policy!r}")
 
-    def surface(self, unit_m: float, params: surface.Params) -> Surface:
+    @cached_property
+    def centre(self) -> np.ndarray:
+        """(3,) middle of the scene's content, in its frame."""
+        return np.median(self.gaussians.means, axis=0) if len(self.gaussians) else np.zeros(3)
+
+    def surface(self, unit_m: float = 1.0, params: surface.Params | None = None) -> Surface:
         """The scene's surface in metres; the last two are kept, so a scene met by many others is prepared once."""
+        params = params or surface.Params()
         key = (unit_m, params)
         if key not in self._surfaces:
             while len(self._surfaces) > 1:
                 self._surfaces.pop(next(iter(self._surfaces)))
-            self._surfaces[key] = Surface.of(self.gaussians, unit_m, params)
+            self._surfaces[key] = Surface.of(self.gaussians, unit_m, params, self.cameras)
         return self._surfaces[key]
 
-    def sight(self, size_px: int) -> Sight | None:
-        """What the scene's cameras see of it, and keep; None without cameras."""
+    def views(self, params: ViewParams | None = None) -> ViewCache | None:
+        """The scene through its own cameras, rendered once and kept; None without cameras."""
+        params = params or ViewParams()
         if not self.cameras or not len(self.gaussians):
             return None
-        if size_px not in self._sights:
-            self._sights.clear()
-            self._sights[size_px] = Sight(self.gaussians, self.cameras, size_px)
-        return self._sights[size_px]
+        if params not in self._views:
+            self._views.clear()
+            self._views[params] = ViewCache(self.gaussians, self.cameras, params)
+        return self._views[params]

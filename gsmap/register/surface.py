@@ -8,20 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.geometry.strays import find_strays
-from gsmap.types import Gaussians
-
-_SH_C0 = 0.28209479177387814
+from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.floaters import find_floaters
+from gsmap.geometry.sh import rgb_of_sh0
+from gsmap.types import Cameras, Gaussians
 
 
 @dataclass(frozen=True)
 class Params:
-    """Which Gaussians are surface, and how finely they are sampled (metres).
+    """Which Gaussians are surface, and how finely they are sampled.
 
     Args:
-        min_opacity, max_scale_m: a surface Gaussian is opaque and not huge; floaters and sky are the rest.
-        min_opaque_share, faintest_opacity: of a capture whose trainer left it fainter, this share of the Gaussians
-            counts as opaque, down to the faintest of these opacities.
+        min_opacity: a surface Gaussian is at least this opaque ...
+        max_scale_m: ... and its largest standard deviation at most this; floaters and sky are the rest.
+        min_opaque_share: of a capture whose trainer left it fainter, this share of the Gaussians counts as opaque ...
+        faintest_opacity: ... down to this opacity.
         stray_colour: floaters are told from the surface they touch by colours (RGB in [0, 1]) this unlike.
         max_scale_quantile: of the opaque Gaussians at least this share is surface, however coarse the scene is.
         resolution_m: points are averaged over cells of this size before they are aligned.
@@ -45,18 +46,29 @@ class Surface:
         colours: (N, 3) float32 view-independent colour.
         resolution_m: cell size of the aligned cloud.
         splats: the N Gaussians themselves, in metres, with their mean colour alone; None where only points are known.
+        unit_m: metres per unit of the scene, under which the surface was made.
+        gaussians, cameras: the whole scene in its own unit; None where only points are known.
     """
 
     points: np.ndarray
     colours: np.ndarray
     resolution_m: float
     splats: Gaussians | None = None
+    unit_m: float = 1.0
+    gaussians: Gaussians | None = None
+    cameras: Cameras | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
     @classmethod
-    def of(cls, gaussians: Gaussians, unit_m: float = 1.0, params: Params | None = None) -> Surface:
+    def of(
+        cls,
+        gaussians: Gaussians,
+        unit_m: float = 1.0,
+        params: Params | None = None,
+        cameras: Cameras | None = None,
+    ) -> Surface:
         """The surface of a scene whose unit is ``unit_m`` metres."""
         params = params or Params()
         largest = gaussians.log_scales.max(1, initial=-np.inf) + np.log(unit_m)
@@ -69,8 +81,8 @@ class Surface:
         if opaque.any():
             limit = max(limit, float(np.quantile(largest[opaque], params.max_scale_quantile)))
         keep = np.flatnonzero(opaque & (largest <= limit))
-        colours = np.clip(gaussians.sh[keep, 0] * _SH_C0 + 0.5, 0.0, 1.0)
-        stray, _ = find_strays(gaussians.means[keep], colours, params.stray_colour)
+        colours = np.clip(rgb_of_sh0(gaussians.sh[keep, 0]), 0.0, 1.0)
+        stray, _ = find_floaters(gaussians.means[keep], colours, params.stray_colour)
         keep, colours = keep[~stray], colours[~stray]
         points = gaussians.means[keep].astype(np.float64) * unit_m
         splats = Gaussians(
@@ -80,7 +92,7 @@ class Surface:
             gaussians.logit_opacities[keep],
             gaussians.sh[keep, :1],
         )
-        return cls(points, colours, params.resolution_m, splats)
+        return cls(points, colours, params.resolution_m, splats, unit_m, gaussians, cameras)
 
     def scaled(self, factor: float) -> Surface:
         """The same surface in a unit ``factor`` times smaller."""
@@ -89,14 +101,8 @@ class Surface:
     @cached_property
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:
         """Cell means (M, 3) of points and of colours at the aligned cloud's resolution, in a fixed order."""
-        cells = np.floor(self.points / self.resolution_m).astype(np.int64)
-        cells -= cells.min(0) if len(cells) else 0
-        size = cells.max(0, initial=0) + 1
-        keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
-        _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
-        values = np.concatenate([self.points, self.colours], axis=1)
-        sums = np.stack([np.bincount(inverse, values[:, k], len(counts)) for k in range(6)], 1)
-        means = sums / counts[:, None]
+        labels, counts = cell_labels(np.floor(self.points / self.resolution_m))
+        means = group_means(np.concatenate([self.points, self.colours], axis=1), labels, counts)
         return means[:, :3], means[:, 3:].astype(np.float32)
 
     def sample(self, count: int) -> np.ndarray:
@@ -117,12 +123,13 @@ class Surface:
     @cached_property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals at the cell means; signs mean nothing."""
-        return self.cloud[0].normals()[:, :3]
+        normals: np.ndarray = self.cloud[0].normals()[:, :3]
+        return normals
 
     @cached_property
     def lightness(self) -> np.ndarray:
         """(M,) float64 lightness of the cell means, 0 to 1."""
-        return self.coarse[1].astype(np.float64) @ [0.299, 0.587, 0.114]
+        return self.coarse[1].astype(np.float64) @ np.array([0.299, 0.587, 0.114])
 
     def lightness_gradients(self, rows: np.ndarray) -> np.ndarray:
         """(R, 3) change of lightness per metre within the tangent plane of some cell means; each computed once."""

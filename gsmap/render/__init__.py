@@ -5,12 +5,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from gsmap.render.backends import backend
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.render.index import ChunkIndex
-from gsmap.render.rendering import Rendered, num_threads, render, set_num_threads
+from gsmap.render.native import num_threads, set_num_threads
+from gsmap.render.outputs import Rendered
+from gsmap.render.rendering import render
 
 if TYPE_CHECKING:
-    from gsmap.render.autograd import GaussianTensors
+    from gsmap.render.tensors import GaussianTensors
 
 __all__ = [
     "ChunkIndex",
@@ -18,6 +21,7 @@ __all__ = [
     "GaussianTensors",
     "LearningRates",
     "Rendered",
+    "backend",
     "num_threads",
     "render",
     "set_num_threads",
@@ -26,5 +30,5 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "GaussianTensors":  # needs torch
-        return importlib.import_module("gsmap.render.autograd").GaussianTensors
+        return importlib.import_module("gsmap.render.tensors").GaussianTensors
     raise AttributeError(f"module 'gsmap.render' has no attribute {name!r}")

@@ -1,100 +1,36 @@
-"""Rendering as a torch operation."""
+"""Rendering on the CPU as a torch operation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
 
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import ConfigError
 from gsmap.render import native
 from gsmap.render.index import ChunkIndex
-from gsmap.types import Cameras, Gaussians
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianTensors:
-    """N Gaussians as float32 tensors, shaped as in `gsmap.types.Gaussians`; any of them may require a gradient."""
-
-    means: torch.Tensor
-    quats: torch.Tensor
-    log_scales: torch.Tensor
-    logit_opacities: torch.Tensor
-    sh: torch.Tensor
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not isinstance(value, torch.Tensor) or value.dtype != torch.float32:
-                kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
-                raise InputError(f"GaussianTensors.{f.name} must be a float32 tensor, got {kind}")
-            if value.device != self.means.device:
-                raise InputError(f"GaussianTensors.{f.name} is on {value.device}, means are on {self.means.device}")
-        n = self.means.shape[0] if self.means.ndim else 0
-        expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
-        for name, shape in expected.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise InputError(
-                    f"GaussianTensors.{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}"
-                )
-        sh = tuple(self.sh.shape)
-        if len(sh) != 3 or sh[0] != n or sh[1] not in (1, 4, 9, 16) or sh[2] != 3:
-            raise InputError(f"GaussianTensors.sh must have shape ({n}, K, 3) with K = 1, 4, 9 or 16, got {sh}")
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
-
-    @classmethod
-    def of(cls, gaussians: Gaussians, device: str = "cpu", requires_grad: bool = False) -> GaussianTensors:
-        """Copies of numpy Gaussians."""
-        tensors = (torch.tensor(a, device=device, requires_grad=requires_grad) for a in native.arrays_of(gaussians))
-        return cls(*tensors)
-
-    def numpy(self) -> Gaussians:
-        """The same as numpy Gaussians (a copy)."""
-        return Gaussians(*(t.detach().cpu().numpy().copy() for t in self.tensors()))
-
-    def tensors(self) -> tuple[torch.Tensor, ...]:
-        return self.means, self.quats, self.log_scales, self.logit_opacities, self.sh
+from gsmap.render.outputs import Rendered, image_size
+from gsmap.render.tensors import GaussianTensors
+from gsmap.types import Cameras
 
 
 def render_tensors(
     gaussians: GaussianTensors,
     cameras: Cameras,
-    T_camera_frame: torch.Tensor | None,
+    T_camera_frame: torch.Tensor,
     background: np.ndarray,
     depth: bool,
     dominant_id: bool,
     max_weight: bool,
     index: ChunkIndex | None,
-    backend: str,
-) -> Any:
-    """`gsmap.render.render` for tensors."""
-    from gsmap.render.rendering import Rendered, gsplat_available, image_size
-
-    if not isinstance(gaussians, GaussianTensors):
-        raise InputError(f"render needs Gaussians or GaussianTensors, got {type(gaussians).__name__}")
-    if T_camera_frame is None:
-        pose = torch.from_numpy(cameras.T_camera_frame)
-    else:
-        pose = T_camera_frame
-        if tuple(pose.shape) != (len(cameras), 4, 4) or not pose.is_floating_point():
-            raise InputError(f"T_camera_frame must be a float tensor ({len(cameras)}, 4, 4), got {tuple(pose.shape)}")
-        if not bool(torch.isfinite(pose).all()):
-            raise InputError("T_camera_frame holds NaN or infinity")
-    on_cuda = gaussians.means.device.type == "cuda"
-    if backend != "native" and (backend == "gsplat" or on_cuda or gsplat_available()):
-        from gsmap.render import gsplat
-
-        return gsplat.render_tensors(gaussians, cameras, pose, background, depth, dominant_id, max_weight)
-    if on_cuda:
+) -> Rendered:
+    """`gsmap.render.render` for tensors on the CPU."""
+    if gaussians.means.device.type == "cuda":
         raise ConfigError("the native backend renders CPU tensors: move them to the CPU or use backend='auto'")
     width, height = image_size(cameras)
     options = (cameras.intrinsics_px, width, height, background, depth, dominant_id, max_weight, index)
-    colour, alpha, depth_, dominant, weight = _Render.apply(*gaussians.tensors(), pose, options)
-    return Rendered(colour, alpha, depth_, dominant, weight)
+    return Rendered(*_Render.apply(*gaussians.tensors(), T_camera_frame, options))
 
 
 class _Render(torch.autograd.Function):

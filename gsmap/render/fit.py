@@ -9,7 +9,7 @@ import numpy as np
 from gsmap._native import fit_step, image_loss
 from gsmap.errors import InputError
 from gsmap.render import native
-from gsmap.render.rendering import image_size
+from gsmap.render.outputs import image_size
 from gsmap.types import Cameras, Gaussians
 
 _NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")

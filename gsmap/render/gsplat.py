@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 from typing import Any
 
 import numpy as np
 import torch
 
 from gsmap.errors import MissingDependencyError
-from gsmap.render.autograd import GaussianTensors
-from gsmap.render.rendering import Rendered, image_size
+from gsmap.render.outputs import Rendered, image_size
+from gsmap.render.tensors import GaussianTensors
 from gsmap.types import Cameras, Gaussians
-
-
-@functools.cache
-def available() -> bool:
-    """Whether gsplat is installed and torch sees a GPU."""
-    return importlib.util.find_spec("gsplat") is not None and torch.cuda.is_available()
 
 
 def render_numpy(

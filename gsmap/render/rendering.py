@@ -1,45 +1,22 @@
-"""The one function that renders, and its answer."""
+"""The one function that renders."""
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmap.errors import ConfigError, InputError
-from gsmap.render import native
+from gsmap.errors import InputError
+from gsmap.render import backends, native
 from gsmap.render.index import ChunkIndex
+from gsmap.render.outputs import Rendered, image_size
 from gsmap.types import Cameras, Gaussians
 
 if TYPE_CHECKING:
     import torch
 
-    from gsmap.render.autograd import GaussianTensors
-
-num_threads = native.num_threads
-set_num_threads = native.set_num_threads
-
-
-@dataclass(frozen=True, eq=False)
-class Rendered:
-    """What C cameras see; numpy arrays or torch tensors, as the Gaussians were.
-
-    Args:
-        colour: (C, H, W, 3) float32, not clamped above.
-        alpha: (C, H, W) float32 in [0, 1].
-        depth: (C, H, W) float32 expected camera-space z, ``sum w z / sum w``, 0 where alpha is 0; or None.
-        dominant_id: (C, H, W) int32 Gaussian with the largest blending weight, -1 where nothing was drawn; or None.
-        max_weight: (N,) float32 largest blending weight of each Gaussian over all pixels of all views; or None.
-    """
-
-    colour: Any
-    alpha: Any
-    depth: Any = None
-    dominant_id: Any = None
-    max_weight: Any = None
+    from gsmap.render.tensors import GaussianTensors
 
 
 def render(
@@ -78,8 +55,7 @@ def render(
         ConfigError: an unknown backend, or one that cannot take these inputs.
         MissingDependencyError: gsplat is asked for and not installed.
     """
-    if backend not in ("auto", "native", "gsplat"):
-        raise ConfigError(f"backend must be auto, native or gsplat, got {backend!r}")
+    chosen = backends.backend(backend)
     width, height = image_size(cameras)
     colour = np.asarray(background, dtype=np.float32)
     if colour.shape != (3,) or not np.isfinite(colour).all():
@@ -87,7 +63,7 @@ def render(
     if isinstance(gaussians, Gaussians):
         if T_camera_frame is not None:
             raise InputError("T_camera_frame goes with GaussianTensors; for numpy, put the pose into the cameras")
-        if backend == "gsplat" or (backend == "auto" and gsplat_available()):
+        if chosen == "gsplat":
             from gsmap.render import gsplat
 
             return gsplat.render_numpy(gaussians, cameras, colour, depth, dominant_id, max_weight)
@@ -98,36 +74,28 @@ def render(
             native.forward(view, arrays, cameras.T_camera_frame[i], cameras.intrinsics_px[i], colour, images, i, index)
         return Rendered(**images)
 
-    from gsmap.render import autograd
+    from gsmap.render import autograd, gsplat
+    from gsmap.render.tensors import GaussianTensors
 
-    return autograd.render_tensors(
-        gaussians, cameras, T_camera_frame, colour, depth, dominant_id, max_weight, index, backend
-    )
-
-
-def gsplat_available() -> bool:
-    """Whether the CUDA backend can be used here."""
-    if importlib.util.find_spec("gsplat") is None:
-        return False  # without importing torch, which numpy callers may do without
-    from gsmap.render import gsplat
-
-    return gsplat.available()
+    if not isinstance(gaussians, GaussianTensors):
+        raise InputError(f"render needs Gaussians or GaussianTensors, got {type(gaussians).__name__}")
+    pose = _view_matrices(cameras, T_camera_frame)
+    # Tensors that lie on the GPU are rendered there, even where gsplat turns out to be missing: its error says so.
+    if chosen == "gsplat" or (backend == "auto" and gaussians.means.device.type == "cuda"):
+        return gsplat.render_tensors(gaussians, cameras, pose, colour, depth, dominant_id, max_weight)
+    return autograd.render_tensors(gaussians, cameras, pose, colour, depth, dominant_id, max_weight, index)
 
 
-def image_size(cameras: Cameras) -> tuple[int, int]:
-    """``(width, height)`` that all cameras share.
+def _view_matrices(cameras: Cameras, T_camera_frame: torch.Tensor | None) -> torch.Tensor:
+    """(C, 4, 4) those given, or the cameras' own."""
+    import torch
 
-    Raises:
-        InputError: not `Cameras`, several sizes, or larger than the rasteriser's 65,535 tiles of 32 pixels a side.
-    """
-    if not isinstance(cameras, Cameras):
-        raise InputError(f"render needs gsmap.types.Cameras, got {type(cameras).__name__}")
-    if len(cameras) == 0:
-        return 1, 1
-    width, height = (int(v) for v in cameras.sizes_px[0])
-    if (cameras.sizes_px != (width, height)).any():
-        sizes = sorted({f"{w}x{h}" for w, h in cameras.sizes_px.tolist()})
-        raise InputError(f"cameras of one render call must share one image size, got {', '.join(sizes[:5])}")
-    if width * height > 2**28:
-        raise InputError(f"an image of {width}x{height} pixels is too large to render: resize the cameras")
-    return width, height
+    if T_camera_frame is None:
+        return torch.from_numpy(cameras.T_camera_frame)
+    if tuple(T_camera_frame.shape) != (len(cameras), 4, 4) or not T_camera_frame.is_floating_point():
+        raise InputError(
+            f"T_camera_frame must be a float tensor ({len(cameras)}, 4, 4), got {tuple(T_camera_frame.shape)}"
+        )
+    if not bool(torch.isfinite(T_camera_frame).all()):
+        raise InputError("T_camera_frame holds NaN or infinity")
+    return T_camera_frame

@@ -1,9 +1,11 @@
 """The frozen nouns of gsmap. numpy only: they travel between stages, processes and machines."""
 
 from gsmap.types.cameras import Cameras
+from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
-from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseGraph, Prior, Provenance, ScenePose
-from gsmap.types.registration import Registration
+from gsmap.types.merging import MergeResult, PlacedScene
+from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
+from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph
 from gsmap.types.sim3 import Sim3
@@ -13,10 +15,15 @@ __all__ = [
     "Cameras",
     "Edge",
     "EdgeOutcome",
+    "FileInfo",
     "Gaussians",
+    "MergeResult",
     "NodeLayer",
+    "PlacedScene",
+    "PoseChange",
     "PoseGraph",
     "Prior",
+    "Proposal",
     "Provenance",
     "Registration",
     "Scene",

@@ -22,7 +22,6 @@ class Edge:
             ``S = S_hat * Exp(xi)`` with the exact Sim(3) exponential (`gsmap.geometry.similarities`), translation in
             the source's unit; a rigid edge carries a stiff scale row.
         confirmed: a person vouches for it: it joins components by itself and is never voted out.
-        strong: the pairwise verdict alone may attach a scene or a small component.
     """
 
     target: str
@@ -30,7 +29,6 @@ class Edge:
     S_target_source: Sim3
     information: np.ndarray
     confirmed: bool = False
-    strong: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,12 +103,15 @@ class Provenance:
 
     Args:
         method: ``batch`` (everything solved anew) or ``incremental`` (new scenes placed in the last answer).
+        recipe: digest of the recipe it was solved by (`gsmap.optimize.recipe_key`); empty where unknown. Only an answer
+            of the same recipe is built upon.
         batch_scenes: how many scenes the last batch solve had.
         measured: fingerprint of the edges and priors that the answer rests on (`gsmap.optimize`); empty where unknown.
         contradicted_priors: scenes whose prior the edges outweighed.
     """
 
     method: str = "batch"
+    recipe: str = ""
     batch_scenes: int = 0
     measured: str = ""
     contradicted_priors: tuple[str, ...] = ()
@@ -143,3 +144,33 @@ class PoseGraph:
     def undecided(self) -> tuple[tuple[str, str], ...]:
         """(target, source) of the edges that nothing could decide."""
         return tuple(pair for pair, outcome in self.outcomes.items() if outcome.undecided)
+
+
+POSE_CHANGES = ("added", "removed", "moved", "same")
+
+
+@dataclass(frozen=True)
+class PoseChange:
+    """How one scene differs between two pose graphs.
+
+    Args:
+        scene: scene id.
+        kind: ``added``, ``removed``, ``moved`` or ``same`` (pose and component both as before).
+        rotation_deg: angle turned; None where the scene is in only one of the two.
+        translation: how far the scene's middle went, in map units; None as above.
+        scale_ratio: new scale by old; None as above.
+        components: its component before and after, None where it is absent.
+        statuses: its status before and after, None where it is absent.
+    """
+
+    scene: str
+    kind: str
+    rotation_deg: float | None
+    translation: float | None
+    scale_ratio: float | None
+    components: tuple[int | None, int | None]
+    statuses: tuple[str | None, str | None]
+
+    def __post_init__(self) -> None:
+        if self.kind not in POSE_CHANGES:
+            raise InputError(f"a scene's change must be one of {', '.join(POSE_CHANGES)}, got {self.kind!r}")

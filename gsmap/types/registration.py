@@ -1,4 +1,4 @@
-"""The result of registering one pair of scenes."""
+"""The result of registering one pair of scenes, and the poses that were proposed on the way."""
 
 from __future__ import annotations
 
@@ -10,6 +10,34 @@ from gsmap.errors import InputError
 from gsmap.types.sim3 import Sim3
 
 STATUSES = ("accepted", "rejected", "no_match")
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A pose of a pair of scenes, to be refined and judged.
+
+    Args:
+        proposer: which method proposed it, and from what, such as ``graph:landmarks``.
+        S_target_source: the pose, in the scenes' own units.
+        with_scale: the scale was estimated; otherwise it is exactly 1.
+        num_inliers: correspondences that it rests on.
+        num_correspondences: candidates that they were chosen from; 0 where none were counted.
+        exact: whether the search proved its answer largest.
+        log_nfa: log10 of the number of false alarms; NaN where nothing was counted.
+        runner_up: size of the best set of correspondences that disagrees, as a share of this one's; 0 where none comes
+            near, NaN where none was sought.
+        flaw: why the pose cannot be used, or empty.
+    """
+
+    proposer: str
+    S_target_source: Sim3
+    with_scale: bool
+    num_inliers: int
+    num_correspondences: int = 0
+    exact: bool = True
+    log_nfa: float = float("nan")
+    runner_up: float = float("nan")
+    flaw: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +55,25 @@ class Registration:
         num_inliers: size of the accepted set of correspondences.
         num_correspondences: candidates it was chosen from.
         overlap: share of the smaller scene's surface that coincides, in [0, 1].
-        proposer: which proposal won (``landmarks``, ``objects``, ``kiss_matcher``), or ``manual``: a person's own
-            measurement.
+        proposer: which method's pose it is, and what that rests on: ``graph:landmarks``, ``graph:objects``,
+            ``kiss_matcher``; ``manual`` where a person measured it; empty where there is none.
         exact: whether the clique search proved its answer largest.
-        seconds: wall seconds by step (``match``, ``refine``, ``verdict``).
-        evidence: the figures the verdict rests on, by name (logNFA, runner-up ratio, ...).
-        notes: what a person should know (a package that was missing, a covariance that was guessed, ...).
+        seconds: wall seconds by step (``match``, ``refine``, ``verdict``; ``fallback`` and ``polish`` where they ran).
+        evidence: the figures that the verdict rests on, those of the best pose; empty where no pose was proposed. By
+            name, all of them floats:
+
+            ``log_nfa``: log10 of the number of false alarms of the correspondences under the pose (a-contrario; below
+            -2 the background model is no explanation); NaN where the proposer counts none.
+            ``runner_up``: size of the largest clique that disagrees with the pose, as a share of the pose's own; NaN
+            where none was sought.
+            ``free_space_violation``: share, in [0, 1], of the surface Gaussians of one scene that the cameras of the
+            other could judge and that stand in front of what these saw; the larger of both directions; NaN without
+            cameras.
+            ``num_seen``: count of Gaussians so judged, the smaller of both directions.
+            ``num_coinciding``: count of cells of the source's surface that lie on the target's.
+            ``colour_correlation``: correlation, in [-1, 1], of local colours where both scenes show the same surface.
+            ``colour_t``: its significance, in standard deviations over patches.
+        notes: what a person should know of how it was computed (a package that is missing, ...).
     """
 
     target: str

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.formats.ply import SH_C0
 from gsmap.formats.tiles3d import coarser
+from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.geometry.voxels import covariances
 from gsmap.types import Cameras, Gaussians, Scene, SceneGraph, ScenePose, Sim3
@@ -26,7 +26,7 @@ class ViewScene:
     """One scene: what is known of it, and how to load the rest when the page asks.
 
     Args:
-        pose: None where nothing placed it; it is then an island of its own.
+        pose: None where nothing placed it; it is then a component of its own.
         gaussians, graph, cameras: called from the server's threads; graph and cameras may give None.
     """
 
@@ -43,7 +43,7 @@ class ViewEdge:
 
     Args:
         target, source: scene ids.
-        status: ``accepted``, ``rejected`` or ``no_match``, a person's word included.
+        status: ``accepted``, ``rejected`` or ``no_match``, a review included.
         used: what the last optimize made of it: True, False or ``"tentative"``; None before.
     """
 
@@ -73,7 +73,7 @@ class ViewMap:
 
     def summary(self) -> dict[str, Any]:
         """Everything the page lists, without splats, nodes and cameras."""
-        islands = 1 + max((s.pose.component for s in self.scenes if s.pose is not None), default=-1)
+        components = 1 + max((s.pose.component for s in self.scenes if s.pose is not None), default=-1)
         scenes = []
         for index, entry in enumerate(self.scenes):
             pose = entry.pose
@@ -83,7 +83,7 @@ class ViewMap:
                     "id": entry.scene.id,
                     "num_gaussians": entry.scene.num_gaussians,
                     "captured_at": entry.scene.captured_at,
-                    "component": pose.component if pose else islands + index,
+                    "component": pose.component if pose else components + index,
                     "status": pose.status if pose else "not placed",
                     "S_map_scene": _pose(entry).matrix().tolist(),
                     "corners": _pose(entry).apply(_corners(entry.scene.bounds)).tolist(),
@@ -115,7 +115,7 @@ class ViewMap:
         rows = np.empty((len(g), 10), "<f4")
         rows[:, :3] = g.means
         rows[:, 3:9] = covariances(g).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        rgba = np.concatenate([g.sh[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], axis=1)
+        rgba = np.concatenate([rgb_of_sh0(g.sh[:, 0]), g.opacities[:, None]], axis=1)
         rows[:, 9:].view("u1")[:] = np.round(np.clip(rgba, 0, 1) * 255)
         return rows.tobytes()
 

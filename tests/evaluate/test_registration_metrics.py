@@ -67,7 +67,7 @@ def test_ate_is_zero_for_a_moved_trajectory_and_rms_otherwise():
     assert absolute_trajectory_error(true + np.array([0.3, 0, 0.4]), true, align="none") == pytest.approx(0.5)
 
 
-def test_ate_aligns_islands_apart():
+def test_ate_aligns_components_apart():
     rng = np.random.default_rng(2)
     true = rng.normal(size=(20, 3))
     estimated = true.copy()

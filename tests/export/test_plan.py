@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from gsmap.errors import ConfigError, InputError
-from gsmap.export import dirty_reason, plan_tiles
+from gsmap.export import TileRecipe, dirty_reason, plan_tiles
 from gsmap.geometry.rotations import exp_so3
+from gsmap.merge import recipe_key
 from gsmap.types import Sim3, Tile
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -13,8 +14,11 @@ def at(x, y=0.0, z=0.0, turn_rad=0.0, scale=1.0):
     return Sim3(exp_so3([0, 0, turn_rad]), [x, y, z], scale)
 
 
-def tile_of(planned, method="voxel"):
-    return Tile(planned.key(method), planned.component, planned.bounds, planned.poses)
+VOXEL, UNION = TileRecipe(recipe_key("voxel")), TileRecipe(recipe_key("union"))
+
+
+def tile_of(planned, recipe=VOXEL):
+    return Tile(recipe.key(planned), planned.component, planned.bounds, planned.poses, recipe=recipe.merge.to_json())
 
 
 def test_tiles_cover_every_point_of_every_scene_exactly_once():
@@ -47,7 +51,7 @@ def test_an_oriented_box_leaves_out_corners_it_does_not_reach():
     assert "tile_+001_+008_+000" not in names
 
 
-def test_islands_are_planned_apart():
+def test_components_are_planned_apart():
     poses = {"a": at(0), "b": at(0)}
     tiles = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=0, components={"a": 0, "b": 3})
     assert [(t.component, t.name, list(t.poses)) for t in tiles] == [(0, "map", ["a"]), (3, "map", ["b"])]
@@ -75,17 +79,17 @@ def test_a_tile_is_dirty_for_content_method_or_pose_but_not_for_a_hair():
     poses, bounds = {"a": at(0), "b": at(1)}, dict.fromkeys("abc", BOX)
     (planned,) = plan_tiles(poses, bounds, tile_size_m=0)
     tile = tile_of(planned)
-    assert dirty_reason(planned, None, "voxel") == "new"
-    assert dirty_reason(planned, tile, "voxel") == ""
-    assert "method" in dirty_reason(planned, tile, "union")
+    assert dirty_reason(planned, None, VOXEL) == "new"
+    assert dirty_reason(planned, tile, VOXEL) == ""
+    assert "method" in dirty_reason(planned, tile, UNION)
     (grown,) = plan_tiles({**poses, "c": at(2)}, bounds, tile_size_m=0)
-    assert "scenes" in dirty_reason(grown, tile, "voxel")
+    assert "scenes" in dirty_reason(grown, tile, VOXEL)
     (hair,) = plan_tiles({**poses, "b": at(1.003)}, bounds, tile_size_m=0)
-    assert dirty_reason(hair, tile, "voxel") == ""
+    assert dirty_reason(hair, tile, VOXEL) == ""
     (moved,) = plan_tiles({**poses, "b": at(1.01)}, bounds, tile_size_m=0)
-    assert "moved" in dirty_reason(moved, tile, "voxel")
+    assert "moved" in dirty_reason(moved, tile, VOXEL)
     (turned,) = plan_tiles({**poses, "b": at(1, turn_rad=0.02)}, bounds, tile_size_m=0)
-    assert "moved" in dirty_reason(turned, tile, "voxel")
+    assert "moved" in dirty_reason(turned, tile, VOXEL)
 
 
 def test_slow_drift_is_noticed_in_the_end():
@@ -95,6 +99,6 @@ def test_slow_drift_is_noticed_in_the_end():
     reasons = []
     for x in np.arange(1, 5) * 0.002:
         (now,) = plan_tiles({"a": at(x)}, bounds, tile_size_m=0)
-        reasons.append(dirty_reason(now, tile, "voxel"))
+        reasons.append(dirty_reason(now, tile, VOXEL))
     assert reasons[0] == reasons[1] == ""
     assert "moved" in reasons[-1]

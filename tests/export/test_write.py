@@ -6,8 +6,9 @@ import pytest
 
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError, StoreError
-from gsmap.export import export_tiles, plan_tiles
-from gsmap.merge.tile import Source, merge_tile
+from gsmap.export import Params, TileRecipe, export_tiles, plan_tiles
+from gsmap.merge import recipe_key
+from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.types import Gaussians, Sim3
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -34,7 +35,7 @@ class Street:
         self.made = []
         self.fail_at = None
 
-    def export(self, scenes="abcd", map_id="street", method="voxel", **options):
+    def export(self, scenes="abcd", map_id="street", method="voxel", format="ply", **options):
         plan = plan_tiles(
             {s: self.poses[s] for s in scenes}, dict.fromkeys(scenes, BOX), tile_size_m=options.pop("tile_size_m", 4.0)
         )
@@ -44,10 +45,11 @@ class Street:
             if len(self.made) == self.fail_at:
                 raise KeyboardInterrupt
             self.made.append(planned.name)
-            sources = [Source(s, pose, lambda box, s=s: self.scenes[s]) for s, pose in planned.poses.items()]
+            sources = [LazyScene(s, pose, lambda box, s=s: self.scenes[s]) for s, pose in planned.poses.items()]
             return merge_tile(sources, method, bounds=planned.bounds, progress=progress)
 
-        return export_tiles(plan, make, self.out, map_id=map_id, method=method, **options)
+        recipe = TileRecipe(recipe_key(method), format)
+        return export_tiles(plan, make, self.out, map_id=map_id, recipe=recipe, **options)
 
     def files(self):
         return sorted(str(p.relative_to(self.out)) for p in self.out.rglob("*") if p.is_file())
@@ -142,7 +144,7 @@ def test_a_full_disk_leaves_no_half_tile(street, monkeypatch):
 
 def test_workers_make_the_same_files(street):
     one = street.export()
-    other = Street(street.out.parent / "threads").export(workers=3)
+    other = Street(street.out.parent / "threads").export(params=Params(workers=3))
     assert [(t.path, t.sha256) for t in one.tiles] == [(t.path, t.sha256) for t in other.tiles]
 
 
@@ -184,7 +186,7 @@ def test_bad_options_are_refused_before_anything_is_written(street):
     with pytest.raises(ConfigError, match="choose one of"):
         street.export(format="obj")
     with pytest.raises(ConfigError, match="worker"):
-        street.export(workers=0)
+        street.export(params=Params(workers=0))
     assert not street.out.exists()
     (street.out.parent / "file").write_text("mine")
     with pytest.raises(StoreError, match="cannot write the export"):

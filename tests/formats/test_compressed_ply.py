@@ -7,6 +7,7 @@ from gsmap import formats
 from gsmap.errors import InputError
 from gsmap.formats import compressed_ply, ply
 from gsmap.geometry.morton import morton_order
+from gsmap.geometry.sh import SH_C0
 
 
 @settings(max_examples=25, deadline=None)
@@ -76,7 +77,7 @@ def test_older_files_without_bounds_of_colours(tmp_path):
     lines = [line for line in lines if not line.endswith(("_r", "_g", "_b"))]
     bounds = np.frombuffer(data, "<f4", 18, header.data_offset)
     old.write_bytes("\n".join([*lines, ""]).encode() + bounds[:12].tobytes() + data[header.data_offset + 72 :])
-    rgb = formats.read(old).sh[:, 0] * ply.SH_C0 + 0.5
+    rgb = formats.read(old).sh[:, 0] * SH_C0 + 0.5
     np.testing.assert_array_equal(np.round(rgb.max(0) * 255), 255)  # the level itself, not stretched to the bounds
     np.testing.assert_array_equal(formats.read(old).means, formats.read(path).means)
 

@@ -1,11 +1,14 @@
 import os
+import sys
 
 import numpy as np
 import pytest
 
 import gsmap
 from gsmap import formats
-from gsmap.errors import InputError, NotFoundError
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.methods import family
+from gsmap.methods.family import _loaded
 from gsmap.types import Gaussians
 
 
@@ -21,11 +24,67 @@ def one(n: int = 3, degree: int = 1) -> Gaussians:
     )
 
 
-def test_longest_suffix_wins(monkeypatch):
-    monkeypatch.setitem(formats.MODULES, ".compressed.ply", "compressed_ply")
+def test_longest_suffix_wins():
     assert formats.suffix_of("a/b.COMPRESSED.ply") == ".compressed.ply"
     assert formats.suffix_of("a/b.ply") == ".ply"
     assert formats.suffix_of("a/plain") is None
+
+
+@pytest.fixture
+def added(tmp_path, monkeypatch):
+    """A package, installed as pip would, that adds a format with a layout of its own and one that cannot be loaded."""
+    site = tmp_path / "site"
+    about = site / "lists-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: lists\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[gsmap.formats]\n.list.ply = splat_lists\n.torn = no_such_module\n")
+    (site / "splat_lists.py").write_text(
+        "import numpy as np\n"
+        "from gsmap.types import FileInfo, Gaussians\n"
+        "VERSION = 3\n"
+        "NAMES = 'means', 'quats', 'log_scales', 'logit_opacities', 'sh'\n"
+        "def read(path):\n"
+        "    with np.load(open(path, 'rb')) as file:\n"
+        "        return Gaussians(*(file[name] for name in NAMES))\n"
+        "def write(path, gaussians, *, loud=False):\n"
+        "    np.savez(open(path, 'wb'), **{name: getattr(gaussians, name) for name in NAMES})\n"
+        "def info(path):\n"
+        "    return FileInfo(notes=('a list',))\n"
+    )
+    monkeypatch.syspath_prepend(site)
+    yield "splat_lists"
+    sys.modules.pop("splat_lists", None)
+    _loaded.cache_clear()
+
+
+def test_another_package_adds_a_format(added, tmp_path):
+    path = tmp_path / "a.list.ply"
+    formats.write(path, one(4, degree=2), loud=True)
+    np.testing.assert_array_equal(formats.read(path).sh, one(4, degree=2).sh)
+    assert formats.info(path).notes == ("a list",)
+    assert family("format").version(".list.ply") == {"format.list.ply": 3}
+    formats.write(tmp_path / "b.ply", one())
+    assert len(formats.read(tmp_path / "b.ply")) == 3
+    assert ".list.ply" in formats.known("read")
+    assert ".torn" not in formats.known("read")
+    with pytest.raises(ConfigError, match=r"package lists cannot be loaded.*no_such_module"):
+        formats.read(tmp_path / "a.torn")
+
+
+def test_built_in_formats_keep_their_contract():
+    assert set(family("format").names()) >= {
+        ".ply",
+        ".compressed.ply",
+        ".glb",
+        ".sog",
+        ".splat",
+        ".spz",
+        "tileset.json",
+    }
+    for suffix in family("format").names():
+        module = family("format").get(suffix)
+        assert isinstance(module.VERSION, int)
+        assert hasattr(module, "read") or hasattr(module, "write")
 
 
 def test_unknown_suffix_lists_what_is_known(tmp_path):

@@ -3,6 +3,7 @@ import pytest
 
 from gsmap.errors import InputError
 from gsmap.formats import info, ply, read, write
+from gsmap.geometry.sh import SH_C0
 from gsmap.types import Gaussians
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
@@ -109,7 +110,7 @@ def test_colours_from_uchar_rgb(tmp_path):
     rgb = np.arange(60).reshape(20, 3) * 4
     table |= {name: rgb[:, i] for i, name in enumerate(("red", "green", "blue"))}
     path = save(tmp_path / "a.ply", table, kinds=dict.fromkeys(("red", "green", "blue"), "uchar"))
-    np.testing.assert_allclose(0.5 + ply.SH_C0 * read(path).sh[:, 0], rgb / 255, atol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * read(path).sh[:, 0], rgb / 255, atol=1e-6)
     assert "colours" in info(path).notes[0]
 
 

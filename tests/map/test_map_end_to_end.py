@@ -14,17 +14,18 @@ import pytest
 
 import gsmap
 import gsmap.map
-from gsmap import demo, formats
+from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.export.manifest import FILE_NAME
 from gsmap.types import Prior, Sim3
+from gsmap_synthetic import make_captures, write_captures
 
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures")
-    made = demo.make_captures(0, 3, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
-    demo.write_captures(folder, made)
+    made = make_captures(0, 3, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
+    write_captures(folder, made)
     return folder
 
 
@@ -272,11 +273,11 @@ def test_models_are_checked_kept_and_used(copy: Path, tmp_path: Path) -> None:
     model = tmp_path / "encoder.onnx"
     model.write_bytes(_image_encoder())
     with gsmap.open(copy) as m:
-        before = m.describe("capture_a")[0].layers["objects"].method
+        before = m.describe("capture_a")[0].layers["objects"].descriptor_id
         m.add_model("clip", model, preset="unit")
         model.unlink()  # the map has its own copy
         after = m.describe("capture_a")[0].layers["objects"]
-        assert after.method != before
+        assert after.descriptor_id != before
         assert [row["kind"] for row in m.model_rows()] == ["clip"]
         m.draw_graph("capture_a", tmp_path / "graph.png")
         with pytest.raises(InputError, match="not an ONNX model"):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gsmap.errors import ConfigError, InputError
-from gsmap.merge import Part, default_params, merge, methods
+from gsmap.merge import PlacedScene, default_params, merge, methods
 from gsmap.types import Gaussians
 
 
@@ -27,7 +27,7 @@ TILES = [np.array([[x, y, -2], [x + 1.005, y + 1.005, 2]]) for x in (-1.005, 0.0
 
 
 def test_union_keeps_everything_with_its_origin():
-    parts = [Part(cloud(0), scene_id="b"), Part(cloud(1, n=500), scene_id="a")]
+    parts = [PlacedScene(cloud(0), scene_id="b"), PlacedScene(cloud(1, n=500), scene_id="a")]
     result = merge(parts, "union")
     assert result.num_input == len(result.gaussians) == 3500
     np.testing.assert_array_equal(result.gaussians.means[result.origin == 1], parts[1].gaussians.means)
@@ -35,7 +35,7 @@ def test_union_keeps_everything_with_its_origin():
 
 def test_distance_keeps_exactly_what_is_nearer_to_its_own_centroid():
     a, b = cloud(0), cloud(1, low=(0, -1, -1), high=(3, 1, 1))
-    result = merge([Part(a, scene_id="a"), Part(b, scene_id="b")], "distance")
+    result = merge([PlacedScene(a, scene_id="a"), PlacedScene(b, scene_id="b")], "distance")
     centre_a, centre_b = a.means.mean(0), b.means.mean(0)
     nearer_a = lambda p: np.linalg.norm(p - centre_a, axis=1) < np.linalg.norm(p - centre_b, axis=1)  # noqa: E731
     np.testing.assert_array_equal(result.gaussians.means[result.origin == 0], a.means[nearer_a(a.means)])
@@ -44,9 +44,11 @@ def test_distance_keeps_exactly_what_is_nearer_to_its_own_centroid():
 
 def test_distance_alone_keeps_everything_and_a_tile_uses_the_whole_captures_centroid():
     a, b = cloud(0), cloud(1, low=(0, -1, -1), high=(3, 1, 1))
-    assert len(merge([Part(a)], "distance").gaussians) == len(a)
-    whole = merge([Part(a, scene_id="a"), Part(b, scene_id="b")], "distance")
-    parts = [Part(g, scene_id=s, centroid=g.means.mean(0, dtype=float)) for g, s in ((a, "a"), (b, "b"))]
+    assert len(merge([PlacedScene(a)], "distance").gaussians) == len(a)
+    whole = merge([PlacedScene(a, scene_id="a"), PlacedScene(b, scene_id="b")], "distance")
+    parts = [
+        PlacedScene(g, scene_id=s, centroid=lambda g=g: g.means.mean(0, dtype=float)) for g, s in ((a, "a"), (b, "b"))
+    ]
     boxes = [np.array([[-9, -9, -9], [0.4, 9, 9]]), np.array([[0.4, -9, -9], [9, 9, 9]])]
     tiles = [merge(parts, "distance", bounds=box).gaussians for box in boxes]
     np.testing.assert_array_equal(rows(Gaussians.concatenate(tiles)), rows(whole.gaussians))
@@ -54,7 +56,7 @@ def test_distance_alone_keeps_everything_and_a_tile_uses_the_whole_captures_cent
 
 @pytest.mark.parametrize("method", ["union", "voxel"])
 def test_tiles_made_apart_are_the_whole(method):
-    parts = [Part(cloud(s, n=20_000), scene_id=str(s)) for s in range(2)]
+    parts = [PlacedScene(cloud(s, n=20_000), scene_id=str(s)) for s in range(2)]
     params = default_params(method)
     if method == "voxel":
         params = type(params)(voxel_m=0.07)
@@ -68,7 +70,7 @@ def test_tiles_made_apart_are_the_whole(method):
 
 @pytest.mark.parametrize("method", ["union", "distance", "voxel"])
 def test_order_of_parts_does_not_matter(method):
-    a, b = Part(cloud(0), scene_id="a"), Part(cloud(1), scene_id="b")
+    a, b = PlacedScene(cloud(0), scene_id="a"), PlacedScene(cloud(1), scene_id="b")
     one, other = merge([a, b], method), merge([b, a], method)
     np.testing.assert_array_equal(one.gaussians.means, other.gaussians.means)
     np.testing.assert_array_equal(one.origin, 1 - other.origin)
@@ -76,15 +78,19 @@ def test_order_of_parts_does_not_matter(method):
 
 def test_voxel_merges_a_capture_with_its_copy_into_one():
     g = cloud(0)
-    result = merge([Part(g, scene_id="a"), Part(g, scene_id="b")], "voxel", type(default_params("voxel"))(voxel_m=1e-4))
+    result = merge(
+        [PlacedScene(g, scene_id="a"), PlacedScene(g, scene_id="b")],
+        "voxel",
+        type(default_params("voxel"))(voxel_m=1e-4),
+    )
     assert len(result.gaussians) == len(g)
     joint = 1 - (1 - g.opacities.astype(float)) ** 2
     np.testing.assert_allclose(np.sort(result.gaussians.opacities), np.sort(joint), rtol=1e-3)
 
 
 def test_bad_input_is_refused_in_words():
-    part = Part(cloud(0))
-    with pytest.raises(InputError, match="no parts"):
+    part = PlacedScene(cloud(0))
+    with pytest.raises(InputError, match="no scenes"):
         merge([], "union")
     with pytest.raises(ConfigError, match="choose one of"):
         merge([part], "concat")
@@ -98,5 +104,5 @@ def test_bad_input_is_refused_in_words():
 
 
 def test_a_tile_without_anything_in_it_is_empty():
-    result = merge([Part(cloud(0))], "voxel", bounds=np.array([[50, 50, 50], [51, 51, 51]]))
+    result = merge([PlacedScene(cloud(0))], "voxel", bounds=np.array([[50, 50, 50], [51, 51, 51]]))
     assert len(result.gaussians) == len(result.origin) == result.num_input == 0

@@ -1,10 +1,10 @@
 import numpy as np
-from made_walls import cameras_facing, texture, two_parts, wall
+from synthetic_walls import cameras_facing, texture, two_scenes, wall
 
-from gsmap.merge import Part
-from gsmap.merge.changes import drop_what_is_gone, what_came_later
+from gsmap.merge import PlacedScene
+from gsmap.merge.changes import newer_surfaces, remove_disappeared
 from gsmap.merge.exposure import apply_gain, balance_exposure
-from gsmap.merge.references import order_of_views, render_references, surface_points
+from gsmap.merge.references import render_references, surface_points, view_schedule
 from gsmap.render import render
 from gsmap.types import Gaussians
 
@@ -23,23 +23,23 @@ def test_surface_points_lie_on_the_wall():
 
 
 def test_references_count_only_what_was_seen_of_the_tile():
-    parts = two_parts()
+    parts = two_scenes()
     whole = render_references(parts, None, 0.0, 64, None, quiet)
     assert len(whole) == 14
     tile = np.array([[0.6, -2, -2], [2, 2, 2]])
     views = render_references(parts, tile, 0.0, 64, None, quiet)
     # Only capture b reaches there, and only some of its cameras look that way.
-    assert set(views.part.tolist()) == {1}
+    assert set(views.scene.tolist()) == {1}
     assert 0 < len(views) < 7
     assert all(w.max() == 255 and w.min() == 0 for w in views.weights)
 
 
 def test_views_take_turns_in_proportion_to_what_they_show():
-    order = order_of_views(np.array([0.1, 0.2, 0.4]), 700, seed=0)
+    order = view_schedule(np.array([0.1, 0.2, 0.4]), 700, seed=0)
     np.testing.assert_allclose(np.bincount(order), [100, 200, 400], atol=2)
     first = np.bincount(order[:70], minlength=3)
     np.testing.assert_allclose(first, [10, 20, 40], atol=3)
-    np.testing.assert_array_equal(order, order_of_views(np.array([0.1, 0.2, 0.4]), 700, seed=0))
+    np.testing.assert_array_equal(order, view_schedule(np.array([0.1, 0.2, 0.4]), 700, seed=0))
 
 
 def test_a_gain_multiplies_every_colour():
@@ -52,9 +52,9 @@ def test_a_gain_multiplies_every_colour():
 
 
 def test_exposure_is_balanced_where_captures_meet():
-    a, b = two_parts(grain=0.0)
+    a, b = two_scenes(grain=0.0)
     gain = np.array([1.25, 1.1, 0.9])
-    brighter = Part(apply_gain(b.gaussians, gain), b.cameras, "b")
+    brighter = PlacedScene(apply_gain(b.gaussians, gain), b.cameras, "b")
     _, log_gains = balance_exposure([a, brighter])
     np.testing.assert_allclose(log_gains[1] - log_gains[0], -np.log(gain), atol=0.02)
     np.testing.assert_allclose(log_gains.sum(0), 0, atol=1e-9)
@@ -64,8 +64,8 @@ def test_exposure_is_balanced_where_captures_meet():
 
 
 def test_captures_that_do_not_meet_keep_their_exposure():
-    a = Part(wall(0, -3, -2), cameras_facing([-2.5]), "a")
-    b = Part(apply_gain(wall(1, 2, 3), np.full(3, 1.5)), cameras_facing([2.5]), "b")
+    a = PlacedScene(wall(0, -3, -2), cameras_facing([-2.5]), "a")
+    b = PlacedScene(apply_gain(wall(1, 2, 3), np.full(3, 1.5)), cameras_facing([2.5]), "b")
     assert not balance_exposure([a, b])[1].any()
 
 
@@ -73,22 +73,22 @@ def test_what_a_later_capture_looked_through_is_gone():
     box = wall(5, -0.2, 0.2, z=-0.5, colour=lambda x, y: 1 - texture(x, y), half_height=0.15)
     before = Gaussians.concatenate([wall(0, -1.5, 1.5), box])
     cameras = cameras_facing(np.linspace(-0.6, 0.6, 7))
-    old = Part(before, cameras, "old", "2026-01-01T00:00:00+00:00")
-    new = Part(wall(1, -1.5, 1.5), cameras, "new", "2026-02-01T00:00:00+00:00")
-    kept, lost = drop_what_is_gone([old, new])
+    old = PlacedScene(before, cameras, "old", "2026-01-01T00:00:00+00:00")
+    new = PlacedScene(wall(1, -1.5, 1.5), cameras, "new", "2026-02-01T00:00:00+00:00")
+    kept, lost = remove_disappeared([old, new])
     assert lost == [len(box), 0]
     assert kept[0].gaussians.means[:, 2].min() > -0.1
     # The other way round the box is new, and stays; so it does where nobody knows the time.
-    assert drop_what_is_gone([Part(before, cameras, "x", new.captured_at), old])[1][0] == 0
-    assert drop_what_is_gone([Part(before, cameras, "x"), new])[1] == [0, 0]
+    assert remove_disappeared([PlacedScene(before, cameras, "x", new.captured_at), old])[1][0] == 0
+    assert remove_disappeared([PlacedScene(before, cameras, "x"), new])[1] == [0, 0]
 
 
-def test_what_came_later_is_not_asked_away_by_older_pictures():
+def test_newer_surfaces_are_not_asked_away_by_older_pictures():
     box = wall(5, -0.2, 0.2, z=-0.5, colour=lambda x, y: 1 - texture(x, y), half_height=0.15)
     cameras = cameras_facing(np.linspace(-0.6, 0.6, 7))
-    old = Part(wall(1, -1.5, 1.5), cameras, "old", "2026-01-01T00:00:00+00:00")
-    new = Part(Gaussians.concatenate([wall(0, -1.5, 1.5), box]), cameras, "new", "2026-02-01T00:00:00+00:00")
-    later = what_came_later([old, new])
+    old = PlacedScene(wall(1, -1.5, 1.5), cameras, "old", "2026-01-01T00:00:00+00:00")
+    new = PlacedScene(Gaussians.concatenate([wall(0, -1.5, 1.5), box]), cameras, "new", "2026-02-01T00:00:00+00:00")
+    later = newer_surfaces([old, new])
     assert [len(x) for x in later] == [1, 0]
     plain = render_references([old, new], None, 0.0, 64, None, quiet)
     views = render_references([old, new], None, 0.0, 64, later, quiet)

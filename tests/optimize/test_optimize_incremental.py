@@ -4,7 +4,7 @@ import numpy as np
 from made_worlds import ROT_RAD, city, true_edges
 
 from gsmap.geometry.rotations import angle_between
-from gsmap.optimize import OptimizeParams, optimize
+from gsmap.optimize import Params, optimize
 
 
 def known(world, count):
@@ -18,10 +18,10 @@ def test_placing_scenes_one_by_one_agrees_with_solving_at_once():
     methods = []
     for count in range(111, 121):
         answer = optimize(*known(world, count), previous=answer)
-        methods.append(answer.parameters["method"])
+        methods.append(answer.provenance.method)
     assert methods.count("incremental") >= 8
-    full = optimize(*known(world, 120), params=OptimizeParams(growth=0))
-    assert full.parameters["method"] == "batch"
+    full = optimize(*known(world, 120), params=Params(growth=0))
+    assert full.provenance.method == "batch"
     away = []
     for scene in world.ids:
         one, other = answer.poses[scene], full.poses[scene]
@@ -31,17 +31,17 @@ def test_placing_scenes_one_by_one_agrees_with_solving_at_once():
     assert len(away) > 100
     assert np.median(away) < 0.03
     assert max(away) < 0.3
-    assert not [key for key in world.wrong_keys if answer.used[key] is True]
-    differing = [key for key in full.used if full.used[key] != answer.used[key]]
-    assert len(differing) < 0.02 * len(full.used)
+    assert not [key for key in world.wrong_keys if answer.outcomes[key].use == "used"]
+    differing = [key for key in full.outcomes if full.use(*key) != answer.use(*key)]
+    assert len(differing) < 0.02 * len(full.outcomes)
 
 
 def test_a_placed_scene_has_an_honest_covariance():
     world = city(100, 0.0, seed=1)
     before = optimize(*known(world, 99))
     after = optimize(*known(world, 100), previous=before)
-    assert after.parameters["method"] == "incremental"
-    full = optimize(*known(world, 100), params=OptimizeParams(growth=0))
+    assert after.provenance.method == "incremental"
+    full = optimize(*known(world, 100), params=Params(growth=0))
     scene = world.ids[99]
     ratio = np.sqrt(np.diag(after.poses[scene].covariance)[:6] / np.diag(full.poses[scene].covariance)[:6])
     assert (ratio > 0.7).all()
@@ -52,7 +52,7 @@ def test_a_scene_without_a_tie_waits_alone():
     world = city(60, 0.0, seed=1)
     before = optimize(world.ids, world.edges)
     after = optimize([*world.ids, "new"], world.edges, previous=before)
-    assert after.parameters["method"] == "incremental"
+    assert after.provenance.method == "incremental"
     assert after.poses["new"].status == "isolated"
     assert after.poses["new"].component not in {p.component for p in before.poses.values()}
     assert {s: p for s, p in after.poses.items() if s != "new"} == dict(before.poses)
@@ -64,7 +64,7 @@ def test_what_changed_underneath_is_solved_in_full():
     before = optimize(ids, edges)
 
     def method(edges):
-        return optimize(world.ids, edges, previous=before).parameters["method"]
+        return optimize(world.ids, edges, previous=before).provenance.method
 
     assert method(world.edges) == "incremental"
     assert method(world.edges[::-1]) == "incremental"
@@ -77,8 +77,8 @@ def test_what_changed_underneath_is_solved_in_full():
 def test_growth_by_a_tenth_and_joined_islands_are_solved_in_full():
     world = city(60, 0.0, seed=1)
     before = optimize(*known(world, 50))
-    assert optimize(*known(world, 54), previous=before).parameters["method"] == "incremental"
-    assert optimize(*known(world, 56), previous=before).parameters["method"] == "batch"
+    assert optimize(*known(world, 54), previous=before).provenance.method == "incremental"
+    assert optimize(*known(world, 56), previous=before).provenance.method == "batch"
 
     rng = np.random.default_rng(0)
     inside = [[a, b] for a in range(10) for b in range(a + 1, 10) if a // 5 == b // 5]
@@ -86,6 +86,6 @@ def test_growth_by_a_tenth_and_joined_islands_are_solved_in_full():
     assert len({p.component for p in apart.poses.values()}) == 2
     ties = true_edges(world.truth, [[0, 10], [1, 10], [2, 10], [5, 10], [6, 10], [7, 10]], rng, world.ids)
     edges = true_edges(world.truth, inside, np.random.default_rng(0), world.ids) + ties
-    joined = optimize(world.ids[:11], edges, previous=apart, params=OptimizeParams(growth=1))
-    assert joined.parameters["method"] == "batch"
+    joined = optimize(world.ids[:11], edges, previous=apart, params=Params(growth=1))
+    assert joined.provenance.method == "batch"
     assert len({p.component for p in joined.poses.values()}) == 1

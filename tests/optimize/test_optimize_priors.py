@@ -137,7 +137,7 @@ def test_a_rigid_edge_keeps_two_scales_equal():
     assert stiff[6, 6] == STIFF
     answer = optimize(ids, [*touching, *again, Edge("s5", "s6", rigid, stiff)])
     a, b = (answer.poses[s].S_map_scene.scale for s in ("s5", "s6"))
-    assert answer.used[("s5", "s6")] is True
+    assert answer.use("s5", "s6") == "used"
     assert a == pytest.approx(b, rel=1e-4)
 
 
@@ -158,7 +158,7 @@ def test_position_priors_part_a_fold_that_edges_alone_support():
         if k % 3 == 0
     ]
     answer = optimize(world.ids, edges, gps)
-    assert not [key for key in world.wrong_keys if key in answer.used and answer.used[key] is True]
+    assert not [key for key in world.wrong_keys if answer.use(*key) == "used"]
     assert error_m(answer, world.ids, world.truth)[[k % 3 == 0 for k in range(150)]].max() < 1.0
 
 
@@ -172,6 +172,6 @@ def test_one_wrong_position_is_outweighed(seed):
         return Prior(world.ids[k], Sim3(np.eye(3), position), np.r_[[INF] * 3, [0.5] * 3, INF])
 
     answer = optimize(world.ids, world.edges, [gps(3), gps(40), gps(77), gps(90), gps(60, off=25)])
-    assert answer.parameters["contradicted_priors"] == [world.ids[60]]
+    assert answer.provenance.contradicted_priors == (world.ids[60],)
     assert answer.poses[world.ids[60]].component == answer.poses[world.ids[3]].component
     assert error_m(answer, world.ids, world.truth)[[3, 40, 60, 77, 90]].max() < 0.5

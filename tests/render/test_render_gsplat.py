@@ -7,7 +7,7 @@ from test_render_parity import random_scene
 
 from gsmap.errors import MissingDependencyError
 from gsmap.render import GaussianTensors, render
-from gsmap.render.rendering import gsplat_available
+from gsmap.render.backends import gsplat_available
 
 needs_gpu = pytest.mark.skipif(not gsplat_available(), reason="needs gsplat and a CUDA GPU")
 

@@ -177,7 +177,7 @@ def test_browser_shows_the_picture_that_gsmap_renders(view, tmp_path):
     assert psnr(shown, np.clip(truth, 0, 1)) > 48
 
 
-def test_browser_lists_scenes_islands_and_edges(view, tmp_path):
+def test_browser_lists_scenes_components_and_edges(view, tmp_path):
     with ViewServer(view).start() as server, Page(server.url, tmp_path / "profile", 900, 600) as page:
         page.wait("window.gsmap && window.gsmap.phase !== 'loading'")
         assert page.value("document.querySelector('#status').textContent").startswith("3 scenes, 1,1")
@@ -187,15 +187,15 @@ def test_browser_lists_scenes_islands_and_edges(view, tmp_path):
             "a",
             "b",
         ]
-        assert page.value("document.querySelector('#island').options.length") == 2
+        assert page.value("document.querySelector('#component').options.length") == 2
         assert page.value("document.querySelector('#edges li:not([hidden]) .detail').textContent") == "21 accepted"
         before = page.picture()
         page.value("document.querySelector('#scenes input').click()")
         page.value("new Promise(done => setTimeout(done, 700))")
         assert np.abs(page.picture()[:, 300:] - before[:, 300:]).max() > 0.2  # scene a is gone
         page.value("document.querySelector('#layer-objects').click()")
-        page.value("document.querySelector('#island').value = '3'")
-        page.value("document.querySelector('#island').dispatchEvent(new Event('change'))")
+        page.value("document.querySelector('#component').value = '3'")
+        page.value("document.querySelector('#component').dispatchEvent(new Event('change'))")
         names = page.value("[...document.querySelectorAll('#scenes li:not([hidden]) button')].map(b => b.innerHTML)")
         assert names == ["far &lt;b&gt;away&lt;/b&gt;"]  # text, never markup
         assert page.failures() == []

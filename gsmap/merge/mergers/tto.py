@@ -2,65 +2,145 @@
 
 Graph-GSReg's merging (voxelise the union, then minimise the difference to renders of the originals; no photographs
 needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
-shows least goes first, newer captures win where the place changed, and exposures can be balanced.
+shows least goes first, newer captures win where the place changed, and exposures can be balanced. With `owner_cells`
+and `newer_wins` off, an `ssim_weight` and `min_weight` of 0 and a `keep` of 1 it is the published method: an L1 fit of
+all voxels of the union.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.voxels import merge_groups, voxel_labels
-from gsmap.merge.changes import drop_what_is_gone, what_came_later
+from gsmap.merge import changes, exposure, references
+from gsmap.merge.changes import newer_surfaces, remove_disappeared
 from gsmap.merge.exposure import balance_exposure
-from gsmap.merge.parts import MergeResult, Part, inside, pulled_inside, united
-from gsmap.merge.references import WEIGHT_UNIT, References, order_of_views, render_references
-from gsmap.merge.selection import most_shown, one_owner_per_cell
+from gsmap.merge.placed import inside, pulled_inside, united
+from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
+from gsmap.merge.selection import most_visible, one_owner_per_cell
 from gsmap.render.fit import Fitter, LearningRates
-from gsmap.types import Gaussians
+from gsmap.types import Gaussians, MergeResult, PlacedScene
+from gsmap.types.progress import Progress
 
-# Adam's first steps, for Gaussians that are nearly right; for positions as a share of the Gaussians' median size.
-_RATES = {"means": 0.035, "quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh_base": 5e-3, "sh_rest": 5e-3}
-_LAST_RATE = 0.1  # of the first, reached exponentially
-_SSIM_WEIGHT = 0.2
-_COVER_M = 0.1  # an owner's Gaussian this near stands for another capture's
-_MIN_PASS = 20  # steps, for a tile that few pixels show
-_SURE_SHARE = 0.5  # of the steps that are taken whatever they gain: the first, long ones may lose
-_GAIN_PER_PASS = 0.002  # stop when a pass over all views lowers the loss by less than this share
+VERSION = 1
+STEPS: str | None = "steps"
+RENDERS = True
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's first steps, for Gaussians that are nearly right.
+
+    Args:
+        means: of positions, as a share of the Gaussians' median size.
+        quats: of rotations.
+        log_scales: of sizes.
+        logit_opacities: of opacities.
+        sh_base: of colours.
+        sh_rest: of what colours depend on the direction.
+        last: the last step as a share of the first, reached exponentially.
+    """
+
+    means: float = 0.035
+    quats: float = 2e-3
+    log_scales: float = 1e-2
+    logit_opacities: float = 5e-2
+    sh_base: float = 5e-3
+    sh_rest: float = 5e-3
+    last: float = 0.1
+
+    def at(self, progress: float, size_m: float) -> LearningRates:
+        """The steps at a share of the optimisation, for Gaussians of a size."""
+        first = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "last"}
+        first |= {"means": self.means * size_m}
+        return LearningRates(**{name: rate * self.last**progress for name, rate in first.items()})
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When to stop, where the number of steps is not given.
+
+    Args:
+        min_pass_steps: steps that count as a pass over all views, for a tile that few pixels show.
+        sure_share: share of the steps that are taken whatever they gain: the first, long ones may lose.
+        min_gain: stop when a pass over all views lowers the loss by less than this share.
+    """
+
+    min_pass_steps: int = 20
+    sure_share: float = 0.5
+    min_gain: float = 0.002
 
 
 @dataclass(frozen=True)
 class Params:
-    """Args:
-    min_weight: drop what nowhere makes up this share of a pixel of its capture's own views, and dominates none.
-    keep: at most this share of the Gaussians that went in, by what shows most; of each tile.
-    voxel_m: side of the voxels in which Gaussians are first merged.
-    cell_m: side of the cells that are given to one capture each.
-    passes: how often each view is used, where steps are not given; fewer when it no longer gains.
-    steps: how many optimisation steps, exactly.
-    halo_m: how far around a tile its surroundings are rendered along, the outer half of it frozen.
-    reach_m: how far around a tile cameras are looked for.
-    longest_side_px: size of the pictures that are compared.
-    balance_exposure: bring captures to one exposure first: even to the eye, but no longer what each capture looks like.
-    newer_wins: drop what later captures looked through.
-    seed: of the order of views.
+    """Test-time optimisation.
+
+    Args:
+        min_weight: drop what nowhere makes up this share of a pixel of its capture's own views, and dominates none.
+        keep: at most this share of the Gaussians that went in, by what shows most; of each tile; 1 keeps all.
+        voxel_m: side of the voxels in which Gaussians are first merged.
+        owner_cells: give every cell of a grid to the capture that shows most of it, so that two captures of one
+            surface do not lie over one another.
+        cell_m: side of these cells.
+        cover_m: an owner's Gaussian this near stands for another capture's.
+        ssim_weight: share of 1 - SSIM in the loss; the rest is L1.
+        passes: how often each view is used, where steps are not given; fewer when it no longer gains.
+        steps: how many optimisation steps, exactly.
+        halo_m: how far around a tile its surroundings are rendered along, the outer half of it frozen.
+        reach_m: how far around a tile cameras are looked for.
+        min_cameras: a tile that no camera stands in or near is refined from this many, the nearest of each capture,
+            wherever they stand.
+        longest_side_px: size of the pictures that are compared.
+        balance_exposure: bring captures to one exposure first: even to the eye, but no longer what each capture looks
+            like.
+        newer_wins: drop what later captures looked through.
+        seed: of the order of views.
+        rates: the optimiser's steps.
+        stopping: when to stop, where the number of steps is not given.
+        references: which views are reproduced.
+        changes: what counts as looked through, where newer captures win.
+        exposure: how exposures are compared, where they are balanced.
     """
 
     min_weight: float = 0.05
     keep: float = 0.8
     voxel_m: float = 0.01
+    owner_cells: bool = True
     cell_m: float = 0.5
+    cover_m: float = 0.1
+    ssim_weight: float = 0.2
     passes: float = 6.0
     steps: int | None = None
     halo_m: float = 1.0
     reach_m: float = 10.0
+    min_cameras: int = 12
     longest_side_px: int = 960
     balance_exposure: bool = False
     newer_wins: bool = True
     seed: int = 0
+    rates: Rates = field(default_factory=Rates)
+    stopping: Stopping = field(default_factory=Stopping)
+    references: references.Params = field(default_factory=references.Params)
+    changes: changes.Params = field(default_factory=changes.Params)
+    exposure: exposure.Params = field(default_factory=exposure.Params)
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 0:
+            raise ConfigError(f"steps must not be negative, got {self.steps}")
+        for name in ("voxel_m", "cell_m", "longest_side_px"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("cover_m", "passes", "halo_m", "reach_m", "min_cameras", "min_weight"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("keep", "ssim_weight"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}")
 
 
 def reach_m(params: Params) -> float:
@@ -71,38 +151,55 @@ def reading_m(params: Params) -> float:
     return params.halo_m + params.reach_m
 
 
+def min_cameras(params: Params) -> int:
+    return params.min_cameras
+
+
+def uses_dates(params: Params) -> bool:
+    return params.newer_wins
+
+
 def merge(
-    parts: list[Part],
+    scenes: Sequence[PlacedScene],
     params: Params,
     bounds: np.ndarray | None,
     budget_s: float | None,
-    progress: Callable[[float, str], None],
+    progress: Progress,
 ) -> MergeResult:
     """Drop what is gone, balance exposures, render references, choose what to keep, and fit it to the references."""
     deadline = None if budget_s is None else time.monotonic() + budget_s
     notes: list[str] = []
-    later = None
+    newer = None
     if params.newer_wins:
-        parts, lost = drop_what_is_gone(parts)
-        later = what_came_later(parts)
+        scenes, lost = remove_disappeared(scenes, params.changes)
+        newer = newer_surfaces(scenes, params.changes)
         notes += [
-            f"{n} Gaussians of {p.scene_id} are gone by later captures" for p, n in zip(parts, lost, strict=True) if n
+            f"{n} Gaussians of scene {s.scene_id[:12]} are gone by later captures"
+            for s, n in zip(scenes, lost, strict=True)
+            if n
         ]
     if params.balance_exposure:
-        parts, log_gains = balance_exposure(parts)
+        scenes, log_gains = balance_exposure(scenes, params.exposure)
         if log_gains.any():
             notes.append(f"exposures differed by up to {np.ptp(log_gains, axis=0).max() / np.log(2):.2f} stops")
-    references = render_references(
-        parts, bounds, params.halo_m, params.longest_side_px, later, lambda f, text: progress(0.2 * f, text)
+    wanted = render_references(
+        scenes,
+        bounds,
+        params.halo_m,
+        params.longest_side_px,
+        newer,
+        lambda fraction, text: progress(0.2 * fraction, text),
+        params.references,
+        params.changes,
     )
-    start, origin = _start(parts, references, params, bounds)
-    if len(references) == 0 or not inside(start.means, bounds).any():
+    start, origin = _start(scenes, wanted, params, bounds)
+    if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
     # The near half of the halo is fitted along, then dropped: were it frozen, what is at the border would make up for
     # neighbours that are going to be refined too.
     frozen = ~inside(start.means, bounds, params.halo_m / 2)
-    fitted, steps, truncated = _fit(start, frozen, references, params, deadline, progress)
+    fitted, steps, truncated = _fit(start, frozen, wanted, params, deadline, progress)
     # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
     mine = inside(start.means, bounds)
     fitted = replace(fitted[mine], means=pulled_inside(fitted.means[mine], bounds))
@@ -110,52 +207,57 @@ def merge(
 
 
 def _start(
-    parts: list[Part], references: References, params: Params, bounds: np.ndarray | None
+    scenes: Sequence[PlacedScene], wanted: References, params: Params, bounds: np.ndarray | None
 ) -> tuple[Gaussians, np.ndarray]:
     """The voxelised originals within the halo, one capture per cell, and within the bounds only what shows most."""
-    gaussians, origin = united(parts)
+    gaussians, origin = united(scenes)
     near = inside(gaussians.means, bounds, params.halo_m)
     labels = voxel_labels(gaussians.means[near], params.voxel_m)
     merged, heaviest = merge_groups(gaussians[near], labels)
-    shown = np.bincount(labels, np.concatenate(references.shown)[near], minlength=len(merged))
+    visible = np.bincount(labels, np.concatenate(wanted.visible_pixels)[near], minlength=len(merged))
     origin = origin[near][heaviest]
-    stays = one_owner_per_cell(merged, origin, shown, params.cell_m, _COVER_M)
-    stays &= shown >= WEIGHT_UNIT * params.min_weight
+    stays = np.ones(len(merged), dtype=bool)
+    if params.owner_cells:
+        stays &= one_owner_per_cell(merged, origin, visible, params.cell_m, params.cover_m)
+    stays &= visible >= WEIGHT_UNIT * params.min_weight
     mine = inside(merged.means, bounds)
-    stays &= ~mine | most_shown(shown, stays & mine, int(params.keep * inside(gaussians.means, bounds).sum()))
+    if params.keep < 1:
+        count = int(params.keep * inside(gaussians.means, bounds).sum())
+        stays &= ~mine | most_visible(visible, stays & mine, count)
     return merged[stays], origin[stays]
 
 
 def _fit(
     start: Gaussians,
     frozen: np.ndarray,
-    references: References,
+    wanted: References,
     params: Params,
     deadline: float | None,
-    progress: Callable[[float, str], None],
+    progress: Progress,
 ) -> tuple[Gaussians, int, bool]:
     """The start fitted to the references; steps taken; whether time ran out."""
-    one_pass = max(_MIN_PASS, round(references.turns.sum()))
+    stopping = params.stopping
+    one_pass = max(stopping.min_pass_steps, round(wanted.view_weights.sum()))
     steps = params.steps if params.steps is not None else round(params.passes * one_pass)
-    fitter = Fitter(start, frozen=frozen, ssim_weight=_SSIM_WEIGHT)
-    cameras = [references.cameras[v] for v in range(len(references))]
-    rates = _RATES | {"means": _RATES["means"] * float(np.exp(np.median(start.log_scales.max(1))))}
+    fitter = Fitter(start, frozen=frozen, ssim_weight=params.ssim_weight)
+    cameras = [wanted.cameras[v] for v in range(len(wanted))]
+    size_m = float(np.exp(np.median(start.log_scales.max(1))))
     losses: list[float] = []
-    for step, view in enumerate(order_of_views(references.turns, steps, params.seed)):
+    for step, view in enumerate(view_schedule(wanted.view_weights, steps, params.seed)):
         if deadline is not None and time.monotonic() > deadline:
             return fitter.gaussians(), step, True
-        fitter.learning_rates = LearningRates(**{k: r * _LAST_RATE ** (step / steps) for k, r in rates.items()})
-        losses.append(fitter.step(cameras[view], references.images[view][None], references.weights[view][None]))
+        fitter.learning_rates = params.rates.at(step / steps, size_m)
+        losses.append(fitter.step(cameras[view], wanted.images[view][None], wanted.weights[view][None]))
         if step % 20 == 0:
             progress(0.2 + 0.8 * step / steps, f"optimising, loss {np.mean(losses[-20:]):.4f}")
-        if params.steps is None and step > _SURE_SHARE * steps and _gains_nothing(losses, one_pass):
+        if params.steps is None and step > stopping.sure_share * steps and _gains_nothing(losses, one_pass, stopping):
             break
     return fitter.gaussians(), len(losses), False
 
 
-def _gains_nothing(losses: list[float], one_pass: int) -> bool:
+def _gains_nothing(losses: list[float], one_pass: int, stopping: Stopping) -> bool:
     """Whether the last pass over all views was hardly better than the one before."""
     if len(losses) % one_pass or len(losses) < 2 * one_pass:
         return False
     before, now = np.mean(losses[-2 * one_pass : -one_pass]), np.mean(losses[-one_pass:])
-    return bool(now > (1 - _GAIN_PER_PASS) * before)
+    return bool(now > (1 - stopping.min_gain) * before)

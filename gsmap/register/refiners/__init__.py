@@ -1,1 +1,1 @@
-"""Ways to sharpen a pose once it is nearly right."""
+"""Ways to sharpen a pose once it is nearly right; the contract is `gsmap.methods.refiner`."""

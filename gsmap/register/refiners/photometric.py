@@ -7,17 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.rotations import retract
+from gsmap.geometry.transforms import transform_cameras
+from gsmap.methods.refiner import Surface
+from gsmap.register.view_cache import select_views
 from gsmap.types import Cameras, Gaussians, Sim3
+
+VERSION = 1
+SCALES = True
 
 
 @dataclass(frozen=True)
 class Params:
-    """Args:
-    num_views: cameras of the target that see most of the source.
-    image_size_px: longer side of the renders.
-    iterations: Gauss-Newton steps.
-    step_rad, step_m, step_log: probes of the derivative; about a pixel at room distance.
-    depth_tolerance: pixels whose two depths differ by more than this share show different surfaces and do not count.
+    """Alignment of renders.
+
+    Args:
+        num_views: cameras of the target that see most of the source.
+        image_size_px: longer side of the renders.
+        iterations: Gauss-Newton steps.
+        step_rad: probe of the derivative by rotation; about a pixel at room distance, as are the other two.
+        step_m: probe of the derivative by translation.
+        step_log: probe of the derivative by the logarithm of the scale.
+        depth_tolerance: pixels whose two depths differ by more than this share show different surfaces and do not
+            count.
+        min_alpha: pixels fainter than this in either render do not count.
+        min_pixels: with fewer pixels that count, the start is given back.
     """
 
     num_views: int = 6
@@ -27,46 +40,68 @@ class Params:
     step_m: float = 0.006
     step_log: float = 0.003
     depth_tolerance: float = 0.1
+    min_alpha: float = 0.7
+    min_pixels: int = 500
 
 
 def refine(
+    target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
+) -> Sim3:
+    """The pose (metres) whose renders of the source match those of the target best, seen by the target's cameras.
+
+    Gauss-Newton on robust colour differences; the derivative is taken by rendering the source from probed poses (a
+    view moves, not 10^5 Gaussians). The source's exposure per channel (gain, offset) is fitted along. A step that does
+    not lower the cost is not taken. Needs a start within a few pixels of the answer, both scenes' Gaussians and the
+    target's cameras; without them the start is given back.
+    """
+    if target.gaussians is None or source.gaussians is None or not target.cameras:
+        return start
+    # Renders are of the scenes in their own units.
+    unit_t, unit_s = target.unit_m, source.unit_m
+    own = Sim3(start.rotation, start.translation / unit_t, start.scale * (unit_s / unit_t))
+    found = _aligned(
+        target.gaussians,
+        source.gaussians,
+        target.cameras,
+        own,
+        params or Params(),
+        unit_m=unit_t,
+        with_scale=with_scale,
+    )
+    if found is own:
+        return start
+    return Sim3(
+        found.rotation, found.translation * unit_t, found.scale * (unit_t / unit_s) if with_scale else start.scale
+    )
+
+
+def _aligned(
     target: Gaussians,
     source: Gaussians,
     cameras: Cameras,
     start: Sim3,
-    params: Params | None = None,
+    params: Params,
     *,
-    unit_m: float = 1.0,
-    with_scale: bool = False,
+    unit_m: float,
+    with_scale: bool,
 ) -> Sim3:
-    """``S_target_source`` whose renders of the source match those of the target best, seen by the target's cameras.
-
-    Gauss-Newton on robust colour differences; the derivative is taken by rendering the source from probed poses (a
-    view moves, not 10^5 Gaussians). The source's exposure per channel (gain, offset) is fitted along. A step that does
-    not lower the cost is not taken.
-
-    Args:
-        start: in the scenes' own units, within a few pixels of the answer.
-        cameras: the target's.
-        unit_m: metres per unit of the target.
-    """
+    """The same between the scenes' own units; ``unit_m`` metres per unit of the target."""
     from gsmap.render import render
 
-    params = params or Params()
     cameras = _most_seeing(cameras.resized(params.image_size_px), source, start, params.num_views)
     if not len(cameras):
         return start
-    seen = render(target, cameras)
+    seen = render(target, cameras, backend="native")
     dim = 7 if with_scale else 6
     probes = np.r_[np.full(3, params.step_rad), np.full(3, params.step_m / unit_m / start.scale), params.step_log][:dim]
     centre = np.median(source.means, axis=0).astype(np.float64)
 
     def residual(pose: Sim3, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Colour differences of the pixels in the mask (P, 3), and the mask."""
-        shot = render(source, _moved(cameras, pose.inverse()))
+        shot = render(source, transform_cameras(cameras, pose.inverse()), backend="native")
         if mask is None:
             depth = shot.depth * pose.scale
-            mask = (seen.alpha > 0.7) & (shot.alpha > 0.7)
+            mask = (seen.alpha > params.min_alpha) & (shot.alpha > params.min_alpha)
             mask &= np.abs(depth - seen.depth) < params.depth_tolerance * seen.depth
         return shot.colour[mask].astype(np.float64), mask
 
@@ -79,7 +114,7 @@ def refine(
     pose = start
     for _ in range(params.iterations):
         colours, mask = residual(pose, None)
-        if mask.sum() < 500:
+        if mask.sum() < params.min_pixels:
             return start
         wanted = seen.colour[mask].astype(np.float64)
         difference, weights, spread = cost(colours, wanted)
@@ -129,15 +164,6 @@ def _exposed(colours: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 def _most_seeing(cameras: Cameras, source: Gaussians, pose: Sim3, count: int) -> Cameras:
     """The cameras with most of the source's surface in view, each part counted once."""
-    from gsmap.register.sight import choose_cameras
-
     opaque = np.flatnonzero(source.opacities > 0.5)
     sample = opaque[:: max(1, len(opaque) // 2000)]
-    return cameras[choose_cameras(cameras, pose.apply(source.means[sample]), count)]
-
-
-def _moved(cameras: Cameras, S_a_b: Sim3) -> Cameras:
-    """Cameras of frame b in frame a."""
-    from gsmap.geometry.transforms import transform_cameras
-
-    return transform_cameras(cameras, S_a_b)
+    return cameras[select_views(cameras, pose.apply(source.means[sample]), count)]

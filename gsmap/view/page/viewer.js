@@ -15,7 +15,7 @@ const state = (window.gsmap = { phase: "loading", frames: 0, loaded: 0, sorted: 
 let map = null;
 let renderer = null;
 let sorter = null;
-let island = 0;
+let shownComponent = 0;
 let busySorting = false;
 let sortAgain = false;
 let dirty = true;
@@ -146,8 +146,8 @@ function resize() {
 
 // ---- what is drawn ----------------------------------------------------------------------------------------------
 
-const onIsland = (i) => map.scenes[i].component === island;
-const shownScenes = () => map.scenes.map((_, i) => i).filter((i) => onIsland(i) && !hidden.has(i));
+const inComponent = (i) => map.scenes[i].component === shownComponent;
+const shownScenes = () => map.scenes.map((_, i) => i).filter((i) => inComponent(i) && !hidden.has(i));
 
 function sort() {
   if (busySorting) {
@@ -270,7 +270,7 @@ function lists() {
   $("scenes").replaceChildren(
     ...map.scenes.map((scene, i) => {
       const item = row(scene.name, `${scene.num_gaussians.toLocaleString()} ${scene.status}`, palette[i % 64], () => {
-        if (!onIsland(i)) choose(scene.component);
+        if (!inComponent(i)) choose(scene.component);
         fit([i]);
       });
       const box = document.createElement("input");
@@ -282,7 +282,7 @@ function lists() {
         look();
       });
       item.prepend(box);
-      item.hidden = !onIsland(i);
+      item.hidden = !inComponent(i);
       return item;
     })
   );
@@ -292,15 +292,15 @@ function lists() {
       const how = edge.status === "accepted" && edge.used === "tentative" ? "tentative" : edge.status;
       const item = row(names, `${edge.num_inliers} ${how}`, edgeColour(edge), () => fit([edge.target, edge.source]));
       item.title = edge.reason || `overlap ${edge.overlap.toFixed(2)}`;
-      item.hidden = !(onIsland(edge.target) || onIsland(edge.source));
+      item.hidden = !(inComponent(edge.target) || inComponent(edge.source));
       return item;
     })
   );
 }
 
 function choose(component) {
-  island = component;
-  $("island").value = String(component);
+  shownComponent = component;
+  $("component").value = String(component);
   lists();
   fit(shownScenes());
 }
@@ -358,24 +358,24 @@ async function main() {
   listen($("canvas"));
   for (const id of ["show-splats", "show-edges", "show-failed", "show-boxes", "show-cameras", "by-scene"])
     $(id).addEventListener("change", () => (dirty = true));
-  const islands = [...new Set(map.scenes.map((s) => s.component))].sort((a, b) => a - b);
-  $("island-row").hidden = islands.length < 2;
-  for (const component of islands) {
+  const components = [...new Set(map.scenes.map((s) => s.component))].sort((a, b) => a - b);
+  $("component-row").hidden = components.length < 2;
+  for (const component of components) {
     const count = map.scenes.filter((s) => s.component === component).length;
-    $("island").append(new Option(`${component} (${count} scene${count > 1 ? "s" : ""})`, String(component)));
+    $("component").append(new Option(`${component} (${count} scene${count > 1 ? "s" : ""})`, String(component)));
   }
-  $("island").addEventListener("change", () => choose(Number($("island").value)));
+  $("component").addEventListener("change", () => choose(Number($("component").value)));
   if (!map.scenes.length) {
     say("the map has no scenes yet: gsmap ingest");
     state.phase = "ready";
     return;
   }
-  choose(islands[0]);
+  choose(components[0]);
   const numbers = (name) => given.get(name).split(",").map(Number);
   if (given.has("fov")) camera.fov = numbers("fov")[0];
   if (given.has("eye")) lookFrom(numbers("eye"), numbers("target"));
   frame();
-  const first = map.scenes.map((_, i) => i).sort((a, b) => onIsland(b) - onIsland(a) || a - b);
+  const first = map.scenes.map((_, i) => i).sort((a, b) => inComponent(b) - inComponent(a) || a - b);
   for (const i of first) {
     say(`loading ${map.scenes[i].name}`);
     await loadScene(i);

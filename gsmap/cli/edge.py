@@ -1,0 +1,97 @@
+"""gsmap edge: a measurement of your own."""
+
+from __future__ import annotations
+
+import json as _json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from gsmap.types import Sim3
+
+_RIGID_SIGMA = 1e-5  # of the log scale of an edge that has none
+
+
+def command(
+    map: MapPath,
+    pair: Annotated[str, typer.Argument(metavar="A:B", help="The pair, by names or ids.")],
+    pose: Annotated[
+        str,
+        typer.Option("--pose", metavar="FILE", help="How B lies in A: a 4x4 matrix (`x_a = M x_b`), as text or JSON."),
+    ],
+    sigma: Annotated[
+        str,
+        typer.Option(
+            "--sigma",
+            metavar="DEG,M[,SCALE]",
+            help="Standard deviations of rotation (degrees, per axis), translation (B's unit, per axis) and, where "
+            "the scale was measured, of its logarithm.",
+        ),
+    ],
+    note: Annotated[str, typer.Option("--note", help="How it was measured, for whoever asks later.")] = "",
+    json: AsJson = False,
+) -> None:
+    """Add a measurement of your own of how scene B lies in scene A; the next optimize weighs it with the others.
+
+    Example: `gsmap edge site.gsmap monday:tuesday --pose tape.txt --sigma 0.5,0.02`
+    """
+    S_target_source = read_pose(Path(pose))
+    sigmas = read_sigmas(sigma, S_target_source)
+    with opened(map) as m:
+        row = m.add_edge(pair, S_target_source, sigmas, note)
+    say(f"noted; run: gsmap optimize {map}")
+    print_rows("edge", row, json)
+
+
+def read_pose(path: Path) -> Sim3:
+    """A 4x4 similarity from a text file (16 numbers) or from JSON (4 rows, or an object with ``S_target_source``).
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: a file that holds no such matrix.
+    """
+    import numpy as np
+
+    from gsmap.errors import InputError, NotFoundError
+    from gsmap.types import Sim3
+
+    try:
+        content = path.read_text(encoding="utf-8")
+        if content.lstrip()[:1] in ("[", "{"):
+            data = _json.loads(content)
+            numbers = np.array(data["S_target_source"] if isinstance(data, dict) else data, dtype=np.float64)
+        else:
+            numbers = np.array(content.replace(",", " ").split(), dtype=np.float64)
+        return Sim3.from_matrix(numbers.reshape(4, 4))
+    except FileNotFoundError as error:
+        raise NotFoundError(f"no pose at {path}") from error
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path} holds no pose, a 4x4 matrix as text or JSON: {error}") from error
+
+
+def read_sigmas(text: str, pose: Sim3) -> np.ndarray:
+    """(7,) standard deviations [rotation (3, rad), translation (3), log scale] from ``DEG,M[,SCALE]``.
+
+    Raises:
+        ConfigError: not two or three positive numbers, or a pose with a scale whose deviation is not given.
+    """
+    import numpy as np
+
+    from gsmap.errors import ConfigError
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or not all(0 < number < float("inf") for number in numbers):
+        raise ConfigError(f"--sigma takes two or three positive numbers, DEG,M[,SCALE], got {text!r}")
+    if len(numbers) == 2 and not pose.is_rigid:
+        raise ConfigError(f"the pose has scale {pose.scale:.6g}: give its deviation too, --sigma DEG,M,SCALE")
+    log_scale = numbers[2] if len(numbers) == 3 else _RIGID_SIGMA
+    return np.array([np.radians(numbers[0])] * 3 + [numbers[1]] * 3 + [log_scale])

@@ -1,0 +1,70 @@
+"""What each verb prints with ``--json``: one object, ``schema`` first. ``docs/json.md`` is made from this."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsmap.types import rows
+from gsmap.types.rows import Row
+
+
+@dataclass(frozen=True)
+class One:
+    """The fields of one row or report beside ``schema``."""
+
+    type: type[Row]
+
+
+@dataclass(frozen=True)
+class Many:
+    """A list of rows under a key beside ``schema``."""
+
+    key: str
+    type: type[Row]
+
+
+@dataclass(frozen=True)
+class Maybe:
+    """A row, or null, under a key beside ``schema``."""
+
+    key: str
+    type: type[Row]
+
+
+Object = One | Many | Maybe
+
+OBJECTS: dict[str, Object] = {
+    "init": One(rows.InitReport),
+    "ingest": Many("ingested", rows.IngestRow),
+    "describe": Many("graphs", rows.GraphRow),
+    "register": Many("edges", rows.EdgeRow),
+    "optimize": One(rows.RevisionRow),
+    "update": One(rows.UpdateReport),
+    "status": One(rows.MapStatus),
+    "confirm": One(rows.EdgeRow),
+    "reject": One(rows.EdgeRow),
+    "edge": One(rows.EdgeRow),
+    "prior": Maybe("prior", rows.PriorRow),
+    "edit": One(rows.SceneRow),
+    "export": One(rows.ExportReport),
+    "list scenes": Many("scenes", rows.SceneRow),
+    "list edges": Many("edges", rows.EdgeRow),
+    "list revisions": Many("revisions", rows.RevisionRow),
+    "list tiles": Many("tiles", rows.TileRow),
+    "show SCENE": One(rows.SceneReport),
+    "show A:B": One(rows.PairReport),
+    "diff": Many("scenes", rows.PoseChangeRow),
+    "poses": Many("poses", rows.PoseRow),
+    "settings": Many("settings", rows.SettingRow),
+    "convert": One(rows.ConvertReport),
+    "models add": One(rows.ModelRow),
+    "models list": Many("models", rows.ModelRow),
+    "evaluate": One(rows.EvaluationReport),
+    "remove": One(rows.SceneRow),
+    "check": One(rows.CheckReport),
+    "prune": One(rows.PruneReport),
+    "migrate": One(rows.MigrateReport),
+    "view": One(rows.ViewReport),
+    "demo": One(rows.DemoReport),
+}
+"""By verb, with what tells its forms apart."""

@@ -1,0 +1,25 @@
+"""gsmap status: what to do next."""
+
+from __future__ import annotations
+
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table
+
+
+def command(map: MapPath, json: AsJson = False) -> None:
+    """Show what is missing, stale or wants a person, each with the command that helps.
+
+    Example: `gsmap status site.gsmap`
+    """
+    with opened(map) as m:
+        report = m.status()
+    if json:
+        print_rows("status", report, json)
+        return
+    if report.todo:
+        print_table("to do", report.todo[0].columns, report.todo)
+    components = f"{report.components} component{'s' * (report.components != 1)}"
+    print(
+        f"{report.scenes} scenes in {components}, {report.tentative} tentative; "
+        + ("no revision yet" if report.revision is None else f"revision {report.revision}")
+        + ("" if report.todo else "; nothing to do")
+    )

@@ -1,7 +1,0 @@
-"""Made places to try gsmap on: a furnished flat from a seed, filmed and trained into captures with known truth."""
-
-from gsmap.demo.capture import Frames, film, walk
-from gsmap.demo.make import DemoCapture, make_captures, shown, write_captures
-from gsmap.demo.place import Place, make_place
-
-__all__ = ["DemoCapture", "Frames", "Place", "film", "make_captures", "make_place", "shown", "walk", "write_captures"]

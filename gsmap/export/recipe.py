@@ -1,0 +1,123 @@
+"""What names a tile, and why one that an earlier export made must be made again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsmap import formats
+from gsmap.errors import ConfigError
+from gsmap.export.plan import Params, PlannedTile
+from gsmap.methods import RecipeKey
+from gsmap.types import Tile
+
+VERSION = 1
+"""Raised whenever the same merged Gaussians are written otherwise: every tile is then made again."""
+
+_TILES_3D = "3dtiles"
+
+
+@dataclass(frozen=True, eq=False)
+class TileRecipe:
+    """How all tiles of one export are made; with a `PlannedTile` it names that tile.
+
+    Args:
+        merge: of the merger and its settings (`gsmap.merge.recipe_key`).
+        format: suffix of the tiles' files without the dot, or ``3dtiles`` (``.glb`` below a tree of coarser levels).
+        provenance: whether the file says of each Gaussian which scene it is from (``.ply`` alone).
+        budget_s: ceiling on the seconds that merging one tile may take, None for none.
+        dates: when each scene was captured, by scene id, if the merger uses dates; None if it does not.
+
+    Raises:
+        ConfigError: a format that cannot be written, or provenance in one that cannot hold it.
+    """
+
+    merge: RecipeKey
+    format: str = "ply"
+    provenance: bool = False
+    budget_s: float | None = None
+    dates: Mapping[str, str | None] | None = None
+
+    def __post_init__(self) -> None:
+        if self.format != _TILES_3D and f".{self.format}" not in formats.known("write"):
+            known = ", ".join([*formats.known("write"), _TILES_3D])
+            raise ConfigError(f"cannot write {self.format!r}: choose one of {known}")
+        if self.provenance and self.format != "ply":
+            raise ConfigError(f"provenance is a property of .ply files, the format asked for is {self.format}")
+
+    @property
+    def is_tileset(self) -> bool:
+        """Whether the tiles are the leaves of a 3D Tiles tree."""
+        return self.format == _TILES_3D
+
+    @property
+    def suffix(self) -> str:
+        """Of the tiles' files, without the dot."""
+        return "glb" if self.is_tileset else self.format
+
+    def with_dates(self, dates: Mapping[str, str | None]) -> TileRecipe:
+        """The same for a merger that uses dates."""
+        return replace(self, dates=dates)
+
+    def key(self, planned: PlannedTile) -> str:
+        """Digest of everything that decides the tile's content but the poses; scene ids are digests of content."""
+        scenes = sorted(planned.poses)
+        inputs = [
+            f"export {VERSION}",
+            f"format {self.format}",
+            f"provenance {self.provenance}",
+            f"budget_s {self.budget_s}",
+            f"component {planned.component}",
+            f"extent {planned.extent}",
+            *(f"scene {scene}" for scene in scenes),
+        ]
+        if self.dates is not None:
+            inputs += [f"captured_at {scene} {self.dates.get(scene)}" for scene in scenes]
+        return self.merge.of(*inputs).digest
+
+
+def dirty_reason(planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, moved_m: float = Params.moved_m) -> str:
+    """Why a tile made earlier must be made again, in words; empty where it need not.
+
+    Poses are compared with those the tile was made with, not with the last revision, so slow drift cannot creep.
+    """
+    if tile is None:
+        return "new"
+    if not tile.key:
+        return "an older gsmap made it"
+    if tile.key != recipe.key(planned):
+        return _what_changed(planned, tile, recipe)
+    low, high = planned.bounds
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    for scene, pose in planned.poses.items():
+        # How far the scene's content at the tile's corners has moved.
+        then = tile.poses[scene] @ pose.inverse()
+        moved = np.linalg.norm(then.apply(corners) - corners, axis=1).max()
+        if moved > moved_m:
+            return f"scene {scene[:12]} moved by {moved:.3g} m"
+    return ""
+
+
+def _what_changed(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
+    """The first difference between what made a tile and what would make it now."""
+    before, now = tile.recipe, recipe.merge.to_json()
+    if before.get("method") != now["method"]:
+        return f"another merge method: {before.get('method')}, now {now['method']}"
+    for part in ("version", "settings", "backend"):
+        if before.get(part) != now[part]:
+            return f"another {part} of the merge method: {_difference(before.get(part), now[part])}"
+    if set(tile.poses) != set(planned.poses):
+        return "other scenes"
+    return "another date of a scene, format, budget, extent or provenance"
+
+
+def _difference(before: Any, now: Any) -> str:
+    """The first leaf that differs, with both values."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for name in sorted({*before, *now}):
+            if before.get(name) != now.get(name):
+                return f"{name} {_difference(before.get(name), now.get(name))}"
+    return f"{before}, now {now}"

@@ -1,0 +1,28 @@
+"""What files of cameras share: reading JSON, and one name for each camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from gsmap.errors import InputError, NotFoundError
+
+
+def load_json(path: Path) -> Any:
+    if not path.exists():
+        raise NotFoundError(f"cannot read cameras from {path}: no such file")
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not JSON: {error}") from error
+
+
+def unique(names: list[str]) -> tuple[str, ...]:
+    """The names, with ``#2`` and so on where one comes again."""
+    seen: dict[str, int] = {}
+    out = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        out.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
+    return tuple(out)

@@ -1,0 +1,476 @@
+"""`Map`: every verb of the command line as a method. Doors only: the work is in `gsmap.map.stages` and `reports`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map import reports
+from gsmap.store import Store
+from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, Sim3
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows import (
+    CheckReport,
+    EdgeRow,
+    EvaluationReport,
+    ExportReport,
+    GraphRow,
+    IngestRow,
+    MapStatus,
+    ModelRow,
+    PairReport,
+    PoseChangeRow,
+    PoseRow,
+    PruneReport,
+    RevisionRow,
+    SceneReport,
+    SceneRow,
+    SettingRow,
+    TileRow,
+    UpdateReport,
+)
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
+    from gsmap.map.stages.register import Pairs
+    from gsmap.view import ViewServer
+
+
+def create(
+    path: str | os.PathLike[str], progress: StageProgress | None = None, *, catalog_url: str | None = None
+) -> Map:
+    """Make an empty map and open it.
+
+    Args:
+        catalog_url: SQLAlchemy URL of an empty PostgreSQL database to keep the catalog in, for many writers.
+    """
+    return Map(Store.create(path, catalog_url=catalog_url), progress)
+
+
+def open(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
+    """Open a map; read-only where its folder cannot be written."""
+    mode = "r" if os.path.isdir(path) and not os.access(path, os.W_OK) else "w"
+    return Map(Store.open(path, mode), progress)
+
+
+def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
+    """Open a map, making it first where there is none."""
+    return open(path, progress) if os.path.exists(path) else create(path, progress)
+
+
+def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
+    """Bring an older map to this version's schema; returns the schema before and after."""
+    return Store.migrate(path)
+
+
+class Map(AbstractContextManager["Map"]):
+    """An open map. Every method is a verb of the command line, and returns types or typed rows (`gsmap.types.rows`)."""
+
+    def __init__(self, store: Store, progress: StageProgress | None = None) -> None:
+        self.store = store
+        self._progress: StageProgress = progress or (lambda stage, fraction, text: None)
+        self._run: tuple[str | None, dict[str, Any]] = (None, {})
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.store.close()
+
+    # --- settings ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The tree in force: defaults, the map's preset and settings, then those of this run (`with_settings`)."""
+        from gsmap.map.settings import read_settings, settings_of
+
+        preset, values = read_settings(self.store.folder)
+        run_preset, run_values = self._run
+        return settings_of({**(values if run_preset is None else {}), **run_values}, run_preset or preset)
+
+    def with_settings(self, values: Mapping[str, Any] | None = None, preset: str | None = None) -> Map:
+        """Change settings for as long as this map is open, and not in ``settings.toml``; returns the map itself.
+
+        Args:
+            values: by dotted name, such as ``{"register.verdict.max_log_nfa": -6}``.
+            preset: start from this preset instead of from what the map is set to.
+
+        Raises:
+            ConfigError: no such preset or setting (the nearest is named), or a value that does not fit.
+        """
+        before, self._run = self._run, (preset or self._run[0], {**self._run[1], **(values or {})})
+        self.__dict__.pop("settings", None)
+        try:
+            self.settings  # noqa: B018  # refuse here what makes no sense
+        except ConfigError:
+            self._run = before
+            raise
+        return self
+
+    def change_settings(
+        self, values: Mapping[str, Any] | None = None, *, preset: str | None = None, unset: Sequence[str] = ()
+    ) -> None:
+        """``gsmap settings MAP --set``: change the map's own settings; nothing is written if any makes no sense."""
+        from gsmap.map.settings import write_settings
+
+        write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
+        self.__dict__.pop("settings", None)
+
+    def setting_rows(self) -> list[SettingRow]:
+        """``gsmap settings MAP``: every setting with value, default, unit and meaning."""
+        return reports.setting_rows(self.settings)
+
+    # --- ingest, describe, register, optimize ------------------------------------------------------------------------
+
+    def ingest(
+        self,
+        *captures: str | os.PathLike[str] | Gaussians,
+        cameras: str | os.PathLike[str] | Cameras | None = None,
+        name: str | None = None,
+        captured_at: str | None = None,
+        scale: str = "auto",
+    ) -> list[IngestRow]:
+        """Add captures: those found at files and folders, or one in memory. Each is checked whole before it is written.
+
+        Args:
+            captures: files and folders; or `Gaussians`, with `Cameras` or none.
+            cameras, name: of the one capture given.
+            captured_at: ISO 8601; UTC where it has no zone.
+            scale: ``known`` (metres), ``unknown`` (any unit) or ``auto`` (registration finds out).
+
+        Raises:
+            NotFoundError, InputError, ConfigError: see `gsmap.ingest`; captures before the bad one are in the map.
+        """
+        from gsmap.map.stages.ingest import ingest
+
+        added = ingest(
+            self.store,
+            captures,
+            cameras=cameras,
+            name=name,
+            captured_at=captured_at,
+            scale=scale,
+            progress=self._progress,
+        )
+        return [reports.ingest_row(*one) for one in added]
+
+    def describe(self, *scenes: str) -> list[GraphRow]:
+        """The scene graph of every scene (or of those named), made where the present recipe has not made it yet."""
+        from gsmap.map.stages.describe import describe
+
+        wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
+        keys = describe(self.store, wanted, self.settings, self._progress)
+        return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
+
+    def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:
+        """Register pairs of described scenes.
+
+        Args:
+            pairs: ``auto`` (candidates that this recipe has not registered yet), ``all``, one pair ``A:B``, a `Path` of
+                a file with a pair a line, or pairs of scenes; pairs that are named are registered again.
+        """
+        from gsmap.map.stages.register import register
+
+        made = register(self.store, pairs, self.settings, self._progress)
+        return reports.rows_of_edges(self.store, made)
+
+    def add_edge(self, pair: str, S_target_source: Sim3, sigmas: np.ndarray, note: str = "") -> EdgeRow:
+        """Keep a measurement of your own of how scene B lies in scene A of ``A:B``; the next optimize uses it.
+
+        Args:
+            sigmas: (7,) standard deviations [rot_rad (3), trans (3), log_scale], on the source side and in its unit.
+        """
+        from gsmap.map.stages.register import add_edge
+
+        a, b = self._pair(pair)
+        add_edge(self.store, a, b, S_target_source, sigmas, note)
+        return reports.edge_row(self.store, a, b)
+
+    def confirm(self, pair: str, note: str = "", *, withdraw: bool = False) -> EdgeRow:
+        """Vouch for the edge of a pair ``A:B``: it is used whatever the votes say. ``withdraw`` takes a review back."""
+        return self._review(pair, "withdraw" if withdraw else "confirm", note)
+
+    def reject(self, pair: str, note: str = "", *, withdraw: bool = False) -> EdgeRow:
+        """Rule out the edge of a pair ``A:B``. ``withdraw`` takes a review back."""
+        return self._review(pair, "withdraw" if withdraw else "reject", note)
+
+    def _review(self, pair: str, review: str, note: str) -> EdgeRow:
+        a, b = self._pair(pair)
+        self.store.registrations.review(a.id, b.id, review, note)
+        return reports.edge_row(self.store, a, b)
+
+    def _pair(self, pair: str) -> tuple[Scene, Scene]:
+        from gsmap.map.stages.register import pair_of
+
+        return pair_of(self.store, pair)
+
+    def optimize(self) -> RevisionRow:
+        """Solve for all scene poses and keep the answer as a new revision."""
+        from gsmap.map.stages.optimize import optimize
+
+        number = optimize(self.store, self.settings, self._progress)
+        return reports.revision_row(self.store, number)
+
+    def update(self, *captures: str | os.PathLike[str]) -> UpdateReport:
+        """Ingest the captures, then describe, register and optimize whatever is missing."""
+        from gsmap.map.stages.describe import describe
+        from gsmap.map.stages.optimize import is_solved, optimize
+        from gsmap.map.stages.register import register
+
+        ingested = self.ingest(*captures) if captures else []
+        describe(self.store, self.scenes(), self.settings, self._progress)
+        while True:
+            register(self.store, "auto", self.settings, self._progress)
+            if is_solved(self.store, self.settings):
+                return reports.update_report(self.store, ingested)
+            optimize(self.store, self.settings, self._progress)  # scenes that now turn out to be neighbours come next
+
+    def set_prior(self, prior: Prior) -> None:
+        """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
+
+        Raises:
+            InputError: what `optimize` could not use; nothing is noted.
+        """
+        from gsmap.optimize.measurements import check_priors
+
+        check_priors([prior.scene], [prior])
+        self.store.priors.set(prior)
+
+    def remove_prior(self, scene: str) -> None:
+        """Take back what was told of where a scene lies."""
+        self.store.priors.remove(scene)
+
+    # --- export ------------------------------------------------------------------------------------------------------
+
+    def export(
+        self,
+        out: str | os.PathLike[str],
+        *,
+        format: str = "ply",
+        tile_size_m: float = 10.0,
+        bbox: Sequence[float] | None = None,
+        merge: str | None = None,
+        revision: int | None = None,
+        component: int | None = None,
+        steps: int | None = None,
+        budget_s: float | None = None,
+        provenance: bool = False,
+    ) -> ExportReport:
+        """Write merged tiles to a folder; only those that changed since it was last exported to are made.
+
+        Args:
+            format: suffix of the tiles' files, or ``3dtiles``.
+            tile_size_m: edge of a tile; 0 is one file per component.
+            bbox: ``x0 y0 z0 x1 y1 z1`` only this box of the map.
+            merge: ``tto``, ``voxel``, ``union``, ``distance``, or one that another package adds; by default what the
+                setting ``merge.method`` says.
+            revision: poses of this revision, the newest by default.
+            component: only this component.
+            steps: optimisation steps per tile; chosen from its size by default.
+            budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
+            provenance: add the property ``scene`` to ``.ply`` files.
+
+        Raises:
+            ConfigError, InputError, StoreError: see `gsmap.export`; no half-written tile is left.
+        """
+        from gsmap.map.stages.export import Request, export
+
+        request = Request(
+            format=format,
+            tile_size_m=tile_size_m,
+            bbox=bbox,
+            merge=merge,
+            revision=revision,
+            component=component,
+            steps=steps,
+            budget_s=budget_s,
+            provenance=provenance,
+        )
+        made = export(self.store, Path(out), request, self.settings, lambda f, text: self._progress("export", f, text))
+        return reports.export_report(self.store, Path(out), made)
+
+    # --- look --------------------------------------------------------------------------------------------------------
+
+    def scenes(self) -> list[Scene]:
+        """The living scenes in the order they came."""
+        return self.store.scenes.list()
+
+    def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
+        """The poses of a revision, of the newest one by default; None before the first optimize."""
+        return self.store.revisions.get(revision)
+
+    def read(self, ref: str, *, frame: str = "scene") -> tuple[Gaussians, Cameras]:
+        """Gaussians and cameras of one scene, in its own frame or in the ``map`` frame of its component.
+
+        Raises:
+            NotFoundError: no such scene, or no pose for it yet.
+            ConfigError: another frame.
+        """
+        scene = self.store.scenes.get(ref)
+        gaussians, cameras = self.store.scenes.gaussians(scene.id), self.store.scenes.cameras(scene.id)
+        if frame == "scene":
+            return gaussians, cameras
+        if frame != "map":
+            raise ConfigError(f"a scene is read in frame 'scene' or 'map', got {frame!r}")
+        graph = self.pose_graph()
+        if graph is None or scene.id not in graph.poses:
+            raise NotFoundError(f"scene {scene.name} has no place in the map yet: run gsmap update first")
+        S_map_scene = graph.poses[scene.id].S_map_scene
+        return transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene)
+
+    def scene_rows(
+        self,
+        *,
+        component: int | None = None,
+        status: str | None = None,
+        after: str | None = None,
+        tag: str | None = None,
+    ) -> list[SceneRow]:
+        """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date, or with a tag."""
+        return reports.scene_rows(self.store, component=component, status=status, after=after, tag=tag)
+
+    def edge_rows(
+        self,
+        *,
+        component: int | None = None,
+        status: str | None = None,
+        after: str | None = None,
+        tag: str | None = None,
+    ) -> list[EdgeRow]:
+        """``gsmap list MAP edges``: all, or those both of whose scenes are as asked, and of one status."""
+        return reports.edge_rows(self.store, component=component, status=status, after=after, tag=tag)
+
+    def revision_rows(self) -> list[RevisionRow]:
+        """``gsmap list MAP revisions``."""
+        return reports.revision_rows(self.store)
+
+    def tile_rows(self) -> list[TileRow]:
+        """``gsmap list MAP tiles``."""
+        return reports.tile_rows(self.store)
+
+    def model_rows(self) -> list[ModelRow]:
+        """``gsmap models list MAP``."""
+        return reports.model_rows(self.store)
+
+    def pose_rows(self) -> list[PoseRow]:
+        """``gsmap poses MAP``: where every placed scene lies."""
+        return reports.pose_rows(self.store)
+
+    def status(self) -> MapStatus:
+        """``gsmap status MAP``: what is missing, stale or wants a person, each with the verb that helps."""
+        from gsmap.map.status import status
+
+        return status(self.store, self.settings)
+
+    def show_scene(self, ref: str) -> SceneReport:
+        """``gsmap show MAP SCENE``: facts, nodes and edges of one scene."""
+        scene = self.store.scenes.get(ref)
+        return reports.scene_report(self.store, scene, self._graph_of(scene))
+
+    def show_pair(self, pair: str) -> PairReport:
+        """``gsmap show MAP A:B``: the pair's edge, its evidence, and its history."""
+        return reports.pair_report(self.store, *self._pair(pair))
+
+    def _graph_of(self, scene: Scene) -> Any:
+        from gsmap.map.stages.describe import graph_keys
+
+        return self.store.graphs.load(scene.id, graph_keys(self.store, [scene], self.settings)[scene.id])
+
+    def diff(self, before: int, after: int) -> list[PoseChangeRow]:
+        """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""
+        return reports.pose_change_rows(self.store, before, after)
+
+    def evaluate(
+        self,
+        truth: str | os.PathLike[str],
+        images: str | os.PathLike[str] | None = None,
+        *,
+        lpips: str | os.PathLike[str] | None = None,
+    ) -> EvaluationReport:
+        """``gsmap evaluate MAP``: poses against ground truth, renders against the captures' own images."""
+        from gsmap.map import evaluating
+
+        report = evaluating.poses(self.store, truth)
+        if images is None:
+            return report
+        rows = evaluating.images(self.store, images, lambda f, text: self._progress("evaluate", f, text), lpips=lpips)
+        return replace(report, images=rows)
+
+    def view(self, *, port: int = 0) -> ViewServer:
+        """``gsmap view MAP``: a page of splats, graphs, cameras and edges, served on this machine only until closed."""
+        from gsmap.map.viewing import view_of
+        from gsmap.view import ViewServer
+
+        return ViewServer(view_of(self.store), port=port)
+
+    def draw_graph(self, ref: str, path: str | os.PathLike[str]) -> None:
+        """``gsmap show MAP SCENE --picture``: the scene's graph over a render, for a person to judge."""
+        from PIL import Image
+
+        from gsmap.view.graph_picture import draw_graph
+
+        scene = self.store.scenes.get(ref)
+        graph = self._graph_of(scene)
+        if graph is None:
+            raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
+        Image.fromarray(draw_graph(*self.read(scene.id), graph)).save(path)
+
+    def write_poses(self, out: str | os.PathLike[str], format: str) -> None:
+        """``gsmap poses MAP OUT --format F``: poses for other programs; see `gsmap.map.poses`."""
+        from gsmap.map.poses import write_poses
+
+        write_poses(self.store, Path(out), format)
+
+    # --- upkeep ------------------------------------------------------------------------------------------------------
+
+    def edit(
+        self,
+        ref: str,
+        *,
+        name: str | None = None,
+        captured_at: str | None = None,
+        note: str | None = None,
+        tags: Sequence[str] = (),
+        untag: Sequence[str] = (),
+    ) -> SceneRow:
+        """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history."""
+        from gsmap.ingest import parse_date
+
+        scene = self.store.scenes.edit(
+            ref,
+            name=name,
+            captured_at=None if captured_at is None else parse_date(captured_at),
+            note=note,
+            tags_add=tuple(tags),
+            tags_remove=tuple(untag),
+        )
+        return reports.scene_row(self.store, scene)
+
+    def remove(self, ref: str) -> SceneRow:
+        """Take a scene out; older revisions keep it."""
+        row = reports.scene_row(self.store, self.store.scenes.get(ref))
+        self.store.scenes.remove(ref)
+        return row
+
+    def check(self) -> CheckReport:
+        """Read every byte of the map and compare it with what was written."""
+        return reports.check_report(self.store.check(lambda f, text: self._progress("check", f, text)))
+
+    def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
+        """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
+        return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
+
+    def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
+        """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""
+        from gsmap.map import models
+
+        models.add(self.store, kind, path, preset, copy)

@@ -1,0 +1,105 @@
+"""The settings of a map: one frozen tree of the parameters of all stages, its presets, and ``MAP/settings.toml``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsmap import describe, engine, export, merge, optimize, register, retrieve
+from gsmap.errors import ConfigError
+from gsmap.settings import FILE_NAME, changed, load, save
+from gsmap.settings.file import PRESET
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    # Graph-GSReg (2026) as published, as far as its stages go: objects alone, context over three hops, the relative
+    # distance test, ICP, and plain L1 optimisation of the union on 1 cm voxels. SAM and CLIP are taken where the map
+    # has their models. The verdict and the pose graph, which the paper has none of, stay gsmap's.
+    "paper": {
+        "describe.landmarks": False,
+        "describe.object.hops": 3,
+        "register.fallback": "never",
+        "register.proposers.graph.kinds": ["objects"],
+        "register.proposers.graph.consistency.test": "ratio",
+        "register.proposers.graph.consistency.height_slope": float("inf"),
+        "register.coarse_refiner": "none",
+        "register.refiner": "icp",
+        "merge.method": "tto",
+        "merge.mergers.tto.voxel_m": 0.01,
+        "merge.mergers.tto.owner_cells": False,
+        "merge.mergers.tto.ssim_weight": 0.0,
+        "merge.mergers.tto.min_weight": 0.0,
+        "merge.mergers.tto.keep": 1.0,
+        "merge.mergers.tto.newer_wins": False,
+    },
+}
+"""Settings by the name of a preset; what a preset does not name has its default."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All parameters of a map.
+
+    Args:
+        describe: how captures become scene graphs.
+        retrieve: which pairs are tried.
+        register: how a pair is registered and judged.
+        optimize: how poses are solved.
+        merge: how captures become one.
+        export: how tiles are planned and kept.
+        engine: where jobs run.
+    """
+
+    describe: describe.Params = field(default_factory=describe.Params)
+    retrieve: retrieve.Params = field(default_factory=retrieve.Params)
+    register: register.Params = field(default_factory=register.Params)
+    optimize: optimize.Params = field(default_factory=optimize.Params)
+    merge: merge.Params = field(default_factory=merge.Params)
+    export: export.Params = field(default_factory=export.Params)
+    engine: engine.Params = field(default_factory=engine.Params)
+
+
+def settings_of(values: Mapping[str, Any], preset: str | None = None) -> Settings:
+    """The defaults, changed by a preset and then by values by dotted name.
+
+    Raises:
+        ConfigError: no such preset or setting, or a value that does not fit.
+    """
+    if preset is not None and preset not in PRESETS:
+        raise ConfigError(f"there is no preset {preset!r}: choose one of {', '.join(PRESETS)}")
+    tree: Settings = changed(Settings(), {**PRESETS[preset or "default"], **values})
+    return tree
+
+
+def read_settings(folder: Path) -> tuple[str, dict[str, Any]]:
+    """The preset of a map and what it changes besides, by dotted name.
+
+    Raises:
+        ConfigError: ``settings.toml`` cannot be read.
+    """
+    values = load(folder / FILE_NAME)
+    return str(values.pop(PRESET, "default")), values
+
+
+def write_settings(
+    folder: Path, values: Mapping[str, Any], *, preset: str | None = None, drop: tuple[str, ...] = ()
+) -> None:
+    """Change a map's ``settings.toml``; nothing is written unless the whole tree makes sense.
+
+    Args:
+        values: settings by dotted name.
+        preset: the map's preset from now on.
+        drop: names that go back to what the preset, or else the default, says.
+
+    Raises:
+        ConfigError: no such preset or setting, or a value that does not fit.
+    """
+    old_preset, old = read_settings(folder)
+    kept = {name: value for name, value in old.items() if name not in drop}
+    unknown = [name for name in drop if name not in old]
+    if unknown:
+        raise ConfigError(f"{unknown[0]} is not changed in {folder / FILE_NAME}: there is nothing to take back")
+    settings_of({**kept, **values}, preset or old_preset)
+    save(folder / FILE_NAME, {**({PRESET: preset} if preset else {}), **values}, drop)

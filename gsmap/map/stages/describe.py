@@ -1,0 +1,35 @@
+"""Describe: every scene's graph, made where the present recipe has not made it yet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gsmap.describe import recipe_key
+from gsmap.engine import run_jobs
+from gsmap.map import models
+from gsmap.map.jobs import describe_scene
+from gsmap.map.settings import Settings
+from gsmap.methods import RecipeKey
+from gsmap.store import Store
+from gsmap.types import Scene
+from gsmap.types.progress import StageProgress
+
+
+def graph_keys(store: Store, scenes: Sequence[Scene], settings: Settings) -> dict[str, RecipeKey]:
+    """What names each scene's graph under these settings, by scene id: content and scale policy are its inputs."""
+    recipe = recipe_key(settings.describe, models.specs(store))
+    return {scene.id: recipe.of(scene.id, scene.scale_policy) for scene in scenes}
+
+
+def describe(
+    store: Store, scenes: Sequence[Scene], settings: Settings, progress: StageProgress
+) -> dict[str, RecipeKey]:
+    """Make the graphs that are missing, reading none of the others; returns the key of each scene's graph."""
+    keys = graph_keys(store, scenes, settings)
+    missing = [scene for scene in scenes if store.graphs.find(keys[scene.id]) is None]
+    specs = models.specs(store)
+    jobs = [(str(store.folder), scene.id, specs, settings.describe) for scene in missing]
+    for done, (i, graph) in enumerate(run_jobs(describe_scene, jobs, settings.engine), 1):
+        store.graphs.save(graph, keys[graph.scene_id])
+        progress("describe", done / len(missing), f"{missing[i].name}: {graph.num_nodes} nodes")
+    return keys

@@ -1,0 +1,187 @@
+"""Export: which scenes, with which poses, merged how; the tiles themselves are `gsmap.export` and `gsmap.merge`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
+from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
+from gsmap.export.tileset import FILE_NAME, write_tilesets
+from gsmap.map.settings import Settings
+from gsmap.merge import reach_m, recipe_key, uses_dates, with_steps
+from gsmap.merge.tile import LazyScene, merge_tile
+from gsmap.store import Store
+from gsmap.types import MergeResult, Scene, ScenePose, Tile
+from gsmap.types.plain import plain
+from gsmap.types.progress import Progress
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of an export; see `gsmap.Map.export`.
+
+    Args:
+        merge: the merger; None takes the one of the settings.
+        steps: optimisation steps per tile; None takes what the merger's settings say.
+    """
+
+    format: str = "ply"
+    tile_size_m: float = 10.0
+    bbox: Sequence[float] | None = None
+    merge: str | None = None
+    revision: int | None = None
+    component: int | None = None
+    steps: int | None = None
+    budget_s: float | None = None
+    provenance: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """The tiles of an export, and how each is made.
+
+    Args:
+        revision: whose poses.
+        scenes: those that are exported, by id.
+        method, params: the merger and its settings.
+        recipe: how every tile is made.
+        tiles: what the folder is to hold.
+    """
+
+    revision: int | None
+    scenes: dict[str, Scene]
+    method: str
+    params: Any
+    recipe: TileRecipe
+    tiles: list[PlannedTile]
+
+
+def plan(store: Store, request: Request, settings: Settings) -> Planned:
+    """Which tiles an export consists of; nothing is read but the catalog."""
+    method = request.merge or settings.merge.method
+    params = settings.merge.mergers[method]
+    if request.steps is not None:
+        params = with_steps(method, params, request.steps)
+    recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
+    _check(request, recipe)
+    revision = request.revision or store.revisions.current()
+    placed = _placed(store, revision, request.component)
+    scenes = {scene: store.scenes.get(scene) for scene in placed}
+    if uses_dates(method, params):
+        recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
+    tiles = plan_tiles(
+        {scene: pose.S_map_scene for scene, pose in placed.items()},
+        {scene: found.bounds for scene, found in scenes.items()},
+        tile_size_m=request.tile_size_m,
+        components={scene: pose.component for scene, pose in placed.items()},
+        bbox=None if request.bbox is None else np.reshape(np.asarray(request.bbox, float), (2, 3)),
+        reach_m=reach_m(method, params),
+        max_tiles=settings.export.max_tiles,
+    )
+    return Planned(revision, scenes, method, params, recipe, tiles)
+
+
+def export(store: Store, out: Path, request: Request, settings: Settings, progress: Progress) -> ExportResult:
+    """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what."""
+    planned = plan(store, request, settings)
+    asked = plain(asdict(replace(request, merge=planned.method)))
+    number: list[int] = []
+
+    def noted(tile: Tile) -> None:
+        if not tile.path:  # nothing lies there
+            return
+        if not number:
+            number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
+        store.exports.add_tile(number[0], tile)
+
+    result = export_tiles(
+        planned.tiles,
+        partial(_make, store, planned, request),
+        out,
+        map_id=store.id,
+        recipe=planned.recipe,
+        params=settings.export,
+        made=noted,
+        progress=progress,
+    )
+    is_new = result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))
+    if planned.recipe.is_tileset and is_new:
+        write_tilesets(out, result.tiles, request.tile_size_m)
+    kept = {tile.path for tile in result.tiles}
+    gone = [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]
+    if gone:
+        store.exports.forget(out, gone)
+    return result
+
+
+def dirty_tiles(store: Store, settings: Settings) -> dict[str, int]:
+    """Tiles that the same export would make again now or take away, by the folder exported to; from the catalog alone.
+
+    A folder whose export named a revision stays as it is, whatever the map does.
+    """
+    newest = {export.target: export for export in store.exports.list()}
+    found = {}
+    for target in store.exports.targets():
+        asked = newest[target].settings
+        known = {field.name for field in fields(Request)}
+        try:
+            planned = plan(store, Request(**{key: value for key, value in asked.items() if key in known}), settings)
+        except GsmapError:
+            continue  # what was exported then cannot be now: its verb will say why
+        old = {(tile.component, Path(tile.path).name.partition(".")[0]): tile for tile in store.exports.tiles(target)}
+        again = [
+            tile
+            for tile in planned.tiles
+            if (made := old.get((tile.component, tile.name))) is not None
+            and dirty_reason(tile, made, planned.recipe, settings.export.moved_m)
+        ]
+        gone = set(old) - {(tile.component, tile.name) for tile in planned.tiles}
+        found[target] = len(again) + len(gone)
+    return {target: count for target, count in found.items() if count}
+
+
+def _check(request: Request, recipe: TileRecipe) -> None:
+    """Refuse what makes no sense before anything is read."""
+    if request.budget_s is not None and not request.budget_s > 0:
+        raise ConfigError(f"the budget must be a positive number of seconds, got {request.budget_s}")
+    if recipe.is_tileset and not request.tile_size_m > 0:
+        raise ConfigError("3dtiles is a tree of tiles: give --tile-size in metres, or use glb for one file")
+
+
+def _placed(store: Store, revision: int | None, component: int | None) -> dict[str, ScenePose]:
+    """The poses of the scenes to export."""
+    graph = store.revisions.get(revision)
+    if graph is None:
+        raise NotFoundError("the map has no poses yet: run gsmap update or gsmap optimize first")
+    living = {s.id for s in store.scenes.list()} if revision == store.revisions.current() else set(graph.poses)
+    placed = {s: p for s, p in graph.poses.items() if s in living}
+    if component is not None:
+        placed = {s: p for s, p in placed.items() if p.component == component}
+        if not placed:
+            known = sorted({p.component for p in graph.poses.values()})
+            raise NotFoundError(f"revision {revision} has no component {component}: it has {known}")
+    if not placed:
+        raise InputError("nothing to export: no scene has a place in the map yet; run gsmap update first")
+    return placed
+
+
+def _make(store: Store, planned: Planned, request: Request, tile: PlannedTile, progress: Progress) -> MergeResult:
+    """The merged content of one tile."""
+    lazy = [
+        LazyScene(
+            scene,
+            pose,
+            partial(store.scenes.gaussians, scene),
+            store.scenes.cameras(scene),
+            planned.scenes[scene].captured_at,
+        )
+        for scene, pose in tile.poses.items()
+    ]
+    bounds = None if request.tile_size_m == 0 and request.bbox is None else tile.bounds
+    return merge_tile(lazy, planned.method, planned.params, bounds=bounds, budget_s=request.budget_s, progress=progress)

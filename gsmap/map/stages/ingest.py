@@ -1,0 +1,62 @@
+"""Ingest: captures in files or in memory become scenes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsmap.errors import ConfigError
+from gsmap.ingest import Capture, find_captures, read_capture, take_capture
+from gsmap.store import Store
+from gsmap.types import Cameras, Gaussians, Scene
+from gsmap.types.progress import StageProgress
+
+Source = str | os.PathLike[str] | Gaussians
+
+
+def ingest(
+    store: Store,
+    sources: Sequence[Source],
+    *,
+    cameras: str | os.PathLike[str] | Cameras | None,
+    name: str | None,
+    captured_at: str | None,
+    scale: str,
+    progress: StageProgress,
+) -> list[tuple[Scene, bool, tuple[str, ...]]]:
+    """Scene, whether it is new to the map, and notes, of every capture found; see `gsmap.map.Map.ingest`."""
+    memory = [source for source in sources if isinstance(source, Gaussians)]
+    if memory and len(sources) > 1:
+        raise ConfigError("Gaussians in memory are ingested one capture at a time")
+    if memory:
+        if cameras is not None and not isinstance(cameras, Cameras):
+            raise ConfigError("Gaussians in memory go with gsmap.Cameras, or with none")
+        capture = take_capture(memory[0], cameras, name=name or "capture", captured_at=captured_at, scale_policy=scale)
+        return [_add(store, capture)]
+    if isinstance(cameras, Cameras):
+        raise ConfigError("cameras in memory go with Gaussians in memory; for a file name a file of cameras")
+    found = find_captures([Path(source) for source in sources if not isinstance(source, Gaussians)])
+    if len(found) > 1 and (cameras is not None or name is not None):
+        raise ConfigError(f"cameras and name are for one capture, {len(found)} were found: ingest them one by one")
+    results = []
+    for i, files in enumerate(found):
+        progress("ingest", i / len(found), files.name)
+        capture = read_capture(files, cameras=cameras, name=name, captured_at=captured_at, scale_policy=scale)
+        results.append(_add(store, capture))
+    progress("ingest", 1.0, f"{len(results)} captures")
+    return results
+
+
+def _add(store: Store, capture: Capture) -> tuple[Scene, bool, tuple[str, ...]]:
+    scene, new = store.scenes.add(
+        capture.gaussians,
+        capture.cameras,
+        name=capture.name,
+        scale_policy=capture.scale_policy,
+        captured_at=capture.captured_at,
+        source=capture.source,
+        antialiased=capture.antialiased,
+        notes=capture.notes,
+    )
+    return scene, new, capture.notes

@@ -1,0 +1,88 @@
+"""Optimize: poses of all scenes from the edges in use, kept as a revision under what they were solved from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap import optimize as solver
+from gsmap.map.settings import Settings
+from gsmap.map.stages.describe import graph_keys
+from gsmap.methods import RecipeKey
+from gsmap.store import Store
+from gsmap.types import Edge, PoseGraph, Prior
+from gsmap.types.plain import canonical
+from gsmap.types.progress import StageProgress
+
+
+@dataclass(frozen=True, eq=False)
+class PoseInputs:
+    """What decides the poses of a map.
+
+    Args:
+        scenes: ids, in the order they came.
+        edges: those that may be used.
+        priors: outside knowledge.
+        ups: (3,) direction against gravity in the scene's frame, by scene id, where it is known.
+        key: the recipe with all of these as its inputs.
+    """
+
+    scenes: list[str]
+    edges: list[Edge]
+    priors: list[Prior]
+    ups: dict[str, np.ndarray]
+    key: RecipeKey
+
+
+def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
+    """Read what decides the poses."""
+    scenes, priors = [scene.id for scene in store.scenes.list()], store.priors.list()
+    edges, named = [], []
+    for stored in store.registrations.current():
+        registration = stored.registration
+        usable = stored.review == "confirm" or (registration.status == "accepted" and stored.review != "reject")
+        if not usable or registration.S_target_source is None or registration.information is None:
+            continue
+        edges.append(
+            Edge(
+                target=registration.target,
+                source=registration.source,
+                S_target_source=registration.S_target_source,
+                information=registration.information,
+                confirmed=stored.review == "confirm",
+            )
+        )
+        named.append(f"{stored.key or stored.number} {stored.review}")
+    ups = _ups(store, settings)
+    told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
+    key = solver.recipe_key(settings.optimize).of(*scenes, *named, canonical(told), canonical(ups))
+    return PoseInputs(scenes, edges, priors, ups, key)
+
+
+def _ups(store: Store, settings: Settings) -> dict[str, np.ndarray]:
+    """What each scene's present graph says is up; where it has none yet, its newest graph."""
+    present = {key.digest for key in graph_keys(store, store.scenes.list(), settings).values()}
+    # Graphs come oldest first; the present one of a scene goes last.
+    graphs = sorted(store.graphs.list(), key=lambda graph: graph.key in present)
+    return {graph.scene: np.array(graph.up) for graph in graphs if graph.up is not None}
+
+
+def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
+    """Solve for all poses and keep the answer as a new revision; returns its number."""
+    given = pose_inputs(store, settings)
+    progress("optimize", 0.0, "poses")
+    previous: PoseGraph | None = store.revisions.get()
+    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, settings.optimize)
+    answer = solver.gravity_align(
+        answer, given.ups, fixed={prior.scene for prior in given.priors}, params=settings.optimize
+    )
+    number = store.revisions.save(answer, given.key)
+    progress("optimize", 1.0, f"revision {number}")
+    return number
+
+
+def is_solved(store: Store, settings: Settings) -> bool:
+    """Whether the newest revision is what this recipe makes of what the map knows now."""
+    revisions = store.revisions.list()
+    return bool(revisions) and revisions[-1].key == pose_inputs(store, settings).key.digest

@@ -1,0 +1,187 @@
+"""Register: which pairs are tried, and the edges of those that the present recipe has not registered yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.engine import run_jobs
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.map.jobs import register_scenes
+from gsmap.map.settings import Settings
+from gsmap.map.stages.describe import graph_keys
+from gsmap.methods import RecipeKey
+from gsmap.register import recipe_key
+from gsmap.retrieve import Placed, candidate_pairs
+from gsmap.store import MANUAL, Store
+from gsmap.store.registrations import StoredRegistration
+from gsmap.types import PoseGraph, Registration, Scene, SceneGraph, Sim3
+from gsmap.types.progress import StageProgress
+
+Pairs = str | Path | Sequence[tuple[str, str]]
+"""``auto``, ``all``, ``A:B``, a file of pairs, or the pairs themselves."""
+
+
+def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProgress) -> list[Registration]:
+    """Register the pairs asked for; those of ``auto`` and ``all`` only where this recipe has not done so yet.
+
+    A result that this recipe made before, under settings that were changed meanwhile, becomes the pair's current one
+    again without being computed.
+    """
+    scenes = store.scenes.list()
+    graphs = graph_keys(store, scenes, settings)
+    recipe = recipe_key(settings.register)
+    wanted = _wanted(store, pairs, graphs, settings, recipe)
+    keys = [recipe.of(graphs[a].digest, graphs[b].digest) for a, b in wanted]
+    todo = list(range(len(wanted)))
+    if pairs in ("auto", "all"):
+        current = {frozenset((r.registration.target, r.registration.source)): r for r in store.registrations.current()}
+        todo = []
+        for i, key in enumerate(keys):
+            known, stands = store.registrations.find(key), current.get(frozenset(wanted[i]))
+            if known is None:
+                todo.append(i)
+            elif stands is not None and stands.key != key.digest and not stands.manual:
+                store.registrations.adopt(known.number)
+    jobs = [
+        (str(store.folder), (a, graphs[a].digest), (b, graphs[b].digest), settings.register)
+        for a, b in (wanted[i] for i in todo)
+    ]
+    names = {scene.id: scene.name for scene in scenes}
+    found: dict[int, Registration] = {}
+    for at, edge in run_jobs(register_scenes, jobs, settings.engine):
+        store.registrations.save(edge, keys[todo[at]])
+        found[at] = edge
+        progress("register", len(found) / len(jobs), f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
+    return [found[i] for i in sorted(found)]
+
+
+def stale(store: Store, settings: Settings) -> list[StoredRegistration]:
+    """The current edges that other settings or another version made; what a person measured is never stale."""
+    graphs = graph_keys(store, store.scenes.list(), settings)
+    recipe = recipe_key(settings.register)
+
+    def made_by(stored: StoredRegistration) -> str:
+        edge = stored.registration
+        return recipe.of(graphs[edge.target].digest, graphs[edge.source].digest).digest
+
+    return [
+        stored
+        for stored in store.registrations.current()
+        if not stored.manual and stored.review != "confirm" and stored.key != made_by(stored)
+    ]
+
+
+def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np.ndarray, note: str) -> None:
+    """Keep a person's own measurement of where ``b`` lies in ``a`` as the pair's current edge.
+
+    Args:
+        sigmas: (7,) standard deviations [rot_rad (3), trans (3), log_scale] on the source side, in the source's unit.
+
+    Raises:
+        InputError: sigmas that are not 7 positive finite numbers.
+    """
+    sigmas = np.asarray(sigmas, dtype=np.float64)
+    if sigmas.shape != (7,) or not np.isfinite(sigmas).all() or not (sigmas > 0).all():
+        raise InputError(f"a measured edge needs 7 positive standard deviations, got {sigmas.tolist()}")
+    edge = Registration(
+        target=a.id,
+        source=b.id,
+        status="accepted",
+        S_target_source=S_target_source,
+        information=np.diag(sigmas**-2.0),
+        proposer=MANUAL,
+        notes=(note,) if note else (),
+    )
+    store.registrations.save(edge)
+
+
+def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
+    """The scenes of ``A:B``; a name may itself hold a colon.
+
+    Raises:
+        NotFoundError: no two scenes are called so.
+    """
+    for at in (i for i, character in enumerate(pair) if character == ":"):
+        try:
+            return store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :])
+        except NotFoundError:
+            continue
+    raise NotFoundError(f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows")
+
+
+def read_pairs(path: Path) -> list[tuple[str, str]]:
+    """Pairs of a text file, one a line: ``A B`` or ``A:B``; ``#`` begins a remark.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: a line that is no pair.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise NotFoundError(f"no file of pairs at {path}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read pairs from {path}: {error}") from error
+    pairs = []
+    for number, line in enumerate(lines, 1):
+        words = line.partition("#")[0].split()
+        if len(words) == 1 and words[0].count(":") == 1:
+            words = words[0].split(":")
+        if words and (len(words) != 2 or not all(words)):
+            raise InputError(f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}")
+        if words:
+            pairs.append((words[0], words[1]))
+    return pairs
+
+
+def _wanted(
+    store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], settings: Settings, recipe: RecipeKey
+) -> list[tuple[str, str]]:
+    """The scene pairs that are asked for, each as (target, source), in a fixed order, each once."""
+    described = [scene for scene, key in graphs.items() if store.graphs.find(key) is not None]
+    if pairs == "all":
+        return [(a, b) for i, a in enumerate(described) for b in described[i + 1 :]]
+    if pairs == "auto":
+        loaded = [_graph(store, graphs[scene]) for scene in described]
+        candidates = candidate_pairs(loaded, placed=placed_scenes(store), params=settings.retrieve)
+        known = {frozenset(pair) for pair in candidates}
+        again = [(r.registration.target, r.registration.source) for r in stale(store, settings)]
+        return candidates + [pair for pair in again if frozenset(pair) not in known and set(pair) <= set(described)]
+    if isinstance(pairs, Path):
+        pairs = read_pairs(pairs)
+    if isinstance(pairs, str):
+        named = [pair_of(store, pairs)]
+    else:
+        named = [(store.scenes.get(a), store.scenes.get(b)) for a, b in pairs]
+    chosen: dict[frozenset[str], tuple[str, str]] = {}
+    for a, b in named:
+        if a.id == b.id:
+            raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
+        for scene in (a, b):
+            if scene.id not in described:
+                raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
+        chosen.setdefault(frozenset((a.id, b.id)), (a.id, b.id))
+    return list(chosen.values())
+
+
+def placed_scenes(store: Store) -> dict[str, Placed]:
+    """Where scenes lie by the newest poses, for finding neighbours."""
+    bounds = {scene.id: scene.bounds for scene in store.scenes.list()}
+    graph: PoseGraph | None = store.revisions.get()
+    placed = {}
+    for scene, pose in (graph.poses if graph else {}).items():
+        if scene in bounds:
+            S = pose.S_map_scene
+            radius = S.scale * float(np.linalg.norm(np.diff(bounds[scene], axis=0))) / 2
+            sigma = 0.0 if pose.covariance is None else S.scale * float(np.sqrt(np.diag(pose.covariance)[3:6].max()))
+            placed[scene] = Placed(pose.component, S.apply(bounds[scene].mean(0)), radius, sigma)
+    return placed
+
+
+def _graph(store: Store, key: RecipeKey) -> SceneGraph:
+    graph = store.graphs.load(key.inputs[0], key)
+    assert graph is not None
+    return graph

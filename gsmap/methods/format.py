@@ -1,0 +1,69 @@
+"""The contract of a format: how files of Gaussians are read and written."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Protocol
+
+from gsmap.types import FileInfo, Gaussians
+
+
+class Format(Protocol):
+    """Files of one layout, by their suffix.
+
+    Its name in the family is the suffix itself, in lower case (``.ply``, ``.compressed.ply``, ``tileset.json``); where
+    several fit a path, the longest counts, and a built-in one goes before another package's of the same name::
+
+        [project.entry-points."gsmap.formats"]
+        ".xyz" = "my_package.xyz"
+
+    A format has `VERSION` and ``read``, ``write`` or both (`ReadableFormat`, `WritableFormat`); one that is read may
+    also say more of a file (`DescribedFormat`). It has no ``Params``: options are keyword arguments of ``write``.
+
+    Frames: right-down-front, the axes of a trained ``.ply``, in the file's own unit; a format of other axes turns its
+    Gaussians, spherical harmonics included (`gsmap.formats.axes`).
+
+    Attributes:
+        VERSION: an int, raised whenever what is read from, or written to, a file changes.
+    """
+
+    VERSION: int
+
+
+class ReadableFormat(Format, Protocol):
+    """A format that can be read."""
+
+    def read(self, path: str | os.PathLike[str], /) -> Gaussians:
+        """The Gaussians of a file; their values are checked elsewhere, so NaN may pass.
+
+        Raises:
+            InputError: the file is not what its suffix says, is damaged, or promises more than its size can hold.
+            OSError: as the system gives it.
+        """
+        ...
+
+
+class DescribedFormat(ReadableFormat, Protocol):
+    """A format whose files say something beside their Gaussians."""
+
+    def info(self, path: str | os.PathLike[str], /) -> FileInfo:
+        """What that is, from the header alone.
+
+        Raises:
+            InputError, OSError: as ``read``.
+        """
+        ...
+
+
+class WritableFormat(Format, Protocol):
+    """A format that can be written."""
+
+    def write(self, path: str | os.PathLike[str], gaussians: Gaussians, /, **options: Any) -> None:
+        """Write a file under a passing name in the folder where it will stay; the caller renames it.
+
+        Raises:
+            InputError: Gaussians that the format cannot hold.
+            ConfigError: an option that makes no sense.
+            OSError: as the system gives it.
+        """
+        ...

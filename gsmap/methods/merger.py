@@ -1,0 +1,82 @@
+"""The contract of a merger: captures that lie in one frame in, one set of Gaussians out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from gsmap.types import MergeResult, PlacedScene
+from gsmap.types.progress import Progress
+
+
+class Merger(Protocol):
+    """One way of merging; a module of `gsmap.merge.mergers`, or what an entry point in ``gsmap.mergers`` names.
+
+    All lengths are in metres of the map frame. Importing a merger must not import torch: recipes are computed of
+    settings alone. The same scenes, params and bounds give the same bits, whatever the order of the scenes was and for
+    any number of threads; ``budget_s`` is the one exception, and a result that it cut short says so.
+    """
+
+    Params: type
+    """Frozen dataclass of its settings, all with defaults."""
+
+    VERSION: int
+    """Raised whenever the output changes for the same input: every tile it made is then made again."""
+
+    STEPS: str | None
+    """The field of ``Params`` that sets how many optimisation steps are taken; None for a closed form."""
+
+    RENDERS: bool
+    """Whether it renders, so that the render backend may change its bits and belongs to the name of its results."""
+
+    def reach_m(self, params: Any) -> float:
+        """How far beyond a tile's bounds a scene's Gaussians decide what is in the tile, in metres.
+
+        A tile depends on the scenes that come that near to it, and on no others.
+        """
+        ...
+
+    def reading_m(self, params: Any) -> float:
+        """How far beyond a tile's bounds Gaussians and cameras are read, in metres; at least `reach_m`.
+
+        More than that where Gaussians farther away only stand in cameras' ways.
+        """
+        ...
+
+    def min_cameras(self, params: Any) -> int:
+        """How many of a scene's cameras are read at least, the nearest ones, however far from a tile they stand.
+
+        0 where what lies within `reading_m` is enough. The Gaussians between such cameras and the tile are read too.
+        """
+        ...
+
+    def uses_dates(self, params: Any) -> bool:
+        """Whether the dates of the captures decide anything: if so, another date makes a tile dirty."""
+        ...
+
+    def merge(
+        self,
+        scenes: Sequence[PlacedScene],
+        params: Any,
+        bounds: np.ndarray | None,
+        budget_s: float | None,
+        progress: Progress,
+    ) -> MergeResult:
+        """Merge scenes.
+
+        Args:
+            scenes: at least one, in the order of their ids, map frame. For a tile each holds at least its Gaussians
+                and cameras within `reading_m` of the bounds; what must be known of the whole capture it can be asked
+                for (`PlacedScene.whole_centroid`).
+            params: an instance of ``Params``.
+            bounds: (2, 3) float64 lowest and highest corner of the tile; None for everything.
+            budget_s: ceiling on the wall seconds it may take (None for no ceiling); closed forms ignore it.
+            progress: to be told the fraction done in [0, 1] and what is being done.
+
+        Returns:
+            The Gaussians whose mean lies in the bounds (others may be among them: they are dropped), with ``origin``
+            counted in ``scenes``. ``num_input`` is filled in by the caller.
+        """
+        ...

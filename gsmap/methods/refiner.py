@@ -1,0 +1,37 @@
+"""The contract of refiners: ways to sharpen a pose that is nearly right."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Protocol
+
+from gsmap.methods.surface import Surface
+from gsmap.types import Sim3
+
+__all__ = ["Refiner", "Surface"]
+
+
+class Refiner(Protocol):
+    """A module or object beside whose ``Params`` and ``VERSION`` stand these."""
+
+    Params: ClassVar[type]
+    VERSION: ClassVar[int]
+
+    SCALES: ClassVar[bool]
+    """Whether it can refine the scale as well; where not, ``register.scale_refiner`` takes its place for such pairs."""
+
+    def refine(
+        self, target: Surface, source: Surface, start: Sim3, params: Any = None, *, with_scale: bool = False
+    ) -> Sim3:
+        """A better pose than the start.
+
+        Args:
+            target, source: surfaces, both in metres.
+            start: takes the source's metres to the target's; within about 8 degrees and 0.4 m of the answer after
+                ``register.coarse_refiner``, and its scale, where one was estimated, within some percent of 1.
+            params: an instance of ``Params``; None for the defaults.
+            with_scale: refine the scale too; only ever asked of a refiner that `SCALES`. Otherwise the start's is kept.
+
+        Returns:
+            The pose between the same frames; ``start`` itself where too little overlaps. The same input gives the same
+            bits in every run. Raises nothing for surfaces that do not match.
+        """

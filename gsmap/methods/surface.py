@@ -1,0 +1,71 @@
+"""The surface of a scene, as proposers and refiners are handed it."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from gsmap.types import Cameras, Gaussians
+
+
+class Surface(Protocol):
+    """The surface of one scene in metres: its frame's axes and origin, lengths times `unit_m`.
+
+    Everything is computed once, when it is first asked for, and kept; arrays are not to be written to.
+    """
+
+    @property
+    def points(self) -> np.ndarray:
+        """(N, 3) float64 centres of the scene's surface Gaussians, metres."""
+
+    @property
+    def colours(self) -> np.ndarray:
+        """(N, 3) float32 their view-independent colours, RGB in [0, 1]."""
+
+    @property
+    def resolution_m(self) -> float:
+        """Side of the cells over which `coarse` averages."""
+
+    @property
+    def unit_m(self) -> float:
+        """Metres per unit of the scene, under which this surface was made."""
+
+    @property
+    def gaussians(self) -> Gaussians | None:
+        """The whole scene in its own unit; None where only points are known."""
+
+    @property
+    def cameras(self) -> Cameras | None:
+        """The scene's cameras in its own unit; None where it has none."""
+
+    def __len__(self) -> int:
+        """How many points there are."""
+
+    @property
+    def coarse(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means (M, 3) of points, float64 metres, and of colours, float32, over cells; in the cells' order in space."""
+
+    def scaled(self, factor: float) -> Surface:
+        """The same surface, points only, in a unit ``factor`` times smaller."""
+
+    def sample(self, count: int) -> np.ndarray:
+        """Rows of at most ``count`` cells, evenly strided."""
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(M, 3) float64 unit normals at the cell means; signs mean nothing."""
+
+    @property
+    def lightness(self) -> np.ndarray:
+        """(M,) float64 lightness of the cells, 0 to 1."""
+
+    def lightness_gradients(self, rows: np.ndarray) -> np.ndarray:
+        """(R, 3) change of lightness per metre within the tangent plane of some cells."""
+
+    @property
+    def cloud(self) -> tuple[Any, Any]:
+        """The cell means with covariances and normals, and their search tree, as small_gicp keeps them."""
+
+    def nearest(self, points: np.ndarray, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Distance (P,) to and row (P,) of the cell mean nearest to each point (P, 3); inf and 0 beyond the radius."""

@@ -1,0 +1,152 @@
+"""The last, exact step: Levenberg-Marquardt and marginal covariances of one component, whose wrong edges are gone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.gauge import open_gauge
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import Gauge
+from gsmap.optimize.priors import PriorTerms
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What a solve found.
+
+    Args:
+        poses: all of them, those of other scenes as given.
+        covariances: (N, 7, 7) marginals on the scene side, zero for other scenes and in the log scale of a rigid
+            graph; None where they were not asked for or could not be computed.
+        problem: why they could not be computed.
+    """
+
+    poses: Similarities
+    covariances: np.ndarray | None
+    problem: str = ""
+
+
+def solve(
+    edges: Measurements, poses: Similarities, anchor: int, priors: PriorTerms, gauge: Gauge, marginal_scenes: int
+) -> Solution:
+    """Optimise the scenes that ``edges`` reach, from a good guess, with one gauge prior on ``anchor``.
+
+    The cost is gtsam's: half the sum of ``xi^T information xi`` with ``xi = Log(S_target_source^-1 S_target^-1
+    S_source)``, as of its `BetweenFactor`, plus the priors' terms.
+
+    Args:
+        marginal_scenes: largest number of scenes for which covariances are computed; 0 for never.
+    """
+    dim = edges.dim
+    scenes = np.unique(np.r_[edges.targets, edges.sources, anchor])
+    factors = _factors(edges, dim)
+    start = poses[np.array([anchor])]
+    held = open_gauge(poses, scenes, anchor, priors, dim, gauge.loose)
+    if len(held):
+        root = held / (gauge_sigmas(gauge)[:dim] if len(held) == dim else np.full(dim, gauge.rotation_sigma_rad))
+        factors.push_back(_gauge_factor(anchor, start, root, dim))
+    for k in range(len(priors)):
+        factors.push_back(_prior_factor(priors[np.array([k])], dim))
+    values = gtsam.Values()
+    for scene in scenes.tolist():
+        values.insert(scene, to_gtsam(poses, scene, dim))
+    params = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    params.setOrderingType("METIS")
+    params.setRelativeErrorTol(1e-8)
+    values = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
+    out = poses.replaced(scenes, from_gtsam(values, scenes, dim))
+    if len(scenes) > marginal_scenes:
+        return Solution(out, None)
+    try:
+        return Solution(out, _marginals(factors, values, scenes, len(poses), dim))
+    except RuntimeError as error:
+        # So badly conditioned (scales or levers of many powers of ten) that no covariance means anything.
+        return Solution(out, None, str(error).strip().splitlines()[0] if str(error).strip() else "singular")
+
+
+def gauge_sigmas(gauge: Gauge) -> np.ndarray:
+    """(7,) standard deviations with which an anchor is held."""
+    return np.array([gauge.rotation_sigma_rad] * 3 + [gauge.translation_sigma] * 3 + [gauge.log_scale_sigma])
+
+
+def _factors(edges: Measurements, dim: int) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    between = gtsam.BetweenFactorPose3 if dim == 6 else gtsam.BetweenFactorSimilarity3
+    noise: dict[bytes, gtsam.noiseModel.Base] = {}
+    targets, sources = edges.targets.tolist(), edges.sources.tolist()
+    for k in range(len(edges)):
+        key = edges.information[k].tobytes()
+        if key not in noise:
+            noise[key] = gtsam.noiseModel.Gaussian.Information(edges.information[k])
+        graph.push_back(between(targets[k], sources[k], to_gtsam(edges.measured, k, dim), noise[key]))
+    return graph
+
+
+def to_gtsam(poses: Similarities, row: int, dim: int) -> gtsam.Pose3 | gtsam.Similarity3:
+    rotation = gtsam.Rot3(poses.rotations[row])
+    if dim == 6:
+        return gtsam.Pose3(rotation, poses.translations[row])
+    scale = float(np.exp(poses.log_scales[row]))
+    # gtsam's Similarity3 acts as s (R p + t).
+    return gtsam.Similarity3(rotation, poses.translations[row] / scale, scale)
+
+
+def from_gtsam(values: gtsam.Values, scenes: np.ndarray, dim: int) -> Similarities:
+    if dim == 6:
+        found = [values.atPose3(k) for k in scenes.tolist()]
+        scales = np.ones(len(found))
+        translations = np.array([p.translation() for p in found])
+    else:
+        found = [values.atSimilarity3(k) for k in scenes.tolist()]
+        scales = np.array([p.scale() for p in found])
+        translations = np.array([p.translation() for p in found]) * scales[:, None]
+    rotations = np.array([p.rotation().matrix() for p in found])
+    return Similarities(rotations, translations, np.log(scales)).orthonormalised()
+
+
+def _pose_of(values: gtsam.Values, key: int, dim: int) -> Similarities:
+    return from_gtsam(values, np.array([key]), dim)
+
+
+def _gauge_factor(anchor: int, start: Similarities, root: np.ndarray, dim: int) -> gtsam.CustomFactor:
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        if jacobians is not None:
+            jacobians[0] = root
+        return root @ (start.inverse() @ _pose_of(values, anchor, dim)).log()[0, :dim]
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(root)), [anchor], error)
+
+
+def _prior_factor(prior: PriorTerms, dim: int) -> gtsam.CustomFactor:
+    scene = int(prior.scenes[0])
+    alone = PriorTerms(np.zeros(1, dtype=np.int64), prior.expected, prior.root_weights, prior.ups)
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        r, J = alone.linearised(_pose_of(values, scene, dim))
+        if jacobians is not None:
+            jacobians[0] = J[0, :, :dim]
+        return r[0]
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(10), [scene], error)
+
+
+def _marginals(
+    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, scenes: np.ndarray, count: int, dim: int
+) -> np.ndarray:
+    out = np.zeros((count, 7, 7))
+    found = gtsam.Marginals(factors, values)
+    for scene in scenes.tolist():
+        out[scene, :dim, :dim] = found.marginalCovariance(scene)
+    return out
+
+
+def objective(edges: Measurements, poses: Similarities) -> float:
+    """gtsam's ``graph.error`` of the edges alone: half the sum of their chi-squares."""
+    values = gtsam.Values()
+    for scene in np.unique(np.r_[edges.targets, edges.sources]).tolist():
+        values.insert(scene, to_gtsam(poses, scene, edges.dim))
+    return float(_factors(edges, edges.dim).error(values))

@@ -1,0 +1,97 @@
+"""How densely two parts of a map are tied: what tells places that touch from places that look alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import betaln
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import LinkDensityParams
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A set of edges that ties two parts of a map.
+
+    Args:
+        rows: its edges.
+        moving: (N,) bool, the side that would move.
+        log_odds_wrong: log odds that it is wrong; see `LinkDensity`.
+    """
+
+    rows: np.ndarray
+    moving: np.ndarray
+    log_odds_wrong: float
+
+
+@dataclass(frozen=True)
+class LinkDensity:
+    """How densely the scenes of a map are tied, against which the density of a link is weighed.
+
+    Assumption: the places of a true link are tied as often as any, those of look-alikes only where the mistake was
+    made. Of the pairs of a link's end scenes, one of either part, that lie near each other, the share that is tied is
+    Beta distributed about that of the whole map under a true link, and about a part of it (``sparser``) under
+    look-alikes. It fails where every single pair of two places was mistaken, and where a true link is sparse because
+    few pairs were tried.
+
+    Args:
+        length: up to which scenes count as near each other, in map units.
+        share: of near pairs, that is tied.
+        params: see `LinkDensityParams`.
+    """
+
+    length: float
+    share: float
+    params: LinkDensityParams
+
+    @classmethod
+    def of(
+        cls,
+        edges: Measurements,
+        accepted: np.ndarray,
+        labels: np.ndarray,
+        poses: Similarities,
+        params: LinkDensityParams,
+    ) -> LinkDensity:
+        length = params.near_lengths * typical_length(edges, poses)
+        # Components have frames of their own: a fourth coordinate keeps them apart.
+        apart = np.c_[poses.translations, 10.0 * length * labels]
+        near = cKDTree(apart).query_pairs(length, output_type="ndarray")
+        pairs = np.bincount(near.ravel(), minlength=edges.num_scenes)
+        tied = np.bincount(_tied(edges, np.flatnonzero(accepted), poses, length).ravel(), minlength=edges.num_scenes)
+        busy = pairs > 0
+        # The median scene's: where the map is folded, scenes that are not neighbours lie together.
+        share = np.median(tied[busy] / pairs[busy]) if busy.any() else 0.5
+        return cls(length, float(np.clip(share, 0.05, 0.9)), params)
+
+    def link(self, edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities) -> Link:
+        """A link by its rows, and the log odds that it is wrong."""
+        params = self.params
+        ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
+        still = cKDTree(poses.translations[ends[~moving[ends]]])
+        pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), self.length))
+        tied = min(pairs, len(_tied(edges, rows, poses, self.length)))
+        true = params.concentration * self.share, params.concentration * (1 - self.share)
+        alike = 1.0, params.sparser / self.share - 1.0
+        wrong = params.alone_wrong if len(rows) == 1 else params.group_wrong
+        evidence = [betaln(a + tied, b + pairs - tied) - betaln(a, b) for a, b in (alike, true)]
+        return Link(rows, moving, float(evidence[0] - evidence[1] + np.log(wrong / (1 - wrong))))
+
+
+def _tied(edges: Measurements, rows: np.ndarray, poses: Similarities, length: float) -> np.ndarray:
+    """(P, 2) pairs of scenes that edges at ``rows`` tie and that lie near each other."""
+    ends = np.sort(np.stack([edges.targets[rows], edges.sources[rows]], axis=1), axis=1)
+    near = np.linalg.norm(poses.translations[ends[:, 0]] - poses.translations[ends[:, 1]], axis=1) <= length
+    return np.unique(ends[near], axis=0)
+
+
+def typical_length(edges: Measurements, poses: Similarities) -> float:
+    """Median length of an edge in map units; 0 where there is none."""
+    if not len(edges):
+        return 0.0
+    unit = np.exp(poses.log_scales[edges.targets])
+    return float(np.median(np.linalg.norm(edges.measured.translations, axis=1) * unit))

@@ -1,0 +1,123 @@
+"""Could a background model have made this many correspondences agree? A-contrario: the number of false alarms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.register.correspondences import Correspondences
+from gsmap.types import NodeLayer, Sim3
+
+_FAR_M = 1e4  # farther than any radius
+
+
+@dataclass(frozen=True)
+class Params:
+    """The background model.
+
+    Args:
+        cell_m: a node's context covers its neighbours', so near correspondences err together: cells of this size are
+            the independent trials, not nodes.
+        height_band_m: where gravity is known, partners are drawn from nodes within this of the candidate's height.
+    """
+
+    cell_m: float = 0.5
+    height_band_m: float = 0.5
+
+
+def agreeing(matches: Correspondences, pose: Sim3, radius_m: float) -> np.ndarray:
+    """(M,) true for correspondences within the radius under the pose, one to one, nearest first."""
+    distance = np.linalg.norm(pose.apply(matches.source) - matches.target, axis=1)
+    keep = np.zeros(len(matches), dtype=bool)
+    used_t, used_s = set(), set()
+    for i in np.argsort(distance, kind="stable"):
+        if distance[i] > radius_m:
+            break
+        t, s = int(matches.target_ids[i]), int(matches.source_ids[i])
+        if t not in used_t and s not in used_s:
+            keep[i] = True
+            used_t.add(t)
+            used_s.add(s)
+    return keep
+
+
+class BackgroundModel:
+    """How well poses do at candidate correspondences, against partners drawn at random.
+
+    The background model (null hypothesis): each candidate's partner is any source node of its type (and of about its
+    height, where gravity is known), independently between cells. Rooms furnished alike repeat whole arrangements and
+    violate that independence, so the bar of the verdict lies lower than the theory's (`gsmap.register.verdict`).
+
+    Args:
+        target, source: the two layers.
+        source_points_m: (N, 3) positions of the source's nodes, in metres.
+        matches: the candidates.
+        source_heights: (N,) heights of the source's nodes in metres, or None.
+    """
+
+    def __init__(
+        self,
+        target: NodeLayer,
+        source: NodeLayer,
+        source_points_m: np.ndarray,
+        matches: Correspondences,
+        params: Params | None = None,
+        *,
+        source_heights: np.ndarray | None = None,
+    ) -> None:
+        from scipy.spatial import cKDTree
+
+        params = params or Params()
+        cell_m, height_band_m = params.cell_m, params.height_band_m
+        self.matches = matches
+        kinds = target.types[matches.target_ids].astype(np.float64)
+        # Nodes of another type lie in another layer of a fourth dimension, so one tree serves all.
+        self._layer = kinds * _FAR_M
+        self._tree = cKDTree(np.column_stack([source_points_m, source.types * _FAR_M]))
+        theirs, own = np.zeros(len(source)), np.zeros(len(matches))
+        if source_heights is not None and matches.source_heights is not None:
+            theirs, own = source_heights, matches.source_heights
+        apart, low = float(np.ptp(theirs)) + 4 * height_band_m, theirs.min()
+        stacked = np.sort(source.types * apart + (theirs - low))
+        own = kinds * apart + (own - low)
+        pool = np.searchsorted(stacked, own + height_band_m) - np.searchsorted(stacked, own - height_band_m)
+        self._pool = np.maximum(pool, 1.0)
+        _, cell = np.unique(np.floor(matches.target / cell_m).astype(int), axis=0, return_inverse=True)
+        self._cell = cell.ravel()
+
+    def log10_nfa(self, pose: Sim3, radius_m: float = 0.15) -> float:
+        """log10 of the number of false alarms: how many poses this good to expect of the background.
+
+        With n cells that could agree, mean probability p each, and k that do, every triple of candidates fixing a pose:
+        ``log10 C(M, 3) + log10 P[Bin(n - 3, p) >= k - 3]`` (Desolneux, Moisan and Morel 2000; the triple itself agrees
+        by construction). Below -2 the background model is no explanation; inf where too little could agree.
+        """
+        m, cell = len(self.matches), self._cell
+        if m < 4:
+            return np.inf
+        predicted = np.column_stack([pose.inverse().apply(self.matches.target), self._layer])
+        near = self._tree.query_ball_point(predicted, radius_m / pose.scale, return_length=True)
+        probability = np.minimum(1.0, near / self._pool)
+        hits = agreeing(self.matches, pose, radius_m)
+        missed = np.bincount(cell, np.log1p(-np.minimum(probability, 1 - 1e-9)))
+        possible = np.bincount(cell, probability > 0) > 0
+        n, k = int(possible.sum()), int((np.bincount(cell, hits) > 0).sum())
+        if n < 4 or k < 4:
+            return np.inf
+        p = float((1.0 - np.exp(missed[possible])).mean())
+        triples = np.log10(m) + np.log10(m - 1) + np.log10(m - 2) - np.log10(6)
+        return float(triples + _log10_binomial_tail(n - 3, k - 3, p))
+
+
+def _log10_binomial_tail(n: int, k: int, p: float) -> float:
+    """log10 P[Bin(n, p) >= k], exact far into the tail."""
+    from scipy.special import gammaln, logsumexp
+
+    if k <= 0 or p >= 1:
+        return 0.0
+    if k > n or p <= 0:
+        return -np.inf
+    j = np.arange(k, n + 1)
+    terms = gammaln(n + 1) - gammaln(j + 1) - gammaln(n - j + 1) + j * np.log(p) + (n - j) * np.log1p(-p)
+    return float(logsumexp(terms) / np.log(10))

@@ -1,0 +1,118 @@
+"""What a registration answers, of the poses that were judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsmap.geometry.rotations import angle_between
+from gsmap.register import verdict
+from gsmap.register.evidence import PoseEvidence
+from gsmap.register.params import Params, SamePose
+from gsmap.register.proposing import num_nodes
+from gsmap.register.scene_view import SceneView
+from gsmap.types import Registration, Sim3
+from gsmap.types.registration import Proposal
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A proposal after refinement, with its evidence.
+
+    Args:
+        proposal: with the refined pose.
+        evidence: under that pose.
+        covariance: (7, 7) of the pose, translations in the source's unit; None where it was not computed.
+        flaw: why the pose is not accepted; empty where it is.
+    """
+
+    proposal: Proposal
+    evidence: PoseEvidence
+    covariance: np.ndarray | None
+    flaw: str
+
+
+def conclude(
+    target: SceneView,
+    source: SceneView,
+    judged: Sequence[Judged],
+    params: Params,
+    *,
+    seconds: dict[str, float],
+    notes: Sequence[str] = (),
+) -> Registration:
+    """The answer: one accepted pose, the best one with what speaks against it, or nothing."""
+    common: dict[str, Any] = {"target": target.id, "source": source.id, "seconds": seconds, "notes": tuple(notes)}
+    if not judged:
+        poorer = num_nodes(target, source)
+        reason = f"no pose proposed that the background model does not explain (the poorer graph has {poorer} nodes)"
+        return Registration(status="no_match", reason=reason, **common)
+    accepted = [j for j in judged if not j.flaw]
+    best = accepted[0] if accepted else min(judged, key=_rank)
+    status, reason = ("accepted", "") if accepted else ("rejected", best.flaw)
+    rivals = [j for j in accepted if not _same(best, j, target, source, params.same_pose)]
+    if rivals:
+        status, reason = "no_match", f"ambiguous: {_apart(best, rivals[0], target, source)}, and both are accepted"
+    elif not accepted and not verdict.is_rare(best.proposal, params.verdict):
+        status, reason = "no_match", verdict.not_significant(best.proposal, params.verdict, best.flaw)
+    information = None
+    if status == "accepted" and best.covariance is not None:
+        information = np.linalg.inv(best.covariance)
+        information = 0.5 * (information + information.T)
+    return Registration(
+        status=status,
+        reason=reason,
+        S_target_source=best.proposal.S_target_source if status != "no_match" else None,
+        information=information,
+        num_inliers=best.proposal.num_inliers,
+        num_correspondences=best.proposal.num_correspondences,
+        overlap=best.evidence.overlap,
+        proposer=best.proposal.proposer,
+        exact=best.proposal.exact,
+        evidence=_figures(best),
+        **common,
+    )
+
+
+def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float, params: SamePose) -> bool:
+    """Both would be refined to one answer; ``centre`` is that of the source's content, ``unit_m`` the target's."""
+    return bool(
+        abs(np.log(a.scale / b.scale)) < params.log_scale
+        and np.degrees(angle_between(a.rotation, b.rotation)) < params.rotation_deg
+        and np.linalg.norm(a.apply(centre) - b.apply(centre)) * unit_m < params.distance_m
+    )
+
+
+def _same(a: Judged, b: Judged, target: SceneView, source: SceneView, params: SamePose) -> bool:
+    poses = a.proposal.S_target_source, b.proposal.S_target_source
+    return is_same_pose(*poses, source.centre, target.graph.unit_m, params)
+
+
+def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
+    S, Q = a.proposal.S_target_source, b.proposal.S_target_source
+    centre = source.centre
+    degrees = np.degrees(angle_between(S.rotation, Q.rotation))
+    metres = np.linalg.norm(S.apply(centre) - Q.apply(centre)) * target.graph.unit_m
+    return f"two poses lie {degrees:.0f} deg and {metres:.1f} m apart"
+
+
+def _figures(judged: Judged) -> dict[str, float]:
+    """The evidence as it is stored; `gsmap.types.Registration` explains each name."""
+    p, e = judged.proposal, judged.evidence
+    return {
+        "log_nfa": p.log_nfa,
+        "runner_up": p.runner_up,
+        "free_space_violation": e.free_space_violation,
+        "num_seen": float(e.num_seen),
+        "num_coinciding": float(e.num_coinciding),
+        "colour_correlation": e.colour_correlation,
+        "colour_t": e.colour_t,
+    }
+
+
+def _rank(judged: Judged) -> tuple[float, float]:
+    """Rejected poses by how much speaks for them."""
+    return (-judged.evidence.colour_correlation * judged.evidence.num_coinciding, judged.proposal.log_nfa)

@@ -1,0 +1,210 @@
+"""Evidence for a pose from renders of both scenes: free space, coinciding surfaces, local colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.geometry.transforms import transform_cameras
+from gsmap.register.surface import Surface
+from gsmap.register.view_cache import ViewCache
+from gsmap.render import Rendered, render
+from gsmap.types import Sim3
+
+
+@dataclass(frozen=True)
+class Params:
+    """How two scenes are compared under a pose.
+
+    Args:
+        radius_m: surfaces closer than this coincide.
+        depth_tolerance_m: depths that differ by more than this ...
+        depth_tolerance: ... and this share of the depth disagree (the two tolerances are added).
+        min_alpha: a pixel fainter than this shows nothing.
+        num_cameras: cameras of each scene that are asked, chosen to see most of the other scene.
+        patch_px: colours are compared after their mean over patches of this size is removed.
+        cell_m: the same for the surface cells of scenes without cameras.
+        min_seen: cameras of a scene that can judge fewer Gaussians of the other are not counted.
+        max_points: points of each scene that are tested for coinciding.
+    """
+
+    radius_m: float = 0.08
+    depth_tolerance_m: float = 0.10
+    depth_tolerance: float = 0.02
+    min_alpha: float = 0.5
+    num_cameras: int = 6
+    patch_px: int = 16
+    cell_m: float = 0.4
+    min_seen: int = 100
+    max_points: int = 12_000
+
+
+@dataclass(frozen=True)
+class PoseEvidence:
+    """Evidence for or against a pose.
+
+    Args:
+        overlap: share of surface cells that coincide, the smaller of both directions.
+        num_coinciding: source cells that coincide with the target.
+        free_space_violation: of the surface Gaussians of one scene that the other's cameras could judge, the share that
+            stands in front of what these saw, and is on it in no view; the larger of both directions. NaN where no
+            cameras could judge. What lies behind is hidden, which proves nothing.
+        num_seen: Gaussians so judged, the smaller of both directions; 0 where one could not be asked.
+        colour_correlation: correlation of the colours of both scenes' renders where their depths agree, differences
+            within a patch only, so neither exposure nor "floors are dark, walls are bright" counts; mean over lightness
+            and two chromas, the smaller of both directions that could be asked. Where neither scene has cameras, that
+            of coinciding cells.
+        colour_t: its significance, in standard deviations over patches.
+    """
+
+    overlap: float = 0.0
+    num_coinciding: int = 0
+    free_space_violation: float = float("nan")
+    num_seen: int = 0
+    colour_correlation: float = 0.0
+    colour_t: float = 0.0
+
+
+Views = tuple[ViewCache, float] | None
+"""A scene through its own cameras, and metres per unit of that scene; None for a scene without cameras."""
+
+
+def measure(
+    target: Surface,
+    source: Surface,
+    pose: Sim3,
+    views: tuple[Views, Views] = (None, None),
+    params: Params | None = None,
+) -> PoseEvidence:
+    """Compare two scenes under ``S_target_source``.
+
+    A few cameras of each scene render both: their own scene whole, as the trainer saw it, and of the other its surface
+    alone, for from where its own cameras never stood its haze and floaters hide everything.
+
+    Args:
+        target, source: surfaces, in metres; so is the pose.
+        views: the target's and the source's own.
+    """
+    params = params or Params()
+    rows_t, rows_s = target.sample(params.max_points), source.sample(params.max_points)
+    forward, back = pose.apply(source.coarse[0][rows_s]), pose.inverse().apply(target.coarse[0][rows_t])
+    distance, row = target.nearest(forward, params.radius_m)
+    hit = np.isfinite(distance)
+    hit_back = np.isfinite(source.nearest(back, params.radius_m)[0])
+    overlap = min(float(hit.mean()), float(hit_back.mean())) if len(hit) and len(hit_back) else 0.0
+    both_ways = [
+        None if own is None else _cross_view(*own, other, other_pose, points, params)
+        for own, other, other_pose, points in (
+            (views[0], source, pose, forward),
+            (views[1], target, pose.inverse(), back),
+        )
+    ]
+    judges = [stats for stats in both_ways if stats is not None and stats.num_seen >= params.min_seen]
+    colours = [stats.colour() for stats in judges]
+    if views == (None, None):
+        cells = np.floor(forward[hit] / params.cell_m).astype(int)
+        cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+        camera_free = CrossViewStats.of(0)
+        camera_free.compare(target.coarse[1][row[hit]], source.coarse[1][rows_s[hit]], cell)
+        colours = [camera_free.colour()]
+    return PoseEvidence(
+        overlap=overlap,
+        num_coinciding=int(hit.sum()),
+        free_space_violation=max((stats.free_space_violation for stats in judges), default=float("nan")),
+        num_seen=min(stats.num_seen for stats in judges) if len(judges) == 2 else 0,
+        colour_correlation=min((correlation for correlation, _ in colours), default=0.0),
+        colour_t=min((t for _, t in colours), default=0.0),
+    )
+
+
+@dataclass
+class CrossViewStats:
+    """What one scene's cameras say of the other: flags for each of its Gaussians, sums of colours over patches."""
+
+    in_front: np.ndarray
+    agrees: np.ndarray
+    products: list[np.ndarray] = field(default_factory=list)  # (patches, 3) each
+    squares: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
+
+    @classmethod
+    def of(cls, count: int) -> CrossViewStats:
+        return cls(np.zeros(count, bool), np.zeros(count, bool))
+
+    @property
+    def num_seen(self) -> int:
+        return int((self.in_front | self.agrees).sum())
+
+    @property
+    def free_space_violation(self) -> float:
+        return float((self.in_front & ~self.agrees).sum()) / self.num_seen
+
+    def compare(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
+        """Take colours (N, 3) of the same places into account, which lie in the patches of index ``patch`` (N,)."""
+        if not len(a):
+            return
+        a, b = _local(a, patch), _local(b, patch)
+        self.products.append(_sums(a * b, patch))
+        self.squares += (a**2).sum(0), (b**2).sum(0)
+
+    def colour(self) -> tuple[float, float]:
+        """Correlation, and its t statistic over patches; 0 and 0 where nothing was compared."""
+        norm = np.sqrt(self.squares.prod(0))
+        if not self.products or not norm.all():
+            return 0.0, 0.0
+        sums = (np.concatenate(self.products) / norm).mean(1)
+        return float(sums.sum()), float(sums.sum() / np.sqrt((sums**2).sum()))
+
+
+def _cross_view(
+    views: ViewCache, unit_m: float, other: Surface, pose: Sim3, points: np.ndarray, params: Params
+) -> CrossViewStats:
+    """The other scene, laid into one by ``pose`` (metres), through that one's cameras; ``points`` of it, so laid."""
+    if other.splats is None or not len(other):
+        return CrossViewStats.of(0)
+    stats = CrossViewStats.of(len(other))
+    into_other = pose.inverse() @ Sim3(np.eye(3), np.zeros(3), unit_m)
+    for row in views.select_views(points / unit_m, params.num_cameras):
+        camera = transform_cameras(views.cameras[[row]], into_other)
+        seen = render(other.splats, camera, backend="native")  # as in `ViewCache`
+        _compare(stats, views.render(row), unit_m, seen, pose.scale, params)
+    return stats
+
+
+def _compare(
+    stats: CrossViewStats, own: Rendered, unit_m: float, other: Rendered, scale: float, params: Params
+) -> None:
+    """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres."""
+    depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
+    solid = own.alpha[0] > params.min_alpha
+    near, far = _extremes(depth, solid)
+    tolerance = params.depth_tolerance_m + params.depth_tolerance * depth
+    both = solid & (other.alpha[0] > params.min_alpha)
+    in_front = both & (other_depth < near - tolerance)
+    agrees = both & ~in_front & (other_depth <= far + tolerance)
+    assert other.dominant_id is not None
+    stats.in_front[other.dominant_id[0][in_front]] = True
+    stats.agrees[other.dominant_id[0][agrees]] = True
+    rows, columns = np.nonzero(agrees)
+    patch = rows // params.patch_px * -(-agrees.shape[1] // params.patch_px) + columns // params.patch_px
+    stats.compare(own.colour[0][agrees], other.colour[0][agrees], patch)
+
+
+def _local(colours: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """(N, 3) lightness and two chromas, less their means over patches."""
+    opponent = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T
+    values = np.clip(colours, 0.0, 1.0) @ opponent
+    means = _sums(values, patch) / np.maximum(np.bincount(patch), 1)[:, None]
+    return values - means[patch]
+
+
+def _sums(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    return np.stack([np.bincount(group, v) for v in values.T], axis=1)
+
+
+def _extremes(depth: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest depth over 3 x 3 pixels, so that a pixel off at an edge violates nothing."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    low = minimum_filter(np.where(solid, depth, np.inf), 3, mode="nearest")
+    return low, maximum_filter(np.where(solid, depth, -np.inf), 3, mode="nearest")

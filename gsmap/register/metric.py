@@ -1,0 +1,66 @@
+"""Scenes in metres: what each unit is taken for, and what is computed under it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsmap.register.evidence import Views
+from gsmap.register.params import Params
+from gsmap.register.scene_view import SceneView
+from gsmap.register.surface import Surface
+from gsmap.types import SceneGraph, Sim3
+from gsmap.types.registration import Proposal
+
+
+@dataclass(frozen=True, eq=False)
+class MetricScene:
+    """One scene with its unit taken for ``unit_m`` metres."""
+
+    view: SceneView
+    unit_m: float
+    params: Params
+
+    @property
+    def graph(self) -> SceneGraph:
+        return self.view.graph
+
+    def surface(self) -> Surface:
+        """The scene's surface in metres."""
+        return self.view.surface(self.unit_m, self.params.surface)
+
+    def views(self) -> Views:
+        """The scene through its own cameras, and metres per unit; None without cameras."""
+        cache = self.view.views(self.params.views)
+        return None if cache is None else (cache, self.unit_m)
+
+
+@dataclass(frozen=True, eq=False)
+class MetricPair:
+    """Both scenes in the target's metres, the source with the proposed scale: what remains is nearly rigid."""
+
+    target: MetricScene
+    source: MetricScene
+    scale: float
+
+    @classmethod
+    def of(cls, target: SceneView, source: SceneView, proposal: Proposal, params: Params) -> MetricPair:
+        """The frames in which a proposal is refined and judged."""
+        scale = proposal.S_target_source.scale
+        unit_m = target_unit_m(target, with_scale=proposal.with_scale)
+        if proposal.with_scale and source.scale_policy == "known":
+            unit_m = 1.0 / scale  # the source knows what a metre is, the target only guesses
+        return cls(MetricScene(target, unit_m, params), MetricScene(source, unit_m * scale, params), scale)
+
+    def to_metres(self, S_target_source: Sim3) -> Sim3:
+        """A pose of the proposed scale, between the scenes' own units, as one between metres."""
+        return Sim3(S_target_source.rotation, S_target_source.translation * self.target.unit_m)
+
+    def to_scene_units(self, pose: Sim3) -> Sim3:
+        """A pose between metres as one between the scenes' own units."""
+        return Sim3(pose.rotation, pose.translation / self.target.unit_m, pose.scale * self.scale)
+
+
+def target_unit_m(target: SceneView, *, with_scale: bool) -> float:
+    """Metres per target unit: 1 where metres are plausible and nothing else is asked for, else the guess."""
+    metric = not with_scale and "landmarks" in target.graph.layers  # made under the scene's own unit
+    return 1.0 if metric or target.scale_policy == "known" else target.graph.unit_m

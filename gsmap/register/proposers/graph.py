@@ -1,0 +1,227 @@
+"""Graph-GSReg: correspondences of nodes, their compatibility graph, its maximum clique, the pose of that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from gsmap.methods.proposer import Proposal, Scene
+from gsmap.register import a_contrario, consistency, correspondences, pose, scale
+from gsmap.register.clique import maximum_clique
+from gsmap.register.correspondences import Correspondences
+from gsmap.types import NodeLayer, SceneGraph, Sim3
+
+VERSION = 1
+SCALES = True
+PACKAGES = ()
+
+
+@dataclass(frozen=True)
+class Params:
+    """How the nodes of two graphs propose poses.
+
+    Args:
+        kinds: of nodes, that propose; each on its own.
+        landmarks: how landmarks are paired.
+        objects: how objects are paired.
+        consistency: how pairs are tested against each other; its sigma is that of landmarks.
+        objects_sigma_m: the same for objects, whose centres are less well defined.
+        scale: the vote, where the scale is not known.
+        num_scales: scales tried of those voted for, over all pairs of layers.
+        min_vote_share: a scale that stands out by less than this share of the best one's score is not tried.
+        noisy_candidates: votes of fewer candidates than this make no noise to speak of; of more, where gravity is
+            known, a scale counts as noise below the two bars that follow.
+        min_vote: the bar for landmarks (measured: places apart mostly stay below 3.3, overlapping ones start at 7.2).
+        objects_min_vote: the bar for objects (weight-free objects of places apart stay below 1.3).
+        step_limit: of a clique search, about two nanoseconds each; a search that stops there is not exact.
+        min_inliers: fewer compatible correspondences propose nothing.
+        inlier_sigmas: correspondences within this many standard deviations of their distance agree with a pose ...
+        min_inlier_radius_m: ... and within this distance whatever the standard deviation.
+        rival_share: a clique that disagrees with the best is a rival from this share of its size on.
+        rival_distance_m: correspondences that the best pose leaves farther apart than this disagree with it.
+        pose: which cliques imply a pose.
+        background: what correspondences would do of themselves, for the number of false alarms.
+    """
+
+    kinds: tuple[str, ...] = ("landmarks", "objects")
+    landmarks: correspondences.Params = field(default_factory=correspondences.Params)
+    objects: correspondences.Params = field(default_factory=lambda: correspondences.Params(top_k=5))
+    consistency: consistency.Params = field(default_factory=consistency.Params)
+    objects_sigma_m: float = 0.05
+    scale: scale.Params = field(default_factory=scale.Params)
+    num_scales: int = 6
+    min_vote_share: float = 0.5
+    noisy_candidates: int = 500
+    min_vote: float = 3.5
+    objects_min_vote: float = 1.5
+    step_limit: int = 2_000_000
+    min_inliers: int = 5
+    inlier_sigmas: float = 4.0
+    min_inlier_radius_m: float = 0.15
+    rival_share: float = 0.6
+    rival_distance_m: float = 1.0
+    pose: pose.Params = field(default_factory=pose.Params)
+    background: a_contrario.Params = field(default_factory=a_contrario.Params)
+
+
+def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
+    """The best pose by each kind of node and, where a rival comes near it, the rival; fewest false alarms first."""
+    params = params or Params()
+    found: list[Proposal] = []
+    for kind in params.kinds:
+        found += propose_by_kind(target.graph, source.graph, kind, params, with_scale=with_scale)
+    return sorted(found, key=lambda proposal: proposal.log_nfa)
+
+
+def propose_by_kind(
+    target: SceneGraph, source: SceneGraph, kind: str, params: Params | None = None, *, with_scale: bool = False
+) -> list[Proposal]:
+    """The best pose by one kind of node and its rival, if there is one; best first.
+
+    Correspondences, compatibility graph, maximum clique, closed-form pose. With an unknown scale every pair of the
+    kind's layers (each made under another guess of the metre) votes, and the scales most voted for are tried.
+    """
+    params = params or Params()
+    pairs = comparable_layers(target, source, kind, with_scale=with_scale)
+    matchings = [Matching(a, b, target, source, kind, params, with_scale) for a, b in pairs]
+    matchings = [m for m in matchings if len(m.matches) >= params.min_inliers]
+    trials = _voted(matchings, params) if with_scale else [(matching, 1.0) for matching in matchings]
+    found = [(p, m, s) for m, s in trials if (p := m.pose_of_largest_clique(m.matches, s)) is not None]
+    if not found:
+        return []
+    best, matching, s = min(found, key=lambda f: (f[0].log_nfa, -f[0].num_inliers))
+    if with_scale and not best.flaw:
+        # The vote is good to a percent; at the scale its own clique implies more correspondences agree.
+        s = best.S_target_source.scale * matching.units_m[0] / matching.units_m[1]
+        again = matching.pose_of_largest_clique(matching.matches, s)
+        if again is not None and again.num_inliers > best.num_inliers:
+            best = again
+    # The rival: the best clique once everything that agrees with this pose is out of the way.
+    at_least = int(np.ceil(params.rival_share * best.num_inliers))
+    rival = matching.pose_of_largest_clique(matching.disagreeing(best.S_target_source), s, at_least)
+    if rival is None:
+        return [replace(best, runner_up=0.0)]
+    share = rival.num_inliers / best.num_inliers
+    return [replace(best, runner_up=share), replace(rival, runner_up=1.0 / share)]
+
+
+def comparable_layers(
+    target: SceneGraph, source: SceneGraph, kind: str, *, with_scale: bool
+) -> list[tuple[NodeLayer, NodeLayer]]:
+    """Pairs of layers of one kind that may be compared: the metric ones, or all guesses of the metre."""
+
+    def of(graph: SceneGraph, other: SceneGraph) -> list[NodeLayer]:
+        gravity_free = kind == "landmarks" and graph.up is not None and other.up is None
+        own = "landmarks_gravity_free" if gravity_free else kind
+        guesses = [layer for name, layer in graph.layers.items() if name.startswith(f"{own}:")]
+        plain = [graph.layers[own]] if own in graph.layers else []
+        return (guesses or plain) if with_scale else plain
+
+    compared = [(a, b) for a in of(target, source) for b in of(source, target)]
+    pairs = [(a, b) for a, b in compared if a.descriptor_id == b.descriptor_id and len(a) and len(b)]
+    if not with_scale:
+        return pairs
+    # Guesses come in fixed steps, so several pairs stand for one relative scale: keep the one with most nodes.
+    chosen: dict[float, tuple[NodeLayer, NodeLayer]] = {}
+    for a, b in sorted(pairs, key=lambda pair: -min(len(pair[0]), len(pair[1]))):
+        chosen.setdefault(round(float(np.log(a.unit_m / b.unit_m)), 3), (a, b))
+    return list(chosen.values())
+
+
+def _voted(matchings: list[Matching], params: Params) -> list[tuple[Matching, float]]:
+    """The scales most voted for over all pairs of layers, each with the pair that votes for it; best first."""
+    votes = [(score, i, s) for i, matching in enumerate(matchings) for s, score in matching.vote()]
+    votes = sorted(votes, reverse=True)[: params.num_scales]
+    return [(matchings[i], s) for score, i, s in votes if score > params.min_vote_share * votes[0][0]]
+
+
+class Matching:
+    """Two layers, their candidate correspondences, and how a clique of those becomes a proposal.
+
+    Args:
+        a, b: the layer of the target and that of the source.
+    """
+
+    def __init__(
+        self,
+        a: NodeLayer,
+        b: NodeLayer,
+        target: SceneGraph,
+        source: SceneGraph,
+        kind: str,
+        params: Params,
+        with_scale: bool,
+    ) -> None:
+        self.a, self.b, self.kind, self.params, self.with_scale = a, b, kind, params, with_scale
+        sigma = params.objects_sigma_m if kind == "objects" else params.consistency.sigma_m
+        self.test = replace(params.consistency, sigma_m=sigma)
+        self.radius_m = max(params.inlier_sigmas * np.sqrt(2.0) * sigma, params.min_inlier_radius_m)
+        # A rigid pose needs one metre for both scenes, whatever each was guessed to be.
+        common = float(np.sqrt(a.unit_m * b.unit_m))
+        self.units_m = (a.unit_m, b.unit_m) if with_scale else (common, common)
+        self.ups = (target.up, source.up)
+        pairing = params.objects if kind == "objects" else params.landmarks
+        self.matches = correspondences.correspondences(a, b, pairing, units_m=self.units_m, ups=self.ups)
+
+    @cached_property
+    def background(self) -> a_contrario.BackgroundModel:
+        points = self.b.positions * self.units_m[1]
+        heights = None if self.ups[0] is None or self.ups[1] is None else points @ self.ups[1]
+        return a_contrario.BackgroundModel(
+            self.a, self.b, points, self.matches, self.params.background, source_heights=heights
+        )
+
+    def vote(self) -> list[tuple[float, float]]:
+        """Scales worth a trial and how far each stands out, best first."""
+        scales = scale.vote_scales(self.matches, self.params.scale)
+        if len(self.matches) < self.params.noisy_candidates or self.matches.target_heights is None:
+            return scales
+        noise = self.params.objects_min_vote if self.kind == "objects" else self.params.min_vote
+        return [(s, score) for s, score in scales if score >= noise]
+
+    def pose_of_largest_clique(self, among: Correspondences, at_scale: float, at_least: int = 0) -> Proposal | None:
+        """The pose of the largest clique among some of the correspondences, if it has so many members."""
+        params = self.params
+        at_least = max(at_least, params.min_inliers)
+        if len(among) < at_least:
+            return None
+        compatibility = consistency.consistency_graph(among, self.test, scale=at_scale)
+        clique = maximum_clique(compatibility, params.step_limit, more_than=at_least - 1)
+        if len(clique) < at_least:
+            return None
+        fit = self._fit(among[clique.members])
+        S = fit.S_target_source
+        inliers = among[a_contrario.agreeing(among, S, self.radius_m)]
+        if not fit.flaw and len(inliers) > len(clique):
+            S = self._fit(inliers).S_target_source
+        return Proposal(
+            proposer=f"graph:{self.kind}",
+            S_target_source=self._in_scene_units(S),
+            with_scale=self.with_scale,
+            num_inliers=len(clique),
+            num_correspondences=len(self.matches),
+            exact=clique.exact,
+            log_nfa=self.background.log10_nfa(S, self.radius_m),
+            flaw=fit.flaw,
+        )
+
+    def disagreeing(self, S_target_source: Sim3) -> Correspondences:
+        """The correspondences that a pose leaves farther apart than a rival's may be."""
+        moved = S_target_source.apply(self.matches.source / self.units_m[1]) * self.units_m[0]
+        return self.matches[np.linalg.norm(moved - self.matches.target, axis=1) > self.params.rival_distance_m]
+
+    def _fit(self, members: Correspondences) -> pose.PoseFit:
+        return pose.fit_pose(
+            members.target,
+            members.source,
+            with_scale=self.with_scale,
+            sigma_m=self.test.sigma_m,
+            params=self.params.pose,
+        )
+
+    def _in_scene_units(self, S: Sim3) -> Sim3:
+        """A pose between metres as one between the scenes' own units."""
+        own = S.scale * self.units_m[1] / self.units_m[0] if self.with_scale else 1.0
+        return Sim3(S.rotation, S.translation / self.units_m[0], own)

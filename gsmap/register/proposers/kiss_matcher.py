@@ -1,0 +1,62 @@
+"""KISS-Matcher on the surfaces' points alone, for scenes whose graphs are too poor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import MissingDependencyError
+from gsmap.methods.proposer import Proposal, Scene
+from gsmap.types import Sim3
+
+VERSION = 1
+SCALES = False
+PACKAGES = ("kiss_matcher",)  # it has no wheel for Python 3.13
+
+
+@dataclass(frozen=True)
+class Params:
+    """Global matching of surfaces by KISS-Matcher.
+
+    Args:
+        voxel_m: cell size at which features are computed.
+        min_inliers: fewer agreeing features propose nothing.
+        min_cells: a surface with fewer cells is not tried.
+    """
+
+    voxel_m: float = 0.15
+    min_inliers: int = 5
+    min_cells: int = 50
+
+
+def propose(target: Scene, source: Scene, params: Params | None = None, *, with_scale: bool = False) -> list[Proposal]:
+    """At most one rigid pose, by features of the surfaces' points.
+
+    Its own confidence is worth little (measured: most of its wrong answers look sure), so it only proposes.
+
+    Raises:
+        MissingDependencyError: the package is not installed.
+    """
+    params = params or Params()
+    try:
+        import kiss_matcher
+    except ImportError as error:
+        raise MissingDependencyError("kiss_matcher is not installed") from error
+
+    points_t, points_s = target.surface().coarse[0], source.surface().coarse[0]
+    if min(len(points_t), len(points_s)) < params.min_cells:
+        return []
+    matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(params.voxel_m))
+    # Frames may lie far from their content; float32 inside the matcher does not forgive that.
+    centre_t, centre_s = points_t.mean(0), points_s.mean(0)
+    solution = matcher.estimate((points_s - centre_s).astype(np.float32), (points_t - centre_t).astype(np.float32))
+    inliers = int(matcher.get_num_final_inliers())
+    if not solution.valid or inliers < params.min_inliers:
+        return []
+    u, _, vt = np.linalg.svd(np.asarray(solution.rotation, dtype=np.float64))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    translation = np.asarray(solution.translation, dtype=np.float64).reshape(3)
+    translation = translation + centre_t - rotation @ centre_s
+    pose = Sim3(rotation, translation / target.unit_m)
+    return [Proposal(proposer="kiss_matcher", S_target_source=pose, with_scale=False, num_inliers=inliers)]

@@ -1,0 +1,76 @@
+"""Which proposers are asked for a pair, in which order, and with which scale."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gsmap.errors import MissingDependencyError
+from gsmap.methods import family
+from gsmap.register.metric import MetricScene, target_unit_m
+from gsmap.register.params import Params, Snap
+from gsmap.register.scene_view import SceneView
+from gsmap.register.stopwatch import Stopwatch
+from gsmap.types import Sim3
+from gsmap.types.registration import Proposal
+
+
+class Proposing:
+    """Rounds of proposals for one pair, each made when it is asked for.
+
+    Args:
+        notes: what a person should know is added here.
+    """
+
+    def __init__(self, target: SceneView, source: SceneView, params: Params, watch: Stopwatch) -> None:
+        self.target, self.source, self.params, self.watch = target, source, params, watch
+        self.policies = {target.scale_policy, source.scale_policy}
+        self.notes: list[str] = []
+
+    def rounds(self) -> Iterator[list[Proposal]]:
+        """Rigid poses, unless a scene's unit is unknown; then poses with a voted scale, unless both scenes are known
+        to be in metres; then, where the graphs are poor, what the fallback proposes."""
+        params = self.params
+        if "unknown" not in self.policies:
+            yield self._asked(params.proposer, "match", with_scale=False)
+        if self.policies != {"known"} and family("proposer").get(params.proposer).SCALES:
+            proposals = self._asked(params.proposer, "match", with_scale=True)
+            yield proposals if "unknown" in self.policies else [snapped(p, params.snap) for p in proposals]
+        if self._wants_fallback():
+            yield self._asked(params.fallback_proposer, "fallback", with_scale=False)
+
+    def _wants_fallback(self) -> bool:
+        poor = num_nodes(self.target, self.source) < self.params.poor_nodes
+        wanted = {"never": False, "always": True, "auto": poor}[self.params.fallback]
+        return wanted and "unknown" not in self.policies
+
+    def _asked(self, name: str, step: str, *, with_scale: bool) -> list[Proposal]:
+        unit_m = target_unit_m(self.target, with_scale=with_scale)
+        target, source = (MetricScene(view, unit_m, self.params) for view in (self.target, self.source))
+        with self.watch.step(step):
+            try:
+                found: list[Proposal] = (
+                    family("proposer")
+                    .get(name)
+                    .propose(target, source, self.params.proposers[name], with_scale=with_scale)
+                )
+            except MissingDependencyError as error:
+                self.notes.append(f"{error}: the proposer {name} was to be asked, and could not be")
+                return []
+        return found
+
+
+def snapped(proposal: Proposal, snap: Snap) -> Proposal:
+    """The proposal made rigid where its scale is 1 within what its correspondences can tell."""
+    S = proposal.S_target_source
+    spread = snap.log_scale + snap.log_scale_spread / np.sqrt(max(proposal.num_inliers, 1))
+    if abs(np.log(S.scale)) > spread:
+        return proposal
+    return replace(proposal, S_target_source=Sim3(S.rotation, S.translation), with_scale=False)
+
+
+def num_nodes(*views: SceneView) -> int:
+    """Nodes of the largest layer of the poorest graph."""
+    return min(max((len(layer) for layer in view.graph.layers.values()), default=0) for view in views)

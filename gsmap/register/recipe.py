@@ -1,0 +1,64 @@
+"""What names a stored registration."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from gsmap.methods import MethodParams, RecipeKey, family
+from gsmap.register.params import Params
+from gsmap.register.refinement import refiner_for
+from gsmap.types.plain import plain
+
+VERSION = 7
+
+_RENDER_BACKEND = "native"  # the one that all renders of this room are pinned to
+
+
+def recipe_key(params: Params | None = None) -> RecipeKey:
+    """The recipe of a pair: settings and versions of all that takes part under these parameters, and no others.
+
+    The inputs, which the caller adds with `RecipeKey.of`, are the keys of the target's and of the source's graph.
+    """
+    params = params or Params()
+    proposers = {params.proposer} | ({params.fallback_proposer} if params.fallback != "never" else set())
+    coarse = _asked(params.coarse_refiner, params)
+    fine = _asked(params.refiner, params) | {params.polisher}
+    families = {"proposers": proposers, "coarse_refiners": coarse, "refiners": fine}
+    settings: dict[str, Any] = {
+        f.name: _chosen(getattr(params, f.name), families[f.name])
+        if f.name in families
+        else plain(getattr(params, f.name))
+        for f in fields(params)
+    }
+    if params.fallback == "never":
+        del settings["fallback_proposer"]
+    if params.fallback != "auto":
+        del settings["poor_nodes"]
+    if params.scale_refiner not in coarse | fine:
+        del settings["scale_refiner"]
+    versions = {"register": VERSION}
+    for kind, names in (("proposer", proposers), ("refiner", coarse | fine)):
+        for name in sorted(names):
+            versions |= family(kind).version(name)
+    packages = sorted({package for name in proposers for package in family("proposer").get(name).PACKAGES})
+    backend = " ".join([_RENDER_BACKEND, *(f"{package}={installed_version(package)}" for package in packages)])
+    return RecipeKey(stage="register", method="pair", version=versions, settings=settings, backend=backend)
+
+
+def installed_version(package: str) -> str:
+    """The version of a package, or ``missing``."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def _asked(name: str, params: Params) -> set[str]:
+    """The refiners that one pass may ask: that of the name, and the one that takes its place for unknown scales."""
+    return {refiner_for(name, params, with_scale) for with_scale in (False, True)}
+
+
+def _chosen(settings: MethodParams, names: set[str]) -> dict[str, Any]:
+    return {name: plain(settings[name]) for name in sorted(names)}

@@ -1,0 +1,40 @@
+"""What the refiners of the small_gicp library share."""
+
+from __future__ import annotations
+
+from gsmap.methods.refiner import Surface
+from gsmap.types import Sim3
+
+_FEWEST = 10  # points and pairs; fewer tell nothing of a pose
+
+
+def align(
+    kind: str, target: Surface, source: Surface, start: Sim3, *, radii_m: tuple[float, ...], max_iterations: int
+) -> Sim3:
+    """Rigid pose by one run at each correspondence distance; the start where too little overlaps, its scale kept.
+
+    Args:
+        kind: as small_gicp names it.
+    """
+    import small_gicp
+
+    source = source.scaled(start.scale)
+    (target_cloud, target_tree), (source_cloud, _) = target.cloud, source.cloud
+    if target_cloud.size() < _FEWEST or source_cloud.size() < _FEWEST:
+        return start
+    pose = Sim3(start.rotation, start.translation)
+    for radius in radii_m:
+        result = small_gicp.align(
+            target_cloud,
+            source_cloud,
+            target_tree,
+            init_T_target_source=pose.matrix(),
+            registration_type=kind,
+            max_correspondence_distance=radius,
+            num_threads=1,
+            max_iterations=max_iterations,
+        )
+        if result.num_inliers < _FEWEST:
+            break
+        pose = Sim3.from_matrix(result.T_target_source)
+    return Sim3(pose.rotation, pose.translation, start.scale)

@@ -1,0 +1,36 @@
+"""Plain point-to-point ICP, as Graph-GSReg refines: a refiner for scenes whose scale is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsmap.methods.refiner import Surface
+from gsmap.register.refiners._small_gicp import align
+from gsmap.types import Sim3
+
+VERSION = 1
+SCALES = False
+
+
+@dataclass(frozen=True)
+class Params:
+    """Point-to-point ICP (Besl and McKay 1992).
+
+    Args:
+        radii_m: correspondence distances, one run each, coarse to fine.
+        max_iterations: of each run.
+    """
+
+    radii_m: tuple[float, ...] = (0.35, 0.12, 0.06)
+    max_iterations: int = 50
+
+
+def refine(
+    target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
+) -> Sim3:
+    """Rigid pose of two surfaces by ICP on their cells' centres (small_gicp).
+
+    Surfaces are in metres. A start that carries a scale keeps it. Returns the start where too little overlaps.
+    """
+    params = params or Params()
+    return align("ICP", target, source, start, radii_m=params.radii_m, max_iterations=params.max_iterations)

@@ -1,0 +1,117 @@
+"""What the cameras of a scene see of it: rendered once, kept, and chosen among."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gsmap.geometry.projection import in_image, project
+from gsmap.render import Rendered, render
+from gsmap.types import Cameras, Gaussians
+
+_KEPT = 64  # renders of 128 x 96 pixels: 16 MB; bounds memory, changes no answer
+
+
+@dataclass(frozen=True)
+class Params:
+    """How a scene is seen through its own cameras, and how cameras are chosen among.
+
+    Args:
+        image_size_px: longer side of the renders.
+        selection_px: longer side of the coarse images by which cameras are chosen.
+        selection_points: opaque centres, at most, that stand for a scene when cameras are chosen.
+        selection_margin: share of the depth by which a point may lie behind what a coarse pixel shows and still count
+            as visible: half a coarse pixel of a slanted wall.
+    """
+
+    image_size_px: int = 128
+    selection_px: int = 16
+    selection_points: int = 8_000
+    selection_margin: float = 0.1
+
+
+class ViewCache:
+    """A scene through its own cameras, in its own frame and unit.
+
+    These renders do not depend on any pose, so a scene that meets many others is rendered once; the latest are kept.
+    """
+
+    def __init__(self, gaussians: Gaussians, cameras: Cameras, params: Params | None = None) -> None:
+        self.params = params or Params()
+        g = gaussians
+        # The mean colour alone: the rest was fitted to directions from which the other scene's cameras do not look.
+        self.gaussians = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1])
+        self.cameras = cameras.resized(self.params.image_size_px)
+        self._renders: OrderedDict[int, Rendered] = OrderedDict()
+
+    def render(self, row: int) -> Rendered:
+        """Colour, alpha and depth (1, H, W) of the view of one camera."""
+        if row not in self._renders:
+            # On the CPU everywhere: a verdict is the same bits on every machine and in every run.
+            self._renders[row] = render(self.gaussians, self.cameras[[row]], dominant_id=False, backend="native")
+            while len(self._renders) > _KEPT:
+                self._renders.popitem(last=False)
+        self._renders.move_to_end(row)
+        return self._renders[row]
+
+    def select_views(self, points: np.ndarray, count: int) -> list[int]:
+        """The cameras to which most of some points (N, 3) are visible, or stand in the way; see `select_views`."""
+        return select_views(self._coarse, points, count, self._nearest)
+
+    @cached_property
+    def _coarse(self) -> Cameras:
+        return self.cameras.resized(self.params.selection_px)
+
+    @cached_property
+    def _nearest(self) -> list[np.ndarray]:
+        """Nearest depth of each coarse pixel of each camera, by a sample of opaque centres: enough to choose by."""
+        solid = np.flatnonzero(self.gaussians.logit_opacities > 0.0)
+        rows = solid[np.linspace(0, len(solid) - 1, min(len(solid), self.params.selection_points)).astype(int)]
+        points, views, out = self.gaussians.means[rows], self._coarse.T_camera_frame, []
+        for view, intrinsics, size in zip(views, self._coarse.intrinsics_px, self._coarse.sizes_px, strict=True):
+            pixel, z, _ = _project(points, view, intrinsics, size)
+            nearest = np.full(int(size.prod()), np.inf, np.float32)
+            np.minimum.at(nearest, pixel, z)
+            out.append(nearest * np.float32(1 + self.params.selection_margin))
+        return out
+
+
+def select_views(
+    cameras: Cameras, points: np.ndarray, count: int, nearest: list[np.ndarray] | None = None
+) -> list[int]:
+    """Greedy choice of the cameras with most of the points in front of them, each point counted once.
+
+    Args:
+        cameras: in the points' frame.
+        points: (N, 3); an even sample of them is looked at.
+        count: how many cameras, at most.
+        nearest: flat depth image of each camera; points behind it are hidden and do not count.
+    """
+    sample = points[np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)].astype(np.float32)
+    inside = np.zeros((len(cameras), len(sample)), dtype=bool)
+    for c, view in enumerate(cameras.T_camera_frame):
+        pixel, z, at = _project(sample, view, cameras.intrinsics_px[c], cameras.sizes_px[c])
+        inside[c, at if nearest is None else at[z <= nearest[c][pixel]]] = True
+    left = np.ones(len(sample), dtype=bool)
+    chosen: list[int] = []
+    for _ in range(min(count, len(cameras))):
+        gain = (inside & left).sum(1)
+        best = int(gain.argmax())
+        if not gain[best]:
+            break
+        chosen.append(best)
+        left &= ~inside[best]
+    return chosen
+
+
+def _project(
+    points: np.ndarray, view: np.ndarray, intrinsics_px: np.ndarray, size_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Flat pixel index, depth and row of the points (float32) that fall into an image."""
+    pixels, depth = project(points, view, intrinsics_px)
+    rows = np.flatnonzero(in_image(pixels, depth, size_px))
+    column, row = np.floor(pixels[rows]).astype(np.int64).T
+    return row * int(size_px[0]) + column, depth[rows], rows

@@ -1,0 +1,37 @@
+"""What renders: the native kernel on the CPU, or gsplat on CUDA."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+
+from gsmap.errors import ConfigError
+
+
+def backend(name: str = "auto") -> str:
+    """The backend that a name stands for here: ``native`` or ``gsplat``.
+
+    The two do not give the same bits, so the answer belongs to the recipe of whatever is rendered. torch is imported
+    only where gsplat is installed.
+
+    Args:
+        name: ``native``, ``gsplat``, or ``auto``: gsplat where it is installed and torch sees a GPU, else native.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    if name not in ("auto", "native", "gsplat"):
+        raise ConfigError(f"backend must be auto, native or gsplat, got {name!r}")
+    if name == "auto":
+        return "gsplat" if gsplat_available() else "native"
+    return name
+
+
+@functools.cache
+def gsplat_available() -> bool:
+    """Whether gsplat is installed and torch sees a GPU."""
+    if importlib.util.find_spec("gsplat") is None:
+        return False  # without importing torch, which numpy callers may do without
+    import torch
+
+    return bool(torch.cuda.is_available())

@@ -1,0 +1,190 @@
+"""A stored result is named by what made it: any setting, any version changes the keys of what it influences, no other.
+
+The settings tree is walked, so a setting that is added is tested without anybody remembering it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+import gsmap
+from gsmap import describe, merge, optimize, register
+from gsmap.errors import ConfigError
+from gsmap.map.settings import PRESETS, Settings, settings_of
+from gsmap.methods import families
+from gsmap.settings import changed, leaves
+
+GRAPH, EDGE, POSES = "graph", "edge", "poses"
+MERGERS = families()["merger"].names()
+
+ALTERNATIVES = {
+    "describe.object.segmenter": "builtin",
+    "describe.object.embedder": "builtin",
+    "register.fallback": "always",
+    "register.refiner": "gicp",
+    "register.propose.consistency.test": "ratio",
+    "register.kinds": ("landmarks",),
+}
+"""Another value of a setting that takes only certain words."""
+
+NAMES_NOTHING = ("retrieve.", "export.", "engine.", "merge.method")
+"""Settings that choose work (which pairs, which tiles, where it runs), and change no result."""
+
+ONLY_IF = {
+    "describe.object.segmenters.builtin.": {"describe.object.segmenter": "builtin"},
+    "describe.object.segmenters.sam.": {"describe.object.segmenter": "sam"},
+    "describe.object.embedders.builtin.": {"describe.object.embedder": "builtin"},
+    "describe.object.embedders.clip.": {"describe.object.embedder": "clip"},
+    **{f"register.refiners.{name}.": {"register.refiner": name} for name in families()["refiner"].names()},
+}
+"""What must be chosen for the settings of a method to count; where it is not, they must not."""
+
+
+def keys(settings: Settings) -> dict[str, str]:
+    """Digest of every kind of result, by its name, for one fixed set of inputs."""
+    graph = describe.recipe_key(settings.describe, {}).of("scene", "auto")
+    edge = register.recipe_key(settings.register).of(graph.digest, graph.digest)
+    poses = optimize.recipe_key(settings.optimize).of("scene", edge.digest)
+    tiles = {f"tile {m}": merge.recipe_key(m, settings.merge.mergers[m]).of("scene").digest for m in MERGERS}
+    return {GRAPH: graph.digest, EDGE: edge.digest, POSES: poses.digest, **tiles}
+
+
+def expected(name: str) -> set[str]:
+    """The results whose keys a setting must change."""
+    if name.startswith(NAMES_NOTHING):
+        return set()
+    room = name.split(".")[0]
+    if room == "merge":
+        return {f"tile {name.split('.')[2]}"}
+    # An edge is made from graphs, and poses from edges: what changes the one changes the other.
+    return {"describe": {GRAPH, EDGE, POSES}, "register": {EDGE, POSES}, "optimize": {POSES}}[room]
+
+
+def another(name: str, value: Any) -> Iterator[Any]:
+    """Values that differ from one, for the settings to refuse or take."""
+    if name in ALTERNATIVES:
+        yield ALTERNATIVES[name]
+    elif isinstance(value, bool):
+        yield not value
+    elif isinstance(value, int):
+        yield from (value + 1, value - 1)
+    elif isinstance(value, float):
+        yield from (value * 0.9 + 1e-3, value * 1.1, value + 1.0, 0.5)
+    elif value is None:
+        yield from (7, 0.5)
+    elif isinstance(value, tuple):
+        yield from (tuple(next(another("", v)) for v in value), (*value, *value[-1:]), value[:-1])
+    else:
+        raise AssertionError(f"{name} is {value!r}: give it an alternative")
+
+
+def with_another(settings: Settings, name: str, value: Any) -> Settings:
+    for candidate in another(name, value):
+        try:
+            new = changed(settings, {name: candidate})
+        except ConfigError:
+            continue
+        if new != settings:
+            return new
+    raise AssertionError(f"no other value of {name} is taken; now {value!r}")
+
+
+def every_setting() -> list[Any]:
+    return [pytest.param(leaf.name, id=leaf.name) for leaf in leaves(Settings())]
+
+
+@pytest.mark.parametrize("name", every_setting())
+def test_a_setting_changes_the_keys_of_what_it_influences_and_no_others(name: str) -> None:
+    settings = Settings()
+    condition: dict[str, Any] = next((c for prefix, c in ONLY_IF.items() if name.startswith(prefix)), {})
+    if condition:
+        other = {k: next(n for n in families()[k.split(".")[-1]].names() if n != v) for k, v in condition.items()}
+        idle = changed(settings, other)
+        leaf = next(leaf for leaf in leaves(idle) if leaf.name == name)
+        assert keys(with_another(idle, name, leaf.value)) == keys(idle), f"{name} counts though it is not chosen"
+        settings = changed(settings, condition)
+    leaf = next(leaf for leaf in leaves(settings) if leaf.name == name)
+    before, after = keys(settings), keys(with_another(settings, name, leaf.value))
+    assert {kind for kind in before if before[kind] != after[kind]} == expected(name)
+
+
+def test_every_setting_has_a_meaning() -> None:
+    silent = [leaf.name for leaf in leaves(Settings()) if not leaf.meaning]
+    assert not silent, f"no docstring says what these mean: {silent}"
+
+
+def test_every_field_of_every_params_is_reachable() -> None:
+    """All frozen ``Params`` of the package hang in the tree."""
+    reachable = {type(node) for node in _nodes(Settings())}
+    lost = [
+        f"{module.__name__}.Params"
+        for module in _modules()
+        if isinstance(getattr(module, "Params", None), type)
+        and module.Params.__module__ == module.__name__
+        and module.Params not in reachable
+    ]
+    assert not lost
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_settings(preset: str) -> None:
+    assert (settings_of({}, preset) == Settings()) == (preset == "default")
+
+
+def _versions() -> list[Any]:
+    """Every module of the package that states a VERSION."""
+    skipped = {"gsmap.version"} | {f"gsmap.engine.executors.{n}" for n in families()["executor"].names()}
+    found = [m.__name__ for m in _modules() if isinstance(getattr(m, "VERSION", None), int)]
+    return [pytest.param(name, id=name) for name in found if name not in skipped and ".formats." not in name]
+
+
+@pytest.mark.parametrize("module", _versions())
+def test_a_version_changes_a_key(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def all_keys() -> list[dict[str, str]]:
+        chosen: list[dict[str, Any]] = [{}]
+        chosen += [{"register.refiner": name} for name in families()["refiner"].names()]
+        chosen += [{"describe.object.segmenter": name} for name in families()["segmenter"].names()]
+        chosen += [{"describe.object.embedder": name} for name in families()["embedder"].names()]
+        return [keys(changed(Settings(), values)) for values in chosen]
+
+    before = all_keys()
+    found = importlib.import_module(module)
+    monkeypatch.setattr(found, "VERSION", found.VERSION + 1)
+    after = all_keys()
+    assert before != after, f"{module} states a VERSION that no key knows"
+    room = {"describe": GRAPH, "register": EDGE, "optimize": POSES}.get(module.split(".")[1], "tile")
+    for old, new in zip(before, after, strict=True):
+        changed_kinds = {kind for kind in old if old[kind] != new[kind]}
+        upstream = {EDGE: {GRAPH}, POSES: {GRAPH, EDGE}, "tile": {GRAPH, EDGE, POSES}}.get(room, set())
+        assert not changed_kinds & upstream
+
+
+def test_inputs_and_backend_count() -> None:
+    key = merge.recipe_key("voxel", merge.Params().mergers["voxel"])
+    assert key.of("a").digest != key.of("b").digest
+    assert key.of("a").recipe == key.of("b").recipe
+    assert replace(key, backend="gsplat").digest != key.digest
+
+
+def _modules() -> list[Any]:
+    skip: Callable[[str], bool] = lambda name: name.endswith("__main__") or "_native" in name  # noqa: E731
+    names = [m.name for m in pkgutil.walk_packages(gsmap.__path__, "gsmap.") if not skip(m.name)]
+    return [importlib.import_module(name) for name in names if ".cli" not in name and ".migrations" not in name]
+
+
+def _nodes(tree: Any) -> Iterator[Any]:
+    from dataclasses import fields, is_dataclass
+
+    from gsmap.methods import MethodParams
+
+    yield tree
+    below = list(tree.values()) if isinstance(tree, MethodParams) else [getattr(tree, f.name) for f in fields(tree)]
+    for node in below:
+        if isinstance(node, MethodParams) or (is_dataclass(node) and not isinstance(node, type)):
+            yield from _nodes(node)

@@ -1,0 +1,26 @@
+"""Floaters are told from the surface, and the surface from floaters."""
+
+import numpy as np
+
+from gsmap.geometry.floaters import find_floaters
+
+
+def test_floaters_alone_and_of_a_foreign_colour_stray_and_the_edge_of_a_stripe_does_not():
+    rng = np.random.default_rng(0)
+    wall = np.c_[rng.uniform(0, 2, (4000, 2)), np.zeros(4000)]
+    stripes = np.where(wall[:, :1] % 0.5 < 0.25, 0.2, 0.8) * np.ones(3)
+    touching, alone = np.c_[rng.uniform(0.2, 1.8, (40, 2)), np.full(40, 0.01)], rng.uniform(3, 9, (40, 3))
+    points = np.concatenate([wall, touching, alone])
+    colours = np.concatenate([stripes, np.tile([1.0, 0, 1], (40, 1)), np.tile([0.2, 0.2, 0.2], (40, 1))])
+    stray, spacing = find_floaters(points, colours, 0.3)
+    assert stray[4000:].all()
+    assert stray[:4000].mean() < 0.01
+    assert np.median(spacing[:4000]) < 0.1
+    turned, _ = find_floaters(points[:, [2, 0, 1]] * 40 + 7, colours, 0.3)
+    assert np.array_equal(turned, stray)
+
+
+def test_a_handful_of_points_does_not_stray():
+    stray, spacing = find_floaters(np.eye(3), np.eye(3), 0.1)
+    assert not stray.any()
+    assert not spacing.any()

@@ -1,0 +1,80 @@
+"""Candidate pairs: true partners are found among many scenes, few others are."""
+
+import numpy as np
+from retrieve_worlds import layer, walk
+
+from gsmap.retrieve import Params, Placed, candidate_pairs
+from gsmap.types import SceneGraph
+
+
+def test_small_maps_are_tried_exhaustively():
+    pairs = candidate_pairs(walk(5))
+    assert len(pairs) == 10
+    assert set(pairs[:4]) == {("s0", "s1"), ("s1", "s2"), ("s2", "s3"), ("s3", "s4")}
+
+
+def test_true_partners_are_found_among_many_scenes():
+    pairs = candidate_pairs(walk(80), params=Params(top_k=5))
+    wanted = {(f"s{i}", f"s{i + 1}") for i in range(79)}
+    assert len(wanted & set(pairs)) >= 75
+    assert len(pairs) < 80 * 5
+    assert len(set(pairs)) == len(pairs)
+    assert all(int(a[1:]) < int(b[1:]) for a, b in pairs)
+
+
+def test_only_pairs_of_new_scenes_are_asked_for():
+    graphs = walk(30)
+    pairs = candidate_pairs(graphs, new={"s7"})
+    assert {("s6", "s7"), ("s7", "s8")} <= set(pairs)
+    assert all("s7" in pair for pair in pairs)
+
+
+def test_placed_neighbours_join_the_votes():
+    rng = np.random.default_rng(1)
+    graphs = [SceneGraph(f"s{i}", {"landmarks": layer(rng, 30)}) for i in range(40)]
+    placed = {f"s{i}": Placed(0, np.array([3.0 * i, 0, 0]), 2.0) for i in range(39)}
+    placed["s39"] = Placed(1, np.array([0.5, 0, 0]), 2.0)
+    pairs = set(candidate_pairs(graphs, placed=placed, params=Params(top_k=0)))
+    assert pairs == {(f"s{i}", f"s{i + 1}") for i in range(38)}
+    uncertain = {s: Placed(p.component, p.centre, p.radius, sigma=1.0) for s, p in placed.items()}
+    assert len(candidate_pairs(graphs, placed=uncertain, params=Params(top_k=0))) > 38
+
+
+def test_layers_of_different_descriptors_never_vote_and_empty_graphs_are_fine():
+    rng = np.random.default_rng(2)
+    a, b = layer(rng, 30), layer(rng, 30, descriptor="another")
+    assert candidate_pairs([SceneGraph("a", {"landmarks": a}), SceneGraph("b", {"landmarks": b})]) == []
+    assert candidate_pairs([SceneGraph("a"), SceneGraph("b")]) == []
+    assert candidate_pairs([]) == []
+
+
+def test_an_asked_scene_may_lack_a_type_of_node():
+    # With a pose to find for one scene alone, types that only the others have have no voters.
+    graphs = walk(12)
+    rng = np.random.default_rng(3)
+    features = graphs[4].layers["landmarks"].embeddings
+    alone = SceneGraph("alone", {"landmarks": layer(rng, 60, embeddings=features, type_ids=np.ones(60, int))})
+    pairs = candidate_pairs([*graphs, alone], new={"alone"})
+    assert pairs[0] == ("s4", "alone")
+    assert all(b == "alone" for _, b in pairs)
+    strange = SceneGraph("strange", {"landmarks": layer(rng, 20, type_ids=np.full(20, 7), dim=24)})
+    assert candidate_pairs([*graphs, strange], new={"strange"}) == []
+
+
+def test_scenes_of_different_components_are_no_neighbours():
+    rng = np.random.default_rng(4)
+    graphs = [SceneGraph(f"s{i}", {"landmarks": layer(rng, 5)}) for i in range(4)]
+    placed = {f"s{i}": Placed(component=i // 2, centre=np.zeros(3), radius=1.0) for i in range(4)}
+    pairs = candidate_pairs(graphs, placed=placed, params=Params(top_k=0))
+    assert pairs == [("s0", "s1"), ("s2", "s3")]
+
+
+def test_gravity_free_landmarks_vote_only_where_a_scene_does_not_know_up():
+    rng = np.random.default_rng(5)
+    plain = layer(rng, 40)
+    levelled = layer(rng, 40, descriptor="levelled")
+    up = np.array([0.0, 0.0, 1.0])
+    knows = SceneGraph("a", {"landmarks": levelled, "landmarks_gravity_free": plain}, up)
+    other = SceneGraph("b", {"landmarks": plain})
+    assert candidate_pairs([knows, other]) == [("a", "b")]
+    assert candidate_pairs([knows, SceneGraph("b", {"landmarks": plain}, up)]) == []
