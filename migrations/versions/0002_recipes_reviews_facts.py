@@ -1,6 +1,8 @@
 """Recipes of results, reviews instead of verdicts, facts of scenes, one row for what became of an edge."""
 
 import json
+from collections.abc import Sequence
+from typing import Any
 
 import sqlalchemy as sa
 from alembic import op
@@ -253,14 +255,14 @@ def _move(old: str, old_column: str, new: str, new_column: str) -> None:
         op.execute(f"SELECT setval(pg_get_serial_sequence('{new}', 'number'), COALESCE(({last}), 0) + 1, false)")
 
 
-def _rows(query: str):
+def _rows(query: str) -> Sequence[sa.Row[Any]]:
     return op.get_bind().execute(sa.text(query)).all()
 
 
-def _run(statement: str, rows: list[dict]) -> None:
+def _run(statement: str, rows: list[dict[str, Any]]) -> None:
     if rows:
         op.get_bind().execute(sa.text(statement), rows)
 
 
-def _json(value) -> str:
+def _json(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"))

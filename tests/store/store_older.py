@@ -83,7 +83,7 @@ def check_all(store: Store) -> None:
     edge = (tuesday.id, monday.id)
     one, two, three = (store.revisions.get(number) for number in (1, 2, 3))
     assert one.settings == {"gate_probability": 0.999, "anneal": 16.0, "marginals": True}
-    assert one.provenance == Provenance("batch", 2, "a41112002c7451ff", (tuesday.id,))
+    assert one.provenance == Provenance("batch", "", 2, "a41112002c7451ff", (tuesday.id,))
     assert two.provenance.method == "incremental"
     assert (three.settings, three.provenance, three.notes) == ({}, Provenance(), ())
     assert one.outcomes == {edge: EdgeOutcome("tentative", 2.5, "no cycle", undecided=True)}
