@@ -5,11 +5,12 @@ import pytest
 from PIL import Image
 
 from gsmap.describe.embedders import clip
-from gsmap.describe.models import check_model, open_session, parse_preset
-from gsmap.describe.segmenters import Mask, sam
-from gsmap.describe.views import View
+from gsmap.describe.onnx.check import check_model, kinds, parse_preset
+from gsmap.describe.onnx.session import open_session
+from gsmap.describe.segmenters import sam
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.types import Cameras
+from gsmap.types.views import Mask, View
 
 networks = pytest.importorskip("describe_networks", reason="needs the onnx package")
 
@@ -146,6 +147,14 @@ def test_noise_never_escapes_the_error_tree(tmp_path):
             check_model("clip", path)
         except GsmapError as error:
             assert "\n" not in str(error)  # noqa: PT017
+
+
+def test_kinds_are_those_that_methods_name():
+    assert {kind: [m.__name__.split(".")[-1] for m in methods] for kind, methods in kinds().items()} == {
+        "sam-encoder": ["sam"],
+        "sam-decoder": ["sam"],
+        "clip": ["clip"],
+    }
 
 
 def test_weights_in_other_files_are_refused(tmp_path):
