@@ -153,7 +153,8 @@ def _read_recording(folder: Path, names: list[str], longest_px: int) -> syntheti
     views = Cameras(pose, np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (count, 1)), np.tile(size, (count, 1)), names)
     small = views.resized(longest_px)
     small_size = tuple(small.sizes_px[0])
-    depths = [np.asarray(Image.open(folder / f"{name}.depth.png").resize(small_size, Image.Resampling.NEAREST)) for name in names]
+    pictures = (Image.open(folder / f"{name}.depth.png") for name in names)
+    depths = [np.asarray(picture.resize(small_size, Image.Resampling.NEAREST)) for picture in pictures]
     depth_m = np.stack(depths).astype(np.float32) / 1000
     depth_m[depth_m > 20] = 0  # 65535 marks "no depth".
     return synthetic.Frames(np.stack([_read_image(p, small_size) for p in colour]), small, depth_m)

@@ -1,35 +1,52 @@
-"""The house's import direction, the public surface, and how little `import gsmap` loads."""
+"""Which way imports run, that they never run in a circle, the public surface, and how little `import gsmap` loads."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 import gsmap
 
-PACKAGE = Path(__file__).resolve().parents[2] / "gsmap"
-STAGES = {"ingest", "describe", "register", "optimize", "merge", "export", "evaluate"}
-BASE = {"errors", "types", "geometry"}
-TOOLS = {"formats", "render"}
-MAY_IMPORT = {
-    "errors": set(),
-    "types": {"errors"},
-    "geometry": {"errors", "types"},
-    "formats": BASE,
-    "render": BASE,
-    "store": BASE,
-    **dict.fromkeys(STAGES, BASE | TOOLS),
-    "demo": BASE | TOOLS,
-    "view": BASE | TOOLS,
-    "__main__": {"cli"},
-    "engine": BASE,
-    "map": BASE | TOOLS | STAGES | {"store", "view", "engine"},
-    "cli": BASE | TOOLS | STAGES | {"store", "view", "map", "demo"},
-}
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = {"gsmap": ROOT / "gsmap", "gsmap_synthetic": ROOT / "synthetic" / "gsmap_synthetic"}
+
+LAYERS = [
+    {"version", "errors", "durable"},
+    {"types"},
+    {"geometry"},
+    {"methods"},
+    {"settings"},
+    {"formats", "render"},
+    {
+        "store",
+        "retrieve",
+        "ingest",
+        "describe",
+        "register",
+        "optimize",
+        "merge",
+        "export",
+        "evaluate",
+        "view",
+        "engine",
+    },
+    {"map"},
+    {"gsmap_synthetic"},
+    {"cli"},
+    {"__init__", "__main__"},
+]
+"""Rooms from the bottom up. A room imports from layers below its own, and from no other room of its own layer."""
+
+RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
+
+NATIVE = "gsmap._native"
+
 HOMES = {
     "sqlalchemy": {"store"},
     "alembic": {"store"},
@@ -39,46 +56,93 @@ HOMES = {
     "onnxruntime": {"describe", "evaluate"},
     "small_gicp": {"register"},
     "kiss_matcher": {"register"},
-    "open3d": {"register", "demo", "formats", "describe"},
+    "open3d": {"gsmap_synthetic"},
     "pycolmap": {"formats"},
-    "torch": {"render", "merge", "demo", "register"},
+    "torch": {"render"},
+    "tomlkit": {"settings"},
     "typer": {"cli"},
     "rich": {"cli"},
 }
+"""The rooms that may import a library that is slow to load."""
 
 
-def modules() -> list[Path]:
-    return sorted(PACKAGE.rglob("*.py"))
+def modules() -> dict[str, Path]:
+    """Every module of the tree by its dotted name; a package goes by its own name."""
+    found = {}
+    for package, folder in SOURCES.items():
+        for path in sorted(folder.rglob("*.py")):
+            parts = [package, *path.relative_to(folder).with_suffix("").parts]
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
 
 
-def imported(path: Path) -> set[str]:
-    """Full dotted names a module imports, anywhere in it, for type checkers alone included."""
-    names = set()
+def imported(name: str, path: Path, known: Mapping[str, Path]) -> Iterator[str]:
+    """What a module imports, anywhere in it, for type checkers alone and inside functions included.
+
+    ``from package import name`` imports the module ``package.name`` where there is one, and otherwise whatever
+    ``package/__init__.py`` imports.
+    """
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+            assert node.level == 0, f"{name} has a relative import"
+            assert node.module is not None
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield inner if inner in known or inner == NATIVE else node.module
 
 
-def room_of(path: Path) -> str:
-    relative = path.relative_to(PACKAGE)
-    return relative.parts[0].removesuffix(".py")
+def import_graph() -> nx.DiGraph:
+    """An edge from each module to each that it imports; libraries are nodes, too."""
+    known = modules()
+    graph = nx.DiGraph()
+    graph.add_nodes_from(known)
+    graph.add_edges_from((name, other) for name, path in known.items() for other in imported(name, path, known))
+    return graph
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_import_direction(path: Path) -> None:
-    room = room_of(path)
-    if room == "__init__":
-        return
-    for name in imported(path):
-        if name.startswith("gsmap.") and name.split(".")[1] not in {"_native", "__version__"}:
-            other = name.split(".")[1]
-            assert other == room or other in MAY_IMPORT[room], f"{room} must not import {name}"
-        top = name.split(".")[0]
+GRAPH = import_graph()
+OURS = sorted(modules())
+
+
+def room_of(module: str) -> str:
+    """The room a module lies in; its package, for what lies outside gsmap."""
+    package, *rest = module.split(".")
+    if package != "gsmap":
+        return package
+    return rest[0] if rest else "__init__"
+
+
+def is_ours(module: str) -> bool:
+    return module.split(".")[0] in SOURCES and module != NATIVE
+
+
+def test_no_import_runs_in_a_circle() -> None:
+    ours = GRAPH.subgraph(OURS)
+    circles = [sorted(part) for part in nx.strongly_connected_components(ours) if len(part) > 1]
+    assert circles == []
+    assert list(nx.selfloop_edges(ours)) == []
+
+
+def test_every_room_has_its_layer() -> None:
+    assert {room_of(module) for module in OURS} <= set(RANK)
+
+
+@pytest.mark.parametrize("module", OURS)
+def test_import_direction(module: str) -> None:
+    room = room_of(module)
+    for other in GRAPH.successors(module):
+        if is_ours(other):
+            below = room_of(other)
+            assert below == room or RANK[below] < RANK[room], f"{module} must not import {other}"
+        top = other.split(".")[0]
         assert top not in HOMES or room in HOMES[top], f"{top} has its home in {HOMES[top]}, not in {room}"
+
+
+def test_only_the_demo_imports_synthetic_scenes() -> None:
+    users = {a for a, b in GRAPH.edges if b.split(".")[0] == "gsmap_synthetic" and a.split(".")[0] == "gsmap"}
+    assert users <= {"gsmap.cli.demo"}
 
 
 def test_public_surface() -> None:
