@@ -25,15 +25,14 @@ from scipy.spatial import cKDTree
 from gsmap import formats
 from gsmap.describe import describe
 from gsmap.describe.cloud import surface_cloud
+from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.types import Gaussians, Sim3
-
-_SH_C0 = 0.28209479177387814
 
 
 def exposed(gaussians: Gaussians, gain: float, gamma: float) -> Gaussians:
     """The capture under another exposure (view-independent colour only)."""
     sh = gaussians.sh.copy()
-    sh[:, 0] = (gain * np.clip(_SH_C0 * sh[:, 0] + 0.5, 0, 1) ** gamma - 0.5) / _SH_C0
+    sh[:, 0] = sh0_of_rgb(gain * np.clip(rgb_of_sh0(sh[:, 0]), 0, 1) ** gamma)
     return replace(gaussians, sh=sh)
 
 

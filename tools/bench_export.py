@@ -79,7 +79,7 @@ def count_of(arguments: argparse.Namespace) -> int:
 
 def ingest(arguments: argparse.Namespace, count: int) -> str:
     """Bring the map to ``count`` replicas side by side, each in a frame of its own."""
-    from gsmap.map.recipe import open_or_create
+    from gsmap.map import open_or_create
 
     (capture,) = read_captures(arguments.capture)
     step_m = 0.9 * np.ptp(np.percentile(capture.gaussians.means, [1, 99], axis=0)[:, 0])

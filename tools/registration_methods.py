@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.describe.context import context_histograms
 from gsmap.describe.embedders.builtin import BuiltinEmbedder
 from gsmap.describe.embedders.builtin import Params as EmbedderParams
-from gsmap.describe.object_layer import ObjectParams
+from gsmap.describe.objects.context import context_histograms
+from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.register import Params, SceneView, dense, propose, register_pair
 from gsmap.register.clique import maximum_clique
 from gsmap.register.consistency import Params as TestParams

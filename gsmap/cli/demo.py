@@ -29,7 +29,6 @@ def command(
     from gsmap.types.rows import DemoReport
 
     synthetic = _synthetic()
-
     root = Path(folder)
     map_path = root / "demo.gsmap"
     with progress_bars() as progress:
@@ -71,8 +70,9 @@ def _synthetic() -> ModuleType:
         raise MissingDependencyError(
             "gsmap demo makes its captures with gsmap-synthetic, which is not installed: "
             "pip install the folder synthetic/ of gsmap's source, or run tools/setup.sh there"
-        ) from None
-    return gsmap_synthetic
+        ) from error
+    module: ModuleType = gsmap_synthetic
+    return module
 
 
 def _draw(m: Map, path: Path) -> None:

@@ -1,5 +1,5 @@
 """From a capture to its scene graph."""
 
-from gsmap.describe.graph import DescribeParams, describe, methods
+from gsmap.describe.graph import Params, describe, recipe_key
 
-__all__ = ["DescribeParams", "describe", "methods"]
+__all__ = ["Params", "describe", "recipe_key"]

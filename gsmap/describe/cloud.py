@@ -8,59 +8,58 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.describe.colour import srgb_to_lab
+from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.floaters import find_floaters
+from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians
-
-_SH_C0 = 0.28209479177387814
-_STRAY_LAB = 20.0  # colours farther apart are unlike
+from gsmap.types.views import Cloud
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """Points of a surface.
+@dataclass(frozen=True)
+class Params:
+    """Which Gaussians make up the surface.
 
     Args:
-        points: (N, 3) float64.
-        lab: (N, 3) float32 CIE L*a*b* (D65).
-        areas: (N,) the surface each point stands for: a disc that holds its 8 nearest neighbours, divided among them.
-        index: (N,) rows of the Gaussians the points are the centres of.
+        min_opacity: more transparent ones are left out.
+        max_relative_scale: those whose largest scale exceeds this many times the median one are left out.
+        floater_lab: how far a Gaussian's colour is from its neighbours', L*a*b* units, for it to be unlike them; see
+            `gsmap.geometry.floaters`.
     """
 
-    points: np.ndarray
-    lab: np.ndarray
-    areas: np.ndarray
-    index: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.points)
+    min_opacity: float = 0.1
+    max_relative_scale: float = 3.5
+    floater_lab: float = 20.0
 
 
-def surface_cloud(gaussians: Gaussians, *, min_opacity: float = 0.1) -> Cloud:
-    """Centres of the Gaussians that make up the surface: opaque, not huge, not floating alone, not of a foreign colour.
+def surface_cloud(gaussians: Gaussians, params: Params | None = None) -> Cloud:
+    """Centres of the Gaussians that make up the surface: opaque, not huge, not floating alone, not of a stray colour.
 
     "Huge" and "alone" are told from the capture itself, so that the cloud of a scene does not depend on its unit: a
-    Gaussian is dropped when its largest scale exceeds 3.5 times the median one, or it floats (`find_floaters`).
+    Gaussian is dropped when its largest scale exceeds a multiple of the median one, or it floats (`find_floaters`).
     Colour is the view-independent part (SH degree 0).
+
+    Args:
+        gaussians: any frame and unit; NaN and infinity are left out.
+
+    Returns:
+        Points in the Gaussians' frame and unit.
     """
+    params = params or Params()
     scale = gaussians.scales.max(1, initial=0)
     finite = np.isfinite(gaussians.means).all(1) & np.isfinite(scale) & np.isfinite(gaussians.sh[:, 0]).all(1)
-    keep = np.flatnonzero((gaussians.opacities > min_opacity) & finite)
+    keep = np.flatnonzero((gaussians.opacities > params.min_opacity) & finite)
     if len(keep):
-        keep = keep[scale[keep] <= 3.5 * np.median(scale[keep])]
+        keep = keep[scale[keep] <= params.max_relative_scale * np.median(scale[keep])]
     points = gaussians.means[keep].astype(np.float64)
-    lab = srgb_to_lab(np.clip(_SH_C0 * gaussians.sh[keep, 0] + 0.5, 0.0, 1.0))
-    stray, spacing = find_floaters(points, lab, _STRAY_LAB)
+    lab = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[keep, 0]), 0.0, 1.0))
+    stray, spacing = find_floaters(points, lab, params.floater_lab)
     return Cloud(points[~stray], lab[~stray], np.pi / 8 * spacing[~stray] ** 2, keep[~stray])
 
 
 def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean position and mean value of the points of each occupied cell of a grid; ``values`` is (N, F)."""
-    keys = np.floor((points - points.min(0)) / cell).astype(np.int64) if len(points) else np.zeros((0, 3), np.int64)
-    size = keys.max(0) + 1 if len(points) else np.ones(3, np.int64)
-    flat = (keys[:, 0] * size[1] + keys[:, 1]) * size[2] + keys[:, 2]
-    _, inverse, count = np.unique(flat, return_inverse=True, return_counts=True)
-    both = np.concatenate([points, values], axis=1)
-    mean = np.stack([np.bincount(inverse, both[:, i], len(count)) for i in range(both.shape[1])], 1) / count[:, None]
+    cells = np.floor((points - points.min(0)) / cell) if len(points) else points
+    mean = group_means(np.concatenate([points, values], axis=1), *cell_labels(cells))
     return mean[:, :3], mean[:, 3:]
 
 

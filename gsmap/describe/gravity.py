@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gsmap.describe.cloud import downsample, local_planes
+from gsmap.geometry.directions import fibonacci_sphere, level_frame
 from gsmap.types import Cameras
 
-_KERNEL_DEG = 4.0  # how far a floor's or wall's normals scatter
-_MAX_NORMALS = 6000
+
+@dataclass(frozen=True)
+class Params:
+    """How the vertical is found.
+
+    Args:
+        kernel_deg: how far the normals of a floor or wall scatter.
+        max_normals: the surface is thinned to about this many.
+        min_plan_cover: without cameras, the least share of the plan that floor and ceiling cover together.
+        min_lead: without cameras, how many times more than the next axis the vertical must cover.
+        min_imbalance: without cameras, how many times more surface the lower half must have than the upper.
+    """
+
+    kernel_deg: float = 4.0
+    max_normals: int = 6000
+    min_plan_cover: float = 0.7
+    min_lead: float = 1.2
+    min_imbalance: float = 1.15
 
 
-def estimate_up(points: np.ndarray, cameras: Cameras | None) -> np.ndarray | None:
+def estimate_up(points: np.ndarray, cameras: Cameras | None, params: Params | None = None) -> np.ndarray | None:
     """Unit vector against gravity (3,) in the points' frame, or None where it cannot be told.
 
     Cameras are held upright: the mean up of the images is right to some 35 degrees (they may all look down), and where
@@ -21,26 +40,20 @@ def estimate_up(points: np.ndarray, cameras: Cameras | None) -> np.ndarray | Non
 
     Args:
         points: (N, 3) surface points, any unit.
+        cameras: in the points' frame.
     """
+    params = params or Params()
     up, cone_deg = _up_of_cameras(cameras)
     if len(points) < 200:
         return up
-    normals, weights, sample = _planes(points)
+    normals, weights, sample = _planes(points, params.max_normals)
     if weights.sum() <= 0:
         return up
-    directions = _sphere(8000)
+    directions = fibonacci_sphere(8000)
     if up is None:
-        return _up_of_room(sample, normals, weights, directions[directions[:, 2] >= 0])
+        return _up_of_room(sample, normals, weights, directions[directions[:, 2] >= 0], params)
     near = directions[directions @ up > np.cos(np.radians(cone_deg))]
-    return _refine(near[np.argmax(_uprightness(near, normals, weights))], normals, weights)
-
-
-def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes ``up`` to +z; the turn about z is arbitrary but depends on ``up`` alone."""
-    z = np.asarray(up, float) / np.linalg.norm(up)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
+    return _refine(near[np.argmax(_uprightness(near, normals, weights, params.kernel_deg))], normals, weights)
 
 
 def _up_of_cameras(cameras: Cameras | None) -> tuple[np.ndarray | None, float]:
@@ -59,28 +72,20 @@ def _up_of_cameras(cameras: Cameras | None) -> tuple[np.ndarray | None, float]:
     return mean_up, 45.0
 
 
-def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _planes(points: np.ndarray, max_normals: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals and weights of a sample of the surface, and the sample."""
     span = np.ptp(np.percentile(points, [2, 98], axis=0), axis=0)
     cell = float(np.sort(span)[1:].mean()) / 60 or 1.0
     sample, _ = downsample(points, points[:, :0], cell)
     normals, planarity = local_planes(sample, 40)
-    step = max(1, len(sample) // _MAX_NORMALS)
+    step = max(1, len(sample) // max_normals)
     return normals[::step], planarity[::step] ** 2, sample
 
 
-def _sphere(count: int) -> np.ndarray:
-    """Evenly spread unit vectors (Fibonacci lattice)."""
-    i = np.arange(count) + 0.5
-    z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z**2)
-    return np.stack([r * np.cos(turn), r * np.sin(turn), z], 1)
-
-
-def _uprightness(directions: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _uprightness(directions: np.ndarray, normals: np.ndarray, weights: np.ndarray, kernel_deg: float) -> np.ndarray:
     """Weight of the normals along each direction plus half of that of those across it, (D,)."""
     squared = (directions.astype(np.float32) @ normals.T.astype(np.float32)) ** 2
-    sharp = np.float32(0.5 / np.radians(_KERNEL_DEG) ** 2)  # the sine of an angle stands for the angle
+    sharp = np.float32(0.5 / np.radians(kernel_deg) ** 2)  # the sine of an angle stands for the angle
     score = np.exp(-sharp * (1 - squared)) + 0.5 * np.exp(-sharp * squared)
     return score @ (weights / weights.sum()).astype(np.float32)
 
@@ -97,16 +102,16 @@ def _refine(up: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def _up_of_room(
-    points: np.ndarray, normals: np.ndarray, weights: np.ndarray, directions: np.ndarray
+    points: np.ndarray, normals: np.ndarray, weights: np.ndarray, directions: np.ndarray, params: Params
 ) -> np.ndarray | None:
     """The vertical of a room that came without cameras, or None.
 
     Candidates are the axes of the strongest heaps of normals. A vertical has what no horizontal axis has: nearly every
     cell of the plan seen along it lies over a floor or under a ceiling, and the plan is large. Its sign: between floor
-    and ceiling there is more surface in the lower half. None when floor and ceiling together cover less than 0.7 of the
-    plan (a part of a room), the best axis does not beat the next by a fifth, or the halves balance.
+    and ceiling there is more surface in the lower half. None when floor and ceiling together cover too little of the
+    plan (a part of a room), the best axis does not clearly beat the next, or the halves balance.
     """
-    score = _uprightness(directions, normals, weights)
+    score = _uprightness(directions, normals, weights, params.kernel_deg)
     axes: list[np.ndarray] = []
     for i in np.argsort(-score):
         if all(abs(directions[i] @ a) < np.cos(np.radians(20)) for a in axes):
@@ -116,16 +121,16 @@ def _up_of_room(
     axes = [_refine(a, normals, weights) for a in axes]
     covers, shares = np.array([_plan_cover(points, a) for a in axes]).T
     best = int(np.argmax(covers))
-    if shares[best] < 0.7:
+    if shares[best] < params.min_plan_cover:
         return None
     others = [c for a, c in zip(axes, covers, strict=True) if abs(a @ axes[best]) < np.cos(np.radians(10))]
-    if others and covers[best] < 1.2 * max(others):
+    if others and covers[best] < params.min_lead * max(others):
         return None
     height = points @ axes[best]
     low, high = np.percentile(height, [2, 98])
     t = (height - low) / max(high - low, 1e-12)
     below, above = np.sum((t > 0.1) & (t < 0.5)), np.sum((t > 0.5) & (t < 0.9))
-    if max(below, above) < 1.15 * min(below, above):
+    if max(below, above) < params.min_imbalance * min(below, above):
         return None
     return axes[best] if below > above else -axes[best]
 
@@ -136,7 +141,7 @@ def _plan_cover(points: np.ndarray, axis: np.ndarray) -> tuple[float, float]:
     Returns:
         The mean area of the two, and the sum of both as shares of the plan.
     """
-    local = points @ rotation_to_z(axis).T
+    local = points @ level_frame(axis).T
     low, high = np.percentile(local[:, 2], [2, 98])
     cell = float(np.ptp(points, axis=0).max()) / 60 or 1.0
     slab = 0.04 * (high - low)

@@ -11,48 +11,86 @@ registration.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras
 
 LEVEL_STEP = 1.45
 LEVELS = (-2, 0, 1)
-_VIEW_DISTANCE_M = 1.7  # typical distance from a camera to what it sees, indoors
-_ROOM_HEIGHT_M = 2.4
-_ROOM_WIDTH_M = 5.0
 
 
-def estimate_unit_m(points: np.ndarray, cameras: Cameras | None, up: np.ndarray | None) -> float:
+@dataclass(frozen=True)
+class Params:
+    """What the metre is guessed from.
+
+    Args:
+        view_distance_m: typical distance from a camera to what it sees; indoors by default.
+        room_height_m: where there are no cameras but up is known.
+        room_width_m: where up is unknown too.
+        plausible_m: metres per scene unit between which a scene's own unit may be the metre. The guess is right to a
+            factor of about 2, and a large hall is still a room.
+    """
+
+    view_distance_m: float = 1.7
+    room_height_m: float = 2.4
+    room_width_m: float = 5.0
+    plausible_m: tuple[float, float] = (0.25, 4.0)
+
+
+def estimate_unit_m(
+    points: np.ndarray, cameras: Cameras | None, up: np.ndarray | None, params: Params | None = None
+) -> float:
     """Metres per scene unit, to a factor of about two; scales exactly inversely with the scene.
 
     From the median distance of the nearest surface in 16 x 12 parts of the images; without cameras from the height of
     the room, or its width where up is unknown too. 1 when there is nothing to tell it from.
+
+    Args:
+        points: (N, 3) surface points, scene frame and unit.
+        cameras: scene frame; synthesised ones tell nothing.
+        up: (3,) against gravity, scene frame.
     """
+    params = params or Params()
     if cameras is not None and len(cameras) and not cameras.synthesised:
         distance = _view_distance(points, cameras)
         if distance > 0:
-            return _VIEW_DISTANCE_M / distance
+            return params.view_distance_m / distance
     if len(points) < 2:
         return 1.0
     if up is not None:
         height = float(np.ptp(np.percentile(points @ up, [2, 98])))
-        return _ROOM_HEIGHT_M / height if height > 0 else 1.0
+        return params.room_height_m / height if height > 0 else 1.0
     width = float(np.median(np.ptp(np.percentile(points, [2, 98], axis=0), axis=0)))
-    return _ROOM_WIDTH_M / width if width > 0 else 1.0
+    return params.room_width_m / width if width > 0 else 1.0
 
 
 def _view_distance(points: np.ndarray, cameras: Cameras, max_cameras: int = 32, max_points: int = 30000) -> float:
     points = points[:: max(1, len(points) // max_points)]
     nearest = []
     for i in np.unique(np.linspace(0, len(cameras) - 1, min(max_cameras, len(cameras))).round().astype(int)):
-        T, (fx, fy, cx, cy), (width, height) = cameras.T_camera_frame[i], cameras.intrinsics_px[i], cameras.sizes_px[i]
-        local = points @ T[:3, :3].T + T[:3, 3]
-        local = local[local[:, 2] > 1e-9 * np.abs(local).max(initial=1)]
-        u, v = (fx * local[:, 0] / local[:, 2] + cx) / width, (fy * local[:, 1] / local[:, 2] + cy) / height
-        seen = (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
-        part = (u[seen] * 16).astype(int) * 12 + (v[seen] * 12).astype(int)
+        at, z = project(points, cameras.T_camera_frame[i], cameras.intrinsics_px[i])
+        at /= cameras.sizes_px[i]
+        seen = in_image(at, z, np.ones(2), 1e-9 * np.abs(z).max(initial=1))
+        part = (at[seen, 0] * 16).astype(int) * 12 + (at[seen, 1] * 12).astype(int)
         depth = np.full(16 * 12, np.inf)
-        np.minimum.at(depth, part, local[seen, 2])
+        np.minimum.at(depth, part, z[seen])
         nearest.append(depth[np.isfinite(depth)])
     all_parts = np.concatenate(nearest) if nearest else np.zeros(0)
     return float(np.median(all_parts)) if len(all_parts) else 0.0
+
+
+def landmark_units(guess_m: float, scale_policy: str, params: Params | None = None) -> dict[str, float]:
+    """Metres per scene unit that each landmark layer assumes, by the layer's name.
+
+    Args:
+        guess_m: metres per scene unit, from `estimate_unit_m`.
+        scale_policy: ``known``, ``unknown`` or ``auto``; see `gsmap.describe.describe`.
+    """
+    low, high = (params or Params()).plausible_m
+    levels = {f"landmarks:{i}": guess_m * LEVEL_STEP**power for i, power in enumerate(LEVELS)}
+    if scale_policy == "known":
+        return {"landmarks": 1.0}
+    return {"landmarks": 1.0, **levels} if scale_policy == "auto" and low < guess_m < high else levels

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from gsmap.formats.camera_files import unique
 from gsmap.types import Cameras
 
 
-def parse(entries: list[dict], path: Path) -> Cameras:
+def parse(entries: list[dict[str, Any]], path: Path) -> Cameras:
     """Cameras of a parsed file. ``cx cy`` are read where present; else the principal point is the image centre."""
     if not entries:
         raise InputError(f"{path} holds no cameras: the list is empty")

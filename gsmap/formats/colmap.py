@@ -1,5 +1,6 @@
-"""COLMAP models: ``cameras`` and ``images``, text or binary; ``points3D``, ``rigs`` and ``frames`` are not needed.
+"""COLMAP models: ``cameras`` and ``images``, read as text or binary, written as text.
 
+``points3D``, ``rigs`` and ``frames`` are not needed.
 pycolmap knows the camera models; the two files are walked here, because its readers hang on a truncated one.
 """
 
@@ -12,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.errors import InputError
+from gsmap.durable import write_whole
+from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import unique
+from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
 from gsmap.types import Cameras
 
 _PLACES = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
@@ -63,6 +66,45 @@ def read(folder: str | os.PathLike[str]) -> Cameras:
     pose[:, :3, :3] = R_frame_camera
     pose[:, :3, 3] = -np.einsum("cij,cj->ci", R_frame_camera, translations)
     return Cameras(pose, chosen[:, :4], chosen[:, 4:].astype(np.int64), names)
+
+
+def write(folder: str | os.PathLike[str], cameras: Cameras) -> None:
+    """Write cameras as a COLMAP model in text, without points: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
+
+    Poses are in the cameras' own frame; images are numbered from 1 in their order, and those of equal size and
+    intrinsics share a camera. White space in a name becomes ``_``: COLMAP's text format ends a name there.
+
+    Raises:
+        InputError: the folder holds a binary model, which every program would read instead.
+        NotFoundError: no folder to put it in.
+    """
+    folder = Path(folder)
+    if (folder / "cameras.bin").exists() or (folder / "images.bin").exists():
+        raise InputError(f"{folder} holds a binary COLMAP model, which would be read instead: write to another folder")
+    if not folder.parent.is_dir():
+        raise NotFoundError(f"cannot write {folder}: no such folder: {folder.parent}")
+    calibrations: dict[tuple[float, ...], int] = {}
+    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as X Y POINT3D_ID"]
+    quats = matrices_to_quats(cameras.T_camera_frame[:, :3, :3])
+    # With the rotation that the quaternion says, so that the centre stays where it is.
+    translations = -np.einsum("cij,cj->ci", quats_to_matrices(quats), cameras.centers)
+    names = unique(["_".join(name.split()) or "_" for name in cameras.names])
+    for i, name in enumerate(names):
+        shape = (*cameras.sizes_px[i].tolist(), *cameras.intrinsics_px[i].tolist())
+        camera = calibrations.setdefault(shape, len(calibrations) + 1)
+        pose = " ".join(repr(value) for value in (*quats[i].tolist(), *translations[i].tolist()))
+        images += [f"{i + 1} {pose} {camera} {name}", ""]
+    lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
+    lines += [f"{camera} PINHOLE {' '.join(map(repr, shape))}" for shape, camera in calibrations.items()]
+    folder.mkdir(exist_ok=True)
+    _write_lines(folder / "cameras.txt", lines)
+    _write_lines(folder / "points3D.txt", ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"])
+    _write_lines(folder / "images.txt", images)
+
+
+def _write_lines(path: Path, lines: list[str]) -> None:
+    text = "\n".join(lines) + "\n"
+    write_whole(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
 
 
 def _calibration(model: object, width: int, height: int, params: list[float]) -> tuple[float, ...]:

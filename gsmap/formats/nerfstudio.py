@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from gsmap.errors import InputError
+from gsmap.durable import write_whole
+from gsmap.errors import InputError, NotFoundError
 from gsmap.formats.camera_files import load_json, unique
 from gsmap.types import Cameras, Sim3
 
 DATAPARSER = "dataparser_transforms.json"
 
 
-def parse(content: dict, path: Path, dataparser: Path | None = None) -> Cameras:
+def parse(content: dict[str, Any], path: Path, dataparser: Path | None = None) -> Cameras:
     """Cameras of a parsed file, moved into the frame the splats were trained in.
 
     Args:
@@ -49,13 +53,39 @@ def parse(content: dict, path: Path, dataparser: Path | None = None) -> Cameras:
     return Cameras(pose, np.array(intrinsics), np.array(sizes), names)
 
 
+def write(path: str | os.PathLike[str], cameras: Cameras) -> None:
+    """Write a ``transforms.json`` with poses in the cameras' own frame, OpenGL axes, intrinsics in every frame.
+
+    A camera's name is its ``file_path``, relative to the file. Nerfstudio centres and scales poses as it loads them;
+    ``--orientation-method none --center-method none --auto-scale-poses False`` keeps the frame.
+
+    Raises:
+        NotFoundError: no folder to put it in.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise NotFoundError(f"cannot write {path}: no such folder: {path.parent}")
+    pose = cameras.T_frame_camera.copy()
+    pose[:, :3, 1:3] *= -1  # OpenCV (y down, z forward) to OpenGL (y up, z back)
+    frames = []
+    for i, name in enumerate(cameras.names):
+        frame: dict[str, Any] = {"file_path": name}
+        frame |= dict(zip(("w", "h"), cameras.sizes_px[i].tolist(), strict=True))
+        frame |= dict(zip(("fl_x", "fl_y", "cx", "cy"), cameras.intrinsics_px[i].tolist(), strict=True))
+        frames.append(frame | {"transform_matrix": pose[i].tolist()})
+    text = json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1)
+    write_whole(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
+
+
 def _rows_to_matrix(rows: list[list[float]]) -> np.ndarray:
     out = np.eye(4)
     out[:3] = np.array(rows, np.float64)[:3]
     return out
 
 
-def _intrinsics(content: dict, frame: dict, path: Path) -> tuple[tuple[float, ...], tuple[int, int]]:
+def _intrinsics(
+    content: dict[str, Any], frame: dict[str, Any], path: Path
+) -> tuple[tuple[float, ...], tuple[int, int]]:
     """Of one frame; each figure may stand in the frame or once for all."""
     both = content | frame
     width, height = (both.get("w"), both.get("h"))

@@ -29,3 +29,24 @@ def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: f
     """(N,) bool: beyond ``near`` (the points' unit) and inside an image of ``size_px`` = ``width height``."""
     with np.errstate(invalid="ignore"):
         return (depth > near) & (pixels >= 0).all(1) & (pixels < np.asarray(size_px)).all(1)
+
+
+def on_surface(
+    points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray, depth: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which points lie on the surface that a depth image shows.
+
+    Args:
+        points, T_camera_frame, intrinsics_px: as in `project`.
+        depth: (H, W) camera-space z, the points' unit, 0 where nothing is seen.
+        tolerance: largest difference of depths, as a share of the surface's.
+
+    Returns:
+        (n,) rows of the points, and the pixels (n, 2) int64 ``column row`` they fall on.
+    """
+    at, z = project(points, T_camera_frame, intrinsics_px)
+    rows = np.flatnonzero(in_image(at, z, np.array(depth.shape[::-1]), 1e-9))
+    pixel = at[rows].astype(np.int64)
+    surface = depth[pixel[:, 1], pixel[:, 0]]
+    on = (surface > 0) & (np.abs(z[rows] - surface) < tolerance * surface)
+    return rows[on], pixel[on]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 
-from gsmap.describe.models import ModelSpec, Tensor, check_model
+from gsmap.describe.onnx.check import check_model
 from gsmap.store import Store
+from gsmap.types.model import ModelSpec, Tensor
 
 
 def add(store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool) -> ModelSpec:

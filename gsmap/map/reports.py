@@ -461,9 +461,9 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
             scene=change.scene,
             scene_name=known[change.scene].name,
             change=change.kind,
-            rotation_deg=_finite(change.rotation_deg),
-            translation_m=_finite(change.translation_m),
-            scale_ratio=_finite(change.scale_ratio),
+            rotation_deg=change.rotation_deg,
+            translation_m=change.translation,
+            scale_ratio=change.scale_ratio,
             component_before=change.components[0],
             component_after=change.components[1],
             status_before=change.statuses[0],
@@ -471,10 +471,6 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
         )
         for change in changes.values()
     ]
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def update_report(store: Store, ingested: Sequence[IngestRow]) -> UpdateReport:

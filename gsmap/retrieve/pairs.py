@@ -103,7 +103,7 @@ def _votes(graphs: Sequence[SceneGraph], asked: Sequence[int], params: Params) -
             if upright and name.startswith("landmarks_gravity_free"):
                 continue
             if len(layer) and (name in metric or name.split(":")[0] not in metric):
-                descriptors[layer.method].append((i, layer))
+                descriptors[layer.descriptor_id].append((i, layer))
     row_of = {scene: row for row, scene in enumerate(asked)}
     for layers in descriptors.values():
         rows = [np.argsort(-layer.weights, kind="stable")[:budget] for _, layer in layers]

@@ -149,14 +149,21 @@ class Arrays:
         kinds = [k for k in sorted(self.root.iterdir()) if k.is_dir() and k != self.staging]
         return [(kind.name, group.name) for kind in kinds for group in sorted(kind.iterdir())]
 
-    def drop_leftovers(self) -> int:
-        """Delete what dead writers left while staging; returns the bytes freed. Nothing while another is staging."""
+    def drop_leftovers(self, *, dry_run: bool = False) -> int:
+        """Delete what dead writers left while staging; returns the bytes freed. Nothing while another is staging.
+
+        Args:
+            dry_run: only count.
+        """
         freed = 0
+        if not self.staging.is_dir():
+            return freed
         try:
             with self._lock_staging(fcntl.LOCK_EX | fcntl.LOCK_NB):
                 for path in self.staging.iterdir():
                     freed += sum(p.stat().st_size for p in path.rglob("*") if p.is_file())
-                    shutil.rmtree(path, ignore_errors=True)
+                    if not dry_run:
+                        shutil.rmtree(path, ignore_errors=True)
         except BlockingIOError:
             pass
         return freed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import Connection, delete, not_, select, text, update
@@ -38,21 +38,25 @@ class Check:
         return not self.problems
 
 
-@dataclass
+@dataclass(frozen=True)
 class Pruned:
     """What `prune` reclaimed (or would).
 
     Args:
         scenes: names of removed scenes whose arrays were dropped.
         revisions: numbers that can no longer be exported in full.
-        num_graphs, num_orphans, num_bytes: graphs, folders without a row, and bytes on disk.
+        num_graphs, num_orphans, num_models: graphs, folders without a row, and copies of models that were forgotten.
+        num_bytes: on disk, of all of these, of replaced graphs, and of what dead writers left.
+        dry_run: nothing was changed.
     """
 
-    scenes: list[str] = field(default_factory=list)
-    revisions: list[int] = field(default_factory=list)
+    scenes: tuple[str, ...] = ()
+    revisions: tuple[int, ...] = ()
     num_graphs: int = 0
     num_orphans: int = 0
+    num_models: int = 0
     num_bytes: int = 0
+    dry_run: bool = False
 
 
 def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) -> Check:
@@ -84,20 +88,17 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
 
     Args:
         keep_revisions: keep only this many of the newest; older ones stay listed but lose their claim. None: all.
-        dry_run: only say what would go.
+        dry_run: only say what would go (also of a map that was opened for reading).
     """
-    out = Pruned()
-    doomed: list[tuple[str, str]] = []
-    with catalog.lock():
+    with contextlib.nullcontext() if dry_run else catalog.lock():
         with contextlib.ExitStack() as stack:
             connection = stack.enter_context(catalog.read() if dry_run else catalog.write())
-            kept, out.revisions = _revisions_to_keep(connection, keep_revisions)
+            kept, dropped = _revisions_to_keep(connection, keep_revisions)
             named = select(poses.c.scene).where(poses.c.revision.in_(kept))
             gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
             of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
             dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None))).all()
             keys = list(connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars())
-            out.scenes, out.num_graphs = [row.name for row in dead], len(keys)
             claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
             claimed |= set(
                 connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars()
@@ -105,13 +106,10 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
             doomed = [(g.kind, g.id) for g in connection.execute(select(groups)) if g.id not in claimed]
             known = {(g.kind, g.id) for g in connection.execute(select(groups))}
             orphans = [group for group in arrays.groups() if group not in known]
-            out.num_orphans = len(orphans)
-            out.num_bytes = sum(arrays.size_bytes(*group) for group in [*doomed, *orphans])
+            num_bytes = sum(arrays.size_bytes(*group) for group in [*doomed, *orphans])
             if not dry_run:
                 ids = [group for _, group in doomed]
-                connection.execute(
-                    update(revisions).where(revisions.c.number.in_(out.revisions)).values(dropped_at=now())
-                )
+                connection.execute(update(revisions).where(revisions.c.number.in_(dropped)).values(dropped_at=now()))
                 connection.execute(delete(graphs).where(graphs.c.key.in_(keys)))
                 connection.execute(update(scenes).where(scenes.c.group_id.in_(ids)).values(group_id=None))
                 for row in dead:
@@ -120,13 +118,24 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
                 connection.execute(delete(files).where(files.c.group_id.in_(ids)))
                 connection.execute(delete(groups).where(groups.c.id.in_(ids)))
         # The rows are gone for good: a crash from here on leaves orphans for the next prune.
-        if not dry_run:
-            with explained(catalog.folder):
+        with explained(catalog.folder):
+            forgotten = _forgotten_models(catalog)
+            num_bytes += sum(path.stat().st_size for path in forgotten)
+            if not dry_run:
                 for group in [*doomed, *orphans]:
                     arrays.drop(*group)
-                out.num_bytes += arrays.drop_leftovers()
-                out.num_bytes += _drop_models(catalog)
-    return out
+                for path in forgotten:
+                    path.unlink()
+            num_bytes += arrays.drop_leftovers(dry_run=dry_run)
+    return Pruned(
+        scenes=tuple(row.name for row in dead),
+        revisions=tuple(dropped),
+        num_graphs=len(keys),
+        num_orphans=len(orphans),
+        num_models=len(forgotten),
+        num_bytes=num_bytes,
+        dry_run=dry_run,
+    )
 
 
 def _row_problems(connection: Connection, folder: Path) -> list[str]:
@@ -157,13 +166,8 @@ def _revisions_to_keep(connection: Connection, keep: int | None) -> tuple[list[i
     return numbers[cut:], numbers[:cut]
 
 
-def _drop_models(catalog: Catalog) -> int:
+def _forgotten_models(catalog: Catalog) -> list[Path]:
     """Copies of models that no row names any more."""
     with catalog.read() as connection:
         standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
-    freed = 0
-    for path in (catalog.folder / FOLDER).glob("*"):
-        if f"{FOLDER}/{path.name}" not in standing:
-            freed += path.stat().st_size
-            path.unlink()
-    return freed
+    return [path for path in sorted((catalog.folder / FOLDER).glob("*")) if f"{FOLDER}/{path.name}" not in standing]

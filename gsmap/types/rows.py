@@ -712,11 +712,11 @@ class TodoRow(Row):
     """Something that is stale or wants a person.
 
     Args:
-        what: ``undescribed`` scenes; ``unregistered`` pairs; ``unsolved`` (1 where scenes, edges, reviews or priors
-            are newer than the poses); ``stale_graphs``, ``stale_edges`` and ``stale_poses``, made by other settings
-            or another version; ``dirty_tiles`` of exports; ``tentative`` scenes; ``undecided`` edges;
-            ``contradicted_priors``; ``isolated`` scenes.
-        count: how many; null where it is not known without doing the work.
+        what: ``undescribed`` scenes; ``stale_graphs``, made by other settings or another version; ``unregistered``
+            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews or priors are
+            newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes; ``undecided``
+            edges; ``contradicted_priors``; ``isolated`` scenes.
+        count: how many; 1 for ``unsolved`` and ``stale_poses``.
         verb: the command that helps.
         meaning: the same in words.
     """
@@ -724,7 +724,7 @@ class TodoRow(Row):
     columns: ClassVar[Mapping[str, str]] = {"count": "count", "meaning": "what", "verb": "helps"}
 
     what: str
-    count: int | None
+    count: int
     verb: str
     meaning: str
 

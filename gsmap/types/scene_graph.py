@@ -21,9 +21,10 @@ class NodeLayer:
         extents: (M, 2, 3) float64 lowest and highest corner of the node's points, scene frame.
         features: (M, F) float32 the embedding's own part without context; for queries by feature.
         num_views: (M,) int32 how many rendered views saw the node; 0 where nothing was rendered.
-        descriptor_id: digest of segmenter, embedder and parameters; layers of different ones are never compared.
+        descriptor_id: digest of everything that decides what a node and its embedding mean; layers of different ids
+            are never compared.
         unit_m: metres per scene unit that the layer was made under. ``positions * unit_m`` is in (assumed) metres, and
-            all metric constants of a method hold there; two layers of one method may be compared whatever their units.
+            all metric constants hold there; two layers of one descriptor may be compared whatever their units.
     """
 
     positions: np.ndarray
@@ -75,8 +76,8 @@ class SceneGraph:
         layers: by name; a layer that was not made is absent. ``objects``; ``landmarks`` takes the scene's unit for
             a metre; ``landmarks:0``, ``:1``, ``:2`` are the landmarks at ``unit_m`` times 1.45 to the powers -2, 0, 1:
             for any two captures of one place, whatever their units, two of them agree to within 20 percent
-            (`gsmap.describe.unit`). ``unlevelled`` (or ``unlevelled:1``) are the landmarks of a scene that knows up as
-            they compare with those of scenes that do not.
+            (`gsmap.describe.unit`). ``landmarks_gravity_free`` (or ``landmarks_gravity_free:1``) are the landmarks of
+            a scene that knows up as they compare with those of scenes that do not.
         up: (3,) unit vector against gravity in the scene frame, or None where it could not be told.
         unit_m: guess of metres per scene unit (good to a factor of about 2); 1 where the scale is known.
         notes: what a person should know (few nodes, no gravity, ...).

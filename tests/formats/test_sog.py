@@ -8,7 +8,7 @@ from PIL import Image
 
 from gsmap import formats
 from gsmap.errors import InputError
-from gsmap.formats import ply
+from gsmap.geometry.sh import SH_C0
 
 N = 5
 
@@ -108,7 +108,7 @@ def test_real_files_hold_what_their_meta_says(shared_data):
         assert len(g) == count
         np.testing.assert_allclose(g.means.min(0), reached[0], rtol=1e-4)
         np.testing.assert_allclose(g.means.max(0), reached[1], rtol=1e-4)
-        assert (g.sh[:, 0] * ply.SH_C0 + 0.5 > -0.1).all()
+        assert (g.sh[:, 0] * SH_C0 + 0.5 > -0.1).all()
 
 
 @pytest.mark.parametrize(

@@ -273,11 +273,11 @@ def test_models_are_checked_kept_and_used(copy: Path, tmp_path: Path) -> None:
     model = tmp_path / "encoder.onnx"
     model.write_bytes(_image_encoder())
     with gsmap.open(copy) as m:
-        before = m.describe("capture_a")[0].layers["objects"].method
+        before = m.describe("capture_a")[0].layers["objects"].descriptor_id
         m.add_model("clip", model, preset="unit")
         model.unlink()  # the map has its own copy
         after = m.describe("capture_a")[0].layers["objects"]
-        assert after.method != before
+        assert after.descriptor_id != before
         assert [row["kind"] for row in m.model_rows()] == ["clip"]
         m.draw_graph("capture_a", tmp_path / "graph.png")
         with pytest.raises(InputError, match="not an ONNX model"):

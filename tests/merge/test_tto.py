@@ -1,8 +1,17 @@
+from dataclasses import replace
+
 import numpy as np
+import pytest
+from scipy.spatial import cKDTree
 from synthetic_walls import cameras_facing, two_scenes, wall
 
+from gsmap.errors import ConfigError
+from gsmap.evaluate.images import ssim
+from gsmap.geometry.voxels import voxel_labels
 from gsmap.merge import PlacedScene, default_params, merge
 from gsmap.merge.exposure import apply_gain
+from gsmap.merge.mergers import tto
+from gsmap.merge.placed import inside
 from gsmap.merge.selection import most_visible, one_owner_per_cell
 from gsmap.render import render
 from gsmap.types import Gaussians
@@ -111,3 +120,112 @@ def test_what_shows_least_goes_first():
     among = np.array([True, True, False, True, True])
     np.testing.assert_array_equal(most_visible(shown, among, 2), [True, False, False, False, True])
     np.testing.assert_array_equal(most_visible(shown, among, 9), among)
+
+
+class WatchedFitter(tto.Fitter):
+    """A fitter that remembers what it was given and what its steps cost."""
+
+    def __init__(self, start, *, frozen, ssim_weight):
+        super().__init__(start, frozen=frozen, ssim_weight=ssim_weight)
+        self.start, self.asked, self.losses = start, [], []
+        WatchedFitter.last = self
+
+    def step(self, cameras, images, masks=None):
+        self.asked.append((cameras, images, masks))
+        self.losses.append(super().step(cameras, images, masks))
+        return self.losses[-1]
+
+
+@pytest.fixture
+def watched(monkeypatch):
+    monkeypatch.setattr(tto, "Fitter", WatchedFitter)
+    return WatchedFitter
+
+
+def test_the_halo_is_fitted_along_and_only_its_outer_half_is_frozen(watched):
+    box, halo_m = np.array([[-0.4, -2, -2], [0.4, 2, 2]]), 0.6
+    result = merge(two_scenes(), "tto", Params(steps=30, halo_m=halo_m), bounds=box)
+    fitter = watched.last
+    beyond = np.maximum(box[0, 0] - fitter.start.means[:, 0], fitter.start.means[:, 0] - box[1, 0])
+    # Surroundings on both sides take part, as far as the halo reaches and no farther.
+    assert 0.9 * halo_m < beyond.max() < halo_m + 0.02
+    assert (beyond > 0).sum() > 0.5 * (beyond <= 0).sum()
+    inner, outer = (beyond > 0) & (beyond < halo_m / 2), beyond >= halo_m / 2
+    np.testing.assert_array_equal(fitter.frozen, outer)
+    changed = (fitter.sh != fitter.start.sh).any((1, 2))
+    assert changed[inner].mean() > 0.8
+    assert not changed[outer].any()
+    assert inside(result.gaussians.means, box).all()
+
+
+def test_a_cell_of_two_captures_holds_one_of_them():
+    scenes, cell_m, cover_m = two_scenes(), 0.5, 0.1
+    params = Params(steps=0, keep=1.0, min_weight=0.0, cell_m=cell_m, cover_m=cover_m)
+
+    def nearest_of_the_other_m(result):
+        """How near the two captures come to one another within a cell."""
+        cell = voxel_labels(result.gaussians.means, cell_m)
+        # Cells far apart, so that only neighbours in one cell count.
+        apart = np.concatenate([result.gaussians.means, 100.0 * cell[:, None]], axis=1)
+        a, b = (apart[result.origin == i] for i in (0, 1))
+        return cKDTree(a).query(b)[0].min()
+
+    owned, shared = merge(scenes, "tto", params), merge(scenes, "tto", replace(params, owner_cells=False))
+    assert nearest_of_the_other_m(owned) >= cover_m
+    assert nearest_of_the_other_m(shared) < 0.02
+    assert len(owned.gaussians) < 0.85 * len(shared.gaussians)
+
+
+def test_ssim_is_part_of_what_is_fitted():
+    scenes = two_scenes()
+
+    def structure(result):
+        return np.mean(
+            [
+                ssim(mine, wanted)
+                for scene in scenes
+                for mine, wanted in zip(
+                    render(result.gaussians, scene.cameras).colour,
+                    render(scene.gaussians, scene.cameras).colour,
+                    strict=True,
+                )
+            ]
+        )
+
+    with_ssim, without = (merge(scenes, "tto", Params(steps=80, **more)) for more in ({}, {"ssim_weight": 0.0}))
+    assert structure(with_ssim) > structure(without) + 1e-4
+
+
+PLAIN = Params(owner_cells=False, ssim_weight=0.0, min_weight=0.0, keep=1.0, newer_wins=False, voxel_m=0.01)
+
+
+@pytest.mark.parametrize("bounds", [None, np.array([[-0.3, -2, -2], [0.6, 2, 2]])])
+def test_the_published_method_fits_every_voxel_of_the_union_by_l1(watched, bounds):
+    scenes = two_scenes()
+    voxels = merge(scenes, "voxel", type(default_params("voxel"))(voxel_m=0.01), bounds=bounds)
+    start = merge(scenes, "tto", replace(PLAIN, steps=0), bounds=bounds)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        np.testing.assert_array_equal(getattr(start.gaussians, name), getattr(voxels.gaussians, name))
+    np.testing.assert_array_equal(start.origin, voxels.origin)
+    fitted = merge(scenes, "tto", replace(PLAIN, steps=20), bounds=bounds)
+    assert len(fitted.gaussians) == len(voxels.gaussians)
+    cameras, images, masks = watched.last.asked[0]
+    error = np.abs(render(watched.last.start, cameras).colour - images / np.float32(255)) * (masks[..., None] / 255)
+    assert watched.last.losses[0] == pytest.approx(error.sum() / (3 * (masks / 255).sum()), rel=1e-4)
+
+
+def test_without_newer_wins_dates_decide_nothing():
+    a, b = two_scenes()
+    dated = [replace(a, captured_at="2026-01-01"), replace(b, captured_at="2026-02-01")]
+    params = Params(steps=5, newer_wins=False)
+    assert not tto.uses_dates(params)
+    assert tto.uses_dates(Params())
+    np.testing.assert_array_equal(merge([a, b], "tto", params).gaussians.sh, merge(dated, "tto", params).gaussians.sh)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"keep": 1.2}, {"steps": -1}, {"voxel_m": 0.0}, {"halo_m": -1.0}, {"ssim_weight": 2.0}]
+)
+def test_settings_that_make_no_sense_are_refused_by_name(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        Params(**wrong)

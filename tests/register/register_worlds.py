@@ -36,7 +36,7 @@ def layer(rng, n, *, positions=None, embeddings=None, types=3, dim=16, type_ids=
     type_ids = rng.integers(0, types, n) if type_ids is None else type_ids
     extents = np.stack([positions - 0.1, positions + 0.1], 1)
     return NodeLayer(
-        positions, embeddings, type_ids, np.ones(n), extents, embeddings, np.zeros(n, np.int32), method="test"
+        positions, embeddings, type_ids, np.ones(n), extents, embeddings, np.zeros(n, np.int32), descriptor_id="test"
     )
 
 

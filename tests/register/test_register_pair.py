@@ -47,8 +47,8 @@ def test_captures_trained_too_briefly_to_turn_opaque_still_register():
 def test_a_scene_whose_vertical_is_unknown_registers_with_one_that_knows_it():
     world = splat_world(0, policy="known")
     layer = world.target.graph.layers["landmarks"]
-    levelled = replace(layer, embeddings=layer.embeddings[::-1], method="levelled")
-    knows = replace(world.target.graph, layers={"landmarks": levelled, "unlevelled": layer})
+    levelled = replace(layer, embeddings=layer.embeddings[::-1], descriptor_id="levelled")
+    knows = replace(world.target.graph, layers={"landmarks": levelled, "landmarks_gravity_free": layer})
     target = replace(world.target, graph=knows)
     source = replace(world.source, graph=replace(world.source.graph, up=None))
     for pair in ((target, source), (source, target)):
@@ -169,7 +169,7 @@ def test_surfaces_propose_where_graphs_are_poor():
 
 def _first(layer: NodeLayer, n: int) -> NodeLayer:
     names = ("positions", "embeddings", "types", "weights", "extents", "features", "num_views")
-    return NodeLayer(*(getattr(layer, k)[:n] for k in names), method=layer.method, unit_m=layer.unit_m)
+    return NodeLayer(*(getattr(layer, k)[:n] for k in names), descriptor_id=layer.descriptor_id, unit_m=layer.unit_m)
 
 
 def test_two_proposals_of_one_pose_are_not_ambiguous(monkeypatch):

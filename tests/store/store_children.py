@@ -5,7 +5,7 @@ import itertools
 import os
 import sys
 
-from store_samples import make_cameras, make_gaussians
+from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.store import Store
 from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
@@ -37,7 +37,7 @@ def work(path: str, first_seed: int, pipe) -> None:
         poses = {s: ScenePose(s, Sim3.identity(), 0, "placed") for s in alive}
         pipe.send(("done", "revise", store.revisions.save(PoseGraph(poses))))
         pipe.send(("begin", "describe", scene))
-        store.graphs.save(SceneGraph(scene), f"method {seed}")
+        store.graphs.save(SceneGraph(scene), key("describe", scene, seed=seed))
         pipe.send(("done", "describe", scene))
         if seed % 2:
             pipe.send(("begin", "remove", alive[0]))

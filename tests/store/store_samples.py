@@ -2,7 +2,12 @@
 
 import numpy as np
 
+from gsmap.methods import RecipeKey
 from gsmap.types import Cameras, Gaussians
+
+
+def key(stage: str, *inputs: str, **settings: object) -> RecipeKey:
+    return RecipeKey(stage, "test", {stage: 1}, settings, "native", inputs)
 
 
 def make_gaussians(n: int = 500, seed: int = 0, degree: int = 1) -> Gaussians:

@@ -1,13 +1,24 @@
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from store_samples import make_cameras, make_gaussians
+from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
-from gsmap.store import Store, graph_key
-from gsmap.types import NodeLayer, PoseGraph, Prior, Registration, SceneGraph, ScenePose, Sim3, Tile
+from gsmap.store import MANUAL, Pruned, Store
+from gsmap.types import (
+    EdgeOutcome,
+    NodeLayer,
+    PoseGraph,
+    Prior,
+    Provenance,
+    Registration,
+    SceneGraph,
+    ScenePose,
+    Sim3,
+    Tile,
+)
 
 
 def pose(seed: int = 0, scale: float = 1.0) -> Sim3:
@@ -20,7 +31,7 @@ def assert_pose(a: Sim3, b: Sim3) -> None:
     assert a.scale == b.scale
 
 
-def layer(m: int = 7, method: str = "m1") -> NodeLayer:
+def layer(m: int = 7, descriptor_id: str = "m1") -> NodeLayer:
     r = np.random.default_rng(m)
     return NodeLayer(
         r.normal(size=(m, 3)),
@@ -30,7 +41,7 @@ def layer(m: int = 7, method: str = "m1") -> NodeLayer:
         r.normal(size=(m, 2, 3)),
         r.normal(size=(m, 8)),
         r.integers(0, 9, m),
-        method,
+        descriptor_id,
         0.1 + 0.2,
     )
 
@@ -43,10 +54,11 @@ def registration(target: str, source: str, **more: object) -> Registration:
         "num_inliers": 12,
         "num_correspondences": 99,
         "overlap": 0.1 + 0.2,
-        "method": "landmarks",
+        "proposer": "landmarks",
         "exact": False,
         "seconds": {"match": 0.5, "refine": 0.25, "verdict": 1e-3},
         "evidence": {"logNFA": np.float32(-7.5), "runner_up": 0.3},
+        "notes": ("no package",),
     }
     return Registration(target, source, **(fields | more))
 
@@ -59,10 +71,12 @@ def test_graph_round_trip(store, two_scenes):
     graph = SceneGraph(
         two_scenes[0].id, {"objects": layer(5), "landmarks:0/x": layer(0, "m2")}, up, 0.4, ("few nodes",)
     )
-    kept = store.graphs.save(graph, "method-1")
-    assert kept.key == graph_key(two_scenes[0].id, "method-1")
+    made = key("describe", graph.scene_id, "auto", voxel_m=0.1 + 0.2)
+    kept = store.graphs.save(graph, made)
+    assert (kept.key, kept.recipe) == (made.digest, made.recipe)
+    assert store.recipes.get(kept.recipe).to_json() == made.to_json()
     assert kept.layers == {"objects": 5, "landmarks:0/x": 0}
-    back = store.graphs.load("scene0", "method-1")
+    back = store.graphs.load("scene0", made)
     assert (back.scene_id, back.unit_m, back.notes) == (two_scenes[0].id, 0.4, ("few nodes",))
     np.testing.assert_array_equal(back.up, up)
     assert list(back.layers) == ["objects", "landmarks:0/x"]
@@ -74,29 +88,40 @@ def test_graph_round_trip(store, two_scenes):
             np.testing.assert_array_equal(a, b, part.name)
 
 
-def test_graphs_by_method(store, two_scenes):
+def test_graphs_by_key(store, two_scenes):
     scene = two_scenes[0].id
-    assert store.graphs.find("scene0", "a") is None
+    a, b = key("describe", scene, "auto"), key("describe", scene, "known")
+    assert store.graphs.find(a) is None
     assert store.graphs.load("scene0") is None
-    first = store.graphs.save(SceneGraph(scene, {"objects": layer(3)}), "a")
-    store.graphs.save(SceneGraph(scene, {"objects": layer(4)}), "b")
-    assert store.graphs.save(SceneGraph(scene, {"objects": layer(3)}), "a") == first  # nothing happened
-    assert store.graphs.find("scene0", "a").num_nodes == 3
+    first = store.graphs.save(SceneGraph(scene, {"objects": layer(3)}), a)
+    store.graphs.save(SceneGraph(scene, {"objects": layer(4)}), b)
+    assert store.graphs.save(SceneGraph(scene, {"objects": layer(3)}), a) == first  # nothing happened
+    assert store.graphs.find(a).num_nodes == store.graphs.find(a.digest).num_nodes == 3
     assert store.graphs.load("scene0").num_nodes == 4  # the newest
-    assert [g.method for g in store.graphs.list()] == ["a", "b"]
-    store.graphs.save(SceneGraph(scene, {"objects": layer(9)}), "a")
-    assert store.graphs.load("scene0", "a").num_nodes == 9
+    assert store.graphs.load("scene1", a) is None
+    assert [g.key for g in store.graphs.list()] == [a.digest, b.digest]
+    assert [r.recipe for r in store.recipes.list()] == [a.recipe]  # once for both
+    store.graphs.save(SceneGraph(scene, {"objects": layer(9)}), a)
+    assert store.graphs.load("scene0", a.digest).num_nodes == 9
     assert len(store.graphs.list()) == 2
     store.prune()  # the replaced graph's bytes go
     assert store.check().ok
-    assert store.graphs.load("scene0", "a").num_nodes == 9
+    assert store.graphs.load("scene0", a).num_nodes == 9
     with pytest.raises(NotFoundError):
-        store.graphs.save(SceneGraph("unknown", {}), "a")
+        store.graphs.save(SceneGraph("unknown", {}), key("describe", "unknown"))
+    with pytest.raises(InputError, match="among its inputs"):
+        store.graphs.save(SceneGraph(scene, {}), key("describe"))
 
 
 def test_empty_graph(store, two_scenes):
-    store.graphs.save(SceneGraph(two_scenes[0].id), "a")
-    assert store.graphs.load("scene0", "a").layers == {}
+    made = key("describe", two_scenes[0].id)
+    store.graphs.save(SceneGraph(two_scenes[0].id), made)
+    assert store.graphs.load("scene0", made).layers == {}
+
+
+def test_unknown_recipe(store):
+    with pytest.raises(NotFoundError, match="recipe"):
+        store.recipes.get("nothing")
 
 
 # -- registrations
@@ -104,58 +129,162 @@ def test_empty_graph(store, two_scenes):
 
 def test_registration_round_trip(store, two_scenes):
     a, b = (s.id for s in two_scenes)
-    r = registration(a, b)
-    store.registrations.save(r, "key")
+    r, made = registration(a, b), key("register", "graph a", "graph b", max_log_nfa=-8.0)
+    store.registrations.save(r, made)
     back = store.registrations.get("scene1", "scene0")
-    assert back.key == "key"
-    assert back.verdict is None
+    assert (back.key, back.recipe, back.adopts) == (made.digest, made.recipe, None)
+    assert store.recipes.get(back.recipe).settings == {"max_log_nfa": -8.0}
+    assert back.review is None
     got = back.registration
     assert_pose(got.S_target_source, r.S_target_source)
     np.testing.assert_array_equal(got.information, r.information)
-    for name in ("target", "source", "status", "reason", "num_inliers", "num_correspondences", "overlap", "method"):
+    names = ("target", "source", "status", "reason", "num_inliers", "num_correspondences", "overlap", "proposer")
+    for name in (*names, "notes"):
         assert getattr(got, name) == getattr(r, name)
     assert got.exact is False
     assert got.seconds == r.seconds
     assert got.evidence == {"logNFA": -7.5, "runner_up": 0.3}
     none = registration(a, b, status="no_match", S_target_source=None, information=None, reason="not enough nodes")
-    assert store.registrations.save(none).registration.S_target_source is None
+    assert store.registrations.save(none, made).registration.S_target_source is None
 
 
 def test_history_and_current(store, two_scenes):
     a, b = (s.id for s in two_scenes)
+    k1, k2 = key("register", "1"), key("register", "2")
     assert store.registrations.get(a, b) is None
-    assert store.registrations.find("k1") is None
-    store.registrations.save(registration(a, b, num_inliers=1), "k1")
-    store.registrations.save(registration(b, a, num_inliers=2), "k2")  # the other direction is the same pair
+    assert store.registrations.find(k1) is None
+    assert store.registrations.find("") is None
+    store.registrations.save(registration(a, b, num_inliers=1), k1)
+    store.registrations.save(registration(b, a, num_inliers=2), k2)  # the other direction is the same pair
     assert [r.registration.num_inliers for r in store.registrations.history(a, b)] == [1, 2]
     assert [r.registration.num_inliers for r in store.registrations.current()] == [2]
     assert store.registrations.get(a, b).registration.target == b
-    assert store.registrations.find("k1").registration.num_inliers == 1
+    assert store.registrations.find(k1).registration.num_inliers == 1
+    assert store.registrations.find(k1.digest).number == 1
     store.scenes.remove("scene0")
     assert store.registrations.current() == []
     with pytest.raises(InputError, match="same scene"):
         store.registrations.get(b, b)
+    with pytest.raises(InputError, match="recipe key"):
+        store.registrations.save(registration(a, b))
 
 
-def test_verdicts(store, two_scenes):
+def test_going_back_to_older_settings_makes_the_older_result_current(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    k1, k2 = key("register", gate=1), key("register", gate=2)
+    first = store.registrations.save(registration(a, b, num_inliers=1), k1)
+    store.registrations.save(registration(b, a, num_inliers=2), k2)
+    adopted = store.registrations.adopt(store.registrations.find(k1).number)
+    assert (adopted.adopts, adopted.key, adopted.recipe) == (first.number, k1.digest, k1.recipe)
+    assert_pose(adopted.registration.S_target_source, first.registration.S_target_source)
+    assert adopted.registration.evidence == first.registration.evidence
+    assert store.registrations.get(a, b).number == adopted.number
+    assert [r.number for r in store.registrations.current()] == [adopted.number]
+    for number in (first.number, adopted.number):  # it is the newest already
+        assert store.registrations.adopt(number).number == adopted.number
+    again = store.registrations.adopt(store.registrations.find(k2).number)
+    third = store.registrations.adopt(store.registrations.find(k1).number)  # which is an adopted row itself
+    assert (again.adopts, third.adopts) == (2, first.number)
+    assert [r.number for r in store.registrations.history(a, b)] == [1, 2, 3, 4, 5]
+    with pytest.raises(NotFoundError, match="registration 99"):
+        store.registrations.adopt(99)
+
+
+def test_a_confirmed_pose_outlives_what_is_adopted(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    old = store.registrations.save(registration(a, b), key("register", gate=1))
+    kept = store.registrations.save(registration(a, b), key("register", gate=2))
+    store.registrations.review(a, b, "confirm")
+    assert store.registrations.adopt(old.number).number > kept.number
+    assert store.registrations.get(a, b).number == kept.number
+
+
+def test_reviews(store, two_scenes):
     a, b = (s.id for s in two_scenes)
     with pytest.raises(NotFoundError, match="never registered"):
-        store.registrations.judge("scene0", "scene1", "confirm")
-    first = store.registrations.save(registration(a, b, num_inliers=1))
-    assert store.registrations.judge("scene0", "scene1", "confirm", "looked at it").verdict == "confirm"
-    store.registrations.save(registration(a, b, num_inliers=2))
+        store.registrations.review("scene0", "scene1", "confirm")
+    first = store.registrations.save(registration(a, b, num_inliers=1), key("register", "1"))
+    with pytest.raises(InputError, match="nothing to withdraw"):
+        store.registrations.review(a, b, "withdraw")
+    assert store.registrations.review("scene0", "scene1", "confirm", "looked at it").review == "confirm"
+    store.registrations.save(registration(a, b, num_inliers=2), key("register", "2"))
     for found in (store.registrations.get(a, b), *store.registrations.current()):
-        assert (found.number, found.verdict) == (first.number, "confirm")  # a person's pose stays
-    assert store.registrations.judge("scene1", "scene0", "reject").verdict == "reject"
+        assert (found.number, found.review) == (first.number, "confirm")  # a person's pose stays
+    assert store.registrations.review("scene1", "scene0", "reject").review == "reject"
     assert store.registrations.current()[0].registration.num_inliers == 2
-    assert store.registrations.judge("scene0", "scene1", "withdraw").verdict is None
-    assert [v.verdict for v in store.registrations.verdicts(a, b)] == ["confirm", "reject", "withdraw"]
-    assert store.registrations.verdicts(a, b)[0].note == "looked at it"
-    with pytest.raises(ConfigError, match="verdict"):
-        store.registrations.judge(a, b, "maybe")
-    store.registrations.save(registration(a, b, status="no_match", S_target_source=None, reason="look alike"))
+    assert store.registrations.review("scene0", "scene1", "withdraw").review is None
+    assert [r.review for r in store.registrations.reviews(a, b)] == ["confirm", "reject", "withdraw"]
+    assert store.registrations.reviews(a, b)[0].note == "looked at it"
+    with pytest.raises(ConfigError, match="review"):
+        store.registrations.review(a, b, "maybe")
+    none = registration(a, b, status="no_match", S_target_source=None, reason="look alike")
+    store.registrations.save(none, key("register", "3"))
     with pytest.raises(InputError, match="look alike"):
-        store.registrations.judge(a, b, "confirm")
+        store.registrations.review(a, b, "confirm")
+
+
+def measured(a: str, b: str, **more: object) -> Registration:
+    return registration(a, b, proposer=MANUAL, notes=("tape measure",), **more)
+
+
+def current(store, a: str, b: str) -> tuple[int, str | None] | None:
+    """Number and review of a pair's current registration, which both ways of asking agree on."""
+    found = store.registrations.get(a, b)
+    assert [r.number for r in store.registrations.current()] == ([] if found is None else [found.number])
+    return None if found is None else (found.number, found.review)
+
+
+def test_a_measurement_stands_until_it_is_withdrawn(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    save, review = store.registrations.save, store.registrations.review
+    computed = save(registration(a, b), key("register", "1")).number
+    mine = save(measured(b, a))
+    assert (mine.manual, mine.key, mine.recipe) == (True, "", None)
+    assert mine.registration.notes == ("tape measure",)
+    later = save(registration(a, b), key("register", "2")).number
+    assert current(store, a, b) == (mine.number, None)
+    review(a, b, "reject")
+    assert current(store, a, b) == (mine.number, "reject")
+    review(a, b, "withdraw")  # of the rejection
+    assert current(store, a, b) == (mine.number, None)
+    review(a, b, "withdraw")  # of the measurement
+    assert current(store, a, b) == (later, None)
+    with pytest.raises(InputError, match="nothing to withdraw"):
+        review(a, b, "withdraw")
+    review(a, b, "confirm")
+    assert current(store, a, b) == (later, "confirm")
+    assert store.registrations.adopt(computed).adopts == computed  # the measurement does not count as newest
+    with pytest.raises(InputError, match="measured"):
+        store.registrations.adopt(mine.number)
+
+
+def test_the_newest_word_of_a_person_counts(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    save, review = store.registrations.save, store.registrations.review
+    computed = save(registration(a, b), key("register")).number
+    for word in ("confirm", "reject"):
+        review(a, b, word)
+        first, second = save(measured(a, b)).number, save(measured(a, b)).number
+        assert current(store, a, b) == (second, None)  # measured after the word was given
+        review(a, b, "withdraw")
+        assert current(store, a, b) == (first, None)
+        review(a, b, "withdraw")
+        assert current(store, a, b) == (computed, word)
+
+
+def test_a_measurement_alone(store, two_scenes):
+    a, b = (s.id for s in two_scenes)
+    mine = store.registrations.save(measured(a, b)).number
+    assert store.registrations.review(a, b, "confirm").review == "confirm"
+    store.registrations.review(a, b, "withdraw")
+    assert current(store, a, b) == (mine, None)
+    assert store.registrations.review(a, b, "withdraw") is None
+    assert current(store, a, b) is None
+    assert [r.number for r in store.registrations.history(a, b)] == [mine]
+    with pytest.raises(InputError, match="accepted"):
+        store.registrations.save(measured(a, b, status="rejected"))
+    with pytest.raises(InputError, match="recipe key"):
+        store.registrations.save(measured(a, b), key("register"))
 
 
 # -- revisions and priors
@@ -168,16 +297,19 @@ def graph_of(scenes, shift: float = 0.0) -> PoseGraph:
         a: ScenePose(a, Sim3(np.eye(3), [shift, 0, 0]), 0, "placed", covariance),
         b: ScenePose(b, None, 1, "isolated"),
     }
-    pair = (a, b)
-    parameters = {"chi2": 12.02, "seed": np.int64(3), "robust": "gnc"}
-    return PoseGraph(placed, {pair: "tentative"}, {pair: np.float64(2.5)}, {pair: "no cycle"}, (pair,), parameters)
+    outcomes = {(a, b): EdgeOutcome("tentative", np.float64(2.5), "no cycle", undecided=True)}
+    settings = {"chi2": 12.02, "seed": np.int64(3), "robust": "gnc"}
+    return PoseGraph(placed, outcomes, settings, Provenance("incremental", 7, "abcd", (b,)), ("no marginals",))
 
 
 def test_revisions(store, two_scenes):
     assert store.revisions.current() is None
     assert store.revisions.get() is None
+    made = key("optimize", "all edges", gate=0.999)
+    assert store.revisions.find(made) is None
     assert store.revisions.save(graph_of(two_scenes)) == 1
-    assert store.revisions.save(graph_of(two_scenes, 0.5), note="new scene") == 2
+    assert store.revisions.save(graph_of(two_scenes, 0.5), made, note="new scene") == 2
+    assert store.revisions.find(made) == store.revisions.find(made.digest) == 2
     a, b = (s.id for s in two_scenes)
     for number, shift in ((1, 0.0), (2, 0.5), (None, 0.5)):
         got = store.revisions.get(number)
@@ -185,23 +317,28 @@ def test_revisions(store, two_scenes):
         np.testing.assert_array_equal(got.poses[a].covariance, np.diag(np.arange(1.0, 8)) / 7)
         assert got.poses[b].S_map_scene is None
         assert (got.poses[b].status, got.poses[b].component) == ("isolated", 1)
-        assert got.used == {(a, b): "tentative"}
-        assert got.residuals == {(a, b): 2.5}
-        assert got.reasons == {(a, b): "no cycle"}
+        assert got.outcomes == {(a, b): EdgeOutcome("tentative", 2.5, "no cycle", undecided=True)}
         assert got.undecided == ((a, b),)
-        assert got.parameters == {"chi2": 12.02, "seed": 3, "robust": "gnc"}
+        assert got.settings == {"chi2": 12.02, "seed": 3, "robust": "gnc"}
+        assert got.provenance == Provenance("incremental", 7, "abcd", (b,))
+        assert got.notes == ("no marginals",)
     first, second = store.revisions.list()
     assert (first.number, first.num_scenes, first.num_placed, first.num_components) == (1, 2, 1, 2)
-    assert second.note == "new scene"
+    assert (first.num_used, first.num_tentative, first.num_unused, first.num_undecided) == (0, 1, 0, 1)
+    assert (first.key, first.recipe) == ("", None)
+    assert (second.note, second.key, second.recipe) == ("new scene", made.digest, made.recipe)
     with pytest.raises(NotFoundError, match="revision 3"):
         store.revisions.get(3)
 
 
-@pytest.mark.parametrize("used", [True, False, "tentative"])
-def test_used_keeps_its_kind(store, two_scenes, used):
+def test_outcomes_come_back(store, two_scenes):
     a, b = (s.id for s in two_scenes)
-    store.revisions.save(PoseGraph({}, {(a, b): used}))
-    assert store.revisions.get().used[(a, b)] is used or used == "tentative"
+    every = [EdgeOutcome("used", 0.1 + 0.2), EdgeOutcome("unused", None, "contradicts"), EdgeOutcome("tentative")]
+    for outcome in every:
+        store.revisions.save(PoseGraph({}, {(a, b): outcome, (b, a): every[0]}))
+        assert store.revisions.get().outcomes == {(a, b): outcome, (b, a): every[0]}
+    counts = [(r.num_used, r.num_tentative, r.num_unused) for r in store.revisions.list()]
+    assert counts == [(2, 0, 0), (1, 0, 1), (1, 1, 0)]
 
 
 def test_a_revision_of_unknown_scenes_leaves_nothing(store):
@@ -263,7 +400,8 @@ def test_models(store, tmp_path):
 
 def tile(path: str, scenes, shift: float = 0.0) -> Tile:
     poses = {s.id: Sim3(np.eye(3), [shift, 0, 0]) for s in scenes}
-    return Tile("key", 0, np.array([[0, 0, 0], [1, 2, 3.0]]), poses, 42, "tto", True, path, "ab" * 32)
+    recipe = key("merge", steps=300).to_json()
+    return Tile("key", 0, np.array([[0, 0, 0], [1, 2, 3.0]]), poses, 42, recipe, True, path, "ab" * 32, ("a seam",))
 
 
 def test_exports_keep_the_newest_tile_of_a_path(store, two_scenes, tmp_path):
@@ -279,7 +417,9 @@ def test_exports_keep_the_newest_tile_of_a_path(store, two_scenes, tmp_path):
     assert (a.path, b.path) == ("0/a.ply", "0/b.ply")
     assert b.poses[two_scenes[0].id].translation[0] == 0.25
     np.testing.assert_array_equal(a.bounds, [[0, 0, 0], [1, 2, 3]])
-    assert (a.key, a.num_gaussians, a.method, a.truncated, a.sha256) == ("key", 42, "tto", True, "ab" * 32)
+    assert (a.key, a.num_gaussians, a.truncated, a.sha256, a.notes) == ("key", 42, True, "ab" * 32, ("a seam",))
+    assert a.recipe == key("merge", steps=300).to_json()
+    assert len(store.recipes.list()) == 1
     store.exports.forget(tmp_path / "out", ["0/a.ply"])
     assert [t.path for t in store.exports.tiles(tmp_path / "out")] == ["0/b.ply"]
     assert [t.path for t in store.exports.tiles(tmp_path / "other")] == ["0/a.ply"]
@@ -292,6 +432,10 @@ def test_exports_keep_the_newest_tile_of_a_path(store, two_scenes, tmp_path):
     assert store.exports.list()[0].settings == {"tile_size_m": 10}
     with pytest.raises(NotFoundError):
         store.exports.add_tile(99, tile("x", two_scenes))
+    with pytest.raises(InputError, match="a recipe has stage"):
+        store.exports.add_tile(first, replace(tile("x", two_scenes), recipe={"method": "tto"}))
+    store.exports.add_tile(first, replace(tile("x", two_scenes), recipe={}))
+    assert store.exports.tiles(tmp_path / "out")[-1].recipe == {}
 
 
 def test_several_changes_in_one_transaction(store, two_scenes):
@@ -299,7 +443,7 @@ def test_several_changes_in_one_transaction(store, two_scenes):
 
     def change() -> None:
         with store.transaction():
-            store.registrations.save(registration(a, b))
+            store.registrations.save(registration(a, b), key("register"))
             store.revisions.save(graph_of(two_scenes))
             assert store.revisions.current() == 1  # seen from inside
             raise RuntimeError
@@ -316,16 +460,16 @@ def test_several_changes_in_one_transaction(store, two_scenes):
 def test_prune_keeps_what_a_revision_names(tmp_path):
     with Store.create(tmp_path / "m") as store:
         scenes = [store.scenes.add(make_gaussians(seed=i), make_cameras(), name=f"scene{i}")[0] for i in range(3)]
-        store.graphs.save(SceneGraph(scenes[0].id, {"objects": layer()}), "a")
-        store.graphs.save(SceneGraph(scenes[2].id, {"objects": layer()}), "a")
+        for scene in (scenes[0].id, scenes[2].id):
+            store.graphs.save(SceneGraph(scene, {"objects": layer()}), key("describe", scene))
         store.revisions.save(graph_of(scenes[:2]))
         store.scenes.remove("scene0")
         store.scenes.remove("scene2")
         would = store.prune(dry_run=True)
-        assert (would.scenes, would.num_graphs) == (["scene2"], 1)
+        assert (would.scenes, would.num_graphs, would.dry_run) == (("scene2",), 1, True)
         assert len(store.scenes.gaussians(scenes[2].id)) == 500
         done = store.prune()
-        assert (done.scenes, done.num_graphs, done.num_bytes) == (["scene2"], 1, would.num_bytes)
+        assert (done.scenes, done.num_graphs, done.num_bytes) == (("scene2",), 1, would.num_bytes)
         assert done.num_bytes > 10_000
         assert len(store.scenes.gaussians(scenes[0].id)) == 500  # revision 1 can still be exported
         with pytest.raises(NotFoundError, match="pruned"):
@@ -333,12 +477,36 @@ def test_prune_keeps_what_a_revision_names(tmp_path):
         assert store.check().ok
 
         store.revisions.save(PoseGraph({scenes[1].id: ScenePose(scenes[1].id, pose(), 0, "placed")}))
-        assert store.prune().scenes == []
+        assert store.prune().scenes == ()
         dropped = store.prune(keep_revisions=1)
-        assert (dropped.scenes, dropped.revisions) == (["scene0"], [1])
+        assert (dropped.scenes, dropped.revisions) == (("scene0",), (1,))
         assert [bool(r.dropped_at) for r in store.revisions.list()] == [True, False]
         assert store.revisions.get(1).poses[scenes[0].id].status == "placed"  # the record itself stays
         assert store.prune().num_bytes == 0
         assert store.check().ok
         assert len(store.scenes.gaussians("scene1")) == 500
         assert len(list((tmp_path / "m" / "arrays" / "scenes").iterdir())) == 1
+
+
+def test_a_dry_run_counts_everything_and_changes_nothing(store, two_scenes, tmp_path):
+    """Orphans, leftovers of dead writers, models and replaced graphs too; also of a map that is open for reading."""
+    scene, made = two_scenes[0].id, key("describe", two_scenes[0].id)
+    for nodes in (3, 4):  # the second takes the first one's place
+        store.graphs.save(SceneGraph(scene, {"objects": layer(nodes)}), made)
+    (tmp_path / "net.onnx").write_bytes(b"x" * 1000)
+    store.models.add("net", tmp_path / "net.onnx", kind="clip")
+    store.models.remove("net")
+    for folder in ("scenes/orphan", "staging/leftover"):
+        (store.folder / "arrays" / folder).mkdir()
+        (store.folder / "arrays" / folder / "c").write_bytes(b"x" * 5000)
+    store.scenes.remove("scene1")
+    before = {p: p.stat().st_mtime_ns for p in store.folder.rglob("*")}
+    with Store.open(store.folder, "r") as reader:
+        would = reader.prune(dry_run=True)
+    assert would == store.prune(dry_run=True)
+    assert {p: p.stat().st_mtime_ns for p in store.folder.rglob("*")} == before
+    assert (would.scenes, would.num_orphans, would.num_models) == (("scene1",), 1, 1)
+    assert would.num_bytes > 11_000
+    assert store.prune() == replace(would, dry_run=False)
+    assert store.prune(dry_run=True) == Pruned(dry_run=True)
+    assert store.check().ok

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import store_children
 from store_children import messages
-from store_samples import make_cameras, make_gaussians
+from store_samples import key, make_cameras, make_gaussians
 from test_store_nouns import graph_of, layer, registration, tile
 
 from gsmap.errors import ConfigError, StoreError
@@ -28,24 +28,26 @@ def test_the_whole_store_on_postgres(tmp_path, postgres_database):
         box = np.array([[-5.0] * 3, [-4.0] * 3])
         inside = ((g.means >= box[0]) & (g.means <= box[1])).all(1).sum()
         assert inside <= len(store.scenes.gaussians("a", box)) < CHUNK_ROWS
-        store.graphs.save(SceneGraph(a.id, {"objects": layer()}), "method")
+        store.graphs.save(SceneGraph(a.id, {"objects": layer()}), key("describe", a.id))
         assert store.graphs.load("a").num_nodes == 7
-        saved = store.registrations.save(registration(a.id, b.id), "k")
-        assert store.registrations.judge("a", "a-2", "confirm").number == saved.number
+        saved = store.registrations.save(registration(a.id, b.id), key("register"))
+        assert store.registrations.adopt(saved.number).number == saved.number
+        assert store.registrations.review("a", "a-2", "confirm").number == saved.number
         np.testing.assert_array_equal(
             store.registrations.current()[0].registration.information, np.diag(np.arange(1.0, 8)) / 3
         )
         assert store.registrations.get("a", "a-2").registration.overlap == 0.1 + 0.2  # all of a double
         assert store.revisions.save(graph_of([a, b])) == 1
-        assert store.revisions.get().residuals == {(a.id, b.id): 2.5}
+        assert store.revisions.get().outcomes == graph_of([a, b]).outcomes
+        assert store.revisions.list()[0].num_tentative == 1
         store.priors.set(Prior("a", Sim3.identity(), np.full(7, np.inf)))
         assert np.isinf(store.priors.list()[0].sigmas).all()
         export = store.exports.begin(tmp_path / "out", revision=1)
         store.exports.add_tile(export, tile("a.ply", [a, b]))
         assert store.exports.tiles(tmp_path / "out")[0].num_gaussians == 42
         store.scenes.remove("a-2")
-        assert store.prune().scenes == []
-        assert store.prune(keep_revisions=0).scenes == ["a-2"]
+        assert store.prune().scenes == ()
+        assert store.prune(keep_revisions=0).scenes == ("a-2",)
         assert store.check().ok
     with pytest.raises(StoreError, match="holds a map already"):
         Store.create(tmp_path / "other", catalog_url=postgres_database)

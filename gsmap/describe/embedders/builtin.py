@@ -19,10 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.describe.colour import srgb_to_lab
-from gsmap.describe.segmenters import Mask
-from gsmap.describe.views import View
+from gsmap.types.views import Mask, SceneContext, View
 
-_HUES, _GREY_CHROMA = 12, 8.0
+VERSION = 1
+MODELS: tuple[str, ...] = ()
+_HUES = 12
 _LIGHTNESS = np.linspace(-45, 45, 7)
 _TEXTURE = np.linspace(-5, 0, 6)  # natural log of |grad L| / L per pixel
 _SIZE = np.log(np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4]))
@@ -33,12 +34,26 @@ _WORDS = 48
 
 @dataclass(frozen=True)
 class Params:
-    """How much each part of the vector weighs (their squares are shares of the cosine)."""
+    """How much each part of the vector weighs (their squares are shares of the cosine).
+
+    Args:
+        hue: of the direction in the a*b* plane.
+        lightness: of L* relative to the view's median.
+        texture: of the strength of the L* gradient.
+        shape: of size, flatness, elongation and tilt in 3D.
+        grey_chroma: a pixel of this chroma, L*a*b* units, counts half as coloured and half as grey.
+    """
 
     hue: float = 1.0
     lightness: float = 0.7
     texture: float = 0.5
     shape: float = 0.9
+    grey_chroma: float = 8.0
+
+
+def make(context: SceneContext, params: Params) -> BuiltinEmbedder:
+    """An embedder that knows the scene's vertical and metre; see `gsmap.methods.embedder`."""
+    return BuiltinEmbedder(params, context.up, context.unit_m)
 
 
 class BuiltinEmbedder:
@@ -47,10 +62,11 @@ class BuiltinEmbedder:
     def __init__(self, params: Params, up: np.ndarray | None, unit_m: float) -> None:
         weights = np.array([params.hue, params.lightness, params.texture, params.shape])
         self.weights = np.repeat(weights / np.linalg.norm(weights), _PARTS).astype(np.float32)
-        self.up, self.unit_m = up, unit_m
+        self.up, self.unit_m, self.grey_chroma = up, unit_m, params.grey_chroma
         self.codebook = self._codebook()
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
+        """(R, F) features of the masks; see `gsmap.methods.embedder`."""
         if not masks:
             return np.zeros((0, sum(_PARTS)), np.float32)
         lab = srgb_to_lab(view.rgb / 255.0)
@@ -61,7 +77,7 @@ class BuiltinEmbedder:
         for mask, shown in zip(masks, points, strict=True):
             pixels, steep = lab[mask.pixels], slope[mask.pixels]
             parts = [
-                _hues(pixels),
+                _hues(pixels, self.grey_chroma),
                 _soft(pixels[:, 0] - middle, _LIGHTNESS),
                 _soft(np.log(np.maximum(steep, 1e-4)), _TEXTURE),
                 self._shape(shown),
@@ -104,10 +120,10 @@ def _soft(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
     return np.bincount(low, 1 - share, len(centres)) + np.bincount(low + 1, share, len(centres))
 
 
-def _hues(lab: np.ndarray) -> np.ndarray:
+def _hues(lab: np.ndarray, grey_chroma: float) -> np.ndarray:
     """Histogram over hue circle and grey: a pixel is coloured as far as its chroma exceeds that of grey things."""
     chroma = np.hypot(lab[:, 1], lab[:, 2])
-    coloured = chroma / (chroma + _GREY_CHROMA)
+    coloured = chroma / (chroma + grey_chroma)
     at = np.arctan2(lab[:, 2], lab[:, 1]) / (2 * np.pi) * _HUES % _HUES
     low = at.astype(int) % _HUES
     share = at - at.astype(int)

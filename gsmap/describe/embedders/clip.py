@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from gsmap.describe.context import random_codebook
-from gsmap.describe.models import ModelSpec, open_session, run
-from gsmap.describe.segmenters import Mask
-from gsmap.describe.views import View
+from gsmap.describe.embedders._codebook import random_codebook
+from gsmap.describe.onnx.session import misfit, open_session, run
 from gsmap.errors import InputError
+from gsmap.types.model import ModelSpec
+from gsmap.types.views import Mask, SceneContext, View
 
+VERSION = 1
+MODELS = ("clip",)
 _CODEBOOK_SEED = 20
 _WORDS = 32
 
@@ -35,6 +37,24 @@ class Params:
     batch: int = 16
 
 
+def make(context: SceneContext, params: Params) -> ClipEmbedder:
+    """Open the encoder; see `gsmap.methods.embedder`."""
+    return ClipEmbedder(params, context.models["clip"])
+
+
+def probe(spec: ModelSpec) -> None:
+    """Refuse a model that is no image encoder. It is run once: declared shapes do not tell all that can go wrong.
+
+    Raises:
+        InputError: its inputs and outputs do not fit, or it does not run.
+    """
+    if len(spec.inputs) != 1 or not spec.inputs[0].is_image or len(spec.inputs[0].shape) != 4:
+        raise misfit(spec, "an image encoder takes one input of shape (N, 3, H, W) or (N, H, W, 3)")
+    if not spec.outputs:
+        raise misfit(spec, "it gives nothing")
+    ClipEmbedder(Params(), spec)
+
+
 class ClipEmbedder:
     """Runs the encoder on one crop per mask. Size, layout and names are read from the model."""
 
@@ -45,7 +65,7 @@ class ClipEmbedder:
         n, *rest = self.input.shape
         self.channels_last = rest[-1] == 3 and rest[0] != 3
         sides = rest[:2] if self.channels_last else rest[1:]
-        self.size = tuple(s or params.side_px for s in sides)  # height, width
+        self.size = (sides[0] or params.side_px, sides[1] or params.side_px)  # height, width
         self.batch = params.batch if n is None else n
         self.fixed = n is not None
         # The embedding is what the model names so, else its first output with one vector per picture.
@@ -56,6 +76,7 @@ class ClipEmbedder:
         self.codebook = random_codebook(_CODEBOOK_SEED, _WORDS, dim)
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
+        """(R, F) features of the masks; see `gsmap.methods.embedder`."""
         if not masks:
             return np.zeros((0, self.codebook.shape[1]), np.float32)
         crops = np.stack([crop(view.rgb, m.pixels, self.size, self.params) for m in masks])
@@ -109,4 +130,4 @@ def crop(rgb: np.ndarray, pixels: np.ndarray, size: tuple[int, int], params: Par
 
 def normalise(pictures: np.ndarray, spec: ModelSpec) -> np.ndarray:
     """Pictures (..., 3) in [0, 1] scaled as the model expects: ``(rgb - mean) / std``."""
-    return ((pictures - np.float32(spec.mean)) / np.float32(spec.std)).astype(np.float32)
+    return ((pictures - np.asarray(spec.mean, np.float32)) / np.asarray(spec.std, np.float32)).astype(np.float32)

@@ -13,9 +13,11 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from gsmap.describe.cloud import Cloud, downsample, local_planes
-from gsmap.describe.segmenters import Mask
-from gsmap.describe.views import View
+from gsmap.describe.cloud import downsample, local_planes
+from gsmap.types.views import Cloud, Mask, SceneContext, View
+
+VERSION = 1
+MODELS: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,24 @@ class Params:
         scale: Felzenszwalb's k: larger makes larger parts.
         min_share: parts of less than this share of the samples join their most similar neighbour.
         min_area: masks of a smaller share of the image are dropped.
+        lightness_weight: of a difference in L*, against one in a* or b*: light and shade part a surface less than a
+            change of hue.
+        lab_scale: the difference of colour, L*a*b* units, that counts as much as an edge of weight 1.
+        turn_weight: of an edge between normals at a right angle.
     """
 
     num_samples: int = 20000
     scale: float = 6.0
     min_share: float = 0.001
     min_area: float = 0.002
+    lightness_weight: float = 0.5
+    lab_scale: float = 5.0
+    turn_weight: float = 3.0
+
+
+def make(context: SceneContext, params: Params) -> BuiltinSegmenter:
+    """Cut the surface of a scene; see `gsmap.methods.segmenter`."""
+    return BuiltinSegmenter(params, context.cloud, context.num_gaussians)
 
 
 class BuiltinSegmenter:
@@ -45,6 +59,7 @@ class BuiltinSegmenter:
             self.part_of_gaussian[cloud.index] = cut_surface(cloud, params)
 
     def segment(self, view: View) -> list[Mask]:
+        """Pixels dominated by each part's Gaussians; one mask per connected blob of them."""
         parts = self.part_of_gaussian[view.dominant_id]
         parts[view.alpha < 0.5] = -1
         masks = []
@@ -78,9 +93,9 @@ def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
     near = distance[:, 1:].ravel() < 3 * cell
     a, b = a[once & near], b[once & near]
     lab = lab[neighbours].mean(1)  # a Gaussian's own colour is noisy
-    difference = (lab[a] - lab[b]) * [0.5, 1.0, 1.0]  # light and shade part a surface less than a change of hue
+    difference = (lab[a] - lab[b]) * [params.lightness_weight, 1.0, 1.0]
     turn = 1 - np.abs((normals[a] * normals[b]).sum(1))
-    weight = np.linalg.norm(difference, axis=1) / 5.0 + 3.0 * turn
+    weight = np.linalg.norm(difference, axis=1) / params.lab_scale + params.turn_weight * turn
     parts = felzenszwalb(len(points), a, b, weight, params.scale, max(4, int(params.min_share * len(points))))
     return parts[cKDTree(points).query(cloud.points)[1]]
 
@@ -88,9 +103,10 @@ def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
 def felzenszwalb(
     count: int, a: np.ndarray, b: np.ndarray, weight: np.ndarray, scale: float, min_size: int
 ) -> np.ndarray:
-    """Component (count,) int of each node: edges in order of weight join components whose inner difference allows it.
+    """Component (count,) int of each node of a graph.
 
-    Components smaller than ``min_size`` are then joined along their lightest edges.
+    Edges in order of weight join components whose inner difference allows it; components smaller than ``min_size`` are
+    then joined along their lightest edges.
     """
     order = np.argsort(weight, kind="stable")
     edges = list(zip(a[order].tolist(), b[order].tolist(), weight[order].tolist(), strict=True))

@@ -9,15 +9,21 @@ free, many prompts go through the decoder at once. Cuts and box suppression are 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
 
-from gsmap.describe.models import SAM_SIDE_PX, ModelSpec, open_session, run
-from gsmap.describe.segmenters import Mask
-from gsmap.describe.views import View
+from gsmap.describe.onnx.session import misfit, open_session, run
+from gsmap.types.model import ModelSpec
+from gsmap.types.views import Mask, SceneContext, View
 
+VERSION = 1
+MODELS = ("sam-encoder", "sam-decoder")
+SAM_SIDE_PX = 1024
+# What the published SAM decoder export takes (segment-anything, scripts/export_onnx_model.py).
+DECODER_INPUTS = ("image_embeddings", "point_coords", "point_labels", "mask_input", "has_mask_input", "orig_im_size")
 _PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _PIXEL_STD = np.array([58.395, 57.12, 57.375], np.float32)
 
@@ -44,6 +50,38 @@ class Params:
     max_area: float = 0.9
 
 
+def make(context: SceneContext, params: Params) -> SamSegmenter:
+    """Open the two models; see `gsmap.methods.segmenter`."""
+    return SamSegmenter(params, *(context.models[kind] for kind in MODELS))
+
+
+def probe(spec: ModelSpec) -> None:
+    """Refuse a model that is no SAM encoder, or no SAM decoder, by its inputs and outputs.
+
+    Raises:
+        InputError: what does not fit.
+    """
+    problem = _encoder_problem(spec) if spec.kind == "sam-encoder" else _decoder_problem(spec)
+    if problem:
+        raise misfit(spec, problem)
+
+
+def _encoder_problem(spec: ModelSpec) -> str:
+    if len(spec.inputs) != 1 or not spec.inputs[0].is_image:
+        return "a SAM encoder takes one image, (1, 3, 1024, 1024) or (H, W, 3)"
+    if any(side not in (1, 3, SAM_SIDE_PX, None) for side in spec.inputs[0].shape):
+        return f"a SAM encoder takes images of {SAM_SIDE_PX} x {SAM_SIDE_PX} pixels"
+    return "" if any(len(t.shape) == 4 for t in spec.outputs) else "a SAM encoder gives embeddings (1, C, h, w)"
+
+
+def _decoder_problem(spec: ModelSpec) -> str:
+    missing = [name for name in DECODER_INPUTS if name not in {t.name for t in spec.inputs}]
+    if missing:
+        return f"the published SAM decoder export also takes {', '.join(missing)}"
+    absent = [name for name in ("masks", "iou_predictions") if name not in {t.name for t in spec.outputs}]
+    return f"it does not give {', '.join(absent)}" if absent else ""
+
+
 class SamSegmenter:
     """Masks of everything SAM finds."""
 
@@ -56,6 +94,7 @@ class SamSegmenter:
         self.types = {t.name: np.float64 if t.dtype == "double" else np.float32 for t in decoder.inputs}
 
     def segment(self, view: View) -> list[Mask]:
+        """Everything that a grid of points finds, without what is unstable, too small, too large, or found twice."""
         height, width = view.rgb.shape[:2]
         embeddings = self._encode(view.rgb)
         side = (np.arange(self.params.points_per_side) + 0.5) / self.params.points_per_side
@@ -97,7 +136,9 @@ class SamSegmenter:
         outputs = run(self.encoder_spec, self.encoder, None, {tensor.name: picture})
         return next(o for o in outputs if o.ndim == 4)
 
-    def _decode(self, embeddings: np.ndarray, points: np.ndarray, height: int, width: int):
+    def _decode(
+        self, embeddings: np.ndarray, points: np.ndarray, height: int, width: int
+    ) -> Iterator[tuple[np.ndarray, float]]:
         """Yield (logits (H, W), predicted IoU) of each mask of each prompt."""
         count = len(points)
         scale = SAM_SIDE_PX / max(height, width)

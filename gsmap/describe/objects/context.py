@@ -22,28 +22,31 @@ def neighbourhood(positions: np.ndarray, max_distance: float, hops: int) -> np.n
 
 
 def context_histograms(
-    features: np.ndarray, positions: np.ndarray, codebook: np.ndarray, *, max_distance: float, hops: int = 3
+    features: np.ndarray,
+    positions: np.ndarray,
+    codebook: np.ndarray,
+    *,
+    max_distance: float,
+    hops: int = 3,
+    sharpness: float = 20.0,
 ) -> np.ndarray:
     """(M, K) unit vectors: how the features around each node spread over the codebook's words.
 
-    A feature is shared among words by the softmax of its similarity (temperature 1/20); the root of the normalised
-    histogram is returned, so that cosines compare as Bhattacharyya coefficients. A node with no neighbour has the zero
-    vector.
+    A feature is shared among words by the softmax of its similarity; the root of the normalised histogram is
+    returned, so that cosines compare as Bhattacharyya coefficients. A node with no neighbour has the zero vector.
 
     Args:
         features: (M, F) unit vectors.
+        positions: (M, 3), any frame.
         codebook: (K, F) unit vectors, the same for every scene.
+        max_distance: longest edge of the local graph, the positions' unit.
+        hops: how far along it.
+        sharpness: of the softmax; the inverse of its temperature.
     """
     if len(features) == 0:
         return np.zeros((0, len(codebook)), np.float32)
-    logits = 20.0 * features @ codebook.T
+    logits = sharpness * features @ codebook.T
     share = np.exp(logits - logits.max(1, keepdims=True))
     share /= share.sum(1, keepdims=True)
     total = neighbourhood(positions, max_distance, hops).astype(np.float64) @ share
     return np.sqrt(total / np.maximum(total.sum(1, keepdims=True), 1e-12)).astype(np.float32)
-
-
-def random_codebook(seed: int, words: int, dim: int) -> np.ndarray:
-    """(words, dim) unit vectors in random directions: a codebook that depends on no data."""
-    directions = np.random.default_rng(seed).normal(size=(words, dim))
-    return (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)

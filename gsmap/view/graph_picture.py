@@ -8,10 +8,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
-from gsmap.describe.lift import visible
-from gsmap.describe.views import View, render_views, sample_cameras
 from gsmap.errors import InputError, NotFoundError
+from gsmap.geometry.projection import in_image, on_surface, project
+from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
+from gsmap.types.views import View
 
 _MAX_LANDMARKS = 150
 _EDGES = 4  # drawn per object
@@ -47,7 +48,7 @@ def draw_graph(
         if isinstance(camera, str) and camera not in cameras.names:
             raise NotFoundError(f"no camera is named {camera}; the first is {cameras.names[0]}")
         row = cameras.names.index(camera) if isinstance(camera, str) else int(camera)
-        view = next(render_views(gaussians, _wide(cameras[row], width_px), 4 * width_px))
+        view = _render(gaussians, _wide(cameras[row], width_px), 4 * width_px)
     picture = Image.fromarray(view.rgb).convert("RGBA")
     over = Image.new("RGBA", picture.size)
     draw = ImageDraw.Draw(over)
@@ -63,14 +64,21 @@ def draw_graph(
 def _best_view(gaussians: Gaussians, cameras: Cameras, graph: SceneGraph, width_px: int) -> View:
     """Of a few sampled views, the one with most nodes on its visible surface."""
     nodes = np.concatenate([layer.positions for layer in graph.layers.values()] or [np.zeros((0, 3))])
-    some = sample_cameras(cameras, 12)
-    seen = [len(visible(nodes, view, 0.1)[0]) for view in render_views(gaussians, some, 240)]
-    return next(render_views(gaussians, _wide(some[int(np.argmax(seen))], width_px), 4 * width_px))
+    some = cameras[np.unique(np.linspace(0, len(cameras) - 1, 12).round().astype(int))]
+    seen = [_visible(nodes, _render(gaussians, some[i], 240), 0.1).sum() for i in range(len(some))]
+    return _render(gaussians, _wide(some[int(np.argmax(seen))], width_px), 4 * width_px)
+
+
+def _render(gaussians: Gaussians, camera: Cameras, longest_side_px: int) -> View:
+    camera = camera.resized(longest_side_px)
+    image = render(gaussians, camera)
+    rgb = (np.clip(np.nan_to_num(image.colour[0]), 0, 1) * 255 + 0.5).astype(np.uint8)
+    return View(rgb, image.depth[0], image.alpha[0], image.dominant_id[0], camera)
 
 
 def _draw_objects(draw: ImageDraw.ImageDraw, layer: NodeLayer, view: View, local_distance: float) -> None:
     at, inside = _pixels(layer.positions, view)
-    shown = np.isin(np.arange(len(layer)), visible(layer.positions, view, 0.15)[0])
+    shown = _visible(layer.positions, view, 0.15)
     rows = np.flatnonzero(inside & shown)
     if len(rows) > 1:
         distance, near = cKDTree(layer.positions[rows]).query(layer.positions[rows], k=min(_EDGES + 1, len(rows)))
@@ -87,7 +95,7 @@ def _draw_objects(draw: ImageDraw.ImageDraw, layer: NodeLayer, view: View, local
 
 
 def _draw_landmarks(draw: ImageDraw.ImageDraw, layer: NodeLayer, view: View) -> None:
-    rows = visible(layer.positions, view, 0.05)[0]
+    rows = np.flatnonzero(_visible(layer.positions, view, 0.05))
     rows = rows[np.argsort(-layer.weights[rows], kind="stable")][:_MAX_LANDMARKS]
     at, _ = _pixels(layer.positions, view)
     octaves = max(1, -(-int(layer.types.max() + 1) // 7))
@@ -104,12 +112,14 @@ def _wide(camera: Cameras, width_px: int) -> Cameras:
     return Cameras(camera.T_frame_camera, camera.intrinsics_px * ratio, size, camera.names)
 
 
+def _visible(points: np.ndarray, view: View, tolerance: float) -> np.ndarray:
+    """(N,) bool: on the surface the view sees, to within a share of its depth."""
+    camera = view.camera
+    rows, _ = on_surface(points, camera.T_camera_frame[0], camera.intrinsics_px[0], view.depth, tolerance)
+    return np.isin(np.arange(len(points)), rows)
+
+
 def _pixels(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
     """Pixel positions (N, 2) float and which are ahead of the camera and inside the picture."""
-    T, (fx, fy, cx, cy) = view.camera.T_camera_frame[0], view.camera.intrinsics_px[0]
-    local = points @ T[:3, :3].T + T[:3, 3]
-    ahead = local[:, 2] > 1e-6
-    z = np.where(ahead, local[:, 2], 1.0)
-    at = np.stack([fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy], 1)
-    height, width = view.depth.shape
-    return at, ahead & (at >= 0).all(1) & (at < [width, height]).all(1)
+    at, z = project(points, view.camera.T_camera_frame[0], view.camera.intrinsics_px[0])
+    return at, in_image(at, z, view.camera.sizes_px[0], 1e-6)

@@ -6,6 +6,7 @@ that cloud alone, so the same place gives the same landmarks whatever frame and 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +15,31 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
-_MAX_SPACING_CELLS = 1.4  # points whose 8th neighbour is farther cannot carry an octave
 _BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
 _WINDOW = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)  # 1.2 sigma
+
+
+@dataclass(frozen=True)
+class Params:
+    """How landmarks are found; lengths are metres under the layer's unit.
+
+    Args:
+        cell_m: grid of the finest octave; its blobs have a scale of 1.6 cells.
+        octaves: number of scales, doubling; those finer than the capture's Gaussians are skipped.
+        max_spacing_cells: an octave is skipped where points are typically farther from their 8th neighbour than this.
+        lab_threshold: smallest colour contrast in a and b, L*a*b* units.
+        lightness_factor: the threshold in L is this many times as much.
+        density_threshold: smallest excess of surface over a plane's.
+        max_per_octave: the strongest are kept.
+    """
+
+    cell_m: float = 0.025
+    octaves: int = 4
+    max_spacing_cells: float = 1.4
+    lab_threshold: float = 2.0
+    lightness_factor: float = 1.3
+    density_threshold: float = 0.6
+    max_per_octave: int = 1500
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +62,7 @@ class Blobs:
         return len(self.positions)
 
 
-def find_blobs(
-    points: np.ndarray,
-    lab: np.ndarray,
-    areas: np.ndarray,
-    *,
-    cell_m: float,
-    octaves: int,
-    lab_threshold: float,
-    density_threshold: float,
-    max_per_octave: int,
-) -> Blobs:
+def find_blobs(points: np.ndarray, lab: np.ndarray, areas: np.ndarray, params: Params | None = None) -> Blobs:
     """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
 
     Points are spread over the grid with the surface they stand for as weight, so that neither the grid's place nor how
@@ -60,22 +73,23 @@ def find_blobs(
 
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
-        lab_threshold: smallest response in a and b; in L 1.3 times as much.
-        density_threshold: smallest excess of surface, in planes.
-        max_per_octave: the strongest are kept.
     """
+    params = params or Params()
+    lab_threshold, octaves = params.lab_threshold, params.octaves
     spacing_m = np.sqrt(8 / np.pi * np.median(areas))
-    thresholds = np.array([1.3 * lab_threshold, lab_threshold, lab_threshold, density_threshold])
+    thresholds = np.array(
+        [params.lightness_factor * lab_threshold, lab_threshold, lab_threshold, params.density_threshold]
+    )
     found = [_empty()]
     for octave in range(octaves):
-        size_m = cell_m * 2**octave
-        if spacing_m > _MAX_SPACING_CELLS * size_m:
+        size_m = params.cell_m * 2**octave
+        if spacing_m > params.max_spacing_cells * size_m:
             continue
         parts = [_empty()]
         for channel, negative, cells, ratio in _extrema(points / size_m, lab, areas / size_m**2, thresholds):
             kind = np.full(len(cells), (channel * 2 + negative) * octaves + octave, np.int32)
             parts.append(Blobs(cells * size_m, kind, ratio, np.full(len(cells), _SIGMA_CELLS * size_m)))
-        found.append(_strongest(parts, max_per_octave))
+        found.append(_strongest(parts, params.max_per_octave))
     return _strongest(found)
 
 
@@ -91,7 +105,9 @@ def _strongest(parts: list[Blobs], count: int | None = None) -> Blobs:
     return Blobs(*(c[order] for c in columns))
 
 
-def _extrema(points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray):
+def _extrema(
+    points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray
+) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
     """Yield (channel, negative, positions (n, 3), responses over threshold (n,)); lengths in cells."""
     blocks = np.unique(np.floor(points / _BLOCK_CELLS).astype(np.int64), axis=0)
     for core in blocks * _BLOCK_CELLS:
@@ -122,7 +138,7 @@ def _corners(points: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np
     return (at[..., 0] * shape[1] + at[..., 1]) * shape[2] + at[..., 2], np.where(steps, t, 1 - t).prod(-1)
 
 
-def _responses(mass: np.ndarray, *colour: np.ndarray):
+def _responses(mass: np.ndarray, *colour: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the response of L, a, b and density on a dense block; zero away from the surface."""
     more = _SIGMA_CELLS * np.sqrt(_SURROUND**2 - 1)
     mass_s = _blur(mass, _SIGMA_CELLS)

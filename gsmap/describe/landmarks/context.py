@@ -1,0 +1,139 @@
+"""What surrounds a landmark: colour and occupancy in the rings of an upright cylinder, or in shells without gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.describe.cloud import downsample
+from gsmap.errors import ConfigError
+
+_LAB_CENTRE, _LAB_SPREAD = np.array([55.0, 3.0, 8.0]), np.array([20.0, 10.0, 14.0])
+
+
+@dataclass(frozen=True)
+class Params:
+    """What is told of a landmark's surroundings; lengths are metres under the layer's unit.
+
+    Args:
+        cell_m: the surroundings are thinned to one point per cell of this size.
+        radii_m: outer radii of the cylinder's rings.
+        heights_m: heights between which its levels lie, relative to the landmark.
+        shells_m: outer radii of the spherical shells, where the vertical is unknown.
+        occupancy_weight: of a bin's occupancy in the embedding.
+        colour_weight: of a bin's colour in the embedding.
+    """
+
+    cell_m: float = 0.07
+    radii_m: tuple[float, ...] = (0.2, 0.45, 0.75, 1.1)
+    heights_m: tuple[float, ...] = (-1.1, -0.65, -0.35, -0.12, 0.12, 0.35, 0.65, 1.1)
+    shells_m: tuple[float, ...] = (0.12, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.95, 1.1)
+    occupancy_weight: float = 0.75
+    colour_weight: float = 0.7
+
+    def __post_init__(self) -> None:
+        for name in ("radii_m", "heights_m", "shells_m"):
+            edges = getattr(self, name)
+            if len(edges) < 1 + (name == "heights_m") or any(b <= a for a, b in pairwise(edges)):
+                raise ConfigError(f"{name} must rise from one to the next, got {list(edges)}")
+
+    @property
+    def num_rings(self) -> int:
+        """Bins of the cylinder."""
+        return len(self.radii_m) * (len(self.heights_m) - 1)
+
+    @property
+    def num_shells(self) -> int:
+        """Bins of the shells."""
+        return len(self.shells_m)
+
+
+def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray, params: Params) -> np.ndarray:
+    """Context (M, num_rings, 4) of each position: per ring and height mean L, a, b (standardised) and occupancy.
+
+    Rings do not tell directions apart, so the context is the same however the capture is turned about gravity. A bin's
+    occupancy is the number of occupied cells relative to a surface cutting through it, at most 1.
+
+    Args:
+        positions: (M, 3) levelled frame (z up), metres.
+        points, lab: (N, 3) levelled cloud and its L*a*b*.
+    """
+    radius, height = np.array(params.radii_m), np.array(params.heights_m)
+    levels = len(height) - 1
+    inner = np.concatenate([[0], radius[:-1]])
+    # A vertical wall through the axis crosses a ring twice; a floor fills it. Expect the smaller of the two.
+    wall = 2 * (radius - inner)[:, None] * np.diff(height)[None]
+    floor = np.pi * (radius**2 - inner**2)[:, None] * np.ones(levels)[None]
+
+    def bins(offsets: np.ndarray) -> np.ndarray:
+        ring = np.searchsorted(radius, np.hypot(offsets[:, 0], offsets[:, 1]))
+        level = np.searchsorted(height, offsets[:, 2]) - 1
+        outside = (ring == len(radius)) | (level < 0) | (level == levels)
+        return np.where(outside, -1, ring * levels + level)
+
+    reach = float(np.hypot(radius[-1], np.abs(height).max()))
+    return _context(positions, points, lab, params.cell_m, reach, bins, np.minimum(wall, floor).ravel())
+
+
+def shell_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray, params: Params) -> np.ndarray:
+    """Context (M, num_shells, 4) in spherical shells: the same in any frame, for scenes whose vertical is unknown.
+
+    Args:
+        positions: (M, 3) in any frame, metres.
+        points, lab: (N, 3) the cloud in that frame and its L*a*b*.
+    """
+    radius = np.array(params.shells_m)
+    inner = np.concatenate([[0], radius[:-1]])
+
+    def bins(offsets: np.ndarray) -> np.ndarray:
+        shell = np.searchsorted(radius, np.linalg.norm(offsets, axis=1))
+        return np.where(shell == len(radius), -1, shell)
+
+    return _context(positions, points, lab, params.cell_m, params.shells_m[-1], bins, np.pi * (radius**2 - inner**2))
+
+
+def _context(
+    positions: np.ndarray,
+    points: np.ndarray,
+    lab: np.ndarray,
+    cell_m: float,
+    reach_m: float,
+    bins: Callable[[np.ndarray], np.ndarray],
+    expected_m2: np.ndarray,
+) -> np.ndarray:
+    """Mean colour and occupancy (M, B, 4) per bin of the offsets to all points within reach; bin -1 is left out."""
+    thin, colour = downsample(points, lab, cell_m)
+    values = (colour - _LAB_CENTRE) / _LAB_SPREAD
+    size = len(expected_m2)
+    out = np.zeros((len(positions), size, 4))
+    for row, near in enumerate(cKDTree(thin).query_ball_point(positions, reach_m, return_sorted=False)):
+        near = np.asarray(near, dtype=np.int64)
+        at = bins(thin[near] - positions[row])
+        near, at = near[at >= 0], at[at >= 0]
+        count = np.bincount(at, minlength=size)
+        for c in range(3):
+            out[row, :, c] = np.bincount(at, values[near, c], size) / np.maximum(count, 1)
+        out[row, :, 3] = np.minimum(1, count * cell_m**2 / expected_m2)
+    return out
+
+
+def embed(context: np.ndarray, params: Params) -> np.ndarray:
+    """(M, 4 * bins) unit vectors of contexts (M, bins, 4): occupancy and relative colour.
+
+    Another exposure adds to L and stretches it (gain and gamma in the logarithm of light), another white balance adds
+    to a and b, so each bin's colour is taken relative to the mean of the whole surrounding and divided by its spread.
+    The mean itself is left out: measured, it wins nothing within one light and costs most matches where two captures'
+    white balances differ by a fifth. A bin counts by the root of its occupancy.
+    """
+    occupancy, colour = context[..., 3:], np.clip(context[..., :3], -2.5, 2.5)
+    total = np.maximum(occupancy.sum(1), 1e-6)
+    relative = colour - ((occupancy * colour).sum(1) / total)[:, None]
+    spread = np.sqrt((occupancy * relative**2).sum(1) / total) + 0.15
+    relative *= params.colour_weight * np.sqrt(occupancy) / spread[:, None]
+    own = params.occupancy_weight * occupancy[..., 0]
+    vector: np.ndarray = np.concatenate([own, relative.reshape(len(context), -1)], 1)
+    return vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9)

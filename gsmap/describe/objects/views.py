@@ -1,0 +1,53 @@
+"""What the sampled cameras of a capture see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+
+from gsmap.render import render
+from gsmap.render.rendering import gsplat_available
+from gsmap.types import Cameras, Gaussians
+from gsmap.types.views import View
+
+
+def sample_cameras(cameras: Cameras, count: int) -> Cameras:
+    """``count`` cameras evenly spread over the capture, in its order; all where there are fewer."""
+    if len(cameras) <= count:
+        return cameras
+    return cameras[np.linspace(0, len(cameras) - 1, count).round().astype(int)]
+
+
+def resolved_backend(backend: Literal["auto", "native", "gsplat"]) -> Literal["native", "gsplat"]:
+    """What renders where ``auto`` is asked for: ``gsplat`` or ``native``, which do not give the same bits."""
+    if backend != "auto":
+        return backend
+    return "gsplat" if gsplat_available() else "native"
+
+
+def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, backend: str = "auto") -> Iterator[View]:
+    """Yield a view per camera, each at its own aspect ratio.
+
+    Args:
+        gaussians, cameras: of one frame.
+        backend: as for `gsmap.render.render`.
+    """
+    small = cameras.resized(longest_side_px)
+    for i in range(len(small)):
+        camera = small[i]
+        image = render(gaussians, camera, backend=backend)
+        rgb = (np.clip(np.nan_to_num(image.colour[0]), 0, 1) * 255 + 0.5).astype(np.uint8)
+        yield View(rgb, image.depth[0], image.alpha[0], image.dominant_id[0], camera)
+
+
+def is_blocked(view: View, nearest: float, min_seen: float = 0.2) -> bool:
+    """Whether the camera stands inside something: most of its picture is closer than ``nearest``, or empty.
+
+    Args:
+        nearest: scene units.
+        min_seen: a picture of which a smaller share shows anything is empty.
+    """
+    seen = view.alpha > 0.5
+    return bool(seen.mean() < min_seen or (view.depth[seen] < nearest).mean() > 0.5)

@@ -1,0 +1,86 @@
+"""The check of a model before a map takes it in."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+from gsmap.describe.onnx.file import refuse_external_data
+from gsmap.describe.onnx.session import declared
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.methods import family
+from gsmap.types.model import ModelSpec
+
+PRESETS = {  # mean and standard deviation of rgb in [0, 1]
+    "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),
+    "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
+    "unit": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+}
+
+
+def kinds() -> dict[str, list[Any]]:
+    """Every kind of model that a segmenter or embedder names, and the methods that name it.
+
+    Raises:
+        ConfigError: a method that names models and has no ``probe`` for them.
+    """
+    found: dict[str, list[Any]] = {}
+    for methods in (family("segmenter"), family("embedder")):
+        for name in methods.names():
+            method = methods.get(name)
+            if method.MODELS and not hasattr(method, "probe"):
+                raise ConfigError(
+                    f"{methods.name} {name!r} lacks probe: see the contract in gsmap.methods.{methods.name}"
+                )
+            for kind in method.MODELS:
+                found.setdefault(kind, []).append(method)
+    return found
+
+
+def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Mean and standard deviation of a preset's name or of ``mean=r,g,b;std=r,g,b``.
+
+    Raises:
+        ConfigError: neither, or a standard deviation that is not positive.
+    """
+    if preset in PRESETS:
+        return PRESETS[preset]
+    try:
+        parts = dict(p.split("=", 1) for p in preset.replace(" ", "").split(";"))
+        mean, std = (tuple(float(v) for v in parts.pop(key).split(",")) for key in ("mean", "std"))
+        if len(mean) == len(std) == 3 and min(std) > 0 and max(map(abs, mean + std)) < 1e6 and not parts:
+            return (mean[0], mean[1], mean[2]), (std[0], std[1], std[2])
+    except (KeyError, ValueError):
+        pass
+    raise ConfigError(
+        f"pixel scaling must be {', '.join(PRESETS)} or mean=r,g,b;std=r,g,b with rgb in [0, 1], got {preset!r}"
+    )
+
+
+def check_model(kind: str, path: str | os.PathLike[str], preset: str = "clip") -> ModelSpec:
+    """Check that a file is an ONNX model of a kind, complete in itself, and that the methods that need one can use it.
+
+    Args:
+        kind: one of `kinds`.
+        preset: see `parse_preset`.
+
+    Raises:
+        ConfigError: an unknown kind or preset.
+        NotFoundError: no such file.
+        InputError: not an ONNX model, weights in other files, or what a method's ``probe`` refuses.
+    """
+    known = kinds()
+    if kind not in known:
+        raise ConfigError(f"model kind must be one of {', '.join(sorted(known))}, got {kind!r}")
+    mean, std = parse_preset(preset)
+    path = Path(path)
+    if not path.is_file():
+        raise NotFoundError(f"no model file at {path}")
+    refuse_external_data(path)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    spec = ModelSpec(kind, str(path), sha256, preset, mean, std, *declared(path, sha256))
+    for method in known[kind]:
+        method.probe(spec)
+    return spec

@@ -1,0 +1,75 @@
+"""The contract of an embedder: from masks of a view to feature vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from gsmap.types.model import ModelSpec
+from gsmap.types.views import Mask, SceneContext, View
+
+
+class Embedder(Protocol):
+    """An embedder ready for the views of one scene: vectors whose cosine says how alike two things look.
+
+    Attributes:
+        codebook: (K, F) float32 unit vectors that context histograms are counted over. It depends on the method, its
+            parameters and its model alone, never on the scene, so that histograms of all scenes of all maps compare.
+    """
+
+    codebook: np.ndarray
+
+    def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
+        """Features of the masks of a view.
+
+        Args:
+            view: the render that the masks are parts of.
+            masks: R of them, perhaps none.
+            points: R arrays (n, 3) float64 of the surface points that each mask shows, scene frame and unit.
+
+        Returns:
+            (R, F) float32 unit vectors.
+
+        Raises:
+            InputError: a model does not run on such pictures.
+        """
+        ...
+
+
+class EmbedderMethod(Protocol):
+    """What a module (or object) offers to be an embedder.
+
+    Attributes:
+        Params: frozen dataclass of its settings, each explained under ``Args:``.
+        VERSION: raised whenever its features change for the same masks.
+        MODELS: kinds of the ONNX models that it needs, such as ``("clip",)``; empty where it needs none. ``auto`` takes
+            the first embedder, in alphabetical order, that needs models and has them all.
+        probe: only where ``MODELS`` names any.
+    """
+
+    Params: type[Any]
+    VERSION: int
+    MODELS: tuple[str, ...]
+
+    def make(self, context: SceneContext, params: Any) -> Embedder:
+        """An embedder for one scene; called once per scene, before its first view.
+
+        Args:
+            context: the scene's surface (scene frame and unit), what is up, the metre, and the models, of which those
+                of ``MODELS`` are there.
+            params: of this method's ``Params``.
+
+        Raises:
+            InputError, NotFoundError: a model's file is gone or is not the one that was checked.
+        """
+        ...
+
+    def probe(self, spec: ModelSpec) -> None:
+        """Refuse a model of one of the kinds in ``MODELS`` that cannot do its work; called when it is added to a map.
+
+        Raises:
+            InputError: its inputs and outputs do not fit, or it does not run.
+        """
+        ...

@@ -1,0 +1,63 @@
+"""The contract of a segmenter: from renders of a scene to masks of things."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from gsmap.types.model import ModelSpec
+from gsmap.types.views import Mask, SceneContext, View
+
+
+class Segmenter(Protocol):
+    """A segmenter ready for the views of one scene."""
+
+    def segment(self, view: View) -> list[Mask]:
+        """The masks of a view, in any order; they may overlap.
+
+        Args:
+            view: a render: colour (H, W, 3) uint8, depth (H, W) in scene units.
+
+        Returns:
+            Masks whose ``pixels`` are (H, W) bool and whose ``confidence`` is in [0, 1].
+
+        Raises:
+            InputError: a model does not run on such a picture.
+        """
+        ...
+
+
+class SegmenterMethod(Protocol):
+    """What a module (or object) offers to be a segmenter.
+
+    Attributes:
+        Params: frozen dataclass of its settings, each explained under ``Args:``.
+        VERSION: raised whenever its masks change for the same view.
+        MODELS: kinds of the ONNX models that it needs, such as ``("sam-encoder", "sam-decoder")``; empty where it needs
+            none. ``auto`` takes the first segmenter, in alphabetical order, that needs models and has them all.
+        probe: only where ``MODELS`` names any.
+    """
+
+    Params: type[Any]
+    VERSION: int
+    MODELS: tuple[str, ...]
+
+    def make(self, context: SceneContext, params: Any) -> Segmenter:
+        """A segmenter for one scene; called once per scene, before its first view.
+
+        Args:
+            context: the scene's surface (scene frame and unit), what is up, the metre, and the models, of which those
+                of ``MODELS`` are there.
+            params: of this method's ``Params``.
+
+        Raises:
+            InputError, NotFoundError: a model's file is gone or is not the one that was checked.
+        """
+        ...
+
+    def probe(self, spec: ModelSpec) -> None:
+        """Refuse a model of one of the kinds in ``MODELS`` that cannot do its work; called when it is added to a map.
+
+        Raises:
+            InputError: its inputs and outputs do not fit, or it does not run.
+        """
+        ...

@@ -1,0 +1,85 @@
+"""What is seen of a scene: its surface, renders of it, and parts of those."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.types.cameras import Cameras
+from gsmap.types.model import ModelSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points of a surface.
+
+    Args:
+        points: (N, 3) float64, scene frame and unit.
+        lab: (N, 3) float32 CIE L*a*b* (D65).
+        areas: (N,) the surface each point stands for: a disc that holds its 8 nearest neighbours, divided among them;
+            square scene units.
+        index: (N,) rows of the Gaussians the points are the centres of.
+    """
+
+    points: np.ndarray
+    lab: np.ndarray
+    areas: np.ndarray
+    index: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneContext:
+    """What segmenters and embedders may know of a scene before they see its first view.
+
+    Args:
+        cloud: the surface, with its colours; scene frame and unit.
+        num_gaussians: of the scene; ``cloud.index`` and ``View.dominant_id`` are rows of these.
+        up: (3,) unit vector against gravity, scene frame, or None where it is unknown.
+        unit_m: metres per scene unit to assume.
+        models: checked ONNX models by kind; those that the method names are there.
+    """
+
+    cloud: Cloud
+    num_gaussians: int
+    up: np.ndarray | None
+    unit_m: float
+    models: Mapping[str, ModelSpec] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One render.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32, scene units, 0 where nothing was drawn.
+        alpha: (H, W) float32.
+        dominant_id: (H, W) int32 row of the Gaussian that weighs most, -1 where nothing was drawn.
+        camera: `Cameras` of length 1, of the render's size.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    alpha: np.ndarray
+    dominant_id: np.ndarray
+    camera: Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """A part of a view.
+
+    Args:
+        pixels: (H, W) bool.
+        confidence: how sure the segmenter is of it, in [0, 1].
+        part: masks of one part show one thing in all views, where the segmenter knows; they need not be associated.
+    """
+
+    pixels: np.ndarray
+    confidence: float
+    part: int | None = None
