@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap import render
 from gsmap.errors import ConfigError, InputError
 from gsmap.merge.placed import inside
 from gsmap.methods import MethodParams, RecipeKey, family
@@ -130,7 +131,7 @@ def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
         ConfigError: unknown method, params of another method.
     """
     settings = plain(checked_params(method, params))
-    backend = _render_backend() if merger(method).RENDERS else ""
+    backend = render.backend() if merger(method).RENDERS else ""
     return RecipeKey("merge", method, {"merge": VERSION} | family("merger").version(method), settings, backend)
 
 
@@ -179,9 +180,3 @@ def merge(
         origin=np.asarray(order, dtype=np.int32)[result.origin[keep]],
         num_input=sum(int(inside(scene.gaussians.means, bounds).sum()) for scene in scenes),
     )
-
-
-def _render_backend() -> str:
-    from gsmap.render.rendering import gsplat_available
-
-    return "gsplat" if gsplat_available() else "native"

@@ -11,10 +11,11 @@ import numpy as np
 from gsmap.describe.objects.associate import Node, associate, region
 from gsmap.describe.objects.context import context_histograms
 from gsmap.describe.objects.lift import visible
-from gsmap.describe.objects.views import is_blocked, render_views, resolved_backend, sample_cameras
+from gsmap.describe.objects.views import is_blocked, render_views, sample_cameras
 from gsmap.errors import ConfigError
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import Family, MethodParams, RecipeKey, family
+from gsmap.render import backend
 from gsmap.types import Cameras, Gaussians, NodeLayer
 from gsmap.types.model import ModelSpec
 from gsmap.types.plain import plain
@@ -116,7 +117,7 @@ def resolved(params: Params, models: Mapping[str, ModelSpec]) -> Resolved:
         if asked == "auto" and took == "builtin"
     ]
     return Resolved(
-        replace(params, segmenter=segmenter, embedder=embedder, render_backend=resolved_backend(params.render_backend)),
+        replace(params, segmenter=segmenter, embedder=embedder, render_backend=backend(params.render_backend)),
         {"objects": VERSION, **segmenters.version(segmenter), **embedders.version(embedder)},
         (*segmenters.get(segmenter).MODELS, *embedders.get(embedder).MODELS),
         (f"built-in {' and '.join(fallbacks)}: no models were added for others",) if fallbacks else (),

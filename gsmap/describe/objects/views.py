@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
 
 import numpy as np
 
 from gsmap.render import render
-from gsmap.render.rendering import gsplat_available
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.views import View
 
@@ -18,13 +16,6 @@ def sample_cameras(cameras: Cameras, count: int) -> Cameras:
     if len(cameras) <= count:
         return cameras
     return cameras[np.linspace(0, len(cameras) - 1, count).round().astype(int)]
-
-
-def resolved_backend(backend: Literal["auto", "native", "gsplat"]) -> Literal["native", "gsplat"]:
-    """What renders where ``auto`` is asked for: ``gsplat`` or ``native``, which do not give the same bits."""
-    if backend != "auto":
-        return backend
-    return "gsplat" if gsplat_available() else "native"
 
 
 def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, backend: str = "auto") -> Iterator[View]:

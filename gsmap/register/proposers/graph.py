@@ -120,7 +120,7 @@ def comparable_layers(
         return (guesses or plain) if with_scale else plain
 
     compared = [(a, b) for a in of(target, source) for b in of(source, target)]
-    pairs = [(a, b) for a, b in compared if a.method == b.method and len(a) and len(b)]
+    pairs = [(a, b) for a, b in compared if a.descriptor_id == b.descriptor_id and len(a) and len(b)]
     if not with_scale:
         return pairs
     # Guesses come in fixed steps, so several pairs stand for one relative scale: keep the one with most nodes.
