@@ -10,6 +10,7 @@ from describe_places import room
 from gsmap.describe import Params, describe
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.embedders import builtin as embedder
+from gsmap.describe.gravity import Params as GravityParams
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
 from gsmap.describe.objects.layer import Params as ObjectParams
@@ -40,10 +41,11 @@ def _context() -> SceneContext:
 def _describe() -> dict[str, np.ndarray]:
     """The whole, and the vertical and the metre with and without cameras."""
     gaussians, cameras = room(n=4000)
-    graph = describe("room", gaussians, cameras, Params(object=_FEW), scale_policy="unknown")
+    few = GravityParams(max_normals=500)
+    graph = describe("room", gaussians, cameras, Params(gravity=few, object=_FEW), scale_policy="unknown")
     assert graph.up is not None
     points = surface_cloud(gaussians).points
-    blind = estimate_up(points, None)
+    blind = estimate_up(points, None, few)
     out = {
         "up": graph.up,
         "up_without_cameras": np.zeros(3) if blind is None else blind,

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsmap.describe import Params, recipe_key
 from gsmap.describe.embedders import clip
+from gsmap.describe.objects.layer import Params as ObjectParams
+from gsmap.describe.objects.layer import descriptor_id
 from gsmap.describe.onnx.check import check_model, kinds, parse_preset
 from gsmap.describe.onnx.session import open_session
 from gsmap.describe.segmenters import sam
@@ -94,6 +97,16 @@ def test_normalise_is_per_channel(tmp_path, preset):
         np.testing.assert_allclose(out[..., c], (picture[..., c] - spec.mean[c]) / spec.std[c], rtol=1e-5, atol=1e-6)
     assert parse_preset("clip")[0][0] == pytest.approx(0.48145466)
     assert parse_preset("imagenet")[1][2] == pytest.approx(0.225)
+
+
+def test_the_model_and_its_pixel_scaling_are_in_the_recipe(tmp_path):
+    one, other = networks.image_encoder(tmp_path / "m.onnx"), networks.image_encoder(tmp_path / "n.onnx", side=16)
+    specs = [check_model("clip", path, preset) for path in (one, other) for preset in ("clip", "unit")]
+    params = Params(object=ObjectParams(num_cameras=4))
+    assert len({recipe_key(params, {"clip": spec}).digest for spec in specs}) == 4
+    assert len({descriptor_id(params.object, {"clip": spec}) for spec in specs}) == 4
+    unused = Params(object=ObjectParams(embedder="builtin"))
+    assert len({recipe_key(unused, {"clip": spec}).digest for spec in specs}) == 1
 
 
 def test_crop_is_square_centred_and_keeps_the_mask():
