@@ -62,7 +62,9 @@ def version_of(name: str) -> int:
 def _stages() -> Iterator[Mapping[str, int]]:
     for stage in ("describe", "register", "optimize", "merge"):
         module = importlib.import_module(f"gsmap.{stage}")
-        yield (module.recipe_key(module.Params()) if hasattr(module, "Params") else module.recipe_key()).version
+        if not hasattr(module, "recipe_key"):
+            continue
+        yield (module.recipe_key() if stage == "merge" else module.recipe_key(module.Params())).version
 
 
 def sketch(array: np.ndarray) -> dict[str, Any]:
