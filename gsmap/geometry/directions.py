@@ -11,7 +11,8 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
     k = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    return np.eye(3) + k + k @ k / (1 + z)
+    rotation: np.ndarray = np.eye(3) + k + k @ k / (1 + z)
+    return rotation
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
