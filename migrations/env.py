@@ -5,18 +5,20 @@ To draft a migration after changing `gsmap.store.schema`: ``alembic -x url=sqlit
 `gsmap.store.schema.HEAD`. Revisions are numbered: gsmap compares them to tell older from newer.
 """
 
+from typing import Any
+
 from alembic import context
-from sqlalchemy import create_engine
+from sqlalchemy import Connection, create_engine
 
 from gsmap.store.schema import CHUNK_BOXES, metadata
 
 
-def ours(name, kind, parents):
+def ours(name: str | None, kind: str, parents: Any) -> bool:
     """The R*Tree and its shadow tables are no part of the metadata."""
-    return not (kind == "table" and name.startswith(CHUNK_BOXES))
+    return not (kind == "table" and name is not None and name.startswith(CHUNK_BOXES))
 
 
-def run(connection):
+def run(connection: Connection) -> None:
     context.configure(
         connection=connection,
         target_metadata=metadata,

@@ -110,13 +110,13 @@ def run(task: dict) -> dict:
 
     from gsmap.evaluate.registration import absolute_trajectory_error
     from gsmap.geometry.similarities import Similarities
-    from gsmap.optimize import OptimizeParams, optimize
+    from gsmap.optimize import Params, optimize
 
     world = city(task["scenes"], task["share"], task["seed"])
     optimize(world.ids[:2], [])  # imports are not the solver's time
     begin = time.process_time()
     if task["method"] == "gsmap":
-        answer = optimize(world.ids, world.edges, params=OptimizeParams(marginals=task["marginals"]))
+        answer = optimize(world.ids, world.edges, params=Params(marginals=task["marginals"]))
         seconds = time.process_time() - begin
         rows = world.placed(answer)
         poses = Similarities.stack([answer.poses[s].S_map_scene for s in world.ids])
@@ -144,10 +144,12 @@ def peer(method: str, world):
     import gtsam
 
     from gsmap.geometry.similarities import Similarities
-    from gsmap.optimize.clean import GAUGE_SIGMAS, _from_gtsam, _to_gtsam
+    from gsmap.optimize import Params
     from gsmap.optimize.cycles import vote
+    from gsmap.optimize.gtsam_solve import from_gtsam, gauge_sigmas, to_gtsam
     from gsmap.optimize.measurements import measurements
-    from gsmap.optimize.robust import islands, spread
+    from gsmap.optimize.robust import spanning_tree_init
+    from gsmap.optimize.structure import component_labels
 
     m = measurements(world.ids, world.edges)
     n = m.num_scenes
@@ -156,7 +158,7 @@ def peer(method: str, world):
         used = ~np.array([key in world.wrong_keys for key in m.keys])
     if method == "pcm":
         used = vote(m, 0.999).agree >= 2
-    labels = islands(m, np.flatnonzero(used))
+    labels = component_labels(m, np.flatnonzero(used))
     lead = labels == np.argmax(np.bincount(labels))
     used &= lead[m.targets]
     scenes, rows = np.flatnonzero(lead), np.flatnonzero(used)
@@ -166,22 +168,26 @@ def peer(method: str, world):
         noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(1.0), noise)
     for k in rows.tolist():
         graph.push_back(
-            gtsam.BetweenFactorPose3(int(m.targets[k]), int(m.sources[k]), _to_gtsam(m.measured, k, 6), noise)
+            gtsam.BetweenFactorPose3(int(m.targets[k]), int(m.sources[k]), to_gtsam(m.measured, k, 6), noise)
         )
     anchor = int(scenes[0])
-    graph.push_back(gtsam.PriorFactorPose3(anchor, gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(GAUGE_SIGMAS[:6])))
+    graph.push_back(
+        gtsam.PriorFactorPose3(
+            anchor, gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(gauge_sigmas(Params().gauge)[:6])
+        )
+    )
     if method == "oracle":
         start = gtsam.Values()
         for k in scenes.tolist():
-            start.insert(k, _to_gtsam(world.truth, k, 6))
+            start.insert(k, to_gtsam(world.truth, k, 6))
     elif method in ("lm", "pcm"):
         start = gtsam.InitializePose3.initialize(graph)
     else:
         cost = np.random.default_rng(0).random(len(rows)) + 0.1  # any spanning tree
-        tree = spread(m, rows, cost, Similarities.identity(n))
+        tree = spanning_tree_init(m, rows, cost, Similarities.identity(n))
         start = gtsam.Values()
         for k in scenes.tolist():
-            start.insert(k, _to_gtsam(tree, k, 6))
+            start.insert(k, to_gtsam(tree, k, 6))
     params = gtsam.LevenbergMarquardtParams.CeresDefaults()
     params.setMaxIterations(100)
     if method == "gnc":
@@ -190,7 +196,7 @@ def peer(method: str, world):
         values = gtsam.GncLMOptimizer(graph, start, settings).optimize()
     else:
         values = gtsam.LevenbergMarquardtOptimizer(graph, start, params).optimize()
-    return Similarities.identity(n).replaced(scenes, _from_gtsam(values, scenes, 6)), scenes, used
+    return Similarities.identity(n).replaced(scenes, from_gtsam(values, scenes, 6)), scenes, used
 
 
 def run_place(task: dict) -> dict:
@@ -223,7 +229,7 @@ def run_twins(seeds: int) -> dict:
     """
     from made_worlds import twin_wings, ways_round
 
-    from gsmap.optimize import OptimizeParams, optimize
+    from gsmap.optimize import Params, optimize
 
     row = {"worlds": 0, "folded": 0, "used_wrong": 0, "placed": []}
     for scenes in (150, 300, 1000):
@@ -232,15 +238,15 @@ def run_twins(seeds: int) -> dict:
                 world = twin_wings(scenes, 0.03, seed, door_m)
                 if ways_round(world) < 3:
                     continue
-                answer = optimize(world.ids, world.edges, params=OptimizeParams(marginals=False))
+                answer = optimize(world.ids, world.edges, params=Params(marginals=False))
                 row["worlds"] += 1
                 row["folded"] += world.worst_island_m(answer) > 0.5
                 row["used_wrong"] += any(answer.outcomes[key].use == "used" for key in world.wrong_keys)
                 row["placed"].append(len(world.placed(answer)) / scenes)
     row["placed"] = float(np.mean(row["placed"]))
     print(
-        f"look-alike wings: {row['folded']} of {row['worlds']} worlds have an island off by more than 0.5 m, "
-        f"{row['used_wrong']} use a wrong edge, {row['placed']:.0%} of the scenes lie in the largest island"
+        f"look-alike wings: {row['folded']} of {row['worlds']} worlds have a component off by more than 0.5 m, "
+        f"{row['used_wrong']} use a wrong edge, {row['placed']:.0%} of the scenes lie in the largest component"
     )
     return row
 
@@ -248,13 +254,13 @@ def run_twins(seeds: int) -> dict:
 def run_g2o(task: dict) -> dict:
     from gsmap.formats.g2o import read_graph
     from gsmap.geometry.similarities import Similarities
-    from gsmap.optimize import OptimizeParams, optimize
-    from gsmap.optimize.clean import objective
+    from gsmap.optimize import Params, optimize
+    from gsmap.optimize.gtsam_solve import objective
     from gsmap.optimize.measurements import measurements
 
     graph = read_graph(task["file"])
     begin = time.process_time()
-    answer = optimize(list(graph.poses), graph.edges, params=OptimizeParams(marginals=False))
+    answer = optimize(list(graph.poses), graph.edges, params=Params(marginals=False))
     seconds = time.process_time() - begin
     poses = Similarities.stack([p.S_map_scene for p in answer.poses.values()])
     return {"error": objective(measurements(list(graph.poses), graph.edges), poses), "cpu_s": seconds}

@@ -16,15 +16,17 @@ from gsmap.describe.embedders.builtin import BuiltinEmbedder
 from gsmap.describe.embedders.builtin import Params as EmbedderParams
 from gsmap.describe.objects.context import context_histograms
 from gsmap.describe.objects.layer import Params as ObjectParams
-from gsmap.register import Params, SceneView, dense, propose, register_pair
+from gsmap.methods import MethodParams
+from gsmap.register import Params, SceneView, register_pair
+from gsmap.register.a_contrario import BackgroundModel, agreeing
 from gsmap.register.clique import maximum_clique
 from gsmap.register.consistency import Params as TestParams
 from gsmap.register.consistency import consistency_graph, unpack
 from gsmap.register.correspondences import Correspondences, correspondences
+from gsmap.register.metric import MetricScene
 from gsmap.register.pose import fit_pose
+from gsmap.register.proposers import graph, kiss_matcher
 from gsmap.register.refiners import gicp
-from gsmap.register.significance import Chance, agreeing
-from gsmap.register.surface import Params as SurfaceParams
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 
 FPFH_SIGMA_M = 0.05
@@ -44,7 +46,7 @@ class Capture:
         return self.view.graph
 
     def surface(self):
-        return self.view.surface(1.0, SurfaceParams())
+        return self.view.surface(1.0)
 
     def once(self, key: Any, make: Callable[[], Any]) -> tuple[Any, float]:
         """Something of this capture alone, made once, and the CPU seconds that took."""
@@ -80,13 +82,18 @@ Method = Callable[[Capture, Capture], Answer]
 # --- gsmap ---------------------------------------------------------------------------------------------------------
 
 
-def gsmap(**changes) -> Method:
+def gsmap(kinds: tuple[str, ...] | None = None, **changes) -> Method:
     params = replace(Params(), **changes)
+    if kinds is not None:
+        proposers = MethodParams("proposer").with_params("graph", graph.Params(kinds=kinds))
+        params = replace(params, proposers=proposers)
 
     def run(target: Capture, source: Capture) -> Answer:
         found = register_pair(target.view, source.view, params)
         e = found.evidence
-        note = f"{found.status} {found.method} w={found.num_inliers} " + " ".join(f"{k}={v:.2f}" for k, v in e.items())
+        note = f"{found.status} {found.proposer} w={found.num_inliers} " + " ".join(
+            f"{k}={v:.2f}" for k, v in e.items()
+        )
         pose = found.S_target_source if found.status == "accepted" else None
         return Answer(pose, f"{note} {found.reason}", information=found.information)
 
@@ -113,7 +120,7 @@ def ablation(change: str, kind: str) -> Method:
 
 def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tuple[float, Sim3, int] | None:
     """log10 NFA, pose and number of correspondences it rests on."""
-    params = propose.Params()
+    params = graph.Params()
     if any(kind not in c.graph.layers or not len(c.graph.layers[kind]) for c in (target, source)):
         return None
     a, b = _layer(target, kind, change), _layer(source, kind, change)
@@ -146,7 +153,7 @@ def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tup
         pose = fit_pose(inliers.target, inliers.source).S_target_source
     points = b.positions * unit
     heights = None if m.source_heights is None else points @ ups[1]
-    log_nfa = Chance(a, b, points, m, source_heights=heights).log10_nfa(pose, radius)
+    log_nfa = BackgroundModel(a, b, points, m, source_heights=heights).log10_nfa(pose, radius)
     return log_nfa, Sim3(pose.rotation, pose.translation / unit), len(members)
 
 
@@ -193,10 +200,12 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def kiss_gicp(voxel_m: float) -> Method:
     def run(target: Capture, source: Capture) -> Answer:
-        found = dense.match_surfaces(target.surface(), source.surface(), dense.Params(voxel_m))
-        if found is None:
+        scenes = (MetricScene(capture.view, 1.0, Params()) for capture in (target, source))
+        found = kiss_matcher.propose(*scenes, kiss_matcher.Params(voxel_m))
+        if not found:
             return Answer(None)
-        return Answer(gicp.refine(target.surface(), source.surface(), found[0]), f"inliers={found[1]}", found[1])
+        pose = gicp.refine(target.surface(), source.surface(), found[0].S_target_source)
+        return Answer(pose, f"inliers={found[0].num_inliers}", found[0].num_inliers)
 
     return run
 
@@ -329,6 +338,7 @@ METHODS: dict[str, Method] = {
     "landmarks": gsmap(kinds=("landmarks",), fallback="never"),
     "objects": gsmap(kinds=("objects",), fallback="never"),
     "gicp": gsmap(refiner="gicp"),
+    "icp": gsmap(refiner="icp"),
     "kiss-0.2": kiss_gicp(0.2),
     "kiss-0.1": kiss_gicp(0.1),
     "fpfh-ransac": fpfh_ransac_icp,

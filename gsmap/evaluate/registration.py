@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -90,7 +91,7 @@ def summarise(errors: Sequence[PoseError | None]) -> RegistrationSummary:
     def share(ok: np.ndarray) -> float:
         return float(ok.sum()) / len(errors) if len(errors) else np.nan
 
-    def over(function, values: np.ndarray) -> float:
+    def over(function: Callable[[np.ndarray], Any], values: np.ndarray) -> float:
         return float(function(values)) if len(values) else np.nan
 
     return RegistrationSummary(

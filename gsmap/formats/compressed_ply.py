@@ -54,7 +54,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     )
     colour = _unpack_bytes(rows["packed_color"])
     rgb = colour[:, :3] / np.float32(255)
-    if "min_r" in chunks.dtype.names:
+    if "min_r" in _columns(chunks):
         _require(path, chunks, _COLOUR_BOUNDS, "float32")
         rgb_low, rgb_high = (np.stack([chunks[f"{end}_{c}"] for c in "rgb"], 1) for end in ("min", "max"))
         rgb = _between(rgb, rgb_low, rgb_high)
@@ -104,11 +104,11 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 def _read_sh(path: str | os.PathLike[str], header: ply.Header, n: int) -> np.ndarray:
     rows = ply.read_element(path, header, "sh")
-    names = [f"f_rest_{i}" for i in range(len(rows.dtype.names))]
+    names = [f"f_rest_{i}" for i in range(len(_columns(rows)))]
     if len(names) not in (9, 24, 45):
         raise InputError(f"{path} has {len(names)} f_rest properties; SH degrees 1 to 3 have 9, 24 or 45")
     _require(path, rows, names, "uint8")
-    if len(rows) != n or list(rows.dtype.names) != names:
+    if len(rows) != n or list(_columns(rows)) != names:
         raise InputError(f"{path}: its SH rows ({len(rows)}) do not fit its {n} Gaussians, or are out of order")
     # Bytes stand for the middle of their bin, but the two ends for the ends of the range.
     value = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
@@ -117,8 +117,12 @@ def _read_sh(path: str | os.PathLike[str], header: ply.Header, n: int) -> np.nda
     return value.astype(np.float32)[level]
 
 
+def _columns(rows: np.ndarray) -> tuple[str, ...]:
+    return rows.dtype.names or ()
+
+
 def _require(path: str | os.PathLike[str], rows: np.ndarray, names: list[str], kind: str) -> None:
-    wrong = [n for n in names if n not in rows.dtype.names or rows.dtype[n] != np.dtype(kind)]
+    wrong = [n for n in names if n not in _columns(rows) or rows.dtype[n] != np.dtype(kind)]
     if wrong:
         raise InputError(f"{path} is not a .compressed.ply: {', '.join(wrong)} missing or not {kind}")
 

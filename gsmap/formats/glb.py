@@ -211,7 +211,9 @@ def _node_matrix(path: str | os.PathLike[str], node: dict[str, Any]) -> np.ndarr
     return matrix
 
 
-def _read_primitive(path, gltf: dict[str, Any], binary: np.ndarray, primitive: dict[str, Any], world) -> Gaussians:
+def _read_primitive(
+    path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray, primitive: dict[str, Any], world: np.ndarray
+) -> Gaussians:
     splatting = primitive["extensions"][EXTENSION]
     attributes = primitive["attributes"]
     nested = splatting.get("extensions", {})
@@ -257,7 +259,9 @@ def _read_primitive(path, gltf: dict[str, Any], binary: np.ndarray, primitive: d
         raise InputError(f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}") from error
 
 
-def _accessor(path, gltf: dict[str, Any], binary: np.ndarray, index: int, count: int, width: int) -> np.ndarray:
+def _accessor(
+    path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray, index: int, count: int, width: int
+) -> np.ndarray:
     """(count, width) float32 of one accessor, its place in the file checked before anything is allocated."""
     accessor = gltf["accessors"][index]
     kind, stored = _COMPONENTS.get(accessor["componentType"]), _WIDTHS.get(accessor["type"])

@@ -120,7 +120,7 @@ def write(
             squeeze = zlib.compressobj(wbits=31, level=3)
             file.write(squeeze.compress(struct.pack("<4sIIBBBB", *fields, 0)))
             for stream in streams:
-                file.write(squeeze.compress(stream))
+                file.write(squeeze.compress(stream.data))
             file.write(squeeze.flush())
         else:
             from numcodecs import zstd

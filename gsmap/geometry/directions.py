@@ -11,7 +11,33 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
     k = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    return np.eye(3) + k + k @ k / (1 + z)
+    rotation: np.ndarray = np.eye(3) + k + k @ k / (1 + z)
+    return rotation
+
+
+def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The shortest rotation (3, 3) that takes the direction of ``a`` (3,) to that of the unit vector ``b`` (3,).
+
+    By axis and angle, so that it is a rotation to the last bits near opposite directions too, where `rotation_to_z`
+    is not; the identity where ``a`` has no length.
+    """
+    from scipy.spatial.transform import Rotation
+
+    length = np.linalg.norm(a)
+    if length < 1e-9:
+        return np.eye(3)
+    axis = np.cross(a / length, b)
+    sine, cosine = np.linalg.norm(axis), float(a @ b / length)
+    if sine < 1e-12:
+        if cosine > 0:
+            return np.eye(3)
+        # Half a turn about any axis at right angles.
+        least = int(np.argmin(np.abs(b)))
+        side = np.eye(3)[least] - b[least] * b
+        side /= np.linalg.norm(side)
+        return 2 * np.outer(side, side) - np.eye(3)
+    matrix: np.ndarray = Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
+    return matrix
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:

@@ -34,7 +34,8 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
     xyzw = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
     wxyz = xyzw[:, [3, 0, 1, 2]]
     wxyz *= np.where(wxyz[:, :1] < 0, -1.0, 1.0)
-    return wxyz.reshape(*matrices.shape[:-2], 4)
+    out: np.ndarray = wxyz.reshape(*matrices.shape[:-2], 4)
+    return out
 
 
 def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -71,7 +72,8 @@ def exp_so3(omega: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) of a rotation vector (3,) in radians."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_rotvec(np.asarray(omega, dtype=np.float64)).as_matrix()
+    matrix: np.ndarray = Rotation.from_rotvec(np.asarray(omega, dtype=np.float64)).as_matrix()
+    return matrix
 
 
 def retract(pose: Sim3, xi: np.ndarray) -> Sim3:

@@ -76,8 +76,9 @@ class Similarities:
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Map one point (N, 3) by each similarity."""
-        moved = np.einsum("nij,nj->ni", self.rotations, points) * np.exp(self.log_scales)[:, None]
-        return moved + self.translations
+        moved: np.ndarray = np.einsum("nij,nj->ni", self.rotations, points) * np.exp(self.log_scales)[:, None]
+        moved = moved + self.translations
+        return moved
 
     def orthonormalised(self) -> Similarities:
         """Rotations projected to SO(3): long products drift off it."""
@@ -125,14 +126,16 @@ def rotations_of(omega: np.ndarray) -> np.ndarray:
     a = np.sinc(theta / np.pi)
     b = 0.5 * np.sinc(theta / (2 * np.pi)) ** 2
     k = skew(omega)
-    return np.eye(3) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+    out: np.ndarray = np.eye(3) + a[:, None, None] * k + b[:, None, None] * (k @ k)
+    return out
 
 
 def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
     """Rotation vectors (N, 3) in radians, length at most pi, of rotation matrices (N, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_matrix(np.asarray(matrices, dtype=np.float64).reshape(-1, 3, 3)).as_rotvec()
+    out: np.ndarray = Rotation.from_matrix(np.asarray(matrices, dtype=np.float64).reshape(-1, 3, 3)).as_rotvec()
+    return out
 
 
 def _left_factor(omega: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
@@ -143,4 +146,5 @@ def _left_factor(omega: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
     first = (growth * _NODES * np.sinc(theta * _NODES / np.pi)).sum(1)
     second = (growth * 0.5 * (_NODES * np.sinc(theta * _NODES / (2 * np.pi))) ** 2).sum(1)
     k = skew(omega)
-    return identity[:, None, None] * np.eye(3) + first[:, None, None] * k + second[:, None, None] * (k @ k)
+    out: np.ndarray = identity[:, None, None] * np.eye(3) + first[:, None, None] * k + second[:, None, None] * (k @ k)
+    return out

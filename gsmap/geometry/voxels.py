@@ -38,14 +38,16 @@ def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
 def covariances(gaussians: Gaussians) -> np.ndarray:
     """(N, 3, 3) float64 covariance matrices, in the frame's unit squared."""
     axes = quats_to_matrices(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
-    return axes @ axes.transpose(0, 2, 1)
+    out: np.ndarray = axes @ axes.transpose(0, 2, 1)
+    return out
 
 
 def projected_areas(scales: np.ndarray) -> np.ndarray:
     """(N,) mean area of the shadows of ellipsoids with semi-axes (N, 3): surface / 4 (Cauchy), surface by Thomsen."""
     a, b, c = np.asarray(scales, dtype=np.float64).T
     mean_power = ((a * b) ** _THOMSEN + (a * c) ** _THOMSEN + (b * c) ** _THOMSEN) / 3
-    return np.pi * mean_power ** (1 / _THOMSEN)
+    areas: np.ndarray = np.pi * mean_power ** (1 / _THOMSEN)
+    return areas
 
 
 def optical_depths(gaussians: Gaussians) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
+from gsmap.map.logs import logged
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, Sim3
 from gsmap.types.progress import StageProgress
@@ -77,7 +78,7 @@ class Map(AbstractContextManager["Map"]):
 
     def __init__(self, store: Store, progress: StageProgress | None = None) -> None:
         self.store = store
-        self._progress: StageProgress = progress or (lambda stage, fraction, text: None)
+        self._progress = logged(progress)
         self._run: tuple[str | None, dict[str, Any]] = (None, {})
 
     def __exit__(self, *error: object) -> None:
@@ -346,7 +347,7 @@ class Map(AbstractContextManager["Map"]):
         after: str | None = None,
         tag: str | None = None,
     ) -> list[EdgeRow]:
-        """``gsmap list MAP edges``: all, or those both of whose scenes are as asked, and of one status."""
+        """``gsmap list MAP edges``: all, or those of one status, registered after a date, between scenes as asked."""
         return reports.edge_rows(self.store, component=component, status=status, after=after, tag=tag)
 
     def revision_rows(self) -> list[RevisionRow]:

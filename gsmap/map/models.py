@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 from gsmap.describe.onnx.check import check_model
 from gsmap.store import Store
@@ -21,8 +22,8 @@ def specs(store: Store) -> dict[str, ModelSpec]:
     return {model.kind: _spec(model.options, str(model.path)) for model in store.models.list()}
 
 
-def _spec(options: dict, path: str) -> ModelSpec:
-    def tensors(rows: list[dict]) -> tuple[Tensor, ...]:
+def _spec(options: dict[str, Any], path: str) -> ModelSpec:
+    def tensors(rows: list[dict[str, Any]]) -> tuple[Tensor, ...]:
         return tuple(Tensor(row["name"], tuple(row["shape"]), row["dtype"]) for row in rows)
 
     return ModelSpec(

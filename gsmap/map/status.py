@@ -21,8 +21,8 @@ def status(store: Store, settings: Settings) -> MapStatus:
     graph = store.revisions.get()
     todo: list[TodoRow] = []
 
-    def add(what: str, count: int | None, verb: str, meaning: str) -> None:
-        if count is None or count:
+    def add(what: str, count: int, verb: str, meaning: str) -> None:
+        if count:
             todo.append(TodoRow(what=what, count=count, verb=verb, meaning=meaning))
 
     keys = graph_keys(store, scenes, settings)

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.structure import ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) ->
 
     # Pairs of edges that leave one scene: edge `first` with every later edge of the same scene.
     end = np.searchsorted(low[order], low[order], side="right")
-    first, offset = _ranges(end - np.arange(len(order)) - 1)
+    first, offset = ranges(end - np.arange(len(order)) - 1)
     second = first + 1 + offset
     b, c = high[order][first], high[order][second]
     swap = rank[b] > rank[c]
@@ -90,7 +91,7 @@ def list_triangles(targets: np.ndarray, sources: np.ndarray, num_scenes: int) ->
 
     # The edges that close the pair; several where the two scenes are tied more than once.
     start = np.searchsorted(key, b * num_scenes + c, side="left")
-    pair, offset = _ranges(np.searchsorted(key, b * num_scenes + c, side="right") - start)
+    pair, offset = ranges(np.searchsorted(key, b * num_scenes + c, side="right") - start)
     triangles = np.stack([order[first[pair]], order[start[pair] + offset], order[second[pair]]], axis=1)
     signs = np.where(forward[triangles], 1, -1) * np.array([1, 1, -1])
     return triangles, signs
@@ -119,10 +120,3 @@ def cycle_chi2(edges: Measurements, cycles: np.ndarray, signs: np.ndarray) -> np
         total = step @ total
     residual = total.log()[:, :dim]
     return np.einsum("td,td->t", residual, np.linalg.solve(covariance, residual[:, :, None])[:, :, 0])
-
-
-def _ranges(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row k repeated ``counts[k]`` times, and 0, 1, ... within each row."""
-    rows = np.repeat(np.arange(len(counts)), counts)
-    offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return rows, offsets

@@ -1,19 +1,23 @@
-"""The frame a component is given in: where its anchor scene stays, or where its priors put it."""
+"""The gauge of a component: what its priors leave open of its frame, and the anchor scene that holds it there.
+
+Turning solved components upright, by what their scenes know of gravity, is another matter: `gsmap.optimize.gravity`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.directions import rotation_between
 from gsmap.geometry.similarities import Similarities, exp, rotation_vectors
 from gsmap.geometry.umeyama import umeyama
-from gsmap.optimize.clean import open_gauge
+from gsmap.optimize.params import Gauge
 from gsmap.optimize.priors import UP, PriorTerms
 from gsmap.types import PoseGraph, Sim3
 
 
 def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGraph | None) -> int:
-    """The scene that holds the component's frame: its first one from the largest island it had before.
+    """The scene that holds the component's frame: its first one from the largest component it had before.
 
     Scenes come in the caller's order (oldest first), so a component that swallows another keeps its own frame, and
     re-optimising moves nothing that need not move.
@@ -23,10 +27,33 @@ def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGrap
     known = [s for s in scenes.tolist() if scene_ids[s] in previous.poses]
     if not known:
         return int(scenes[0])
-    islands = [previous.poses[scene_ids[s]].component for s in known]
-    counts = {island: islands.count(island) for island in islands}
-    surviving = min(counts, key=lambda island: (-counts[island], island))
-    return int(known[islands.index(surviving)])
+    components = [previous.poses[scene_ids[s]].component for s in known]
+    counts = {component: components.count(component) for component in components}
+    surviving = min(counts, key=lambda component: (-counts[component], component))
+    return int(known[components.index(surviving)])
+
+
+def open_gauge(
+    poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int, loose: float
+) -> np.ndarray:
+    """(K, dim) directions, as steps of the anchor's scene, in which the whole component moves unseen by its priors.
+
+    All of them (K = dim) without priors; none if the priors fix rotation, position and, in a graph of similarities,
+    scale.
+
+    Args:
+        loose: see `Gauge`.
+    """
+    if not len(priors):
+        return np.eye(dim)
+    start = poses[np.array([anchor])]
+    size = max(1e-9, float(np.ptp(poses.translations[scenes], axis=0).max())) * float(np.exp(-start.log_scales[0]))
+    unit = np.array([1.0] * 3 + [size] * 3 + [1.0])[:dim]
+    _, J = priors.linearised(poses)
+    carry = (poses[priors.scenes].inverse() @ poses[np.full(len(priors), anchor)]).adjoint()
+    moved = (J @ carry)[:, :, :dim] * unit
+    values, vectors = np.linalg.eigh(np.einsum("pij,pik->jk", moved, moved))
+    return vectors[:, values < loose**-2].T / unit
 
 
 def onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3) -> Similarities:
@@ -36,7 +63,9 @@ def onto_anchor(poses: Similarities, scenes: np.ndarray, anchor: int, pose: Sim3
     return poses.replaced(scenes, (move @ poses[scenes]).orthonormalised())
 
 
-def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int) -> Similarities:
+def onto_priors(
+    poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, dim: int, loose: float
+) -> Similarities:
     """Move a component as one to where its priors want it; what they leave open stays as it is.
 
     A closed-form guess from full poses, positions or up directions, then Gauss-Newton over the component's own degrees
@@ -46,7 +75,7 @@ def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: Pr
         return poses
     poses = _guess(poses, scenes, priors, dim)
     for _ in range(20):
-        held = open_gauge(poses, scenes, anchor, priors, dim)
+        held = open_gauge(poses, scenes, anchor, priors, dim, loose)
         r, J = priors.linearised(poses)
         carry = (poses[priors.scenes].inverse() @ poses[np.full(len(priors), anchor)]).adjoint()
         moved = (J @ carry)[:, :, :dim]
@@ -60,12 +89,14 @@ def onto_priors(poses: Similarities, scenes: np.ndarray, anchor: int, priors: Pr
     return poses
 
 
-def far_off(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarray:
+def outlier_priors(poses: Similarities, priors: PriorTerms, length: float, params: Gauge) -> np.ndarray:
     """(P,) bool: priors that stay far off under the one motion of the component that satisfies most of them.
 
-    Far is more than five sigmas, and more than a typical edge's length or ten degrees, so that drift is not mistaken
-    for contradiction. The motions tried are those of single full poses and of triples of positions (at most 200,
-    drawn with a fixed seed).
+    What counts as far is in `Gauge`. The motions tried are those of single full poses and of triples of positions,
+    drawn with a fixed seed.
+
+    Args:
+        length: of a typical edge.
     """
     knows = priors.root_weights > 0
     motions = []
@@ -74,7 +105,7 @@ def far_off(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarra
         motions.append(Sim3(want.rotation, want.translation, have.scale) @ have.inverse())
     placed = np.flatnonzero(knows[:, 3:6].all(1))
     rng = np.random.default_rng(0)
-    for _ in range(200 if len(placed) >= 4 else 0):
+    for _ in range(params.outlier_draws if len(placed) >= 4 else 0):
         three = placed[rng.choice(len(placed), 3, replace=False)]
         try:
             motions.append(umeyama(priors.expected.translations[three], poses.translations[priors.scenes[three]]))
@@ -85,8 +116,10 @@ def far_off(poses: Similarities, priors: PriorTerms, length: float) -> np.ndarra
         moved = Similarities.stack([S] * len(priors)) @ poses[priors.scenes]
         shift = np.linalg.norm(moved.translations - priors.expected.translations, axis=1)
         with np.errstate(divide="ignore"):
-            allowed = np.maximum(length, 5 / priors.root_weights[:, 3:6].min(1))
-            turn = np.maximum(np.radians(10), 5 / priors.root_weights[:, :3].min(1))
+            allowed = np.maximum(length, params.outlier_sigmas / priors.root_weights[:, 3:6].min(1))
+            turn = np.maximum(
+                np.radians(params.outlier_rotation_deg), params.outlier_sigmas / priors.root_weights[:, :3].min(1)
+            )
         angle = np.linalg.norm(rotation_vectors(priors.expected.rotations.transpose(0, 2, 1) @ moved.rotations), axis=1)
         good = (shift < allowed) & (angle < turn)
         # Of motions that satisfy as many, the one that does it better: positions along a line allow two.
@@ -116,7 +149,7 @@ def _guess(poses: Similarities, scenes: np.ndarray, priors: PriorTerms, dim: int
     upright = np.flatnonzero(knows[:, 7:].all(1))
     if len(upright):
         ups = np.einsum("pij,pj->pi", poses.rotations[priors.scenes[upright]], priors.ups[upright])
-        poses = _moved(poses, scenes, Sim3(_turn(ups.mean(0)), np.zeros(3)))
+        poses = _moved(poses, scenes, Sim3(rotation_between(ups.mean(0), UP), np.zeros(3)))
     if len(placed):
         shift = (priors.expected.translations[placed] - poses.translations[rows]).mean(0)
         poses = _moved(poses, scenes, Sim3(np.eye(3), shift))
@@ -126,17 +159,3 @@ def _guess(poses: Similarities, scenes: np.ndarray, priors: PriorTerms, dim: int
 def _moved(poses: Similarities, scenes: np.ndarray, S: Sim3) -> Similarities:
     move = Similarities.stack([S] * len(scenes))
     return poses.replaced(scenes, (move @ poses[scenes]).orthonormalised())
-
-
-def _turn(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes ``up`` to the map's up."""
-    from scipy.spatial.transform import Rotation
-
-    length = np.linalg.norm(up)
-    if length < 1e-9:
-        return np.eye(3)
-    axis = np.cross(up / length, UP)
-    sine, cosine = np.linalg.norm(axis), float(up @ UP / length)
-    if sine < 1e-12:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()

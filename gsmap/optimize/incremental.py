@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,36 +9,18 @@ import numpy as np
 from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.batch import OptimizeParams, State, answer_of, take_in
 from gsmap.optimize.cycles import Vote
-from gsmap.optimize.measurements import measurements
+from gsmap.optimize.fingerprint import fingerprint
+from gsmap.optimize.growing import take_in
+from gsmap.optimize.measurements import Measurements, all_rigid, measurements
+from gsmap.optimize.params import Params
 from gsmap.optimize.priors import PriorTerms
-from gsmap.optimize.robust import Descent, chi_squares, islands
+from gsmap.optimize.recipe import recipe_key
+from gsmap.optimize.report import pose_graph
+from gsmap.optimize.robust import Descent, chi_squares
+from gsmap.optimize.state import State
+from gsmap.optimize.structure import component_labels
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, Prior, ScenePose, Sim3
-
-RING = 2  # hops of surroundings that are looked at; the outermost scenes stay where they are
-
-
-def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = ()) -> int:
-    """64-bit sum over hashes of all measurements: what an answer rests on must be unchanged to be built upon.
-
-    Independent of their order, and that of two sets is the sum of both (modulo 2^64). Meant to notice change, not to
-    resist an attacker.
-    """
-    flat = [(e.S_target_source, e.information, f"{e.target}\0{e.source}", 2 + e.confirmed) for e in edges]
-    flat += [(p.S_map_scene, np.diag(p.sigmas), f"{p.scene}\0{p.up!r}{p.up_sigma_rad!r}", 4) for p in priors]
-    n = len(flat)
-    values = np.empty((n, 64))
-    values[:, :49] = np.array([row[1] for row in flat], dtype=np.float64).reshape(n, 49)
-    values[:, 49:58] = np.array([row[0].rotation for row in flat]).reshape(n, 9)
-    values[:, 58:61] = np.array([row[0].translation for row in flat]).reshape(n, 3)
-    values[:, 61] = [row[0].scale for row in flat]
-    values[:, 62] = [zlib.crc32(row[2].encode()) for row in flat]
-    values[:, 63] = [row[3] for row in flat]
-    factors = np.random.default_rng(0).integers(1, 2**63, 64, dtype=np.uint64) | np.uint64(1)
-    mixed = ((values.view(np.uint64) ^ (values.view(np.uint64) >> np.uint64(29))) * factors).sum(1)
-    mixed = (mixed ^ (mixed >> np.uint64(32))) * factors[0]
-    return int((mixed ^ (mixed >> np.uint64(29))).sum())
 
 
 def place_new(
@@ -47,14 +28,16 @@ def place_new(
     edges: Sequence[Edge],
     priors: Sequence[Prior],
     previous: PoseGraph,
-    params: OptimizeParams,
+    params: Params,
 ) -> PoseGraph | None:
     """The previous answer with the new scenes placed in it, or None where only a full solve will do.
 
-    A full solve is due when scenes or measurements between old scenes changed, when the map grew by ``params.growth``
-    since the last one, or when a new scene ties components together or closes a long loop. Poses placed here are
-    provisional: only the surroundings of a new scene give way to it.
+    A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
+    ``params.growth`` since the last one, or when a new scene ties components together or closes a long loop. Poses
+    placed here are provisional: only the surroundings of a new scene give way to it.
     """
+    if previous.provenance.recipe != recipe_key(params).recipe:
+        return None
     known = set(previous.poses)
     new = [scene for scene in scene_ids if scene not in known]
     solved = previous.provenance.batch_scenes
@@ -85,21 +68,19 @@ def place_new(
     return replace(answer, poses={s: answer.poses[s] for s in scene_ids}, provenance=provenance)
 
 
-def _place(
-    scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, params: OptimizeParams
-) -> PoseGraph | None:
-    near, rim, around = _surroundings(scene, own, taken)
-    m = measurements([*near, scene], around + own, rigid=_all_rigid(previous, own))
+def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, params: Params) -> PoseGraph | None:
+    near, rim, around = _surroundings(scene, own, taken, params.neighbourhood)
+    m = measurements([*near, scene], around + own, rigid=all_rigid([*around, *own], (), previous))
     poses = Similarities.stack([previous.poses[s].S_map_scene for s in near] + [Sim3.identity()])
     accepted = np.r_[np.ones(len(around), dtype=bool), m.confirmed[len(around) :]]
     if m.confirmed[len(around) :].any():
         return None
-    before = islands(m, np.flatnonzero(accepted))
+    before = component_labels(m, np.flatnonzero(accepted))
     nothing = np.zeros(len(m), dtype=np.int64)
     state = State.fresh(m, poses, accepted, PriorTerms.stack((), ()))
     take_in(m, state, params)
     rows = np.flatnonzero(state.accepted)
-    after = islands(m, rows)
+    after = component_labels(m, rows)
     mine = np.flatnonzero(after == after[-1])[:-1]
     if len(np.unique(before[mine])) > 1:
         return None
@@ -108,7 +89,7 @@ def _place(
     covariances = np.zeros((m.num_scenes, 7, 7))
     components = np.array([previous.poses[s].component for s in near] + [component])
     if len(mine):
-        # Joining moved whichever island was smaller; the map keeps its frame.
+        # Joining moved whichever component was smaller; the map keeps its frame.
         first = mine[:1]
         back = poses[first] @ state.poses[first].inverse()
         state.poses = state.poses.replaced(np.array([len(near)]), back @ state.poses[np.array([len(near)])])
@@ -116,15 +97,15 @@ def _place(
         fixed = np.r_[np.array([s in rim for s in near], dtype=bool), False] | (after != after[-1])
         if fixed[mine].all() or not fixed[mine].any():
             fixed[mine] = True
-        descent = Descent(m[rows], fixed)
+        descent = Descent(m[rows], fixed, params.limits.fill_blocks)
         state.poses = descent.fit(state.poses, max_steps=5)
         components[-1] = components[first[0]]
-        covariances[-1] = _covariance(m.dim, len(near), rows, m, state.poses, [previous.poses[s] for s in near])
+        covariances[-1] = _covariance(len(near), rows, m, state.poses, [previous.poses[s] for s in near])
         gate = float(chi2.ppf(params.gate_probability, m.dim))
         bad = chi_squares(m, state.poses) > gate
         if (bad & state.accepted)[: len(around)].any():
             return None
-    local = answer_of(m, state.poses, components, covariances, state, Vote.of(m, nothing), params)
+    local = pose_graph(m, state.poses, components, covariances, state, Vote.of(m, nothing), params)
     own_keys = {(e.target, e.source) for e in own}
     poses_now = dict(previous.poses)
     for k, s in enumerate(near):
@@ -136,7 +117,10 @@ def _place(
     outcomes = dict(previous.outcomes)
     for key, outcome in local.outcomes.items():
         outcomes[key] = outcome if key in own_keys else _updated(previous.outcomes[key], outcome)
-    return replace(previous, poses=poses_now, outcomes=outcomes)
+    notes = previous.notes
+    if params.marginals and len(mine) and all(previous.poses[near[k]].covariance is None for k in mine.tolist()):
+        notes += (f"the covariance of scene {scene} counts from its neighbours, which have none",)
+    return replace(previous, poses=poses_now, outcomes=outcomes, notes=notes)
 
 
 def _updated(old: EdgeOutcome, new: EdgeOutcome) -> EdgeOutcome:
@@ -145,31 +129,21 @@ def _updated(old: EdgeOutcome, new: EdgeOutcome) -> EdgeOutcome:
     return EdgeOutcome("used", residual) if new.use == "used" else replace(old, residual_chi2=residual)
 
 
-def _surroundings(scene: str, own: list[Edge], taken: list[Edge]) -> tuple[list[str], set[str], list[Edge]]:
-    """Scenes within `RING` hops of the new scene's neighbours, the outermost of them, and the edges between them."""
+def _surroundings(scene: str, own: list[Edge], taken: list[Edge], hops: int) -> tuple[list[str], set[str], list[Edge]]:
+    """Scenes within ``hops`` of the new scene's neighbours, the outermost of them, and the edges between them."""
     reached = {e.source if e.target == scene else e.target: 0 for e in own}
-    for hop in range(1, RING + 1):
+    for hop in range(1, hops + 1):
         ring = {b for e in taken for a, b in ((e.target, e.source), (e.source, e.target)) if reached.get(a) == hop - 1}
         for s in sorted(ring):
             reached.setdefault(s, hop)
     near = sorted(reached)
     around = [e for e in taken if e.target in reached and e.source in reached]
-    return near, {s for s in near if reached[s] == RING}, around
+    return near, {s for s in near if reached[s] == hops}, around
 
 
-def _all_rigid(previous: PoseGraph, own: list[Edge]) -> bool | None:
-    if all(e.S_target_source.is_rigid for e in own) and all(p.S_map_scene.is_rigid for p in previous.poses.values()):
-        return None
-    return False
-
-
-def _covariance(
-    dim: int, scene: int, rows: np.ndarray, m: object, poses: Similarities, old: list[ScenePose]
-) -> np.ndarray:
+def _covariance(scene: int, rows: np.ndarray, m: Measurements, poses: Similarities, old: list[ScenePose]) -> np.ndarray:
     """Provisional: that of the best neighbour, carried over, plus that of the new scene's own edges together."""
-    from gsmap.optimize.measurements import Measurements
-
-    assert isinstance(m, Measurements)
+    dim = m.dim
     own = rows[(m.sources[rows] == scene) | (m.targets[rows] == scene)]
     information = np.zeros((dim, dim))
     for k in own.tolist():
@@ -181,9 +155,9 @@ def _covariance(
     out = np.zeros((7, 7))
     out[:dim, :dim] = np.linalg.inv(information)
     neighbours = np.where(m.sources[own] == scene, m.targets[own], m.sources[own])
-    known = [n for n in neighbours.tolist() if old[n].covariance is not None]
+    known = [(n, found) for n in neighbours.tolist() if (found := old[n].covariance) is not None]
     if known:
-        best = min(known, key=lambda n: float(np.trace(old[n].covariance)))
+        best, covariance = min(known, key=lambda item: float(np.trace(item[1])))
         carry = (poses[np.array([scene])].inverse() @ poses[np.array([best])]).adjoint()[0]
-        out += carry @ old[best].covariance @ carry.T
+        out += carry @ covariance @ carry.T
     return out

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
-from gsmap.types import Edge, Prior
+from gsmap.types import Edge, PoseGraph, Prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +109,15 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
         measured,
         np.ascontiguousarray(information),
         np.array([e.confirmed for e in edges], dtype=bool),
+    )
+
+
+def all_rigid(edges: Sequence[Edge], priors: Sequence[Prior], previous: PoseGraph | None) -> bool:
+    """Whether scale can be left out: nothing has one, so six dimensions suffice."""
+    return (
+        all(e.S_target_source.is_rigid for e in edges)
+        and all(p.S_map_scene.is_rigid for p in priors)
+        and (previous is None or all(p.S_map_scene.is_rigid for p in previous.poses.values()))
     )
 
 

@@ -1,40 +1,26 @@
-"""Poses from edges that may be wrong: spread along a tree, chordal relaxation, Gauss-Newton with annealed weights."""
+"""Poses from edges that may be wrong: from a spanning tree, chordal relaxation, graduated non-convexity."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from gsmap.geometry.similarities import Similarities, commutator, exp
 from gsmap.optimize.blocks import BlockSystem
 from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.structure import component_labels, roots
 
 
-def islands(edges: Measurements, rows: np.ndarray) -> np.ndarray:
-    """(N,) island of each scene, tied by the edges at ``rows``; islands are numbered by their first scene."""
-    n = edges.num_scenes
-    graph = sp.coo_matrix((np.ones(len(rows)), (edges.targets[rows], edges.sources[rows])), shape=(n, n))
-    labels = connected_components(graph, directed=False)[1]
-    _, first = np.unique(labels, return_index=True)
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[labels]
-
-
-def roots(labels: np.ndarray) -> np.ndarray:
-    """First scene of each island."""
-    return np.unique(labels, return_index=True)[1]
-
-
-def spread(edges: Measurements, rows: np.ndarray, cost: np.ndarray, poses: Similarities) -> Similarities:
-    """Poses by following the cheapest spanning forest of the edges at ``rows`` from each island's first scene.
+def spanning_tree_init(edges: Measurements, rows: np.ndarray, cost: np.ndarray, poses: Similarities) -> Similarities:
+    """Poses by following the cheapest spanning forest of the edges at ``rows`` from each component's first scene.
 
     Args:
         cost: (len(rows),) positive; a lower one is trusted more.
-        poses: where the first scene of each island stays.
+        poses: where the first scene of each component stays.
     """
     n = edges.num_scenes
     order = np.lexsort((rows, cost))
@@ -52,7 +38,7 @@ def spread(edges: Measurements, rows: np.ndarray, cost: np.ndarray, poses: Simil
     out = Similarities(poses.rotations.copy(), poses.translations.copy(), poses.log_scales.copy())
     depth = np.full(n, -1)
     parent = np.full(n, -1)
-    for root in roots(islands(edges, rows)):
+    for root in roots(component_labels(edges, rows)):
         found, before = breadth_first_order(link, root, directed=False)
         parent[found] = before[found]
         depth[root] = 0
@@ -81,7 +67,7 @@ def chi_squares(edges: Measurements, poses: Similarities) -> np.ndarray:
     return np.einsum("ed,edf,ef->e", r, edges.information, r)
 
 
-def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Similarities:
+def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities, fill_blocks: int) -> Similarities:
     """Least-squares poses without a starting guess; fixed scenes keep theirs.
 
     Rotations by the chordal relaxation (Martinec and Pajdla 2007; Carlone et al. 2015, sec. III-B): solve
@@ -99,7 +85,7 @@ def chordal(edges: Measurements, fixed: np.ndarray, poses: Similarities) -> Simi
     def solve(A: np.ndarray, B: np.ndarray, weight: np.ndarray, r: np.ndarray, known: np.ndarray) -> np.ndarray:
         """x over all scenes, from 0 at the unknown ones and ``known`` at the fixed ones."""
         start = np.where(still[:, None, None], known, 0.0)
-        system = BlockSystem(a, b, still, A.shape[2])
+        system = BlockSystem(a, b, still, A.shape[2], fill_blocks)
         W = weight[:, None, None] * np.eye(A.shape[1])
         return start + system.solve(A, B, W, A @ start[a] + B @ start[b] + r)
 
@@ -128,16 +114,19 @@ class Descent:
     Args:
         edges: what to fit.
         fixed: (N,) scenes that stay where they are.
+        fill_blocks: see `Limits`.
     """
 
     edges: Measurements
     fixed: np.ndarray
+    fill_blocks: int
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def system(self) -> BlockSystem:
         touched = np.zeros(self.edges.num_scenes, dtype=bool)
         touched[self.edges.targets] = touched[self.edges.sources] = True
-        system = BlockSystem(self.edges.targets, self.edges.sources, self.fixed | ~touched, self.edges.dim)
-        object.__setattr__(self, "system", system)
+        still = self.fixed | ~touched
+        return BlockSystem(self.edges.targets, self.edges.sources, still, self.edges.dim, self.fill_blocks)
 
     def step(self, poses: Similarities, weights: np.ndarray, r: np.ndarray) -> np.ndarray:
         """(N, D) Gauss-Newton step from residuals ``r`` and a weight per edge."""
@@ -172,11 +161,13 @@ class Descent:
                 break
         return poses
 
-    def anneal(self, poses: Similarities, gate: float, widest: float, trusted: np.ndarray) -> Similarities:
+    def solve_gnc(
+        self, poses: Similarities, gate: float, widest: float, shrink: float, trusted: np.ndarray
+    ) -> Similarities:
         """Iteratively reweighted least squares with Geman-McClure weights, from wide to the width of the gate.
 
-        ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by 4 (graduated non-convexity, Yang et al.
-        2020, with a start that the vote makes narrow). ``trusted`` edges keep weight 1.
+        ``w = (c / (c + chi2))^2``; c starts at ``widest`` gates and shrinks by ``shrink`` (graduated non-convexity,
+        Yang et al. 2020, with a start that the vote makes narrow). ``trusted`` edges keep weight 1.
         """
         c = gate * max(1.0, widest)
         noise = float(np.sqrt(np.median(np.einsum("eii->ei", self.edges.covariance)[:, :3])))
@@ -192,7 +183,7 @@ class Descent:
                     break
             if c <= gate:
                 return poses
-            c = max(gate, c / 4)
+            c = max(gate, c / shrink)
 
     def _cost(self, poses: Similarities) -> float:
         return float(chi_squares(self.edges, poses).sum())

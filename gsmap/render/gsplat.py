@@ -72,15 +72,17 @@ def render_tensors(
     )
     behind = torch.tensor(background, device=device)
     colour = image[..., :3] + (1 - alpha) * behind
-    ids, weights = None, None
+    ids: torch.Tensor | None = None
+    weights: torch.Tensor | None = None
     if dominant_id or max_weight:
-        ids, weights = _weights(meta, views, height, width, rows, n)
+        found = _weights(meta, views, height, width, rows, n)
+        ids, weights = found[0].to(home) if dominant_id else None, found[1].to(home) if max_weight else None
     return Rendered(
         colour.to(home),
         alpha[..., 0].to(home),
         image[..., 3].to(home) if depth else None,
-        ids.to(home) if dominant_id else None,
-        weights.to(home) if max_weight else None,
+        ids,
+        weights,
     )
 
 
@@ -129,9 +131,8 @@ def _weights(
     weight = (alpha * torch.exp(before - before[start])).float()
     weights.scatter_reduce_(0, rows[gaussian], weight, "amax")
     best = torch.zeros(len(ids), device=ids.device).scatter_reduce_(0, cell, weight, "amax")
-    winner = torch.nonzero(weight == best[cell])[:, 0].flip(
-        0
-    )  # reversed, so that the nearest of equals is written last
+    # Reversed, so that the nearest of equals is written last.
+    winner = torch.nonzero(weight == best[cell])[:, 0].flip(0)
     ids[cell[winner]] = rows[gaussian[winner]].to(torch.int32)
     return ids.reshape(views, height, width), weights
 

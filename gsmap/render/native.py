@@ -36,8 +36,8 @@ def arrays_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
 
 def allocate(
     views: int, height: int, width: int, num_gaussians: int, depth: bool, dominant_id: bool, max_weight: bool
-) -> dict[str, np.ndarray | None]:
-    """Output arrays of `Rendered` by field name."""
+) -> dict[str, Any]:
+    """Output arrays of `Rendered` by field name; None where one is not wanted."""
     shape = (views, height, width)
     return {
         "colour": np.empty((*shape, 3), np.float32),
@@ -54,7 +54,7 @@ def forward(
     T_camera_frame: np.ndarray,
     intrinsics_px: np.ndarray,
     background: np.ndarray,
-    images: dict[str, np.ndarray | None],
+    images: dict[str, Any],
     i: int,
     index: ChunkIndex | None,
 ) -> None:

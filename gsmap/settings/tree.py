@@ -94,7 +94,8 @@ def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
         for name in tree:
             yield name, tree[name], None, ""
         return
-    docs, hints = field_docs(type(tree)), get_type_hints(type(tree))
+    cls: type = type(tree)
+    docs, hints = field_docs(cls), get_type_hints(cls)
     for field in fields(tree):
         if field.init:
             yield field.name, getattr(tree, field.name), hints[field.name], docs.get(field.name, "")

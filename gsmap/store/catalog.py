@@ -167,6 +167,10 @@ def explained(folder: Path) -> Iterator[None]:
             raise StoreError(
                 f"{folder}: the catalog cannot be opened ({said}); check the folder's permissions"
             ) from error
+        if "password" in low:
+            raise StoreError(
+                f"{folder}: the catalog's server wants another password ({said}): give it in PGPASSWORD or ~/.pgpass"
+            ) from error
         if isinstance(error, DBAPIError):
             raise StoreError(f"{folder}: the catalog refused: {said}") from error
         raise

@@ -262,11 +262,14 @@ class Scenes:
             fields = fields | {"name": f"{name}-{number}"}
             number += 1
         fields = fields | {"ingested_at": now(), "removed_at": None}
-        if _by_id(connection, new_id) is None:
+        before = _by_id(connection, new_id)
+        if before is None:
             connection.execute(insert(scenes), fields | {"id": new_id})
         else:
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(**fields))
-        facts.say(connection, new_id, [(kind, fields[kind]) for kind in ("name", "captured_at") if fields[kind]])
+        facts.say(connection, new_id, [("name", fields["name"])])
+        if fields["captured_at"] or (before is not None and before.captured_at):
+            facts.say(connection, new_id, [("captured_at", fields["captured_at"] or "")])
         return _with_tags(connection, _find(connection, new_id))
 
 

@@ -90,7 +90,7 @@ class Store:
                 sync_folder(folder.parent)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
-        return cls.open(path, "w")
+        return cls.open(path, "w", catalog_url=catalog_url)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], mode: str = "w", *, catalog_url: str | None = None) -> Store:

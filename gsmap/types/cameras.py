@@ -64,7 +64,7 @@ class Cameras:
         object.__setattr__(self, "names", names)
 
     def __len__(self) -> int:
-        return self.T_frame_camera.shape[0]
+        return len(self.T_frame_camera)
 
     @property
     def centers(self) -> np.ndarray:

@@ -46,7 +46,7 @@ class Gaussians:
             raise InputError(f"Gaussians.sh must have shape ({n}, K, 3) with K = 1, 4, 9 or 16, got {self.sh.shape}")
 
     def __len__(self) -> int:
-        return self.means.shape[0]
+        return len(self.means)
 
     @property
     def sh_degree(self) -> int:
@@ -56,12 +56,14 @@ class Gaussians:
     def opacities(self) -> np.ndarray:
         """(N,) float32 in [0, 1]."""
         with np.errstate(over="ignore"):
-            return 1.0 / (1.0 + np.exp(-self.logit_opacities))
+            out: np.ndarray = 1.0 / (1.0 + np.exp(-self.logit_opacities))
+        return out
 
     @property
     def scales(self) -> np.ndarray:
         """(N, 3) float32 standard deviations, in the frame's unit."""
-        return np.exp(self.log_scales)
+        out: np.ndarray = np.exp(self.log_scales)
+        return out
 
     @property
     def nbytes(self) -> int:

@@ -86,7 +86,8 @@ class Sim3:
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Map points (..., 3) from frame b to frame a, in float64."""
-        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
+        moved: np.ndarray = self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
+        return moved
 
     @property
     def is_rigid(self) -> bool:

@@ -10,7 +10,7 @@ depends_on = None
 
 # What the types were at this revision, whatever gsmap.store.schema says later.
 JSON = sa.Text()
-REAL = sa.Double().with_variant(sa.REAL(), "sqlite")
+REAL: sa.types.TypeEngine[float] = sa.Double().with_variant(sa.REAL(), "sqlite")
 BYTES = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 LIVING = sa.text("removed_at IS NULL")
 
@@ -233,8 +233,10 @@ def upgrade() -> None:
     if op.get_bind().dialect.name == "sqlite":
         op.execute("CREATE VIRTUAL TABLE chunk_boxes USING rtree(id, s0, s1, x0, x1, y0, y1, z0, z1, +chunk INTEGER)")
     else:
-        sides = [sa.Column(name, sa.Double(), nullable=False) for name in ("x0", "x1", "y0", "y1", "z0", "z1")]
-        scene = [sa.Column(name, sa.Integer, nullable=False) for name in ("s0", "s1", "chunk")]
+        sides: list[sa.Column[float]] = [
+            sa.Column(name, sa.Double(), nullable=False) for name in ("x0", "x1", "y0", "y1", "z0", "z1")
+        ]
+        scene: list[sa.Column[int]] = [sa.Column(name, sa.Integer, nullable=False) for name in ("s0", "s1", "chunk")]
         op.create_table("chunk_boxes", sa.Column("id", sa.Integer, primary_key=True), *scene, *sides)
         op.create_index("ix_chunk_boxes_s0", "chunk_boxes", ["s0"])
 

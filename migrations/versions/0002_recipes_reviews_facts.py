@@ -1,6 +1,8 @@
 """Recipes of results, reviews instead of verdicts, facts of scenes, one row for what became of an edge."""
 
 import json
+from collections.abc import Sequence
+from typing import Any
 
 import sqlalchemy as sa
 from alembic import op
@@ -13,7 +15,7 @@ depends_on = None
 _PROVENANCE = ("method", "batch_scenes", "measured", "contradicted_priors")
 _WITH_RECIPE = ("graphs", "registrations", "revisions", "tiles")
 # Old word, new word: of proposers, of evidence, of layers.
-_PROPOSERS = {"dense": "kiss_matcher"}
+_PROPOSERS = {"landmarks": "graph:landmarks", "objects": "graph:objects", "dense": "kiss_matcher"}
 _EVIDENCE = {"contradiction": "free_space_violation"}
 _LAYERS = {"unlevelled": "landmarks_gravity_free"}
 
@@ -253,14 +255,14 @@ def _move(old: str, old_column: str, new: str, new_column: str) -> None:
         op.execute(f"SELECT setval(pg_get_serial_sequence('{new}', 'number'), COALESCE(({last}), 0) + 1, false)")
 
 
-def _rows(query: str):
+def _rows(query: str) -> Sequence[sa.Row[Any]]:
     return op.get_bind().execute(sa.text(query)).all()
 
 
-def _run(statement: str, rows: list[dict]) -> None:
+def _run(statement: str, rows: list[dict[str, Any]]) -> None:
     if rows:
         op.get_bind().execute(sa.text(statement), rows)
 
 
-def _json(value) -> str:
+def _json(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -146,32 +147,32 @@ def test_only_the_demo_imports_synthetic_scenes() -> None:
 
 
 def test_public_surface() -> None:
-    assert gsmap.__all__ == sorted(
-        [
-            "Cameras",
-            "Edge",
-            "Gaussians",
-            "Map",
-            "NodeLayer",
-            "PoseGraph",
-            "Prior",
-            "Registration",
-            "Scene",
-            "SceneGraph",
-            "ScenePose",
-            "Sim3",
-            "Tile",
-            "__version__",
-            "errors",
-            "map",
-            "open",
-            "read",
-            "render",
-            "write",
-        ]
-    )
-    for name in gsmap.__all__:
+    """What is imported on first use is what type checkers are told of, and everything is there."""
+    tree = ast.parse((PACKAGE / "__init__.py").read_text())
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    told = {
+        (alias.asname, node.module)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname == alias.name  # what makes it public to a strict type checker
+    }
+    listed = {(name, home) for home, names in gsmap._HOME.items() for name in names}
+    assert told == listed | {(room, "gsmap") for room in gsmap._ROOMS}
+    assert {"Map", "Gaussians", "open", "read", "write", "__version__"} <= set(gsmap.__all__)
+    assert set(dir(gsmap)) == set(gsmap.__all__) | set(gsmap._ROOMS)
+    for name in dir(gsmap):
         assert getattr(gsmap, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = gsmap.nothing
+
+
+def test_names_in_the_readme_are_there() -> None:
+    """Every dotted name that the README says is there after ``import gsmap``."""
+    named = set(re.findall(r"`gsmap\.((?:\w+\.)*\w+)`", (PACKAGE.parent / "README.md").read_text()))
+    assert named
+    names = ", ".join(sorted(f"gsmap.{name}" for name in named))
+    subprocess.run([sys.executable, "-c", f"import gsmap; {names}"], check=True, timeout=120)
 
 
 @pytest.mark.parametrize("arguments", [["-P", "-c", "import gsmap"], ["-P", "-m", "gsmap", "--help"]])

@@ -23,27 +23,52 @@ from gsmap.settings import changed, leaves
 GRAPH, EDGE, POSES = "graph", "edge", "poses"
 MERGERS = families()["merger"].names()
 
-ALTERNATIVES = {
+ALTERNATIVES: dict[str, Any] = {
     "describe.object.segmenter": "builtin",
     "describe.object.embedder": "builtin",
+    "describe.object.render_backend": "gsplat",
+    "register.proposer": "kiss_matcher",
+    "register.fallback_proposer": "graph",
     "register.fallback": "always",
+    "register.coarse_refiner": "gicp",
     "register.refiner": "gicp",
-    "register.propose.consistency.test": "ratio",
-    "register.kinds": ("landmarks",),
+    "register.polisher": "photometric",
+    "register.proposers.graph.kinds": ("landmarks",),
+    "register.proposers.graph.consistency.test": "ratio",
 }
 """Another value of a setting that takes only certain words."""
 
 NAMES_NOTHING = ("retrieve.", "export.", "engine.", "merge.method")
 """Settings that choose work (which pairs, which tiles, where it runs), and change no result."""
 
+
+def _chosen_by(plural: str, switch: str, kind: str) -> dict[str, dict[str, Any]]:
+    return {f"{plural}.{name}.": {switch: name} for name in families()[kind].names()}
+
+
 ONLY_IF = {
-    "describe.object.segmenters.builtin.": {"describe.object.segmenter": "builtin"},
-    "describe.object.segmenters.sam.": {"describe.object.segmenter": "sam"},
-    "describe.object.embedders.builtin.": {"describe.object.embedder": "builtin"},
-    "describe.object.embedders.clip.": {"describe.object.embedder": "clip"},
-    **{f"register.refiners.{name}.": {"register.refiner": name} for name in families()["refiner"].names()},
+    **_chosen_by("describe.object.segmenters", "describe.object.segmenter", "segmenter"),
+    **_chosen_by("describe.object.embedders", "describe.object.embedder", "embedder"),
+    **_chosen_by("register.proposers", "register.proposer", "proposer"),
+    **_chosen_by("register.coarse_refiners", "register.coarse_refiner", "refiner"),
+    **_chosen_by("register.refiners", "register.refiner", "refiner"),
 }
-"""What must be chosen for the settings of a method to count; where it is not, they must not."""
+"""What must be chosen for the settings of a method to count; where nothing asks for the method, they must not."""
+
+IDLE = {
+    "describe.object.segmenters": {"describe.objects": False},
+    "describe.object.embedders": {"describe.objects": False},
+    "register.proposers": {"register.fallback": "never"},
+    "register.coarse_refiners": {},
+    "register.refiners": {},
+}
+"""Beside another method, what keeps one from being asked: `colored_icp` stands in where the scale is unknown."""
+
+
+def _modules() -> list[Any]:
+    skip: Callable[[str], bool] = lambda name: name.endswith("__main__") or "_native" in name  # noqa: E731
+    names = [m.name for m in pkgutil.walk_packages(gsmap.__path__, "gsmap.") if not skip(m.name)]
+    return [importlib.import_module(name) for name in names if ".cli" not in name and ".migrations" not in name]
 
 
 def keys(settings: Settings) -> dict[str, str]:
@@ -104,11 +129,17 @@ def test_a_setting_changes_the_keys_of_what_it_influences_and_no_others(name: st
     settings = Settings()
     condition: dict[str, Any] = next((c for prefix, c in ONLY_IF.items() if name.startswith(prefix)), {})
     if condition:
-        other = {k: next(n for n in families()[k.split(".")[-1]].names() if n != v) for k, v in condition.items()}
-        idle = changed(settings, other)
-        leaf = next(leaf for leaf in leaves(idle) if leaf.name == name)
-        assert keys(with_another(idle, name, leaf.value)) == keys(idle), f"{name} counts though it is not chosen"
+        (switch, method), plural = next(iter(condition.items())), ".".join(name.split(".")[:3])
+        plural = next(p for p in IDLE if name.startswith(p + "."))
+        kind = next(f for f in families() if f"{f}s" == plural.split(".")[-1].removeprefix("coarse_"))
+        elsewhere = next((n for n in families()[kind].names() if n != method and n != "none"), None)
+        if elsewhere is not None and method != "colored_icp":
+            idle = changed(settings, {**IDLE[plural], switch: elsewhere})
+            leaf = next(leaf for leaf in leaves(idle) if leaf.name == name)
+            assert keys(with_another(idle, name, leaf.value)) == keys(idle), f"{name} counts though nothing asks for it"
         settings = changed(settings, condition)
+    elif name == "register.scale_refiner":
+        pytest.skip("only one built-in refiner can refine the scale")
     leaf = next(leaf for leaf in leaves(settings) if leaf.name == name)
     before, after = keys(settings), keys(with_another(settings, name, leaf.value))
     assert {kind for kind in before if before[kind] != after[kind]} == expected(name)
@@ -149,6 +180,7 @@ def test_a_version_changes_a_key(module: str, monkeypatch: pytest.MonkeyPatch) -
     def all_keys() -> list[dict[str, str]]:
         chosen: list[dict[str, Any]] = [{}]
         chosen += [{"register.refiner": name} for name in families()["refiner"].names()]
+        chosen += [{"register.proposer": name} for name in families()["proposer"].names()]
         chosen += [{"describe.object.segmenter": name} for name in families()["segmenter"].names()]
         chosen += [{"describe.object.embedder": name} for name in families()["embedder"].names()]
         return [keys(changed(Settings(), values)) for values in chosen]
@@ -170,12 +202,6 @@ def test_inputs_and_backend_count() -> None:
     assert key.of("a").digest != key.of("b").digest
     assert key.of("a").recipe == key.of("b").recipe
     assert replace(key, backend="gsplat").digest != key.digest
-
-
-def _modules() -> list[Any]:
-    skip: Callable[[str], bool] = lambda name: name.endswith("__main__") or "_native" in name  # noqa: E731
-    names = [m.name for m in pkgutil.walk_packages(gsmap.__path__, "gsmap.") if not skip(m.name)]
-    return [importlib.import_module(name) for name in names if ".cli" not in name and ".migrations" not in name]
 
 
 def _nodes(tree: Any) -> Iterator[Any]:

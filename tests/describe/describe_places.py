@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.types import Cameras, Gaussians, Sim3
 
 
@@ -26,7 +27,7 @@ def room(seed: int = 0, n: int = 30000, patches: int = 120) -> tuple[Gaussians, 
     centres[np.arange(patches), on] = texture.integers(0, 2, patches) * size[on]
     distance, index = cKDTree(centres).query(points)
     rgb = 0.5 + colours[index] * (distance < 0.12)[:, None]
-    dc = (rgb - 0.5) / 0.28209479177387814
+    dc = sh0_of_rgb(rgb)
     m = len(points)
     gaussians = Gaussians(
         points, np.tile([1.0, 0, 0, 0], (m, 1)), np.full((m, 3), np.log(0.02)), np.full(m, 3.0), dc[:, None]

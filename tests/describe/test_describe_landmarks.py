@@ -8,15 +8,17 @@ from describe_places import moved, room
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gsmap.describe import DescribeParams, describe
+from gsmap.describe import Params, describe
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
-from gsmap.describe.landmark_layer import LandmarkParams, landmark_layer, landmark_method
+from gsmap.describe.landmarks import layer as landmarks
+from gsmap.describe.landmarks.layer import landmark_layer
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
+from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.register.correspondences import correspondences
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
 
-LANDMARKS = DescribeParams(objects=False)
+LANDMARKS = Params(objects=False)
 
 
 def counterparts(a: NodeLayer, b: NodeLayer, S_a_b: Sim3, within: float) -> float:
@@ -62,8 +64,8 @@ def test_another_white_balance_leaves_landmarks_alike():
     layers = []
     for seed, light in ((1, [1.3, 1.0, 0.7]), (2, [0.75, 1.0, 1.25])):
         g, cameras = room(seed)
-        rgb = np.clip(0.5 + 0.28209479177387814 * g.sh, 0, 1)
-        lit = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, (light * rgb - 0.5) / 0.28209479177387814)
+        rgb = np.clip(rgb_of_sh0(g.sh), 0, 1)
+        lit = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, sh0_of_rgb(light * rgb))
         layers.append(describe("room", lit, cameras, LANDMARKS, scale_policy="known").layers["landmarks"])
     found = correspondences(*layers)
     right = np.linalg.norm(found.target - found.source, axis=1) < 0.1
@@ -96,13 +98,13 @@ def test_a_scene_that_knows_up_still_matches_one_that_does_not():
     R = Rotation.random(random_state=5).as_matrix()
     turned, _ = moved(*room(2), Sim3(R, np.zeros(3)))
     other = landmark_layer(surface_cloud(turned), None, 1.0)
-    assert other.method != graph.layers["landmarks"].method
-    assert other.method == graph.layers["unlevelled"].method
-    found = correspondences(graph.layers["unlevelled"], other)
+    assert other.descriptor_id != graph.layers["landmarks"].descriptor_id
+    assert other.descriptor_id == graph.layers["landmarks_gravity_free"].descriptor_id
+    found = correspondences(graph.layers["landmarks_gravity_free"], other)
     right = np.linalg.norm(found.target @ R.T - found.source, axis=1) < 0.1
     assert right.sum() > 60
     unknown = describe("upright", *room(1), LANDMARKS, scale_policy="unknown")
-    assert unknown.layers["unlevelled:1"].unit_m == unknown.layers["landmarks:1"].unit_m
+    assert unknown.layers["landmarks_gravity_free:1"].unit_m == unknown.layers["landmarks:1"].unit_m
 
 
 def test_any_two_units_have_a_pair_of_levels_within_20_percent():
@@ -143,7 +145,7 @@ def test_a_ball_without_cameras_has_no_up_and_says_so():
     one, two = (describe("x", g, None, LANDMARKS, scale_policy="known").layers["landmarks"] for g in (ball, turned))
     assert len(one) > 20
     assert counterparts(one, two, S.inverse(), 0.1) > 0.7
-    assert one.method != landmark_method(LandmarkParams())
+    assert one.descriptor_id != landmarks.descriptor_id(landmarks.Params())
 
 
 @pytest.mark.parametrize("shape", ["line", "point", "two points", "plane", "far away"])

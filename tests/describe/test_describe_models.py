@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsmap.describe import Params, recipe_key
 from gsmap.describe.embedders import clip
-from gsmap.describe.models import check_model, open_session, parse_preset
-from gsmap.describe.segmenters import Mask, sam
-from gsmap.describe.views import View
+from gsmap.describe.objects.layer import Params as ObjectParams
+from gsmap.describe.objects.layer import descriptor_id
+from gsmap.describe.onnx.check import check_model, kinds, parse_preset
+from gsmap.describe.onnx.session import open_session
+from gsmap.describe.segmenters import sam
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.types import Cameras
+from gsmap.types.views import Mask, View
 
 networks = pytest.importorskip("describe_networks", reason="needs the onnx package")
 
@@ -95,6 +99,16 @@ def test_normalise_is_per_channel(tmp_path, preset):
     assert parse_preset("imagenet")[1][2] == pytest.approx(0.225)
 
 
+def test_the_model_and_its_pixel_scaling_are_in_the_recipe(tmp_path):
+    one, other = networks.image_encoder(tmp_path / "m.onnx"), networks.image_encoder(tmp_path / "n.onnx", side=16)
+    specs = [check_model("clip", path, preset) for path in (one, other) for preset in ("clip", "unit")]
+    params = Params(object=ObjectParams(num_cameras=4))
+    assert len({recipe_key(params, {"clip": spec}).digest for spec in specs}) == 4
+    assert len({descriptor_id(params.object, {"clip": spec}) for spec in specs}) == 4
+    unused = Params(object=ObjectParams(embedder="builtin"))
+    assert len({recipe_key(unused, {"clip": spec}).digest for spec in specs}) == 1
+
+
 def test_crop_is_square_centred_and_keeps_the_mask():
     rgb = np.zeros((40, 60, 3), np.uint8)
     pixels = np.zeros((40, 60), bool)
@@ -146,6 +160,14 @@ def test_noise_never_escapes_the_error_tree(tmp_path):
             check_model("clip", path)
         except GsmapError as error:
             assert "\n" not in str(error)  # noqa: PT017
+
+
+def test_kinds_are_those_that_methods_name():
+    assert {kind: [m.__name__.split(".")[-1] for m in methods] for kind, methods in kinds().items()} == {
+        "sam-encoder": ["sam"],
+        "sam-decoder": ["sam"],
+        "clip": ["clip"],
+    }
 
 
 def test_weights_in_other_files_are_refused(tmp_path):

@@ -6,19 +6,27 @@ import pytest
 from describe_places import moved, room
 from scipy.spatial.transform import Rotation
 
-from gsmap.describe import DescribeParams, describe, methods
-from gsmap.describe.associate import associate, giou, region
-from gsmap.describe.context import context_histograms, neighbourhood, random_codebook
-from gsmap.describe.lift import visible
-from gsmap.describe.models import check_model
-from gsmap.describe.object_layer import ObjectParams
-from gsmap.describe.picture import draw_graph
+from gsmap.describe import Params, describe, embedders, recipe_key
+from gsmap.describe.embedders._codebook import random_codebook
+from gsmap.describe.embedders.builtin import BuiltinEmbedder
+from gsmap.describe.embedders.builtin import Params as EmbedderParams
+from gsmap.describe.landmarks import layer as landmarks
+from gsmap.describe.landmarks.layer import Params as LandmarkParams
+from gsmap.describe.objects.associate import associate, giou, region
+from gsmap.describe.objects.context import context_histograms, neighbourhood
+from gsmap.describe.objects.layer import Params as ObjectParams
+from gsmap.describe.objects.layer import descriptor_id
+from gsmap.describe.objects.lift import visible
+from gsmap.describe.objects.views import sample_cameras
+from gsmap.describe.onnx.check import check_model
 from gsmap.describe.segmenters.builtin import felzenszwalb
-from gsmap.describe.views import View, sample_cameras
-from gsmap.errors import ConfigError, NotFoundError
+from gsmap.errors import ConfigError
+from gsmap.geometry.sh import sh0_of_rgb
+from gsmap.settings import changed, leaves
 from gsmap.types import Cameras, Sim3
+from gsmap.types.views import View
 
-OBJECTS = DescribeParams(landmarks=False, object=ObjectParams(num_cameras=16))
+OBJECTS = Params(landmarks=False, object=ObjectParams(num_cameras=16))
 
 
 def box(low, high) -> np.ndarray:
@@ -103,13 +111,127 @@ def test_felzenszwalb_cuts_at_the_heavy_edge():
     assert len(set(felzenszwalb(10, a, b, weight, 1.0, 6))) == 1
 
 
+def small(**changed) -> Params:
+    """Objects of a few small views."""
+    return Params(landmarks=False, object=ObjectParams(num_cameras=6, longest_side_px=160, **changed))
+
+
+def test_embeddings_hold_the_feature_and_the_context_of_the_neighbours_within_hops():
+    gaussians, cameras = room(n=6000)
+    for hops, weight in ((1, 0.5), (3, 1.5)):
+        params = small(hops=hops, context_weight=weight, local_distance_m=1.0)
+        layer = describe("room", gaussians, cameras, params, scale_policy="known").layers["objects"]
+        words = BuiltinEmbedder(EmbedderParams(), None, 1.0).codebook
+        apart = np.linalg.norm(layer.positions[:, None] - layer.positions[None], axis=2)
+        graph = nx.Graph((i, j) for i, j in np.argwhere((apart < 1.0) & (apart > 0)))
+        assert 5 < len(graph) <= len(layer)
+        length = layer.features.shape[1]
+        for i in range(len(layer)):
+            near = set(nx.single_source_shortest_path_length(graph, i, hops)) - {i} if i in graph else set()
+            share = np.exp(20.0 * layer.features[sorted(near)].astype(float) @ words.T)
+            counted = (share / share.sum(1, keepdims=True)).sum(0)
+            context = np.sqrt(counted / max(counted.sum(), 1e-12))
+            both = np.concatenate([layer.features[i], weight * context])
+            np.testing.assert_allclose(layer.embeddings[i], both / np.linalg.norm(both), atol=1e-5)
+            assert bool(layer.embeddings[i, length:].any()) == bool(near)
+
+
+def test_masks_of_low_confidence_make_no_objects():
+    gaussians, cameras = room(n=6000)
+
+    def layer(c_mask: float):
+        return describe("room", gaussians, cameras, small(c_mask=c_mask), scale_policy="known").layers["objects"]
+
+    every, sure = layer(0.0), layer(0.9)
+    assert every.weights.min() < 0.8
+    assert 0 < len(sure) < len(every)
+    assert sure.weights.min() >= 0.9
+    assert len(layer(1.01)) == 0
+
+
+def test_auto_falls_back_to_the_built_in_ones_and_says_so():
+    gaussians, cameras = room(n=2000)
+    fallen = describe("room", gaussians, cameras, small())
+    assert "built-in segmenter and embedder: no models were added for others" in fallen.notes
+    asked = describe("room", gaussians, cameras, small(segmenter="builtin", embedder="builtin"))
+    assert not any("built-in" in note for note in asked.notes)
+    assert recipe_key(small()).digest == recipe_key(small(segmenter="builtin", embedder="builtin")).digest
+    assert recipe_key(small()).backend in ("native", "gsplat")
+
+
+FLAT = """
+from dataclasses import dataclass
+import numpy as np
+
+VERSION = 5
+MODELS = ()
+
+@dataclass(frozen=True)
+class Params:
+    dim: int = 4
+
+def make(context, params):
+    return Flat(params.dim)
+
+class Flat:
+    def __init__(self, dim):
+        self.codebook = np.eye(dim, dtype=np.float32)
+
+    def embed(self, view, masks, points):
+        return np.tile(self.codebook[:1], (len(masks), 1))
+"""
+
+
+def test_an_embedder_is_one_file(tmp_path, monkeypatch):
+    (tmp_path / "flat.py").write_text(FLAT)
+    monkeypatch.setattr(embedders.__spec__, "submodule_search_locations", [*embedders.__path__, str(tmp_path)])
+    monkeypatch.setattr(embedders, "__path__", [*embedders.__path__, str(tmp_path)])
+    params = changed(small(embedder="flat"), {"object.embedders.flat.dim": 6})
+    layer = describe("room", *room(n=6000), params, scale_policy="known").layers["objects"]
+    assert len(layer) > 0
+    assert layer.features.shape[1] == 6
+    assert layer.embeddings.shape[1] == 12
+    key = recipe_key(params)
+    assert key.version["embedder.flat"] == 5
+    assert key.settings["object"]["embedders"] == {"flat": {"dim": 6}}
+
+
+def test_every_parameter_is_explained_and_in_the_key_of_what_it_changes():
+    explicit = Params(object=ObjectParams(segmenter="builtin", embedder="builtin"))
+    base = recipe_key(explicit).digest
+    other = {bool: lambda v: not v, int: lambda v: v + 1, float: lambda v: v * 1.01 + 1e-3}
+    other[tuple] = lambda v: tuple(x * 1.01 for x in v)
+    for leaf in leaves(explicit):
+        assert leaf.meaning, leaf.name
+        if isinstance(leaf.value, str):
+            continue  # names of methods: see the tests above
+        key = recipe_key(changed(explicit, {leaf.name: other[type(leaf.value)](leaf.value)})).digest
+        unused = any(part in leaf.name for part in ("segmenters.sam", "embedders.clip"))
+        assert (key == base) == unused, leaf.name
+
+
+def test_how_much_is_kept_does_not_keep_layers_from_being_compared():
+    base, more = ObjectParams(), ObjectParams(num_cameras=96, c_mask=0.4)
+    assert descriptor_id(base, {}) == descriptor_id(more, {})
+    assert descriptor_id(base, {}) != descriptor_id(ObjectParams(hops=2), {})
+    many = changed(LandmarkParams(), {"detect.max_per_octave": 9})
+    wide = changed(LandmarkParams(), {"context.radii_m": [0.5, 1.0]})
+    ids = [landmarks.descriptor_id(p) for p in (LandmarkParams(), many, wide)]
+    assert ids[0] == ids[1] != ids[2]
+
+
+def test_rings_that_do_not_rise_are_refused():
+    with pytest.raises(ConfigError, match="radii_m must rise"):
+        changed(LandmarkParams(), {"context.radii_m": [1.0, 0.5]})
+
+
 def test_objects_sit_on_the_furniture_and_follow_the_scene():
     gaussians, cameras = room()
     green, red = [-0.4, 0.3, -0.4], [0.4, -0.4, -0.4]
     rgb = np.zeros_like(gaussians.means)
     n = len(gaussians) - 2 * 3000
     rgb[n : n + 3000], rgb[n + 3000 :] = green, red
-    sh = (rgb / 0.28209479177387814)[:, None]
+    sh = sh0_of_rgb(rgb + 0.5)[:, None]
     gaussians = type(gaussians)(
         gaussians.means, gaussians.quats, gaussians.log_scales + 0.7, gaussians.logit_opacities, sh
     )
@@ -144,7 +266,7 @@ def test_no_cameras_no_objects_but_a_note():
 
 @pytest.mark.parametrize("name", ["segmenter", "embedder"])
 def test_back_ends_that_do_not_exist_are_refused(name):
-    params = DescribeParams(landmarks=False, object=ObjectParams(**{name: "magic"}))
+    params = Params(landmarks=False, object=ObjectParams(**{name: "magic"}))
     with pytest.raises(ConfigError, match="magic"):
         describe("x", *room(n=500), params)
 
@@ -152,39 +274,28 @@ def test_back_ends_that_do_not_exist_are_refused(name):
 @pytest.mark.parametrize("name", ["sam", "clip"])
 def test_back_ends_without_their_model_say_what_to_add(name):
     kind = {"sam": "segmenter", "clip": "embedder"}[name]
-    params = DescribeParams(landmarks=False, object=ObjectParams(**{kind: name}))
+    params = Params(landmarks=False, object=ObjectParams(**{kind: name}))
     with pytest.raises(ConfigError, match="gsmap models add"):
         describe("x", *room(n=500), params)
 
 
-def test_methods_change_with_parameters_and_name_the_layers():
-    base = methods()
-    assert set(base) == {"landmarks", "objects"}
-    assert methods() == base
-    other = methods(DescribeParams(object=ObjectParams(tau_asso=1.2)))
-    assert other["landmarks"] == base["landmarks"]
-    assert other["objects"] != base["objects"]
+def test_recipes_change_with_parameters_and_name_what_is_comparable():
+    base = recipe_key()
+    assert (base.stage, base.method) == ("describe", "graph")
+    assert set(base.settings["layers"]) == {"landmarks", "objects"}
+    assert recipe_key().digest == base.digest
+    other = recipe_key(Params(object=ObjectParams(tau_asso=1.2)))
+    assert other.settings["landmark"] == base.settings["landmark"]
+    assert other.settings["object"] != base.settings["object"]
+    assert other.digest != base.digest
     graph = describe("x", *room(n=3000), OBJECTS)
-    assert graph.layers["objects"].method == methods(OBJECTS)["objects"]
+    assert graph.layers["objects"].descriptor_id == descriptor_id(OBJECTS.object, {})
 
 
 def test_sampled_cameras_are_spread():
     cameras = room()[1]
     assert sample_cameras(cameras, 5).names == ("0", "6", "12", "17", "23")
     assert len(sample_cameras(cameras, 100)) == 24
-
-
-def test_a_picture_of_the_graph_shows_it():
-    gaussians, cameras = room(n=15000)
-    graph = describe("one", gaussians, cameras, scale_policy="known")
-    with_graph = draw_graph(gaussians, cameras, graph, camera="3", width_px=320)
-    assert with_graph.shape == (240, 320, 3)
-    assert with_graph.dtype == np.uint8
-    empty = draw_graph(gaussians, cameras, type(graph)("one"), camera="3", width_px=320)
-    assert (with_graph != empty).any(2).mean() > 0.002
-    assert draw_graph(gaussians, cameras, graph).shape == (720, 960, 3)
-    with pytest.raises(NotFoundError, match="no camera"):
-        draw_graph(gaussians, cameras, graph, camera="attic")
 
 
 def test_models_that_are_given_are_used(tmp_path):
@@ -194,13 +305,14 @@ def test_models_that_are_given_are_used(tmp_path):
         "sam-decoder": check_model("sam-decoder", networks.sam_decoder(tmp_path / "d.onnx")),
         "clip": check_model("clip", networks.image_encoder(tmp_path / "c.onnx"), "unit"),
     }
-    params = DescribeParams(landmarks=False, object=ObjectParams(num_cameras=4, min_views=1))
+    params = Params(landmarks=False, object=ObjectParams(num_cameras=4, min_views=1))
     gaussians, cameras = room(n=15000)
     graph = describe("models", gaussians, cameras, params, models)
     layer = graph.layers["objects"]
     assert len(layer) > 0
     assert layer.features.shape[1] == 3
-    assert layer.method == methods(params, models)["objects"]
-    assert (
-        len({methods(params, {})["objects"], layer.method, methods(params, {"clip": models["clip"]})["objects"]}) == 3
-    )
+    assert not any("built-in" in note for note in graph.notes)
+    assert layer.descriptor_id == descriptor_id(params.object, models)
+    only = {"clip": models["clip"]}
+    assert len({descriptor_id(params.object, {}), layer.descriptor_id, descriptor_id(params.object, only)}) == 3
+    assert len({recipe_key(params, given).digest for given in ({}, models, only)}) == 3

@@ -232,7 +232,7 @@ def test_a_merger_of_another_package_merges_exports_and_has_settings(added, row)
     first = row.export(merging)
     assert first.tiles[0].recipe["version"] == {"merge": 1, "merger.most_opaque": 1}
     assert first.tiles[0].recipe["settings"] == {"cell_m": 0.05, "rounds": 0}
-    assert "centroids at [[0.0, 0.5, 0.5]]" in first.tiles[0].notes[0]
+    assert "centroids at [[0.0, 0.5, 0.5]" in first.tiles[0].notes[0]
     assert row.export(merging).recomputed == 0
     assert row.export(changed(merging, {f"mergers.{added}.rounds": 1})).recomputed == len(first.tiles)
     assert with_steps(added, None, 2).rounds == 2

@@ -3,7 +3,9 @@ import pytest
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.merge import PlacedScene, default_params, merge, methods
-from gsmap.types import Gaussians
+from gsmap.merge.placed import inside
+from gsmap.merge.tile import LazyScene, merge_tile
+from gsmap.types import Cameras, Gaussians, Sim3
 
 
 def cloud(seed, n=3000, low=(-1, -1, -1), high=(1, 1, 1)):
@@ -106,3 +108,38 @@ def test_bad_input_is_refused_in_words():
 def test_a_tile_without_anything_in_it_is_empty():
     result = merge([PlacedScene(cloud(0))], "voxel", bounds=np.array([[50, 50, 50], [51, 51, 51]]))
     assert len(result.gaussians) == len(result.origin) == result.num_input == 0
+
+
+def lazy(gaussians, scene_id, asked=None, cameras=None):
+    """A scene that reads no more than it is asked for, and notes what that was."""
+
+    def load(box):
+        if asked is not None:
+            asked.append(box)
+        return gaussians if box is None else gaussians[inside(gaussians.means, box)]
+
+    return LazyScene(scene_id, Sim3(np.eye(3), [1.0, 0, 0]), load, cameras)
+
+
+def test_distance_read_piece_by_piece_knows_the_centroid_of_the_whole_capture():
+    a, b = cloud(0), cloud(1, low=(0, -1, -1), high=(3, 1, 1))
+    whole = merge_tile([lazy(a, "a"), lazy(b, "b")], "distance")
+    boxes = [np.array([[-9, -9, -9], [1.4, 9, 9]]), np.array([[1.4, -9, -9], [2.3, 9, 9]])]
+    boxes.append(np.array([[2.3, -9, -9], [9, 9, 9]]))
+    tiles = [merge_tile([lazy(a, "a"), lazy(b, "b")], "distance", bounds=box).gaussians for box in boxes]
+    assert 0 < len(whole.gaussians) < 6000
+    np.testing.assert_array_equal(rows(Gaussians.concatenate(tiles)), rows(whole.gaussians))
+
+
+def test_a_tile_reads_no_more_than_its_merger_says():
+    far = Cameras(np.eye(4)[None], np.array([[50.0, 50, 32, 24]]), np.array([[64, 48]]))
+    far.T_frame_camera[0, :3, 3] = 50.0
+    box = np.array([[1.0, 0, 0], [1.5, 1, 1]])
+    asked = {method: [] for method in ("union", "voxel", "tto")}
+    for method, boxes in asked.items():
+        merge_tile([lazy(cloud(0), "a", boxes, far)], method, bounds=box)
+    np.testing.assert_allclose(asked["union"][0], box - [1, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(asked["voxel"][0], box - [1, 0, 0] + [[-0.01], [0.01]], atol=1e-3)
+    # Cameras however far away, and what stands between them and the tile; the whole capture for nobody here.
+    assert asked["tto"][0][1].min() >= 50
+    assert [len(boxes) for boxes in asked.values()] == [1, 1, 1]

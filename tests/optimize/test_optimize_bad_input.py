@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from made_worlds import information, poses_at, true_edges
 
 from gsmap.errors import ConfigError, InputError
-from gsmap.optimize import OptimizeParams, optimize
+from gsmap.optimize import Params, optimize
 from gsmap.types import Edge, Prior, Sim3
 
 IDS = list("abcd")
@@ -94,7 +94,7 @@ def test_a_scene_listed_twice_and_odd_parameters():
     with pytest.raises(InputError, match="listed twice"):
         optimize(["a", "a"], [])
     with pytest.raises(ConfigError):
-        OptimizeParams(gate_probability=1.0)
+        Params(gate_probability=1.0)
 
 
 def test_nothing_at_all():

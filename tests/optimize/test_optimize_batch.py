@@ -5,10 +5,10 @@ import pytest
 from made_worlds import city, information, near_pairs, poses_at, true_edges
 
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize import OptimizeParams, diff, optimize
+from gsmap.optimize import Params, diff, optimize
 from gsmap.types import Edge, Sim3
 
-QUICK = OptimizeParams(marginals=False)
+QUICK = Params(marginals=False)
 
 
 @pytest.mark.parametrize(("share", "limit"), [(0.0, 1.02), (0.3, 1.1), (0.5, 1.5)])
@@ -61,7 +61,7 @@ def test_two_islands_stay_two_until_a_bridge_of_three_edges_joins_them():
     apart = optimize(ids, inside)
     assert [apart.poses[s].component for s in ids] == [0] * 5 + [1] * 5
     for weak in (bridge[:1], bridge[:2]):
-        still = optimize(ids, inside + weak, previous=apart, params=OptimizeParams(growth=0))
+        still = optimize(ids, inside + weak, previous=apart, params=Params(growth=0))
         assert [still.poses[s].component for s in ids] == [0] * 5 + [1] * 5
         assert set(still.undecided) == {(e.target, e.source) for e in weak}
         assert "needs 3 agreeing edges" in still.outcomes[(weak[0].target, weak[0].source)].reason

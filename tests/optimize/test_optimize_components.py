@@ -2,8 +2,8 @@ import networkx
 import numpy as np
 
 from gsmap.geometry.similarities import Similarities
-from gsmap.optimize.components import bridges
 from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.structure import bridges
 
 
 def test_bridges_are_networkx_bridges():

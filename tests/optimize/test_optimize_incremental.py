@@ -4,7 +4,7 @@ import numpy as np
 from made_worlds import ROT_RAD, city, true_edges
 
 from gsmap.geometry.rotations import angle_between
-from gsmap.optimize import OptimizeParams, optimize
+from gsmap.optimize import Params, optimize
 
 
 def known(world, count):
@@ -20,7 +20,7 @@ def test_placing_scenes_one_by_one_agrees_with_solving_at_once():
         answer = optimize(*known(world, count), previous=answer)
         methods.append(answer.provenance.method)
     assert methods.count("incremental") >= 8
-    full = optimize(*known(world, 120), params=OptimizeParams(growth=0))
+    full = optimize(*known(world, 120), params=Params(growth=0))
     assert full.provenance.method == "batch"
     away = []
     for scene in world.ids:
@@ -41,7 +41,7 @@ def test_a_placed_scene_has_an_honest_covariance():
     before = optimize(*known(world, 99))
     after = optimize(*known(world, 100), previous=before)
     assert after.provenance.method == "incremental"
-    full = optimize(*known(world, 100), params=OptimizeParams(growth=0))
+    full = optimize(*known(world, 100), params=Params(growth=0))
     scene = world.ids[99]
     ratio = np.sqrt(np.diag(after.poses[scene].covariance)[:6] / np.diag(full.poses[scene].covariance)[:6])
     assert (ratio > 0.7).all()
@@ -86,6 +86,6 @@ def test_growth_by_a_tenth_and_joined_islands_are_solved_in_full():
     assert len({p.component for p in apart.poses.values()}) == 2
     ties = true_edges(world.truth, [[0, 10], [1, 10], [2, 10], [5, 10], [6, 10], [7, 10]], rng, world.ids)
     edges = true_edges(world.truth, inside, np.random.default_rng(0), world.ids) + ties
-    joined = optimize(world.ids[:11], edges, previous=apart, params=OptimizeParams(growth=1))
+    joined = optimize(world.ids[:11], edges, previous=apart, params=Params(growth=1))
     assert joined.provenance.method == "batch"
     assert len({p.component for p in joined.poses.values()}) == 1

@@ -3,9 +3,9 @@ from dataclasses import replace
 import pytest
 from made_worlds import twin_wings
 
-from gsmap.optimize import OptimizeParams, optimize
+from gsmap.optimize import Params, optimize
 
-QUICK = OptimizeParams(marginals=False)
+QUICK = Params(marginals=False)
 
 
 # Known gap: here look-alikes still fold the map, or take single scenes to the wrong wing.

@@ -9,11 +9,11 @@ from register_worlds import splat_world
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import verdict
-from gsmap.register.agreement import Agreement, measure
-from gsmap.register.propose import Proposal
-from gsmap.register.sight import Sight
+from gsmap.register.evidence import PoseEvidence, measure
 from gsmap.register.surface import Surface
-from gsmap.types import Cameras, Gaussians, Sim3
+from gsmap.register.view_cache import Params as ViewParams
+from gsmap.register.view_cache import ViewCache
+from gsmap.types import Cameras, Gaussians, Proposal, Sim3
 
 _RIGHT = Sim3.identity()
 
@@ -43,18 +43,18 @@ def _cameras(*centres, turn=(0.0, 0.0, 0.0)) -> Cameras:
 _HERE = _cameras((0.0, 0, 0), (0.3, 0, 0), (-0.3, 0.1, 0))
 
 
-def _measured(target, source, pose=_RIGHT, cameras=(_HERE, _HERE), unit_s=1.0) -> Agreement:
-    """The agreement of two scenes; the target is in metres, the source in units of ``unit_s``."""
-    sights = [
-        None if c is None else (Sight(g, c, 128), unit)
+def _measured(target, source, pose=_RIGHT, cameras=(_HERE, _HERE), unit_s=1.0) -> PoseEvidence:
+    """The evidence of two scenes; the target is in metres, the source in units of ``unit_s``."""
+    views = [
+        None if c is None else (ViewCache(g, c), unit)
         for g, c, unit in ((target, cameras[0], 1.0), (source, cameras[1], unit_s))
     ]
-    return measure(Surface.of(target), Surface.of(source, unit_s), pose, tuple(sights))
+    return measure(Surface.of(target), Surface.of(source, unit_s), pose, tuple(views))
 
 
 def test_two_captures_of_one_wall_agree():
     found = _measured(_wall(3.0), _wall(3.0))
-    assert found.contradiction == 0.0
+    assert found.free_space_violation == 0.0
     assert found.colour_correlation > 0.95
     assert found.colour_t > 4
     assert found.num_seen > 2000
@@ -63,11 +63,11 @@ def test_two_captures_of_one_wall_agree():
 def test_what_stands_in_front_contradicts_and_what_lies_behind_does_not():
     bare, screened = _wall(3.0), Gaussians.concatenate([_wall(3.0), _wall(1.5, width=0.8, height=2.0)])
     # To the cameras of the bare wall the screen stands in the way; to the others the wall behind it is hidden.
-    assert 0.1 < _measured(bare, screened, cameras=(_HERE, None)).contradiction < 0.6
-    assert _measured(screened, bare, cameras=(_HERE, None)).contradiction < 0.005
+    assert 0.1 < _measured(bare, screened, cameras=(_HERE, None)).free_space_violation < 0.6
+    assert _measured(screened, bare, cameras=(_HERE, None)).free_space_violation < 0.005
     # Both ways together, the contradiction counts.
     for pair in ((bare, screened), (screened, bare)):
-        assert 0.1 < _measured(*pair).contradiction < 0.6
+        assert 0.1 < _measured(*pair).free_space_violation < 0.6
 
 
 def test_a_wall_seen_past_the_edge_of_another_is_judged_where_both_see():
@@ -75,9 +75,9 @@ def test_a_wall_seen_past_the_edge_of_another_is_judged_where_both_see():
     # the source's cameras saw through the target's.
     target, source = _wall(3.0), _wall(3.5)
     one_sided = [_measured(target, source, cameras=c) for c in ((_HERE, None), (None, _HERE))]
-    assert np.isnan(one_sided[0].contradiction)
-    assert one_sided[1].contradiction > 0.95
-    assert _measured(target, source).contradiction > 0.95
+    assert np.isnan(one_sided[0].free_space_violation)
+    assert one_sided[1].free_space_violation > 0.95
+    assert _measured(target, source).free_space_violation > 0.95
 
 
 def test_exposure_does_not_matter_and_another_texture_does():
@@ -88,7 +88,7 @@ def test_exposure_does_not_matter_and_another_texture_does():
     assert abs(same.colour_correlation - dim.colour_correlation) < 0.02
     assert abs(other.colour_correlation) < 0.15
     assert abs(other.colour_t) < 3
-    assert other.contradiction == 0.0  # the shape is right
+    assert other.free_space_violation == 0.0  # the shape is right
 
 
 def test_a_pose_a_little_off_agrees_less():
@@ -101,18 +101,18 @@ def test_a_pose_a_little_off_agrees_less():
 def test_rooms_half_a_turn_off_contradict_each_other():
     world = splat_world(0, points=30_000)
     surfaces = Surface.of(world.target.gaussians), Surface.of(world.source.gaussians)
-    sights = (world.target.sight(128), 1.0), (world.source.sight(128), 1.0)
-    right = measure(*surfaces, world.S_target_source, sights)
-    assert right.contradiction < 0.01
+    views = (world.target.views(), 1.0), (world.source.views(), 1.0)
+    right = measure(*surfaces, world.S_target_source, views)
+    assert right.free_space_violation < 0.01
     assert right.colour_correlation > 0.6
     assert right.colour_t > 5
     assert right.num_seen > 500
     # About the vertical through the middle of the shared part.
     turn = exp_so3([0, 0, np.pi])
     middle = np.array([3.0, 2.0, 1.2])
-    wrong = measure(*surfaces, Sim3(turn, middle - turn @ middle) @ world.S_target_source, sights)
+    wrong = measure(*surfaces, Sim3(turn, middle - turn @ middle) @ world.S_target_source, views)
     assert wrong.colour_correlation < 0.1
-    assert wrong.contradiction > 0.1
+    assert wrong.free_space_violation > 0.1
 
 
 def test_units_and_frames_change_nothing():
@@ -122,26 +122,26 @@ def test_units_and_frames_change_nothing():
     moved, cameras = transform_gaussians(source, move), transform_cameras(_HERE, move)
     pose = Sim3(move.rotation, move.translation * 0.25).inverse()
     found = _measured(target, moved, pose, (_HERE, cameras), unit_s=0.25)
-    assert found.contradiction == pytest.approx(expected.contradiction, abs=0.01)
+    assert found.free_space_violation == pytest.approx(expected.free_space_violation, abs=0.01)
     assert found.colour_correlation == pytest.approx(expected.colour_correlation, abs=0.01)
     # A pose may scale by itself, too.
     larger = Sim3(np.eye(3), np.zeros(3), 1.2)
     grown, cameras = transform_gaussians(source, larger), transform_cameras(_HERE, larger)
     found = _measured(target, grown, larger.inverse(), (_HERE, cameras))
-    assert found.contradiction == pytest.approx(expected.contradiction, abs=0.02)
+    assert found.free_space_violation == pytest.approx(expected.free_space_violation, abs=0.02)
     assert found.colour_correlation == pytest.approx(expected.colour_correlation, abs=0.02)
 
 
 def test_cameras_that_see_nothing_say_nothing():
     wall = _wall(3.0)
     away, inside = _cameras((0.0, 0, 0), turn=(0.0, np.pi, 0.0)), _cameras((0.0, 0, 3.0), (0.5, 0, 3.0))
-    for blind in (away, inside):
-        alone = _measured(wall, wall, cameras=(blind, blind))
-        assert np.isnan(alone.contradiction)
+    for sightless in (away, inside):
+        alone = _measured(wall, wall, cameras=(sightless, sightless))
+        assert np.isnan(alone.free_space_violation)
         assert (alone.num_seen, alone.colour_correlation, alone.colour_t) == (0, 0.0, 0.0)
         # The other scene's cameras are heard all the same.
-        helped = _measured(wall, wall, cameras=(blind, _HERE))
-        assert helped.contradiction == 0.0
+        helped = _measured(wall, wall, cameras=(sightless, _HERE))
+        assert helped.free_space_violation == 0.0
         assert helped.num_seen == 0
         assert helped.colour_correlation > 0.95
 
@@ -149,7 +149,7 @@ def test_cameras_that_see_nothing_say_nothing():
 def test_without_cameras_the_colours_of_coinciding_cells_speak():
     wall = _wall(3.0)
     right, other = (_measured(wall, s, cameras=(None, None)) for s in (_wall(3.0), _wall(3.0, seed=5)))
-    assert np.isnan(right.contradiction)
+    assert np.isnan(right.free_space_violation)
     assert right.colour_correlation > 0.9
     assert right.colour_t > 4
     assert abs(other.colour_correlation) < 0.15
@@ -164,34 +164,36 @@ def test_haze_that_only_a_foreign_camera_meets_is_not_held_against_a_scene():
     huge = Gaussians(points, quats, np.full((600, 3), np.log(0.5)), np.full(600, 2.0), sh)
     for haze in (faint, huge):
         found = _measured(_wall(3.0), Gaussians.concatenate([_wall(3.0), haze]), cameras=(_HERE, None))
-        assert found.contradiction < 0.01
+        assert found.free_space_violation < 0.01
         assert found.colour_correlation > 0.95
 
 
-def test_sight_renders_each_view_once_and_keeps_a_bounded_number():
+def test_view_cache_renders_each_view_once_and_keeps_a_bounded_number():
     wall, count = _wall(3.0, step=0.1), 80
-    sight = Sight(wall, _cameras(*[(0.01 * i, 0, 0) for i in range(count)]), 64)
-    first = sight.shot(0)
-    assert sight.shot(0) is first
+    cache = ViewCache(wall, _cameras(*[(0.01 * i, 0, 0) for i in range(count)]), ViewParams(64))
+    first = cache.render(0)
+    assert cache.render(0) is first
     assert first.colour.shape == (1, 48, 64, 3)
     for row in range(count):
-        sight.shot(row)
-    assert len(sight._renders) < count
-    assert np.array_equal(sight.shot(0).colour, first.colour)
+        cache.render(row)
+    assert len(cache._renders) < count
+    assert np.array_equal(cache.render(0).colour, first.colour)
 
 
-def test_sight_prefers_cameras_that_nothing_hides_the_points_from():
+def test_view_cache_prefers_cameras_that_nothing_hides_the_points_from():
     # A screen before the first camera hides the wall from it.
     scene = Gaussians.concatenate([_wall(3.0), _wall(0.5, width=0.8, height=0.7)])
-    sight = Sight(scene, _cameras((0.0, 0, 0), (0.0, 0, 0.8)), 128)
+    cache = ViewCache(scene, _cameras((0.0, 0, 0), (0.0, 0, 0.8)))
     on_wall = _wall(3.0).means
-    assert sight.choose(on_wall, 1) == [1]
-    assert sight.choose(np.array([[0.0, 0, -5.0]]), 2) == []  # behind both
+    assert cache.select_views(on_wall, 1) == [1]
+    assert cache.select_views(np.array([[0.0, 0, -5.0]]), 2) == []  # behind both
 
 
 _SURE = Proposal("landmarks", Sim3.identity(), with_scale=False, num_inliers=30, log_nfa=-20.0, runner_up=0.2)
 _UNSURE = replace(_SURE, log_nfa=-2.0)
-_GOOD = Agreement(0.4, 3000, 0.01, 2000, 0.7, 8.0)
+_GOOD = PoseEvidence(
+    overlap=0.4, num_coinciding=3000, free_space_violation=0.01, num_seen=2000, colour_correlation=0.7, colour_t=8.0
+)
 _SIGMAS = (0.003, 0.011, 1e-6)
 
 
@@ -200,18 +202,18 @@ _SIGMAS = (0.003, 0.011, 1e-6)
     [
         ({}, _SURE, True),
         ({}, _UNSURE, True),
-        ({"contradiction": 0.05}, _SURE, True),
-        ({"contradiction": 0.12}, _SURE, True),  # a place that changed, its colours beyond doubt
-        ({"contradiction": 0.12, "colour_correlation": 0.4}, _SURE, False),
-        ({"contradiction": 0.25}, _SURE, False),
-        ({"contradiction": 0.05, "colour_correlation": 0.4}, _SURE, True),
-        ({"contradiction": 0.05, "colour_correlation": 0.4}, _UNSURE, False),
-        ({"contradiction": 0.015, "colour_correlation": 0.3}, _UNSURE, True),
+        ({"free_space_violation": 0.05}, _SURE, True),
+        ({"free_space_violation": 0.12}, _SURE, True),  # a place that changed, its colours beyond doubt
+        ({"free_space_violation": 0.12, "colour_correlation": 0.4}, _SURE, False),
+        ({"free_space_violation": 0.25}, _SURE, False),
+        ({"free_space_violation": 0.05, "colour_correlation": 0.4}, _SURE, True),
+        ({"free_space_violation": 0.05, "colour_correlation": 0.4}, _UNSURE, False),
+        ({"free_space_violation": 0.015, "colour_correlation": 0.3}, _UNSURE, True),
         ({"colour_correlation": 0.1}, _SURE, False),
         ({"colour_t": 2.0}, _SURE, False),
-        ({"colour_correlation": 0.0, "colour_t": 0.0, "contradiction": np.nan, "num_seen": 0}, _SURE, False),
-        ({"contradiction": np.nan, "num_seen": 0}, _SURE, True),  # no cameras, but a clique beyond chance
-        ({"contradiction": np.nan, "num_seen": 0}, _UNSURE, False),
+        ({"colour_correlation": 0.0, "colour_t": 0.0, "free_space_violation": np.nan, "num_seen": 0}, _SURE, False),
+        ({"free_space_violation": np.nan, "num_seen": 0}, _SURE, True),  # no cameras, but a clique beyond chance
+        ({"free_space_violation": np.nan, "num_seen": 0}, _UNSURE, False),
         ({"overlap": 0.05}, _UNSURE, False),
         ({"num_coinciding": 100}, _SURE, False),
     ],

@@ -9,9 +9,9 @@ from register_worlds import splat_world
 from gsmap.errors import ConfigError
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
-from gsmap.register import Params, SceneView, propose, register_pair
-from gsmap.retrieve import candidate_pairs
-from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph, Sim3
+from gsmap.register import Params, SceneView, register_pair
+from gsmap.register.proposers import graph
+from gsmap.types import Cameras, Gaussians, NodeLayer, Proposal, SceneGraph, Sim3
 
 
 def _error(world, found):
@@ -26,7 +26,7 @@ def test_overlapping_captures_are_accepted_to_the_millimetre():
     assert error.rre_deg < 0.1
     assert error.centroid_m < 0.01
     assert found.S_target_source.is_rigid
-    assert (found.target, found.source, found.method) == ("s0", "s1", "landmarks")
+    assert (found.target, found.source, found.proposer) == ("s0", "s1", "graph:landmarks")
     assert 0.1 < found.overlap < 0.8
     assert found.evidence["log_nfa"] < -10
     assert set(found.seconds) >= {"match", "refine", "verdict"}
@@ -54,7 +54,6 @@ def test_a_scene_whose_vertical_is_unknown_registers_with_one_that_knows_it():
     for pair in ((target, source), (source, target)):
         assert register_pair(*pair).status == "accepted"
     assert register_pair(target, world.source, Params(fallback="never")).status == "no_match"
-    assert candidate_pairs([knows, source.graph]) == [(knows.scene_id, source.id)]
 
 
 def test_the_answer_is_the_same_both_ways_and_twice():
@@ -129,7 +128,7 @@ def test_look_alike_nodes_do_not_carry_a_pose_that_the_surfaces_contradict():
     found = register_pair(right.target, source)
     assert found.evidence["log_nfa"] < -10
     assert found.status == "rejected"
-    assert "colour" in found.reason or "contradict" in found.reason
+    assert "colour" in found.reason or "free-space" in found.reason
 
 
 def test_repainted_room_in_another_shape_is_contradicted_by_free_space():
@@ -144,7 +143,7 @@ def test_repainted_room_in_another_shape_is_contradicted_by_free_space():
         np.zeros((9000, 1, 3)),
     )  # fmt: skip
     found = register_pair(right.target, replace(right.source, gaussians=Gaussians.concatenate([g, extra])))
-    assert found.evidence["contradiction"] > 0.15
+    assert found.evidence["free_space_violation"] > 0.15
     assert found.status == "rejected"
 
 
@@ -152,7 +151,7 @@ def test_without_cameras_the_rest_still_decides():
     world = splat_world(7, with_cameras=False)
     found = register_pair(world.target, world.source)
     assert found.status == "accepted"
-    assert np.isnan(found.evidence["contradiction"])
+    assert np.isnan(found.evidence["free_space_violation"])
 
 
 def test_surfaces_propose_where_graphs_are_poor():
@@ -160,7 +159,7 @@ def test_surfaces_propose_where_graphs_are_poor():
     few = {k: _first(layer, 4) for k, layer in world.target.graph.layers.items()}
     target = replace(world.target, graph=replace(world.target.graph, layers=few))
     found = register_pair(target, world.source)
-    assert found.method == "dense"
+    assert found.proposer == "kiss_matcher"
     assert found.status == "accepted"
     assert _error(world, found).rre_deg < 0.2
     assert "fallback" in found.seconds
@@ -180,9 +179,9 @@ def test_two_proposals_of_one_pose_are_not_ambiguous(monkeypatch):
     for degrees in (1.0, 4.5):
         turn = exp_so3(np.radians(degrees) * np.array([0.0, 0.6, 0.8]))
         S = world.S_target_source @ Sim3(turn, centre - turn @ centre)
-        found.append(propose.Proposal("landmarks", S, with_scale=False, num_inliers=20, log_nfa=-1.0, runner_up=0.9))
-    monkeypatch.setattr(propose, "propose", lambda *args, **kwargs: found)
-    answer = register_pair(world.target, world.source, Params(kinds=("landmarks",), fallback="never"))
+        found.append(Proposal("graph:landmarks", S, with_scale=False, num_inliers=20, log_nfa=-1.0, runner_up=0.9))
+    monkeypatch.setattr(graph, "propose", lambda *args, **kwargs: found)
+    answer = register_pair(world.target, world.source, Params(fallback="never"))
     assert (answer.status, answer.reason) == ("accepted", "")
     assert _error(world, answer).rre_deg < 0.1
 

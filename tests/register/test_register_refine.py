@@ -7,11 +7,11 @@ from register_worlds import node_world, splat_world
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
+from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
 from gsmap.register.correspondences import Correspondences
 from gsmap.register.covariance import in_scene_units, point_to_plane_jacobian, pose_covariance
-from gsmap.register.refiners import coloured, gicp
+from gsmap.register.refiners import colored_icp, gicp, icp
 from gsmap.register.scale import vote_scales
-from gsmap.register.significance import Chance, _log10_binomial_tail, agreeing
 from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Sim3
@@ -32,16 +32,16 @@ def _off(pose: Sim3, about: np.ndarray, degrees: float, metres: float, factor: f
     return pose @ Sim3(turn, about - factor * turn @ about + metres * np.array([0.0, 0.6, 0.8]), factor)
 
 
-def test_coloured_refiner_comes_back_from_four_degrees(world, surfaces):
+def test_colored_icp_refiner_comes_back_from_four_degrees(world, surfaces):
     centre = scene_centroid(world.source.gaussians)
-    found = coloured.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15))
+    found = colored_icp.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15))
     error = pose_error(found, world.S_target_source, centre)
     assert (error.rre_deg < 0.05, error.centroid_m < 0.003, found.scale) == (True, True, 1.0)
 
 
-def test_coloured_refiner_finds_the_scale(world, surfaces):
+def test_colored_icp_refiner_finds_the_scale(world, surfaces):
     centre = scene_centroid(world.source.gaussians)
-    found = coloured.refine(*surfaces, _off(world.S_target_source, centre, 2, 0.08, 1.02), with_scale=True)
+    found = colored_icp.refine(*surfaces, _off(world.S_target_source, centre, 2, 0.08, 1.02), with_scale=True)
     assert pose_error(found, world.S_target_source, centre).rse < 0.002
 
 
@@ -50,8 +50,8 @@ def test_scale_is_the_same_both_ways_on_rough_surfaces():
     for seed in (1, 2):
         rough = splat_world(seed, points=30_000, noise_m=0.04)
         target, source = Surface.of(rough.target.gaussians), Surface.of(rough.source.gaussians)
-        there = coloured.refine(target, source, rough.S_target_source, with_scale=True)
-        back = coloured.refine(source, target, rough.S_target_source.inverse(), with_scale=True)
+        there = colored_icp.refine(target, source, rough.S_target_source, with_scale=True)
+        back = colored_icp.refine(source, target, rough.S_target_source.inverse(), with_scale=True)
         assert abs(np.log(there.scale * back.scale)) < 0.001
         assert abs(np.log(there.scale)) < 0.003
 
@@ -64,11 +64,23 @@ def test_gicp_refiner_agrees(world, surfaces):
     assert error.centroid_m < 0.01
 
 
+def test_icp_refiner_comes_back_and_gicp_is_finer():
+    # All overlaps: points beyond an overlap would be pulled to its edge.
+    world = splat_world(0, points=20_000, cut_m=(6.0, 0.0), with_cameras=False)
+    surfaces = Surface.of(world.target.gaussians), Surface.of(world.source.gaussians)
+    centre = scene_centroid(world.source.gaussians)
+    start = _off(world.S_target_source, centre, 2, 0.08)
+    errors = [pose_error(r.refine(*surfaces, start), world.S_target_source, centre) for r in (icp, gicp)]
+    assert errors[0].rre_deg < 0.1
+    assert errors[0].centroid_m < 0.03
+    assert errors[1].rre_deg < errors[0].rre_deg  # points of two samplings never coincide; their planes do
+
+
 def test_refiners_give_back_the_start_where_nothing_overlaps(surfaces):
     target, source = surfaces
     away = Sim3(np.eye(3), [500.0, 0, 0])
     nothing = Surface.of(Gaussians.empty())
-    for refine in (coloured.refine, gicp.refine):
+    for refine in (colored_icp.refine, gicp.refine, icp.refine):
         assert np.allclose(refine(target, source, away).matrix(), away.matrix())
         assert refine(target, nothing, away) is away
         assert refine(nothing, source, away) is away
@@ -83,8 +95,8 @@ def test_colour_fixes_what_a_bare_wall_leaves_free():
 
     target, source = Surface.of(wall(1)), Surface.of(wall(2))
     start = Sim3(exp_so3([0, 0, 0.01]), [0.05, -0.01, 0.0])
-    with_colour = coloured.refine(target, source, start)
-    without = coloured.refine(target, source, start, coloured.Params(colour_weight=0))
+    with_colour = colored_icp.refine(target, source, start)
+    without = colored_icp.refine(target, source, start, colored_icp.Params(colour_weight=0))
     assert np.linalg.norm(with_colour.apply([2.0, 2, 0]) - [2.0, 2, 0]) < 0.008
     assert np.linalg.norm(without.apply([2.0, 2, 0]) - [2.0, 2, 0]) > 0.02
 
@@ -111,7 +123,7 @@ def test_covariance_is_as_large_as_the_errors_are(cut_m):
         world = splat_world(seed, place=(seed, seed), points=20_000, cut_m=cut_m, with_cameras=False)
         target = _warped(Surface.of(world.target.gaussians), 0.01, seed)
         source = _warped(Surface.of(world.source.gaussians), 0.01, 99 + seed)
-        pose = coloured.refine(target, source, world.S_target_source)
+        pose = colored_icp.refine(target, source, world.S_target_source)
         covariance, _ = pose_covariance(target, source, pose)
         off = (Similarities.stack([pose]).inverse() @ Similarities.stack([world.S_target_source])).log()[0, :6]
         errors.append(off @ np.linalg.solve(covariance[:6, :6], off))
@@ -174,7 +186,7 @@ def test_binomial_tail_far_out():
         assert _log10_binomial_tail(n, k, p) == pytest.approx(binom.logsf(k - 1, n, p) / np.log(10), rel=1e-9)
 
 
-def test_chance_is_never_significant_and_a_planted_pose_is():
+def test_random_partners_are_never_significant_and_a_planted_pose_is():
     scores = []
     for seed in range(20):
         world = node_world(seed, shared=40, extra=60, wrong=300)
@@ -189,9 +201,9 @@ def test_chance_is_never_significant_and_a_planted_pose_is():
 
         members = wrong[maximum_clique(consistency_graph(wrong)).members]
         pose = fit_pose(members.target, members.source).S_target_source
-        scores.append(Chance(world.target, world.source, world.source.positions, wrong).log10_nfa(pose))
-        chance = Chance(world.target, world.source, world.source.positions, m)
-        right = chance.log10_nfa(world.S_target_source)
+        scores.append(BackgroundModel(world.target, world.source, world.source.positions, wrong).log10_nfa(pose))
+        background = BackgroundModel(world.target, world.source, world.source.positions, m)
+        right = background.log10_nfa(world.S_target_source)
         assert right < -10
     assert min(scores) > -2
 
@@ -239,13 +251,32 @@ def test_photometric_refiner_lays_renders_over_each_other():
     from gsmap.register.refiners import photometric
 
     world = splat_world(4, points=30_000)
-    target, cameras, S = world.target.gaussians, world.target.cameras, world.S_target_source
-    source = transform_gaussians(target, S.inverse())
-    centre = scene_centroid(source)
+    scene, cameras, S = world.target.gaussians, world.target.cameras, world.S_target_source
+    target = Surface.of(scene, cameras=cameras)
+    source = Surface.of(transform_gaussians(scene, S.inverse()))
+    centre = scene_centroid(source.gaussians)
     start = _off(S, centre, 0.3, 0.015)
-    found = photometric.refine(target, source, cameras, start, photometric.Params(iterations=6))
+    found = photometric.refine(target, source, start, photometric.Params(iterations=6))
     before, after = (pose_error(p, S, centre) for p in (start, found))
     assert after.rre_deg < 0.2 * before.rre_deg
     assert after.centroid_m < 0.2 * before.centroid_m
     away = Sim3(np.eye(3), [500.0, 0, 0])
-    assert photometric.refine(target, source, cameras, away) is away
+    assert photometric.refine(target, source, away) is away
+    assert photometric.refine(Surface.of(scene), source, start) is start  # without cameras there is nothing to see
+
+
+def test_photometric_refiner_reads_each_scene_in_its_own_unit():
+    from gsmap.geometry.transforms import transform_gaussians
+    from gsmap.register.refiners import photometric
+
+    world = splat_world(4, points=15_000)
+    metric = world.target.gaussians
+    quarter = Sim3(np.eye(3), np.zeros(3), 4.0)
+    answers = []
+    for unit_m, scene in ((1.0, metric), (0.25, transform_gaussians(metric, quarter))):
+        target = Surface.of(metric, cameras=world.target.cameras)
+        source = Surface.of(scene, unit_m)
+        start = Sim3(exp_so3([0.0, 0.004, 0.0]), [0.01, 0.0, 0.0])
+        answers.append(photometric.refine(target, source, start, photometric.Params(iterations=2)).matrix())
+    assert not np.allclose(answers[0], start.matrix(), atol=1e-4)
+    assert np.allclose(*answers, atol=1e-4)

@@ -82,6 +82,8 @@ def postgres_url(tmp_path_factory):
     data, log = str(folder / "data"), str(folder / "log")
     try:
         run(initdb, "-D", data, "-U", "gsmap", "-A", "trust", "--no-sync")
+        rules = folder / "data" / "pg_hba.conf"  # one database wants a password
+        rules.write_text("local guarded all scram-sha-256\n" + rules.read_text())
         run(server_ctl, "-D", data, "-l", log, "-w", "-o", f"-k {folder} -c listen_addresses=''", "start")
         yield f"postgresql+psycopg://gsmap@/{{}}?host={folder}"
         run(server_ctl, "-D", data, "-m", "immediate", "stop")
@@ -99,3 +101,16 @@ def postgres_database(postgres_url):
         connection.execute(text("CREATE DATABASE site"))
     admin.dispose()
     return postgres_url.format("site")
+
+
+@pytest.fixture
+def guarded_database(postgres_url):
+    """A database that wants the password ``secret``; the URL has it."""
+    from sqlalchemy import create_engine, text
+
+    admin = create_engine(postgres_url.format("postgres"), isolation_level="AUTOCOMMIT")
+    with admin.connect() as connection:
+        connection.execute(text("ALTER ROLE gsmap PASSWORD 'secret'"))
+        connection.execute(text("CREATE DATABASE guarded"))
+    admin.dispose()
+    return postgres_url.format("guarded").replace("gsmap@", "gsmap:secret@")

@@ -15,21 +15,8 @@ from gsmap.types import EdgeOutcome, Provenance
 
 ARCHIVE = Path(__file__).with_name("schema_0001.tar.xz")
 TABLES = [
-    "about",
-    "groups",
-    "files",
-    "scenes",
-    "chunk_boxes",
-    "graphs",
-    "registrations",
-    "verdicts",
-    "revisions",
-    "poses",
-    "edges",
-    "priors",
-    "models",
-    "exports",
-    "tiles",
+    *("about", "groups", "files", "scenes", "chunk_boxes", "graphs", "registrations", "verdicts"),
+    *("revisions", "poses", "edges", "priors", "models", "exports", "tiles"),
 ]
 
 
@@ -85,7 +72,7 @@ def check_all(store: Store) -> None:
     assert [g.recipe for g in store.graphs.list()] == [None, None]
 
     first, second = store.registrations.history("monday", "tuesday")
-    assert (first.registration.proposer, second.registration.proposer) == ("kiss_matcher", "landmarks")
+    assert (first.registration.proposer, second.registration.proposer) == ("kiss_matcher", "graph:landmarks")
     assert first.registration.evidence == {"log_nfa": -7.5, "free_space_violation": 0.25}
     assert (first.registration.notes, first.key, first.recipe, first.adopts) == ((), "key-1", None, None)
     assert first.registration.overlap == 0.1 + 0.2
@@ -96,7 +83,7 @@ def check_all(store: Store) -> None:
     edge = (tuesday.id, monday.id)
     one, two, three = (store.revisions.get(number) for number in (1, 2, 3))
     assert one.settings == {"gate_probability": 0.999, "anneal": 16.0, "marginals": True}
-    assert one.provenance == Provenance("batch", 2, "a41112002c7451ff", (tuesday.id,))
+    assert one.provenance == Provenance("batch", "", 2, "a41112002c7451ff", (tuesday.id,))
     assert two.provenance.method == "incremental"
     assert (three.settings, three.provenance, three.notes) == ({}, Provenance(), ())
     assert one.outcomes == {edge: EdgeOutcome("tentative", 2.5, "no cycle", undecided=True)}

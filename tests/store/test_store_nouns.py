@@ -299,7 +299,7 @@ def graph_of(scenes, shift: float = 0.0) -> PoseGraph:
     }
     outcomes = {(a, b): EdgeOutcome("tentative", np.float64(2.5), "no cycle", undecided=True)}
     settings = {"chi2": 12.02, "seed": np.int64(3), "robust": "gnc"}
-    return PoseGraph(placed, outcomes, settings, Provenance("incremental", 7, "abcd", (b,)), ("no marginals",))
+    return PoseGraph(placed, outcomes, settings, Provenance("incremental", "ef01", 7, "abcd", (b,)), ("no marginals",))
 
 
 def test_revisions(store, two_scenes):
@@ -320,7 +320,7 @@ def test_revisions(store, two_scenes):
         assert got.outcomes == {(a, b): EdgeOutcome("tentative", 2.5, "no cycle", undecided=True)}
         assert got.undecided == ((a, b),)
         assert got.settings == {"chi2": 12.02, "seed": 3, "robust": "gnc"}
-        assert got.provenance == Provenance("incremental", 7, "abcd", (b,))
+        assert got.provenance == Provenance("incremental", "ef01", 7, "abcd", (b,))
         assert got.notes == ("no marginals",)
     first, second = store.revisions.list()
     assert (first.number, first.num_scenes, first.num_placed, first.num_components) == (1, 2, 1, 2)

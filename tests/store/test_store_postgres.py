@@ -63,11 +63,19 @@ def test_migrated_tables_are_the_schema_on_postgres(tmp_path, postgres_database)
         assert compare_metadata(MigrationContext.configure(connection, opts=options), schema.metadata) == []
 
 
-def test_the_password_stays_out_of_the_map(tmp_path, postgres_database):
-    url = postgres_database.replace("gsmap@", "gsmap:secret@")
-    with Store.create(tmp_path / "m", catalog_url=url):
-        pass
+def test_the_password_stays_out_of_the_map(tmp_path, guarded_database, monkeypatch):
+    monkeypatch.delenv("PGPASSWORD", raising=False)
+    with Store.create(tmp_path / "m", catalog_url=guarded_database) as store:
+        made = store.id
     assert not [p for p in (tmp_path / "m").rglob("*") if p.is_file() and b"secret" in p.read_bytes()]
+    with pytest.raises(StoreError, match="PGPASSWORD") as caught:
+        Store.open(tmp_path / "m")
+    assert "\n" not in str(caught.value)
+    with Store.open(tmp_path / "m", catalog_url=guarded_database) as store:
+        assert store.id == made
+    monkeypatch.setenv("PGPASSWORD", "secret")
+    with Store.open(tmp_path / "m") as store:
+        assert store.id == made
 
 
 def test_a_server_that_is_not_there(tmp_path):

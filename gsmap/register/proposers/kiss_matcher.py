@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +53,8 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(params.voxel_m))
     # Frames may lie far from their content; float32 inside the matcher does not forgive that.
     centre_t, centre_s = points_t.mean(0), points_s.mean(0)
-    solution = matcher.estimate((points_s - centre_s).astype(np.float32), (points_t - centre_t).astype(np.float32))
+    with _one_core():
+        solution = matcher.estimate((points_s - centre_s).astype(np.float32), (points_t - centre_t).astype(np.float32))
     inliers = int(matcher.get_num_final_inliers())
     if not solution.valid or inliers < params.min_inliers:
         return []
@@ -60,3 +64,21 @@ def propose(target: Scene, source: Scene, params: Params | None = None, *, with_
     translation = translation + centre_t - rotation @ centre_s
     pose = Sim3(rotation, translation / target.unit_m)
     return [Proposal(proposer="kiss_matcher", S_target_source=pose, with_scale=False, num_inliers=inliers)]
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    """The calling thread, and the threads that the library starts from it, on one core.
+
+    The library adds up in the order in which its threads finish: on several cores its pose varies by centimetres
+    between runs. Systems that cannot pin a thread (macOS) have to live with that.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    free = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(free)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, free)

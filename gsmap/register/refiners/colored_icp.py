@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -79,19 +80,13 @@ def refine(
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
             centre = pairs.points.mean(0)
             centred, points = pose @ Sim3(np.eye(3), centre), pairs.points - centre
-            system, gradient = pairs.equations(
-                lambda along, c=centred, p=points: point_to_plane_jacobian(c, p, along), radius, params
-            )
+            system, gradient = pairs.equations(partial(point_to_plane_jacobian, centred, points), radius, params)
             if with_scale:
                 back = _Pairs.of(source, target, pose.inverse(), chosen_back, radius)
                 if len(back.points) < _FEWEST:
                     return pose
                 # A step that moves the source forward moves what is laid on it back.
-                other = back.equations(
-                    lambda along, p=back.moved - centre: point_to_plane_jacobian(Sim3.identity(), p, -along),
-                    radius,
-                    params,
-                )
+                other = back.equations(partial(_backward_jacobian, back.moved - centre), radius, params)
                 share = len(pairs.points) / len(back.points)
                 system, gradient = system + share * other[0], gradient + share * other[1]
             step = np.zeros(7)
@@ -109,6 +104,10 @@ def refine(
             if np.linalg.norm(pose.apply(pairs.points) - pairs.moved, axis=1).max() < 0.002 * radius:
                 break
     return pose
+
+
+def _backward_jacobian(points: np.ndarray, along: np.ndarray) -> np.ndarray:
+    return point_to_plane_jacobian(Sim3.identity(), points, -along)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,15 @@ SCALES = False
 class Params:
     """Point-to-point ICP (Besl and McKay 1992).
 
+    Where scenes overlap in part, points beyond the overlap are pulled to its edge: the larger the distance, the more
+    the pose drifts along walls and floors (measured in a room: 1.3 m at 0.35, 9 cm at 0.12).
+
     Args:
         radii_m: correspondence distances, one run each, coarse to fine.
         max_iterations: of each run.
     """
 
-    radii_m: tuple[float, ...] = (0.35, 0.12, 0.06)
+    radii_m: tuple[float, ...] = (0.12, 0.06)
     max_iterations: int = 50
 
 

@@ -10,41 +10,55 @@ from scipy.special import betaln
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.measurements import Measurements
-
-# How likely a link is wrong before its density is looked at: one edge by itself may be any mistake, several that agree
-# only a place that looks like another.
-ALONE, ALIKE = 0.3, 0.01
-# How much the density of true links varies, as the weight of that many pairs; look-alikes are this many times sparser.
-SPREAD, SPARSER = 20.0, 3.0
-# Scenes nearer than this many typical edges count as near each other.
-NEAR = 1.25
+from gsmap.optimize.params import LinkDensityParams
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A set of edges that ties two parts of a map: its rows, the side that moves, and the log odds that it is wrong.
+    """A set of edges that ties two parts of a map.
 
-    The places of a true link are tied as often as any, those of look-alikes only where the mistake was made: of the
-    pairs of a link's end scenes, one of either part, that lie near each other, how many are tied? Under a true link the
-    share is Beta distributed about that of the whole map, under look-alikes about a third of it.
+    Args:
+        rows: its edges.
+        moving: (N,) bool, the side that would move.
+        log_odds_wrong: log odds that it is wrong; see `LinkDensity`.
     """
 
     rows: np.ndarray
     moving: np.ndarray
-    doubt: float
+    log_odds_wrong: float
 
 
 @dataclass(frozen=True)
-class Ties:
-    """Up to which ``length`` scenes count as near each other, and the ``share`` of near pairs that is tied."""
+class LinkDensity:
+    """How densely the scenes of a map are tied, against which the density of a link is weighed.
+
+    Assumption: the places of a true link are tied as often as any, those of look-alikes only where the mistake was
+    made. Of the pairs of a link's end scenes, one of either part, that lie near each other, the share that is tied is
+    Beta distributed about that of the whole map under a true link, and about a part of it (``sparser``) under
+    look-alikes. It fails where every single pair of two places was mistaken, and where a true link is sparse because
+    few pairs were tried.
+
+    Args:
+        length: up to which scenes count as near each other, in map units.
+        share: of near pairs, that is tied.
+        params: see `LinkDensityParams`.
+    """
 
     length: float
     share: float
+    params: LinkDensityParams
 
     @classmethod
-    def of(cls, edges: Measurements, accepted: np.ndarray, labels: np.ndarray, poses: Similarities) -> Ties:
-        length = NEAR * typical_length(edges, poses)
-        # Islands have frames of their own: a fourth coordinate keeps them apart.
+    def of(
+        cls,
+        edges: Measurements,
+        accepted: np.ndarray,
+        labels: np.ndarray,
+        poses: Similarities,
+        params: LinkDensityParams,
+    ) -> LinkDensity:
+        length = params.near_lengths * typical_length(edges, poses)
+        # Components have frames of their own: a fourth coordinate keeps them apart.
         apart = np.c_[poses.translations, 10.0 * length * labels]
         near = cKDTree(apart).query_pairs(length, output_type="ndarray")
         pairs = np.bincount(near.ravel(), minlength=edges.num_scenes)
@@ -52,17 +66,18 @@ class Ties:
         busy = pairs > 0
         # The median scene's: where the map is folded, scenes that are not neighbours lie together.
         share = np.median(tied[busy] / pairs[busy]) if busy.any() else 0.5
-        return cls(length, float(np.clip(share, 0.05, 0.9)))
+        return cls(length, float(np.clip(share, 0.05, 0.9)), params)
 
     def link(self, edges: Measurements, rows: np.ndarray, moving: np.ndarray, poses: Similarities) -> Link:
-        """A link by its rows, and how much speaks against it."""
+        """A link by its rows, and the log odds that it is wrong."""
+        params = self.params
         ends = np.unique(np.r_[edges.targets[rows], edges.sources[rows]])
         still = cKDTree(poses.translations[ends[~moving[ends]]])
         pairs = int(still.count_neighbors(cKDTree(poses.translations[ends[moving[ends]]]), self.length))
         tied = min(pairs, len(_tied(edges, rows, poses, self.length)))
-        true = SPREAD * self.share, SPREAD * (1 - self.share)
-        alike = 1.0, SPARSER / self.share - 1.0
-        wrong = ALONE if len(rows) == 1 else ALIKE
+        true = params.concentration * self.share, params.concentration * (1 - self.share)
+        alike = 1.0, params.sparser / self.share - 1.0
+        wrong = params.alone_wrong if len(rows) == 1 else params.group_wrong
         evidence = [betaln(a + tied, b + pairs - tied) - betaln(a, b) for a, b in (alike, true)]
         return Link(rows, moving, float(evidence[0] - evidence[1] + np.log(wrong / (1 - wrong))))
 

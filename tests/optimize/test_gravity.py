@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsmap import PoseGraph, ScenePose, Sim3
-from gsmap.optimize.level import leveled
+from gsmap.optimize import gravity_align
 
 RNG = np.random.default_rng(11)
 
@@ -24,7 +24,7 @@ def island(component: int, count: int, turn: np.ndarray) -> tuple[dict, dict]:
 def test_up_becomes_z_and_relative_poses_stay(turn: np.ndarray) -> None:
     poses, ups = island(0, 4, turn)
     ups["0-0"] = Rotation.from_euler("x", 90, degrees=True).as_matrix() @ ups["0-0"]  # one scene errs
-    out = leveled(PoseGraph(poses), ups).poses
+    out = gravity_align(PoseGraph(poses), ups).poses
     for name in ("0-1", "0-2", "0-3"):
         np.testing.assert_allclose(out[name].S_map_scene.rotation @ ups[name], [0, 0, 1], atol=1e-9)
     before = poses["0-1"].S_map_scene.inverse() @ poses["0-2"].S_map_scene
@@ -36,5 +36,5 @@ def test_nearly_level_and_held_islands_stay() -> None:
     nearly, ups = island(0, 3, Rotation.from_euler("x", 3, degrees=True).as_matrix())
     held, more = island(1, 3, Rotation.from_euler("x", 50, degrees=True).as_matrix())
     graph = PoseGraph({**nearly, **held})
-    out = leveled(graph, {**ups, **more}, fixed={"1-2"})
+    out = gravity_align(graph, {**ups, **more}, fixed={"1-2"})
     assert out.poses == graph.poses

@@ -1,0 +1,83 @@
+"""The last solve: each component by itself, in its own frame, with the covariances of its scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.gauge import anchor_of, onto_anchor, onto_priors, open_gauge
+from gsmap.optimize.gtsam_solve import solve
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import Params
+from gsmap.optimize.state import State
+from gsmap.optimize.structure import component_labels
+from gsmap.types import PoseGraph, Sim3
+from gsmap.types.progress import Progress
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """All scenes in their final frames.
+
+    Args:
+        poses: N.
+        component: (N,) largest first; those that priors fix completely share the outside world's frame, as one.
+        covariances: (N, 7, 7), zero where there is none.
+        notes: on covariances that there are not.
+    """
+
+    poses: Similarities
+    component: np.ndarray
+    covariances: np.ndarray
+    notes: tuple[str, ...]
+
+
+def solve_components(
+    m: Measurements, state: State, previous: PoseGraph | None, params: Params, progress: Progress
+) -> Solved:
+    """Exact poses and covariances of every component from the edges that are taken in."""
+    rows = np.flatnonzero(state.accepted)
+    labels = component_labels(m, rows)
+    sizes = np.bincount(labels, minlength=1)
+    order = sorted(range(labels.max(initial=-1) + 1), key=lambda k: (-sizes[k], k))
+    members = np.split(np.argsort(labels, kind="stable"), np.cumsum(sizes)[:-1]) if m.num_scenes else []
+    edge_order = rows[np.argsort(labels[m.targets[rows]], kind="stable")]
+    edge_members = np.split(edge_order, np.cumsum(np.bincount(labels[m.targets[rows]], minlength=len(sizes)))[:-1])
+    prior_labels = labels[state.terms.scenes]
+    tied = set(prior_labels.tolist())
+
+    poses = state.poses
+    covariances = np.zeros((m.num_scenes, 7, 7))
+    component = np.zeros(m.num_scenes, dtype=np.int64)
+    missing: list[tuple[int, int, str]] = []
+    world: int | None = None
+    most = params.limits.marginal_scenes if params.marginals else 0
+    for index, label in enumerate(order):
+        progress(index / len(order), "final solve")
+        scenes, mine = members[label], edge_members[label]
+        own = state.terms[np.flatnonzero(prior_labels == label)] if label in tied else state.terms[:0]
+        anchor = anchor_of(scenes, m.scene_ids, previous)
+        component[scenes] = index
+        old = previous.poses.get(m.scene_ids[anchor]) if previous else None
+        poses = onto_anchor(poses, scenes, anchor, old.S_map_scene if old else Sim3.identity())
+        if len(own):
+            poses = onto_priors(poses, scenes, anchor, own, m.dim, params.gauge.loose)
+            if not len(open_gauge(poses, scenes, anchor, own, m.dim, params.gauge.loose)):
+                # Fully known to the outside: it shares the world's frame with every other such component.
+                component[scenes] = world = index if world is None else world
+        if not len(mine) and not len(own):
+            continue
+        solution = solve(m[mine], poses, anchor, own, params.gauge, most)
+        poses = solution.poses
+        if solution.covariances is not None:
+            covariances[scenes] = solution.covariances[scenes]
+        elif params.marginals:
+            why = solution.problem or f"more than limits.marginal_scenes, {most}"
+            missing.append((int(scenes[0]), len(scenes), why))
+    _, component = np.unique(component, return_inverse=True)
+    notes = tuple(
+        f"no covariances in component {component[scene]} ({size} scenes): {why}" for scene, size, why in missing
+    )
+    return Solved(poses, component, covariances, notes)

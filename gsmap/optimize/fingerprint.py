@@ -1,0 +1,32 @@
+"""What an answer rests on, in 64 bits."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsmap.types import Edge, Prior
+
+
+def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = ()) -> int:
+    """64-bit sum over hashes of all measurements: what an answer rests on must be unchanged to be built upon.
+
+    Independent of their order, and that of two sets is the sum of both (modulo 2^64). Meant to notice change, not to
+    resist an attacker.
+    """
+    flat = [(e.S_target_source, e.information, f"{e.target}\0{e.source}", 2 + e.confirmed) for e in edges]
+    flat += [(p.S_map_scene, np.diag(p.sigmas), f"{p.scene}\0{p.up!r}{p.up_sigma_rad!r}", 4) for p in priors]
+    n = len(flat)
+    values = np.empty((n, 64))
+    values[:, :49] = np.array([row[1] for row in flat], dtype=np.float64).reshape(n, 49)
+    values[:, 49:58] = np.array([row[0].rotation for row in flat]).reshape(n, 9)
+    values[:, 58:61] = np.array([row[0].translation for row in flat]).reshape(n, 3)
+    values[:, 61] = [row[0].scale for row in flat]
+    values[:, 62] = [zlib.crc32(row[2].encode()) for row in flat]
+    values[:, 63] = [row[3] for row in flat]
+    factors = np.random.default_rng(0).integers(1, 2**63, 64, dtype=np.uint64) | np.uint64(1)
+    mixed = ((values.view(np.uint64) ^ (values.view(np.uint64) >> np.uint64(29))) * factors).sum(1)
+    mixed = (mixed ^ (mixed >> np.uint64(32))) * factors[0]
+    return int((mixed ^ (mixed >> np.uint64(29))).sum())

@@ -1,0 +1,45 @@
+"""Turning components upright: the map's z against gravity, where scenes know what is up."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from gsmap.geometry.directions import rotation_to_z
+from gsmap.optimize.params import Gravity
+from gsmap.types import PoseGraph, ScenePose, Sim3
+
+
+def gravity_align(
+    graph: PoseGraph, ups: Mapping[str, np.ndarray], fixed: Collection[str] = (), params: Gravity | None = None
+) -> PoseGraph:
+    """The same answer with every component turned as a whole so that up is +z, unless it nearly is already.
+
+    Poses relative to each other, and covariances (which are on the scenes' side), do not change.
+
+    Args:
+        ups: (3,) direction against gravity in the scene's frame, by scene id; scenes that cannot tell are left out.
+        fixed: scenes held by a prior; their components stay as they are.
+        params: see `Gravity`.
+    """
+    params = params or Gravity()
+    components: dict[int, list[ScenePose]] = {}
+    for pose in graph.poses.values():
+        components.setdefault(pose.component, []).append(pose)
+    poses = dict(graph.poses)
+    for members in components.values():
+        votes = [p.S_map_scene.rotation @ ups[p.scene] for p in members if p.scene in ups]
+        if not votes or any(p.scene in fixed for p in members):
+            continue
+        up = np.median(votes, axis=0)  # one scene that took a wall for the floor must not tilt the map
+        length = np.linalg.norm(up)
+        if length < params.min_agreement:
+            continue
+        if np.arccos(np.clip(up[2] / length, -1, 1)) < np.radians(params.max_tilt_deg):
+            continue
+        turn = Sim3(rotation_to_z(up / length), np.zeros(3))
+        for pose in members:
+            poses[pose.scene] = replace(pose, S_map_scene=turn @ pose.S_map_scene)
+    return replace(graph, poses=poses)

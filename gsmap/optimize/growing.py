@@ -1,0 +1,113 @@
+"""Components grow: by edges that close loops in them, by joining, and by single edges; and are cut again."""
+
+from __future__ import annotations
+
+import networkx
+import numpy as np
+
+from gsmap.optimize.consistency import consistent_with_component
+from gsmap.optimize.joining import attaching_joins, find_joins, join_decision, merge_components, spanning_joins
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import Params
+from gsmap.optimize.state import State
+from gsmap.optimize.structure import bridges, component_labels
+
+
+def take_in_agreeing(m: Measurements, state: State, params: Params) -> bool:
+    """Take in edges and join components as long as edges agree; poses are moved, not yet refined."""
+    any_taken = False
+    while close_loops(m, state, params) or join_components(m, state, params, single=False):
+        any_taken = True
+    return any_taken
+
+
+def take_in(m: Measurements, state: State, params: Params) -> None:
+    """Take in what agrees, and then what single edges attach."""
+    while take_in_agreeing(m, state, params) or join_components(m, state, params, single=True):
+        pass
+
+
+def attach_singles(m: Measurements, state: State, params: Params) -> None:
+    """Attach small components by single edges, as long as there are any."""
+    while join_components(m, state, params, single=True):
+        pass
+
+
+def close_through_singles(m: Measurements, state: State, params: Params) -> bool:
+    """Take in the cycles that close once single edges attach small components.
+
+    The single edges that no cycle confirms are let go again, for a scene that rests on one edge is no evidence
+    for others; they come back when nothing else does.
+    """
+    accepted, poses = state.accepted.copy(), state.poses
+    while join_components(m, state, params, single=True):
+        close_loops(m, state, params)
+    state.accepted &= accepted | m.confirmed | ~bridges(m, state.accepted)
+    if (state.accepted & ~accepted).any():
+        return True
+    state.poses = poses
+    return False
+
+
+def close_loops(m: Measurements, state: State, params: Params) -> bool:
+    """Take in the edges inside a component that agree with what the component predicts for them."""
+    rows = state.open(params.max_failures)
+    if not len(rows):
+        return False
+    drift = state.drift(m, params)
+    fits = rows[consistent_with_component(m, rows, drift, params.gate_probability)]
+    state.accepted[fits] = True
+    return len(fits) > 0
+
+
+def join_components(m: Measurements, state: State, params: Params, *, single: bool) -> bool:
+    """Join components where edges agree, or, with ``single``, where one edge attaches a small component."""
+    rows = state.open(params.max_failures)
+    if not len(rows):
+        return False
+    drift = state.drift(m, params)
+    sizes = np.bincount(drift.labels)
+    offers = find_joins(m, rows, drift, params.gate_probability)
+    decisions = [join_decision(join, m, sizes, params.joining) for join in offers]
+    wanted = "single" if single else "agreed"
+    fitting = [join for join, decision in zip(offers, decisions, strict=True) if decision == wanted]
+    if single:
+        chosen = attaching_joins(fitting, sizes, params.joining.small_component)
+    else:
+        chosen = spanning_joins(fitting, len(sizes))
+    state.pending = {
+        int(row): decision
+        for join, decision in zip(offers, decisions, strict=True)
+        for row in join.offered
+        if decision not in ("agreed", "single")
+    }
+    if not chosen:
+        return False
+    taken, state.poses = merge_components(m, chosen, drift.labels, state.poses)
+    state.accepted[taken] = True
+    return True
+
+
+def cut_weak_bridges(m: Measurements, state: State, params: Params) -> None:
+    """Let go of single edges that have come to hold two firm components together.
+
+    A scene attached by one edge may turn out to belong to a component of its own; then that edge alone would join
+    two components, which it may not.
+    """
+    single = bridges(m, state.accepted) & ~m.confirmed
+    blocks = component_labels(m, np.flatnonzero(state.accepted & ~single))
+    solid = np.bincount(blocks) >= params.joining.small_component
+    graph = networkx.Graph()
+    rows = np.flatnonzero(single)
+    ends = np.stack([blocks[m.targets[rows]], blocks[m.sources[rows]]], axis=1)
+    graph.add_edges_from((a, b, {"row": row}) for (a, b), row in zip(ends.tolist(), rows.tolist(), strict=True))
+    for part in networkx.connected_components(graph):
+        tree = graph.subgraph(part)
+        total = sum(solid[k] for k in part)
+        if total < 2:
+            continue
+        below = {k: int(solid[k]) for k in part}
+        for child, parent in reversed([(b, a) for a, b in networkx.bfs_edges(tree, min(part))]):
+            if 0 < below[child] < total:
+                state.accepted[tree.edges[child, parent]["row"]] = False
+            below[parent] += below[child]

@@ -1,0 +1,168 @@
+"""When two components may join, and how they are moved together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.consistency import agreeing_pairs
+from gsmap.optimize.drift import DriftModel
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import Joining
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """Edges that agree on how component ``source`` lies in the frame of component ``target``.
+
+    Args:
+        target, source: components by label.
+        edges: rows of the edges that agree, the one that most others agree with first.
+        rival: how many edges the largest group has that contradicts them.
+        offered: rows of all edges between the two.
+    """
+
+    target: int
+    source: int
+    edges: np.ndarray
+    rival: int
+    offered: np.ndarray
+
+
+def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probability: float) -> list[Join]:
+    """For every pair of components with edges between them, the largest group of edges that agree."""
+    labels = drift.labels
+    rows = rows[labels[edges.targets[rows]] != labels[edges.sources[rows]]]
+    if not len(rows):
+        return []
+    low = np.minimum(labels[edges.targets[rows]], labels[edges.sources[rows]])
+    high = np.maximum(labels[edges.targets[rows]], labels[edges.sources[rows]])
+    order = np.lexsort((rows, high, low))
+    rows, low, high = rows[order], low[order], high[order]
+    starts = np.flatnonzero(np.r_[True, (low[1:] != low[:-1]) | (high[1:] != high[:-1])])
+    ends = np.r_[starts[1:], len(rows)]
+    first, second = agreeing_pairs(edges, rows, drift, np.repeat(ends, ends - starts), probability)
+    neighbours = sp.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(rows), len(rows))).tocsr()
+    neighbours = neighbours + neighbours.T
+    count = np.diff(neighbours.indptr)
+    # A pair of scenes tied twice is one piece of evidence when it comes to counting pairs; see `join_decision`.
+    weight = -np.log(np.trace(edges.covariance[rows], axis1=1, axis2=2))
+    out = []
+    for begin, end in zip(starts, ends, strict=True):
+        # A confirmed edge decides which group counts.
+        best = begin + int(np.lexsort((weight[begin:end], count[begin:end], edges.confirmed[rows[begin:end]]))[-1])
+        mine = np.zeros(end - begin, dtype=bool)
+        mine[np.r_[neighbours.indices[neighbours.indptr[best] : neighbours.indptr[best + 1]], best] - begin] = True
+        rival = _largest_apart(neighbours, begin, mine)
+        group = np.r_[best, begin + np.flatnonzero(mine)]
+        group = group[np.sort(np.unique(group, return_index=True)[1])]
+        out.append(Join(int(low[begin]), int(high[begin]), rows[group], rival, rows[begin:end]))
+    return out
+
+
+def _largest_apart(neighbours: sp.csr_matrix, begin: int, mine: np.ndarray) -> int:
+    """Size of the largest agreeing group among edges that agree with none of ``mine``."""
+    block = neighbours[begin : begin + len(mine), begin : begin + len(mine)]
+    apart = ~mine & (block @ mine.astype(float) == 0)
+    return int((block[apart] @ apart.astype(float)).max()) + 1 if apart.any() else 0
+
+
+def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Joining) -> str:
+    """``agreed``, ``single`` or, where the evidence does not suffice, the reason in words.
+
+    For what is assumed of edges that agree see `Joining`.
+    """
+    rows = join.edges
+    if edges.confirmed[join.offered].any():
+        return "agreed"
+    large = min(sizes[join.target], sizes[join.source]) >= params.small_component
+    aliased = join.rival >= params.rival_edges and len(rows) < params.rival_factor * join.rival
+    if len(rows) <= join.rival or (large and aliased):
+        return f"{len(rows)} edges agree and {join.rival} others contradict them: undecided"
+    low = np.minimum(edges.targets[rows], edges.sources[rows])
+    high = np.maximum(edges.targets[rows], edges.sources[rows])
+    pairs = len(np.unique(low * edges.num_scenes + high))
+    if large:
+        if pairs >= params.bridge_edges:
+            return "agreed"
+        return (
+            f"would join two components of {params.small_component} or more scenes: needs {params.bridge_edges} "
+            f"agreeing edges over {params.bridge_edges} scene pairs, or one that is confirmed, has {pairs}"
+        )
+    return "agreed" if pairs >= 2 else "single"
+
+
+def merge_components(
+    edges: Measurements, chosen: list[Join], labels: np.ndarray, poses: Similarities
+) -> tuple[np.ndarray, Similarities]:
+    """Move whole components so that the first edge of each chosen join is met. Joins must form no cycle.
+
+    Returns:
+        Rows of the edges taken in, and the moved poses.
+    """
+    ties: dict[int, list[tuple[int, int]]] = {}
+    for k, join in enumerate(chosen):
+        ties.setdefault(join.target, []).append((join.source, k))
+        ties.setdefault(join.source, []).append((join.target, k))
+    size = np.bincount(labels)
+    motion = Similarities.identity(len(size))
+    seen = np.zeros(len(size), dtype=bool)
+    # The larger component keeps its frame.
+    for start in sorted(ties, key=lambda label: (-size[label], label)):
+        if seen[start]:
+            continue
+        seen[start] = True
+        front = [start]
+        while front:
+            here = front.pop()
+            for there, k in ties[here]:
+                if seen[there]:
+                    continue
+                seen[there] = True
+                edge = chosen[k].edges[:1]
+                a, b, S = edges.targets[edge], edges.sources[edge], edges.measured[edge]
+                if labels[a[0]] == here:
+                    onto = poses[a] @ S @ poses[b].inverse()
+                else:
+                    onto = poses[b] @ S.inverse() @ poses[a].inverse()
+                motion = motion.replaced(np.array([there]), motion[np.array([here])] @ onto)
+                front.append(there)
+    taken = np.concatenate([join.edges for join in chosen]) if chosen else np.zeros(0, dtype=np.int64)
+    return taken, (motion[labels] @ poses).orthonormalised()
+
+
+def spanning_joins(offers: list[Join], count: int) -> list[Join]:
+    """The joins of most edges that form no cycle between ``count`` components."""
+    order = sorted(offers, key=lambda join: (-len(join.edges), join.target, join.source))
+    # Distinct weights: the minimum spanning forest is the one that taking them in order would give.
+    rank = np.arange(1.0, len(order) + 1)
+    ends = np.array([join.target for join in order]), np.array([join.source for join in order])
+    tree = minimum_spanning_tree(sp.coo_matrix((rank, ends), shape=(count, count)).tocsr())
+    return [order[int(k) - 1] for k in np.sort(tree.data)]
+
+
+def attaching_joins(offers: list[Join], sizes: np.ndarray, small_component: int) -> list[Join]:
+    """Joins by single edges: from the largest component outwards, each step taking in one small component."""
+    ties: dict[int, list[tuple[int, Join]]] = {}
+    for join in offers:
+        ties.setdefault(join.target, []).append((join.source, join))
+        ties.setdefault(join.source, []).append((join.target, join))
+    taken: set[int] = set()
+    out = []
+    for start in sorted(ties, key=lambda label: (-sizes[label], label)):
+        if start in taken:
+            continue
+        taken.add(start)
+        front = [start]
+        while front:
+            here = front.pop(0)
+            for there, join in sorted(ties[here], key=lambda tie: tie[0]):
+                if there not in taken and sizes[there] < small_component:
+                    taken.add(there)
+                    out.append(join)
+                    front.append(there)
+    return out

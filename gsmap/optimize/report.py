@@ -1,0 +1,96 @@
+"""An answer as people read it: scenes and edges by id, with reasons in words."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.cycles import Vote
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import Params
+from gsmap.optimize.robust import chi_squares
+from gsmap.optimize.state import State
+from gsmap.optimize.structure import bridges, component_labels
+from gsmap.types import EdgeOutcome, PoseGraph, ScenePose
+from gsmap.types.plain import plain
+
+
+def pose_graph(
+    m: Measurements,
+    poses: Similarities,
+    component: np.ndarray,
+    covariances: np.ndarray,
+    state: State,
+    votes: Vote,
+    params: Params,
+) -> PoseGraph:
+    """Scenes and edges by id; its provenance is left to the caller."""
+    firm = state.accepted & (~bridges(m, state.accepted) | m.confirmed)
+    status = _statuses(m, state.accepted, firm)
+    return PoseGraph(
+        poses={
+            scene: ScenePose(
+                scene,
+                poses.item(k),
+                int(component[k]),
+                str(status[k]),
+                covariances[k] if covariances[k].any() else None,
+            )
+            for k, scene in enumerate(m.scene_ids)
+        },
+        outcomes=_outcomes(m, poses, component, firm, status, state, votes, params),
+        settings=plain(params),
+    )
+
+
+def _outcomes(
+    m: Measurements,
+    poses: Similarities,
+    component: np.ndarray,
+    firm: np.ndarray,
+    status: np.ndarray,
+    state: State,
+    votes: Vote,
+    params: Params,
+) -> dict[tuple[str, str], EdgeOutcome]:
+    gate = float(chi2.ppf(params.gate_probability, m.dim))
+    chi = chi_squares(m, poses)
+    together = component[m.targets] == component[m.sources]
+    out: dict[tuple[str, str], EdgeOutcome] = {}
+    for k, key in enumerate(m.keys):
+        residual = float(chi[k]) if together[k] else None
+        if firm[k]:
+            out[key] = EdgeOutcome("used", residual)
+        elif state.accepted[k]:
+            out[key] = EdgeOutcome("tentative", residual, "in no agreeing cycle: rests on its own verdict alone")
+        elif not together[k]:
+            reason = state.pending.get(k, "contradicts what else is known of the two components")
+            if state.undecided[k]:
+                reason = "edges that agree among themselves contradict each other here: places that look alike?"
+            out[key] = EdgeOutcome("unused", None, reason, undecided=True)
+        else:
+            reason = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
+            if votes.agree[k] > 0:
+                reason += "; it agrees with others that do too (a place that looks alike?)"
+            doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
+            undecided = bool(votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
+            out[key] = EdgeOutcome("unused", residual, reason, undecided)
+    return out
+
+
+def _statuses(m: Measurements, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:
+    """(N,) ``placed`` in the largest firmly tied part of a component, ``tentative`` beside it, ``isolated`` alone."""
+    component = component_labels(m, np.flatnonzero(accepted))
+    blocks = component_labels(m, np.flatnonzero(firm))
+    sizes = np.bincount(blocks, minlength=1)[blocks]
+    order = np.lexsort((blocks, -sizes, component))
+    _, first, which = np.unique(component[order], return_index=True, return_inverse=True)
+    main = np.empty(m.num_scenes, dtype=bool)
+    main[order] = blocks[order] == blocks[order[first]][which]
+    status = np.where(main & (sizes > 1), "placed", "tentative").astype(object)
+    tied = np.zeros(m.num_scenes, dtype=bool)
+    rows = np.flatnonzero(accepted)
+    tied[m.targets[rows]] = tied[m.sources[rows]] = True
+    status[~tied] = "isolated"
+    return status

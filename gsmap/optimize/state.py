@@ -1,0 +1,92 @@
+"""What the solve believes at the moment, its start, and its refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.consistency import consistent_with_component
+from gsmap.optimize.cycles import Vote
+from gsmap.optimize.drift import DriftModel
+from gsmap.optimize.measurements import Measurements
+from gsmap.optimize.params import Params
+from gsmap.optimize.priors import PriorTerms
+from gsmap.optimize.robust import Descent, chi_squares, chordal, spanning_tree_init
+from gsmap.optimize.structure import component_labels, roots
+
+
+@dataclass(eq=False)
+class State:
+    """Where scenes are, and which edges are taken in.
+
+    Args:
+        poses: N. accepted: (E,) bool, edges taken in.
+        failures: (E,) how often an edge was taken in and let go.
+        undecided, rejected: (E,) bool, edges that places that look alike leave open, or that are surely wrong.
+        terms: priors that are believed.
+        pending: by edge, why the components that it ties may not join.
+    """
+
+    poses: Similarities
+    accepted: np.ndarray
+    failures: np.ndarray
+    undecided: np.ndarray
+    rejected: np.ndarray
+    terms: PriorTerms
+    pending: dict[int, str]
+
+    @classmethod
+    def fresh(cls, m: Measurements, poses: Similarities, accepted: np.ndarray, terms: PriorTerms) -> State:
+        """Nothing has failed yet."""
+        no = np.zeros(len(m), dtype=bool)
+        return cls(poses, accepted, np.zeros(len(m), dtype=np.int64), no, no, terms, {})
+
+    def open(self, max_failures: int) -> np.ndarray:
+        """Rows of the edges that may still be taken in."""
+        settled = self.accepted | self.undecided | self.rejected
+        return np.flatnonzero(~settled & (self.failures < max_failures))
+
+    def drift(self, m: Measurements, params: Params) -> DriftModel:
+        """How far predictions along the accepted edges may be off."""
+        return DriftModel.over(m, np.flatnonzero(self.accepted), self.poses, params.limits.exact_hops)
+
+
+def initial_state(m: Measurements, votes: Vote, terms: PriorTerms, params: Params) -> State:
+    """Poses along the best supported edges; the supported edges that agree with them are taken in."""
+    accepted = (votes.agree > 0) | m.confirmed
+    rows = np.flatnonzero(accepted)
+    # Confirmed edges first, then what neighbours support, then the more certain measurement.
+    certainty = np.trace(m.covariance[rows], axis1=1, axis2=2)
+    order = np.lexsort((certainty, -votes.support[rows], ~m.confirmed[rows]))
+    cost = np.empty(len(rows))
+    cost[order] = np.arange(1, len(rows) + 1)
+    poses = spanning_tree_init(m, rows, cost, Similarities.identity(m.num_scenes))
+    if len(rows):
+        drift = DriftModel.over(m, rows, poses, params.limits.exact_hops)
+        accepted[rows] = consistent_with_component(m, rows, drift, params.gate_probability) | m.confirmed[rows]
+    return State.fresh(m, poses, accepted, terms)
+
+
+def refine(m: Measurements, state: State, gate: float, widest: float, params: Params) -> None:
+    """Robust poses of every component from its accepted edges; edges that do not fit are let go.
+
+    Args:
+        gate: chi-square up to which an edge fits.
+        widest: width in gates at which the robust kernel starts.
+    """
+    rows = np.flatnonzero(state.accepted)
+    if not len(rows):
+        return
+    fixed = np.zeros(m.num_scenes, dtype=bool)
+    fixed[roots(component_labels(m, rows))] = True
+    edges = m[rows]
+    fill_blocks = params.limits.fill_blocks
+    if (chi_squares(edges, state.poses) > params.restart * gate).any():
+        state.poses = chordal(edges, fixed, state.poses, fill_blocks)
+    descent = Descent(edges, fixed, fill_blocks)
+    state.poses = descent.solve_gnc(state.poses, gate, widest, params.gnc_shrink, edges.confirmed)
+    bad = (chi_squares(edges, state.poses) > gate) & ~edges.confirmed
+    state.accepted[rows[bad]] = False
+    state.failures[rows[bad]] += 1

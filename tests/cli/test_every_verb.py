@@ -1,0 +1,374 @@
+"""Every verb, as a table and as JSON, on one small map."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer.main
+
+import gsmap
+import gsmap_synthetic
+from gsmap import formats
+from gsmap.cli.app import build
+from gsmap.cli.objects import OBJECTS, Many, Maybe
+
+Run = Callable[..., Any]
+
+
+def verbs(command: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """The verbs of the program, by walking its tree of commands, so that none can be forgotten."""
+    command = command or typer.main.get_command(build())
+    for name, inner in getattr(command, "commands", {}).items():
+        if hasattr(inner, "commands"):
+            yield from verbs(inner, (*path, name))
+        else:
+            yield " ".join((*path, name)), inner
+
+
+VERBS = dict(verbs())
+
+# What is run for each verb (or each of its forms, as `gsmap.cli.objects` names them). MAP is a copy of the small map.
+RUNS = {
+    "init": "init TMP/new.gsmap",
+    "ingest": "ingest MAP CAPTURES/left.ply --scale known",
+    "describe": "describe MAP left",
+    "register": "register MAP --pairs left:right",
+    "optimize": "optimize MAP",
+    "update": "update MAP",
+    "status": "status MAP",
+    "confirm": "confirm MAP left:right --note seen",
+    "reject": "reject MAP left:right --note mirrored",
+    "edge": "edge MAP left:right --pose TMP/pose.txt --sigma 0.5,0.02 --note tape",
+    "prior": "prior MAP left --anchor",
+    "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
+    "export": "export MAP TMP/out --tile-size 0 --merge voxel",
+    "list scenes": "list MAP scenes",
+    "list edges": "list MAP edges",
+    "list revisions": "list MAP revisions",
+    "list tiles": "list MAP tiles",
+    "show SCENE": "show MAP left",
+    "show A:B": "show MAP left:right",
+    "diff": "diff MAP 1 2",
+    "poses": "poses MAP",
+    "settings": "settings MAP",
+    "convert": "convert CAPTURES/left.ply TMP/left.spz",
+    "models add": "models add MAP clip TMP/encoder.onnx --preset unit",
+    "models list": "models list MAP",
+    "evaluate": "evaluate MAP --truth CAPTURES/truth",
+    "remove": "remove MAP odd:one",
+    "check": "check MAP",
+    "prune": "prune MAP --dry-run",
+    "migrate": "migrate MAP",
+    "view": "view MAP --no-browser",
+    "demo": "demo TMP/demo",
+}
+SILENT = {"init", "prior", "convert", "models add", "remove", "check", "migrate", "view"}
+"""Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""
+
+
+@pytest.fixture
+def gsmap_run(
+    cli: Run, site: Path, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], Any]:
+    """Runs a line of `RUNS`."""
+    np.savetxt(tmp_path / "pose.txt", np.eye(4))
+    (tmp_path / "encoder.onnx").write_bytes(_image_encoder())
+    monkeypatch.setattr("gsmap.view.ViewServer.serve_forever", lambda self: None)
+    # The demo's own captures take a minute: what it does with them is what is tried here.
+    monkeypatch.setattr(gsmap_synthetic, "make_captures", lambda seed, progress: [])
+    monkeypatch.setattr(gsmap_synthetic, "write_captures", lambda folder, made: _link_captures(captures, folder))
+
+    def call(line: str) -> Any:
+        places = {"MAP": site, "TMP": tmp_path, "CAPTURES": captures}
+        words = []
+        for word in line.split():
+            first, slash, rest = word.partition("/")
+            words.append(f"{places[first]}{slash}{rest}" if first in places else word)
+        return cli(*words)
+
+    return call
+
+
+def _link_captures(captures: Path, folder: Path) -> None:
+    (folder / "truth").mkdir(parents=True)
+    for path in [*captures.glob("left*"), *captures.glob("truth/left*")]:
+        (folder / path.relative_to(captures)).symlink_to(path)
+
+
+def _image_encoder() -> bytes:
+    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
+    from onnx import TensorProto, helper
+
+    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
+    flat = helper.make_node("Flatten", ["pooled"], ["features"])
+    graph = helper.make_graph(
+        [pool, flat],
+        "encoder",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
+        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
+
+
+def test_no_verb_is_forgotten() -> None:
+    assert set(RUNS) == set(OBJECTS)
+    run = {line.split()[0] + (f" {line.split()[1]}" if line.startswith("models") else "") for line in RUNS.values()}
+    assert run == set(VERBS)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_takes_json_and_explains_itself(verb: str, cli: Run) -> None:
+    options = {option for parameter in VERBS[verb].params for option in parameter.opts}
+    assert "--json" in options
+    short = cli(*verb.split(), "-h")
+    assert short.code == 0
+    assert f"gsmap {verb.split()[0]}" in short.stdout.split("Example:")[1]
+
+
+@pytest.mark.parametrize("verb", RUNS)
+def test_every_verb_prints_a_table(verb: str, gsmap_run: Callable[[str], Any]) -> None:
+    done = gsmap_run(RUNS[verb])
+    assert done.code == 0, done.stderr
+    assert (done.stdout == "") == (verb in SILENT), done.stdout
+    assert done.stdout or done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("verb", RUNS)
+def test_every_verb_prints_its_object_as_json(verb: str, gsmap_run: Callable[[str], Any]) -> None:
+    done = gsmap_run(RUNS[verb] + " --json")
+    assert done.code == 0, done.stderr
+    data = done.json
+    assert list(data)[0] == "schema"
+    assert data["schema"] == 1
+    shape = OBJECTS[verb]
+    names = [field.name for field in fields(shape.type)]
+    if isinstance(shape, Many | Maybe):
+        assert list(data) == ["schema", shape.key]
+        rows = data[shape.key] if isinstance(shape, Many) else [data[shape.key]]
+        assert rows or verb == "models list"
+        assert [list(row) for row in rows] == [names] * len(rows)
+    else:
+        assert list(data) == ["schema", *names]
+
+
+def test_the_contract_of_scenes_and_edges_stands(site: Path, cli: Run) -> None:
+    scenes = {row["name"]: row for row in cli("list", site, "scenes", "--json").json["scenes"]}
+    assert list(scenes["left"])[:8] == [
+        "name",
+        "id",
+        "num_gaussians",
+        "num_nodes",
+        "component",
+        "S_map_scene",
+        "captured_at",
+        "status",
+    ]
+    assert np.shape(scenes["left"]["S_map_scene"]) == (4, 4)
+    assert scenes["left"]["component"] == scenes["right"]["component"] != scenes["odd:one"]["component"]
+    edges = cli("list", site, "edges", "--json").json["edges"]
+    by_pair = {frozenset((row["target_name"], row["source_name"])): row for row in edges}
+    good, bad = by_pair[frozenset(("left", "right"))], by_pair[frozenset(("left", "odd:one"))]
+    assert {good["target"], good["source"]} == {scenes["left"]["id"], scenes["right"]["id"]}
+    assert np.shape(good["S_target_source"]) == (4, 4)
+    assert np.shape(good["information"]) == (7, 7)
+    assert (good["status"], good["used"]) == ("accepted", "tentative")
+    assert set(good["seconds"]) == {"match", "refine", "verdict"}
+    assert (bad["status"], bad["used"], bad["S_target_source"]) == ("no_match", False, None)
+    assert bad["reason"]
+
+
+def test_diff_shows_what_moved(site: Path, cli: Run) -> None:
+    cli("prior", site, "left", "--position", 5, 6, 7, "--sigma", 0.01)
+    cli("optimize", site)
+    shown = cli("diff", site, 2, 3)
+    assert shown.code == 0, shown.stderr
+    rows = {row["scene_name"]: row for row in cli("diff", site, 2, 3, "--json").json["scenes"]}
+    assert rows["left"]["change"] == "moved"
+    assert rows["left"]["translation_m"] > 1
+    assert rows["left"]["scale_ratio"] == pytest.approx(1)
+    assert rows["odd:one"]["change"] == "same"
+    cli("remove", site, "odd:one")
+    cli("optimize", site)
+    gone = {row["scene_name"]: row for row in cli("diff", site, 3, 4, "--json").json["scenes"]}["odd:one"]
+    assert (gone["change"], gone["rotation_deg"], gone["component_after"]) == ("removed", None, None)
+    assert "removed" in cli("diff", site, 3, 4).stdout
+
+
+def test_show_fits_a_screen_and_takes_names_with_colons(site: Path, cli: Run) -> None:
+    shown = cli("show", site, "left")
+    assert len(shown.stdout.splitlines()) <= 40
+    assert "landmarks" in shown.stdout
+    with_nodes = cli("show", site, "left", "--nodes")
+    assert len(with_nodes.stdout.splitlines()) > 100
+    assert cli("show", site, "odd:one", "--json").json["name"] == "odd:one"
+    pair = cli("show", site, "left:odd:one", "--json").json
+    assert {pair["target_name"], pair["source_name"]} == {"left", "odd:one"}
+    lost = cli("show", site, "left:nobody")
+    assert lost.code == 1
+    assert "left:nobody" in lost.stderr
+
+
+def test_lists_are_filtered(site: Path, cli: Run) -> None:
+    def names(*options: object) -> list[str]:
+        return [row["name"] for row in cli("list", site, "scenes", "--json", *options).json["scenes"]]
+
+    cli("edit", site, "left", "--tag", "hall", "--captured-at", "2024-05-31")
+    cli("edit", site, "right", "--tag", "hall", "--captured-at", "2024-06-30")
+    assert names("--tag", "hall") == ["left", "right"]
+    assert names("--component", 1) == names("--island", 1) == ["odd:one"]
+    assert names("--status", "isolated") == ["odd:one"]
+    assert names("--after", "2024-06-01", "--tag", "hall") == ["right"]
+    assert names("--after", "2999-01-01") == []
+    edges = cli("list", site, "edges", "--json", "--tag", "hall").json["edges"]
+    assert [(row["target_name"], row["source_name"]) for row in edges] == [("left", "right")]
+    assert len(cli("list", site, "edges", "--json", "--status", "no_match").json["edges"]) == 2
+    assert len(cli("list", site, "revisions", "--json", "--after", "2000-01-01").json["revisions"]) == 2
+    assert len(cli("list", site, "tiles", "--json", "--component", 0).json["tiles"]) == 1
+    assert cli("list", site, "scenes", "--status", "nice").code == 2
+    assert cli("list", site, "scenes", "--after", "yesterday").code == 2
+    assert cli("list", site, "tiles", "--tag", "hall").code == 2
+    untagged = cli("edit", site, "left", "--untag", "hall", "--name", "west", "--json").json
+    assert (untagged["name"], untagged["tags"], untagged["captured_at"][:10]) == ("west", [], "2024-05-31")
+    history = cli("show", site, "west", "--json").json["history"]
+    assert [row["value"] for row in history if row["fact"] == "name"] == ["left", "west"]
+
+
+def test_reviews_count_and_can_be_withdrawn(site: Path, cli: Run) -> None:
+    rejected = cli("reject", site, "left:right", "--note", "mirrored", "--json").json
+    assert (rejected["status"], rejected["review"]) == ("rejected", "reject")
+    assert "unsolved" in {row["what"] for row in cli("status", site, "--json").json["todo"]}
+    cli("optimize", site)
+    assert cli("status", site, "--json").json["components"] == 3
+    taken_back = cli("reject", site, "left:right", "--withdraw", "--json").json
+    assert (taken_back["status"], taken_back["review"]) == ("accepted", None)
+    assert cli("confirm", site, "left:right", "--json").json["review"] == "confirm"
+    cli("optimize", site)
+    status = cli("status", site, "--json").json
+    assert (status["components"], status["islands"]) == (2, 2)
+    events = [row["what"] for row in cli("show", site, "left:right", "--json").json["history"]]
+    assert events == ["accepted", "reject", "withdraw", "confirm"]
+
+
+def test_a_measurement_of_ones_own_places_a_scene(site: Path, cli: Run, tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = [20, 0, 0]
+    (tmp_path / "pose.json").write_text(json.dumps(pose.tolist()))
+    line = ["edge", site, "left:odd:one", "--pose", tmp_path / "pose.json", "--sigma", "0.5,0.02"]
+    row = cli(*line, "--json").json
+    assert (row["status"], row["proposer"]) == ("accepted", "manual")
+    sigmas = np.sqrt(np.diag(np.linalg.inv(row["information"])))
+    np.testing.assert_allclose(sigmas, [np.radians(0.5)] * 3 + [0.02] * 3 + [1e-5], rtol=1e-6)
+    cli("optimize", site)
+    poses = {row["scene_name"]: row for row in cli("poses", site, "--json").json["poses"]}
+    assert {row["component"] for row in poses.values()} == {0}
+    found = np.linalg.inv(poses["left"]["S_map_scene"]) @ poses["odd:one"]["S_map_scene"]
+    np.testing.assert_allclose(found, pose, atol=1e-3)
+    for bad in ("0.5", "0.5,-1", "a,b", "1,2,3,4"):
+        assert cli(*line[:-1], bad).code == 2
+    (tmp_path / "pose.json").write_text("[1, 2]")
+    assert cli(*line).code == 1
+    scaled = tmp_path / "scaled.txt"
+    np.savetxt(scaled, np.diag([2.0, 2, 2, 1]))
+    assert cli("edge", site, "left:odd:one", "--pose", scaled, "--sigma", "1,1").code == 2
+
+
+def test_settings_are_shown_changed_and_refused(site: Path, cli: Run) -> None:
+    rows = {row["name"]: row for row in cli("settings", site, "--json").json["settings"]}
+    assert all(row["doc"] for row in rows.values())
+    name = "optimize.gate_probability"
+    assert rows[name]["value"] == rows[name]["default"]
+    changed = cli("settings", site, "--set", f"{name}=0.9", "--json").json["settings"]
+    assert {row["name"]: row["value"] for row in changed}[name] == 0.9
+    assert "stale_poses" in {row["what"] for row in cli("status", site, "--json").json["todo"]}
+    cli("settings", site, "--unset", name)
+    assert cli("settings", site, "--json").json["settings"] == list(rows.values())
+    for verb in (["settings", site], ["describe", site], ["register", site], ["optimize", site], ["update", site]):
+        wrong = cli(*verb, "--set", "optimize.gate_probabilty=0.9")
+        assert (wrong.code, wrong.stdout) == (2, "")
+        assert name in wrong.stderr
+    assert cli("export", site, site.parent / "o", "--preset", "napkin").code == 2
+    assert cli("settings", site, "--set", name).code == 2
+    assert cli("settings", site, "--set", f"{name}=often").code == 2
+
+
+def test_settings_of_one_run_are_not_kept(site: Path, cli: Run) -> None:
+    def revisions() -> int:
+        return len(cli("list", site, "revisions", "--json").json["revisions"])
+
+    before = revisions()
+    cli("update", site)
+    assert revisions() == before
+    cli("update", site, "--set", "optimize.gate_probability=0.9")
+    assert revisions() == before + 1
+    assert not (site / "settings.toml").exists()
+
+
+def test_pairs_from_a_file(site: Path, cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "pairs.txt").write_text("# checked by hand\nleft right\n\nright odd:one\n")
+    rows = cli("register", site, "--pairs", tmp_path / "pairs.txt", "--json").json["edges"]
+    assert [(row["target_name"], row["source_name"]) for row in rows] == [("left", "right"), ("right", "odd:one")]
+    assert cli("register", site, "--pairs", tmp_path / "none.txt").code == 1
+
+
+@pytest.mark.parametrize("format", ["tum", "g2o", "colmap", "nerfstudio", "json"])
+def test_poses_for_other_programs(site: Path, cli: Run, tmp_path: Path, format: str) -> None:
+    done = cli("poses", site, tmp_path / "poses.out", "--format", format)
+    assert (done.code, done.stdout) == (0, ""), done.stderr
+    assert list(tmp_path.glob("poses*"))
+    assert cli("poses", site, "--format", format).code == 2
+
+
+def test_prune_says_what_it_would_do(site: Path, cli: Run) -> None:
+    cli("remove", site, "odd:one")
+    cli("optimize", site)
+    line = ["prune", site, "--keep-revisions", 1, "--json"]
+    planned = cli(*line, "--dry-run").json
+    assert planned["dry_run"] is True
+    assert planned["scene_names"] == ["odd:one"]
+    assert planned["num_bytes"] > 10_000
+    done = cli(*line).json
+    assert done["dry_run"] is False
+    assert done["scene_names"] == ["odd:one"]
+    assert cli(*line).json["scene_names"] == []
+
+
+def test_check_exits_with_1_and_names_what_is_damaged(made_site: Path, site: Path, cli: Run) -> None:
+    victim = next(path for path in sorted((site / "arrays" / "scenes").rglob("c/*")) if path.is_file())
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 1
+    victim.unlink()  # it is a link to that of the map which the other tests share
+    victim.write_bytes(data)
+    assert cli("check", site).code == 1
+    done = cli("check", site, "--json")
+    assert done.code == 1
+    assert done.json["ok"] is False
+    assert len(done.json["problems"]) >= 1
+    assert cli("check", made_site).code == 0
+
+
+def test_quiet_and_verbose(site: Path, cli: Run, captures: Path) -> None:
+    again = ["ingest", site, captures / "left.ply", "--scale", "known"]
+    assert "left" in cli(*again).stderr
+    assert cli("-q", *again).stderr == ""
+    assert cli("-q", "list", site, "tiles", "--tag", "x").stderr.count("\n") == 1
+    assert "INFO gsmap." in cli("-v", *again).stderr
+    assert "INFO gsmap." not in cli(*again).stderr
+
+
+def test_python_and_the_command_line_say_the_same(site: Path, cli: Run) -> None:
+    with gsmap.open(site) as m:
+        rows = m.scene_rows()
+        assert rows == m.scene_rows()
+        assert [row.to_json() for row in rows] == cli("list", site, "scenes", "--json").json["scenes"]
+
+
+def test_a_converted_file_holds_what_the_json_says(cli: Run, captures: Path, tmp_path: Path) -> None:
+    said = cli("convert", captures / "left.ply", tmp_path / "left.spz", "--json").json
+    assert len(formats.read(tmp_path / "left.spz")) == said["num_gaussians"] > 1000

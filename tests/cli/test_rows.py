@@ -1,0 +1,139 @@
+"""Rows are defined once: their fields are the JSON, their columns a table, and docs/json.md says what each means."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import typing
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from gsmap.cli.console import json_object, print_rows, print_table, text
+from gsmap.types import Sim3, rows
+from gsmap.types.rows import Row
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "json.md"
+TYPES = [cls for cls in vars(rows).values() if isinstance(cls, type) and issubclass(cls, Row) and is_dataclass(cls)]
+
+
+def make_json_docs() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("make_json_docs", ROOT / "tools" / "make_json_docs.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+TOOL = make_json_docs()
+
+
+def test_the_page_is_what_the_rows_say() -> None:
+    assert PAGE.read_text(encoding="utf-8") == TOOL.page(), "run python tools/make_json_docs.py"
+
+
+@pytest.mark.parametrize("row", TYPES, ids=lambda row: row.__name__)
+def test_the_page_documents_every_field_and_nothing_else(row: type[Row]) -> None:
+    section = PAGE.read_text(encoding="utf-8").split(f"\n### {row.__name__}\n")[1].split("\n### ")[0]
+    entries = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+) \|$", section, re.M)
+    assert [name for name, _, _ in entries] == [field.name for field in fields(row)]
+    assert all(len(meaning) > 2 for *_, meaning in entries)
+    assert set(TOOL.docs_of(row)) == {field.name for field in fields(row)}
+
+
+@pytest.mark.parametrize("row", TYPES, ids=lambda row: row.__name__)
+def test_columns_are_fields_or_properties(row: type[Row]) -> None:
+    assert all(hasattr(row, name) or name in row.__dataclass_fields__ for name in row.columns)
+
+
+@pytest.mark.parametrize("row", TYPES, ids=lambda row: row.__name__)
+def test_ids_and_names_go_together(row: type[Row]) -> None:
+    names = {field.name for field in fields(row)}
+    for key in ("scene", "target", "source"):
+        assert (key in names) == (f"{key}_name" in names), key
+    hints = typing.get_type_hints(row)
+    assert all(hints[key] is str for key in ("scene", "target", "source") if key in names)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sample(Row):
+    pose: Sim3
+    matrix: np.ndarray
+    number: float
+    inner: tuple[rows.SceneRef, ...]
+    more: dict[str, float]
+
+
+def sample(number: float) -> Sample:
+    return Sample(
+        pose=Sim3(np.eye(3), np.array([1.0, 2, 3]), 2.0),
+        matrix=np.array([1.0, np.nan, np.inf]),
+        number=number,
+        inner=(rows.SceneRef(scene="a", scene_name="monday"),),
+        more={"x": float("nan"), "y": 1},
+    )
+
+
+def test_json_is_strict_and_whole() -> None:
+    data = json.loads(json.dumps(sample(float("inf")).to_json(), allow_nan=False))
+    assert data == {
+        "pose": [[2, 0, 0, 1], [0, 2, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]],
+        "matrix": [1, None, None],
+        "number": None,
+        "inner": [{"scene": "a", "scene_name": "monday"}],
+        "more": {"x": None, "y": 1},
+    }
+
+
+def test_floats_keep_their_bits() -> None:
+    value = 0.1 + 0.2
+    assert json.loads(json.dumps(sample(value).to_json()))["number"] == value
+
+
+def test_equal_rows_say_the_same() -> None:
+    assert sample(1.0) == sample(1.0) != sample(2.0)
+    assert rows.SceneRef(scene="a", scene_name="b") != rows.ViewReport(url="a")
+
+
+def test_a_verb_cannot_print_another_row_than_it_declares() -> None:
+    with pytest.raises(TypeError, match="InitReport, not ViewReport"):
+        json_object("init", rows.ViewReport(url="x"))
+    with pytest.raises(TypeError, match="one InitReport"):
+        json_object("init", [])
+    assert json_object("prior", None) == {"schema": 1, "prior": None}
+    assert json_object("models list", []) == {"schema": 1, "models": []}
+
+
+def test_tables_shorten_digests_and_escape_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    digest = "0123456789abcdef" * 2
+    print_table("t", {"scene": "id", "scene_name": "name"}, [rows.SceneRef(scene=digest, scene_name="[bold]x")])
+    printed = capsys.readouterr().out
+    assert digest[:12] in printed
+    assert digest not in printed
+    assert "[bold]x" in printed
+
+
+def test_an_empty_table_has_its_headings(capsys: pytest.CaptureFixture[str]) -> None:
+    print_rows("models list", [], json=False)
+    assert "preset" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (None, "-"),
+        (True, "yes"),
+        (0.123456, "0.1235"),
+        ((1, "a"), "1, a"),
+        (np.array([1.0, 2.5]), "1 2.5"),
+        ({"a": 1.0}, "a 1"),
+    ],
+)
+def test_values_read_as_people_write_them(value: object, shown: str) -> None:
+    assert text(value) == shown
