@@ -148,7 +148,7 @@ def test_only_the_demo_imports_synthetic_scenes() -> None:
 
 def test_public_surface() -> None:
     """What is imported on first use is what type checkers are told of, and everything is there."""
-    tree = ast.parse((PACKAGE / "__init__.py").read_text())
+    tree = ast.parse((SOURCES["gsmap"] / "__init__.py").read_text())
     block = next(node for node in tree.body if isinstance(node, ast.If))
     told = {
         (alias.asname, node.module)
@@ -169,7 +169,7 @@ def test_public_surface() -> None:
 
 def test_names_in_the_readme_are_there() -> None:
     """Every dotted name that the README says is there after ``import gsmap``."""
-    named = set(re.findall(r"`gsmap\.((?:\w+\.)*\w+)`", (PACKAGE.parent / "README.md").read_text()))
+    named = set(re.findall(r"`gsmap\.((?:\w+\.)*\w+)`", (SOURCES["gsmap"].parent / "README.md").read_text()))
     assert named
     names = ", ".join(sorted(f"gsmap.{name}" for name in named))
     subprocess.run([sys.executable, "-c", f"import gsmap; {names}"], check=True, timeout=120)
