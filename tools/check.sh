@@ -1,5 +1,6 @@
 #!/bin/sh
-# Everything CI checks: the README's own test command from a clean clone in a fresh environment, then the linters.
+# Everything CI checks: the README's own test command from a clean clone in a fresh environment, the linters, the types,
+# and that a fault planted in each of five rooms turns its tests red.
 #
 #   tools/check.sh            a clean clone of what is committed
 #   tools/check.sh --here     this checkout as it lies, in its own .venv
@@ -23,8 +24,12 @@ log=$(mktemp)
 status=0
 sh -c "$command" >"$log" 2>&1 || status=$?
 cat "$log"
-.venv/bin/ruff check .
-.venv/bin/ruff format --check .
+# All are run, whatever one of them finds.
+.venv/bin/ruff check . || status=1
+.venv/bin/ruff format --check . || status=1
+.venv/bin/mypy || status=1
+.venv/bin/python tools/planted_faults.py --quick || status=1
 # The tests' closing line last, so that whoever reads only the end sees it.
 grep -E '^=+ .*(passed|failed|error).* =+$' "$log" | tail -n 1
+rm -f "$log"
 exit "$status"

@@ -47,13 +47,18 @@ def _load(path: Path) -> Any:
 
 
 def version_of(name: str) -> int:
-    """The ``VERSION`` of a method (``merger.tto``), or of a stage or a part of one (``register``, ``landmarks``)."""
+    """The ``VERSION`` of a method (``merger.tto``) or of a stage or a part of one (``register``, ``landmarks``).
+
+    A part without a number of its own (``merge.exposure``) has its stage's.
+    """
     room, _, method = name.partition(".")
     if method and room in families():
         return families()[room].version(method)[name]
     for versions in _stages():
         if name in versions:
             return versions[name]
+    if method:
+        return version_of(room)
     version = getattr(importlib.import_module(f"gsmap.{name}"), "VERSION", None)
     assert version is not None, f"nothing called {name!r} has a VERSION"
     return int(version)

