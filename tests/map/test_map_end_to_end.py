@@ -18,6 +18,7 @@ from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.export.manifest import FILE_NAME
 from gsmap.types import Prior, Sim3
+from gsmap.types.rows import GraphRow
 from gsmap_synthetic import make_captures, write_captures
 
 
@@ -55,11 +56,11 @@ def test_every_scene_is_placed_where_it_was_made(site: Path, captures: Path) -> 
     with gsmap.open(site) as m:
         report = m.evaluate(captures / "truth")
         rows = m.scene_rows()
-    assert len(report["pairs"]) == 3
-    assert report["pairs_worst_rre_deg"] < 0.2
-    assert report["pairs_worst_centroid_m"] < 0.01
-    assert {row["status"] for row in rows} == {"placed"}
-    assert {row["component"] for row in rows} == {0}
+    assert len(report.pairs) == 3
+    assert report.pairs_worst_rre_deg < 0.2
+    assert report.pairs_worst_centroid_m < 0.01
+    assert {row.status for row in rows} == {"placed"}
+    assert {row.component for row in rows} == {0}
 
 
 def test_the_map_stands_upright(site: Path) -> None:
@@ -70,20 +71,13 @@ def test_the_map_stands_upright(site: Path) -> None:
 
 
 def test_json_keeps_the_contract(site: Path) -> None:
-    scenes = json.loads(cli("list", site, "scenes", "--json"))
-    assert list(scenes[0]) == [
-        "name",
-        "id",
-        "num_gaussians",
-        "num_nodes",
-        "component",
-        "S_map_scene",
-        "captured_at",
-        "status",
-    ]
+    """The keys that scripts outside rely on; `docs/json.md` has them all."""
+    scenes = json.loads(cli("list", site, "scenes", "--json"))["scenes"]
+    wanted = ["name", "id", "num_gaussians", "num_nodes", "component", "S_map_scene", "captured_at", "status"]
+    assert list(scenes[0])[: len(wanted)] == wanted
     assert np.shape(scenes[0]["S_map_scene"]) == (4, 4)
-    edges = json.loads(cli("list", site, "edges", "--json"))
-    assert list(edges[0]) == [
+    edges = json.loads(cli("list", site, "edges", "--json"))["edges"]
+    assert set(edges[0]) >= {
         "target",
         "source",
         "status",
@@ -96,17 +90,18 @@ def test_json_keeps_the_contract(site: Path) -> None:
         "overlap",
         "seconds",
         "used",
-    ]
+    }
     assert set(edges[0]["seconds"]) == {"match", "refine", "verdict"}
     assert np.shape(edges[0]["information"]) == (7, 7)
     assert {e["target"] for e in edges} <= {s["id"] for s in scenes}
+    assert {e["target_name"] for e in edges} <= {s["name"] for s in scenes}
 
 
 def test_nothing_is_computed_twice(copy: Path, captures: Path) -> None:
     with gsmap.open(copy) as m:
-        before = m.revision_rows()
-        assert [r.new for r in m.update(captures)] == [False] * 3
-        assert m.revision_rows() == before
+        before = [row.number for row in m.revision_rows()]
+        assert [row.new for row in m.update(captures).ingested] == [False] * 3
+        assert [row.number for row in m.revision_rows()] == before
         assert m.register("auto") == []
 
 
@@ -117,7 +112,7 @@ def test_two_workers_find_what_one_finds(
     with gsmap.map.create(tmp_path / "again.gsmap") as again, gsmap.open(site) as m:
         again.update(captures)
         for mine, theirs in zip(again.scene_rows(), m.scene_rows(), strict=True):
-            np.testing.assert_allclose(mine["S_map_scene"], theirs["S_map_scene"], atol=1e-9)
+            np.testing.assert_allclose(mine.S_map_scene.matrix(), theirs.S_map_scene.matrix(), atol=1e-9)
 
 
 def test_removing_a_scene_keeps_history(copy: Path) -> None:
@@ -126,7 +121,7 @@ def test_removing_a_scene_keeps_history(copy: Path) -> None:
         m.update()
         assert gone.id not in m.pose_graph().poses
         assert gone.id in m.pose_graph(1).poses
-        assert [row["change"] for row in m.diff(1, 2) if row["scene"] == "capture_b"] == ["removed"]
+        assert [row.change for row in m.diff(1, 2) if row.scene_name == "capture_b"] == ["removed"]
         with pytest.raises(NotFoundError, match="capture_b"):
             m.show_scene("capture_b")
 
@@ -135,11 +130,14 @@ def test_prune_frees_what_no_kept_revision_names(copy: Path) -> None:
     with gsmap.open(copy) as m:
         m.remove("capture_b")
         m.update()
-        assert m.prune().scenes == []
+        assert m.prune().scene_names == ()
+        would = m.prune(keep_revisions=1, dry_run=True)
         freed = m.prune(keep_revisions=1)
-        assert freed.scenes == ["capture_b"]
+        assert would.dry_run
+        assert (would.scene_names, would.num_bytes) == (freed.scene_names, freed.num_bytes)
+        assert freed.scene_names == ("capture_b",)
         assert freed.num_bytes > 100_000
-        assert m.check() == []
+        assert m.check().problems == ()
 
 
 def test_a_person_s_word_counts(copy: Path) -> None:
@@ -147,12 +145,12 @@ def test_a_person_s_word_counts(copy: Path) -> None:
         for pair in ("capture_a:capture_b", "capture_b:capture_c"):
             m.reject(pair, note="the doors look alike")
         m.update()
-        rows = {row["name"]: row for row in m.scene_rows()}
-        assert rows["capture_a"]["component"] == rows["capture_c"]["component"] != rows["capture_b"]["component"]
+        rows = {row.name: row for row in m.scene_rows()}
+        assert rows["capture_a"].component == rows["capture_c"].component != rows["capture_b"].component
         m.confirm("capture_a:capture_b")
         m.update()
-        assert len({row["component"] for row in m.scene_rows()}) == 1
-        said = [row["what"] for row in m.show_pair("capture_a:capture_b")["history"]]
+        assert len({row.component for row in m.scene_rows()}) == 1
+        said = [row.what for row in m.show_pair("capture_a:capture_b").history]
         assert said == ["accepted", "reject", "confirm"]
 
 
@@ -176,13 +174,13 @@ def test_exports_only_what_changed(copy: Path, tmp_path: Path) -> None:
         assert (again.recomputed, again.reused) == (0, len(first.tiles))
         whole = m.export(tmp_path / "whole", tile_size_m=0, merge="voxel")
         assert sum(t.num_gaussians for t in first.tiles) == sum(t.num_gaussians for t in whole.tiles)
-        assert {row["out"] for row in m.tile_rows()} == {str(out), str(tmp_path / "whole")}
+        assert {row.out for row in m.tile_rows()} == {str(out), str(tmp_path / "whole")}
         m.remove("capture_b")
         m.update()
         third = m.export(out, tile_size_m=4, merge="voxel")
         assert third.recomputed > 0
         assert third.removed + third.recomputed > 0
-        assert {row["path"] for row in m.tile_rows() if row["out"] == str(out)} == {
+        assert {row.path for row in m.tile_rows() if row.out == str(out)} == {
             t.path for t in third.tiles if t.path
         }
 
@@ -224,11 +222,11 @@ def test_3dtiles_tree_holds_every_gaussian_at_its_finest(site: Path, tmp_path: P
         ({"bbox": [0, 0, 0, 0, 1, 1]}, InputError, "box"),
         ({"bbox": [900, 900, 900, 901, 901, 901]}, InputError, "outside the map"),
         ({"budget_s": 0.0}, ConfigError, "budget"),
-        ({"merge": "glue"}, ConfigError, "merge method 'glue'"),
+        ({"merge": "glue"}, ConfigError, "no merger 'glue'"),
         ({"format": "dwg"}, ConfigError, "dwg"),
         ({"tile_size_m": -1}, ConfigError, "tile size"),
         ({"revision": 99}, NotFoundError, "no revision 99"),
-        ({"component": 7}, NotFoundError, "no island 7"),
+        ({"component": 7}, NotFoundError, "no component 7"),
         ({"merge": "union", "steps": 5}, ConfigError, "takes no steps"),
         ({"format": "spz", "provenance": True}, ConfigError, "provenance"),
         ({"format": "3dtiles", "tile_size_m": 0}, ConfigError, "tile-size"),
@@ -257,7 +255,7 @@ def test_another_map_s_folder_is_refused(site: Path, captures: Path, tmp_path: P
 
 def test_whole_map_checks_out(site: Path) -> None:
     with gsmap.open(site) as m:
-        assert m.check() == []
+        assert m.check().problems == ()
 
 
 def test_bad_pairs_are_refused(site: Path) -> None:
@@ -273,16 +271,19 @@ def test_models_are_checked_kept_and_used(copy: Path, tmp_path: Path) -> None:
     model = tmp_path / "encoder.onnx"
     model.write_bytes(_image_encoder())
     with gsmap.open(copy) as m:
-        before = m.describe("capture_a")[0].layers["objects"].descriptor_id
+        before = _objects(m.describe("capture_a")[0])
         m.add_model("clip", model, preset="unit")
         model.unlink()  # the map has its own copy
-        after = m.describe("capture_a")[0].layers["objects"]
-        assert after.descriptor_id != before
-        assert [row["kind"] for row in m.model_rows()] == ["clip"]
+        assert _objects(m.describe("capture_a")[0]) != before
+        assert [row.kind for row in m.model_rows()] == ["clip"]
         m.draw_graph("capture_a", tmp_path / "graph.png")
         with pytest.raises(InputError, match="not an ONNX model"):
             m.add_model("clip", copy / "map.sqlite")
     assert (tmp_path / "graph.png").stat().st_size > 10_000
+
+
+def _objects(row: GraphRow) -> str:
+    return next(layer.descriptor_id for layer in row.layers if layer.layer == "objects")
 
 
 def _image_encoder() -> bytes:
@@ -302,7 +303,7 @@ def _image_encoder() -> bytes:
 
 def test_an_anchor_and_a_survey_hold_the_map(copy: Path) -> None:
     with gsmap.open(copy) as m:
-        names = [row["name"] for row in m.scene_rows()]
+        names = [row.name for row in m.scene_rows()]
         before = {p.scene: p.S_map_scene for p in m.pose_graph().poses.values()}
         ids = {s.name: s.id for s in m.scenes()}
         with pytest.raises(InputError, match="up direction"):
@@ -323,8 +324,8 @@ def test_an_anchor_and_a_survey_hold_the_map(copy: Path) -> None:
     with gsmap.open(copy) as m:
         assert np.allclose(m.pose_graph().poses[ids[names[1]]].S_map_scene.translation, [8, 6, 7], atol=0.02)
     shown = json.loads(cli("show", copy, names[1], "--json"))
-    assert shown["prior"]["pose"][0][3] == 8
-    assert shown["prior"]["verdict"] == "used"
+    assert shown["prior"]["S_map_scene"][0][3] == 8
+    assert shown["prior"]["outcome"] == "used"
     cli("prior", copy, names[1], "--remove")
     with gsmap.open(copy) as m:
         assert m.store.priors.list() == []
