@@ -1,7 +1,7 @@
 """The native module by itself: numpy and nothing else, so that it runs under qemu-user too (tools/build_wheels.sh).
 
     python tools/check_kernels.py MODULE.so --write NUMBERS.npz     what this machine gives
-    python tools/check_kernels.py MODULE.so --compare NUMBERS.npz   that another one's is the same, to float32's accuracy
+    python tools/check_kernels.py MODULE.so --compare NUMBERS.npz  that another one's is alike, to float32's accuracy
 
 Renders a seeded cloud forward and backward with the baseline kernels, and finds a clique.
 """
