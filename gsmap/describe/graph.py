@@ -9,7 +9,7 @@ from gsmap.describe.cloud import Params as SurfaceParams
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import Params as GravityParams
 from gsmap.describe.gravity import estimate_up
-from gsmap.describe.landmarks.layer import VERSION as LANDMARKS_VERSION
+from gsmap.describe.landmarks import layer as landmarks
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
 from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
 from gsmap.describe.objects.layer import Params as ObjectParams
@@ -67,7 +67,7 @@ def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | N
     }
     backend = ""
     if params.landmarks:
-        version["landmarks"] = LANDMARKS_VERSION
+        version["landmarks"] = landmarks.VERSION
         settings["landmark"] = plain(params.landmark)
     if params.objects:
         chosen = resolved(params.object, models)

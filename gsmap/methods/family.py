@@ -6,6 +6,7 @@ import difflib
 import importlib
 import importlib.util
 import pkgutil
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,13 +80,10 @@ class Family:
     def _built_in(self) -> dict[str, str]:
         if self.table:
             return dict(self.table)
-        spec = importlib.util.find_spec(self.folder)
-        places = (spec.submodule_search_locations if spec else None) or []
-        found = [module.name for module in pkgutil.iter_modules(list(places))]
-        return {name: f"{self.folder}.{name}" for name in found if not name.startswith("_") and name != "base"}
+        return {name: f"{self.folder}.{name}" for name in _modules_of(self.folder)}
 
     def _added(self) -> dict[str, EntryPoint]:
-        return {point.name: point for point in entry_points(group=self.group)}
+        return {point.name: point for point in _entry_points(self.group, tuple(sys.path))}
 
     def _load(self, name: str) -> Any:
         built_in, added = self._built_in(), self._added()
@@ -169,6 +167,21 @@ def _is_frozen(params: Any) -> bool:
     """Whether it is a frozen dataclass."""
     shape = getattr(params, "__dataclass_params__", None)
     return shape is not None and bool(shape.frozen)
+
+
+@lru_cache(maxsize=64)
+def _modules_of(folder: str) -> tuple[str, ...]:
+    """Names of the methods that a package holds."""
+    spec = importlib.util.find_spec(folder)
+    places = (spec.submodule_search_locations if spec else None) or []
+    found = [module.name for module in pkgutil.iter_modules(list(places))]
+    return tuple(name for name in found if not name.startswith("_") and name != "base")
+
+
+@lru_cache(maxsize=64)
+def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """What other packages add; reading what is installed takes milliseconds, so once for a search path."""
+    return tuple(entry_points(group=group))
 
 
 @lru_cache(maxsize=256)

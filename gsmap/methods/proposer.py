@@ -48,7 +48,8 @@ class Proposer(Protocol):
             with_scale: the scale is not known: estimate it.
 
         Returns:
-            Proposals in the scenes' own units, the same bits in every run where the system allows. Raises nothing for scenes that do not match.
+            Proposals in the scenes' own units, the same bits in every run where the system allows. Raises nothing for
+            scenes that do not match.
 
         Raises:
             MissingDependencyError: a package it needs is not installed; the registration then says so in its notes.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -75,7 +76,7 @@ def gauge_sigmas(gauge: Gauge) -> np.ndarray:
 
 def _factors(edges: Measurements, dim: int) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
-    between = gtsam.BetweenFactorPose3 if dim == 6 else gtsam.BetweenFactorSimilarity3
+    between: Any = gtsam.BetweenFactorPose3 if dim == 6 else gtsam.BetweenFactorSimilarity3
     noise: dict[bytes, gtsam.noiseModel.Base] = {}
     targets, sources = edges.targets.tolist(), edges.sources.tolist()
     for k in range(len(edges)):
@@ -96,15 +97,14 @@ def to_gtsam(poses: Similarities, row: int, dim: int) -> gtsam.Pose3 | gtsam.Sim
 
 
 def from_gtsam(values: gtsam.Values, scenes: np.ndarray, dim: int) -> Similarities:
-    if dim == 6:
-        found = [values.atPose3(k) for k in scenes.tolist()]
-        scales = np.ones(len(found))
-        translations = np.array([p.translation() for p in found])
-    else:
-        found = [values.atSimilarity3(k) for k in scenes.tolist()]
-        scales = np.array([p.scale() for p in found])
-        translations = np.array([p.translation() for p in found]) * scales[:, None]
+    read: Any = values.atPose3 if dim == 6 else values.atSimilarity3
+    found = [read(k) for k in scenes.tolist()]
     rotations = np.array([p.rotation().matrix() for p in found])
+    translations = np.array([p.translation() for p in found])
+    scales = np.ones(len(found))
+    if dim == 7:
+        scales = np.array([p.scale() for p in found])
+        translations = translations * scales[:, None]
     return Similarities(rotations, translations, np.log(scales)).orthonormalised()
 
 

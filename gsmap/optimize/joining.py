@@ -52,7 +52,7 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
     # A pair of scenes tied twice is one piece of evidence when it comes to counting pairs; see `join_decision`.
     weight = -np.log(np.trace(edges.covariance[rows], axis1=1, axis2=2))
     out = []
-    for begin, end in zip(starts, ends, strict=True):
+    for begin, end in zip(starts.tolist(), ends.tolist(), strict=True):
         # A confirmed edge decides which group counts.
         best = begin + int(np.lexsort((weight[begin:end], count[begin:end], edges.confirmed[rows[begin:end]]))[-1])
         mine = np.zeros(end - begin, dtype=bool)

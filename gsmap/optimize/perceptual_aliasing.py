@@ -1,4 +1,4 @@
-"""Perceptual aliasing: groups of edges that agree with each other and contradict the map, for places look alike.
+"""Perceptual aliasing: groups of edges that agree with each other and contradict the map, because places look alike.
 
 One such edge is noise; a group means that two places look the same, or that the map is folded. Which of the two
 cannot be told from the group itself, only from the weight of what holds the map together the other way round.

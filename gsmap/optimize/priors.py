@@ -44,7 +44,7 @@ class PriorTerms:
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def __getitem__(self, rows: np.ndarray) -> PriorTerms:
+    def __getitem__(self, rows: np.ndarray | slice) -> PriorTerms:
         return PriorTerms(self.scenes[rows], self.expected[rows], self.root_weights[rows], self.ups[rows])
 
     def linearised(self, poses: Similarities) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ those load solvers."""
 
 def recipe_key(params: Params) -> RecipeKey:
     """The recipe of a solve, without its inputs (scenes, edges, reviews, priors); every setting takes part."""
-    return RecipeKey("optimize", "pose_graph", VERSIONS, plain(params), _gtsam())
+    return RecipeKey("optimize", "pose_graph", dict(VERSIONS), plain(params), _gtsam())
 
 
 def _gtsam() -> str:

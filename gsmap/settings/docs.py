@@ -33,10 +33,12 @@ def field_docs(cls: type) -> dict[str, str]:
     if start is None:
         return {}
     body = lines[start + 1 :]
-    width = min((len(line) - len(line.lstrip()) for line in body if line.strip()), default=0)
+    width = next((len(line) - len(line.lstrip()) for line in body if line.strip()), 0)
     out: dict[str, str] = {}
     names: list[str] = []
     for line in body:
+        if line.strip() and line[:width].strip():  # the next section, such as Raises:
+            break
         text = line[width:]
         entry = _ENTRY.match(text)
         if entry:

@@ -10,6 +10,7 @@ import difflib
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from gsmap.errors import ConfigError
@@ -99,6 +100,11 @@ def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
     for field in fields(tree):
         if field.init:
             yield field.name, getattr(tree, field.name), hints[field.name], docs.get(field.name, "")
+
+
+@lru_cache(maxsize=512)
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
 
 
 def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:

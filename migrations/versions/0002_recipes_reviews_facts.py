@@ -238,10 +238,8 @@ def _add(table: str, column: str) -> None:
 
 def _drop_reference(table: str, column: str) -> None:
     """Drop a column that refers to another table; SQLite rebuilds the table for it, and forgets its checks."""
-    checks = [
-        sa.CheckConstraint("status in ('accepted', 'rejected', 'no_match')", name=op.f("ck_registrations_status"))
-    ]
-    kept = checks if table == "registrations" else []
+    status = sa.CheckConstraint("status in ('accepted', 'rejected', 'no_match')", name=op.f("ck_registrations_status"))
+    kept = (status,) if table == "registrations" else ()
     with op.batch_alter_table(table, table_kwargs={"sqlite_strict": True}, table_args=kept) as batch:
         batch.drop_column(column)
 

@@ -43,7 +43,7 @@ def write_captures(folder: Path) -> None:
 
 
 def _surfaces(rng: np.random.Generator, room: int, low: float, high: float, count: int) -> Gaussians:
-    """Gaussians on floor, walls and boxes of a room, between two values of x; their colours depend on where they are."""
+    """Gaussians on floor, walls and boxes of a room, between two values of x; colours depend on the place."""
     boxes = [(np.zeros(3), SIZE)]
     furniture = np.random.default_rng(room)
     for _ in range(10):

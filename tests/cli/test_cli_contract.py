@@ -19,13 +19,6 @@ def gsmap(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_shows_an_example(verb: str) -> None:
-    done = gsmap(verb, *(["add"] if verb == "models" else []), "--help")
-    assert done.returncode == 0, done.stderr
-    assert f"gsmap {verb}" in done.stdout.split("Example:")[1]
-
-
 def test_readme_names_every_verb() -> None:
     text = README.read_text()
     assert [verb for verb in VERBS if f"gsmap {verb}" not in text] == []

@@ -145,7 +145,7 @@ def test_every_verb_prints_its_object_as_json(verb: str, gsmap_run: Callable[[st
     done = gsmap_run(RUNS[verb] + " --json")
     assert done.code == 0, done.stderr
     data = done.json
-    assert list(data)[0] == "schema"
+    assert next(iter(data)) == "schema"
     assert data["schema"] == 1
     shape = OBJECTS[verb]
     names = [field.name for field in fields(shape.type)]

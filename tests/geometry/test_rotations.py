@@ -67,6 +67,20 @@ def test_umeyama_stays_proper_on_a_mirrored_set() -> None:
     assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 
+def test_umeyama_scale_of_a_mirrored_set_is_that_of_the_best_proper_similarity() -> None:
+    """Umeyama 1991, eq. 43: the sign of the mirrored axis counts in the scale as well as in the rotation."""
+    source = RNG.normal(size=(30, 3)) * [1.0, 0.8, 0.6]
+    target = 1.7 * (source * [1, 1, -1]) @ ROTATIONS[3].as_matrix().T + [1, 2, 3]
+    found = umeyama(target, source, with_scale=True)
+    s, t = source - source.mean(0), target - target.mean(0)
+
+    def residual(scale: float) -> float:
+        return float(((t - scale * s @ found.rotation.T) ** 2).sum())
+
+    assert residual(found.scale) < min(residual(found.scale * 1.01), residual(found.scale * 0.99))
+    assert found.scale < 1.6  # the mirrored axis pulls it below the scale of the two others
+
+
 def test_umeyama_weights_leave_outliers_out() -> None:
     truth = Sim3(ROTATIONS[2].as_matrix(), [0, 1, 0])
     source = RNG.normal(size=(10, 3))

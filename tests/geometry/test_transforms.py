@@ -76,6 +76,20 @@ def test_means_and_covariances_follow_the_similarity():
     np.testing.assert_array_equal(moved.logit_opacities, gaussians.logit_opacities)
 
 
+def test_colours_turn_with_the_gaussians():
+    """What is seen along a direction before is seen along the turned direction after, whatever the scale."""
+    rng = np.random.default_rng(6)
+    gaussians = random_gaussians(rng)
+    S = Sim3(random_rotation(rng), rng.normal(size=3), 0.7)
+    moved = transform_gaussians(gaussians, S)
+    directions = rng.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before = np.einsum("nk,nkc->nc", sh_basis(directions, 3), gaussians.sh)
+    after = np.einsum("nk,nkc->nc", sh_basis(directions @ S.rotation.T, 3), moved.sh)
+    np.testing.assert_allclose(after, before, atol=1e-5)
+    assert np.abs(moved.sh[:, 1:] - gaussians.sh[:, 1:]).max() > 0.1  # they do depend on the direction
+
+
 def test_there_and_back_is_the_identity():
     rng = np.random.default_rng(2)
     gaussians = random_gaussians(rng)

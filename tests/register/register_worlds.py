@@ -76,6 +76,19 @@ def node_world(seed=0, shared=80, extra=80, noise_m=0.02, wrong=200, scale=1.0, 
     return NodeWorld(target, source, partner, S, matches, up, S.rotation.T @ up)
 
 
+def two_pose_world(seed=0, first=40, second=30, extra=20) -> tuple[NodeWorld, Sim3]:
+    """A node world some of whose shared nodes moved together between the captures, and the pose of those."""
+    world = node_world(seed, shared=first + second, extra=extra, embedding_noise=0.02)
+    rng = np.random.default_rng(seed + 1)
+    moved = np.flatnonzero(world.partner >= 0)
+    moved = rng.choice(moved, second, replace=False)
+    motion = Sim3(exp_so3([0.0, 0.0, 1.2]), [2.5, -3.0, 0.4])
+    positions = world.target.positions.copy()
+    positions[moved] = motion.apply(positions[moved])
+    world.target = replace(world.target, positions=positions)
+    return world, motion @ world.S_target_source
+
+
 def _texture(points: np.ndarray, seed: int) -> np.ndarray:
     """(N, 3) colours in [0, 1] that vary over decimetres, the same wherever a point is sampled twice."""
     rng = np.random.default_rng(seed)
@@ -109,6 +122,10 @@ def _room_points(rng, count: int, seed: int) -> np.ndarray:
     return points
 
 
+HALF_TURN = Sim3(exp_so3([0.0, 0.0, np.pi]), [6.0, 4.0, 0.0])
+"""About the vertical through the middle of a room."""
+
+
 @dataclass
 class SplatWorld:
     target: SceneView
@@ -128,10 +145,12 @@ def splat_world(
     cut_m=(3.8, 2.2),
     offset_m=10.0,
     with_cameras=True,
+    symmetric=False,
 ) -> SplatWorld:
     """Two captures of textured rooms, as Gaussians, cameras and landmark nodes; ``place`` seeds each room.
 
-    The target holds x < cut_m[0] of its room, the source x > cut_m[1] of its own.
+    The target holds x < cut_m[0] of its room, the source x > cut_m[1] of its own. A symmetric room looks the same, in
+    shape, colours and nodes, after half a turn about its middle: two poses lay the captures on each other equally well.
     """
     rng = np.random.default_rng(seed)
     S = Sim3(exp_so3(rng.normal(size=3) * 2), rng.normal(size=3) * offset_m, scale)
@@ -142,8 +161,12 @@ def splat_world(
             return p[:, 0] < cut_m[0] if k == 0 else p[:, 0] > cut_m[1]
 
         p = _room_points(rng, points, room)
+        if symmetric:
+            half = p[:, 0] < HALF_TURN.translation[0] / 2
+            p = np.concatenate([p[half], HALF_TURN.apply(p[half])])
         p = p[inside(p)]
-        colours = _texture(p, room)
+        turned = symmetric & (p[:, 0] > HALF_TURN.translation[0] / 2)
+        colours = _texture(np.where(turned[:, None], HALF_TURN.apply(p), p) if symmetric else p, room)
         p = p + rng.normal(size=p.shape) * noise_m
         sh = ((colours - 0.5) / 0.28209479177387814)[:, None]
         n = len(p)
@@ -157,6 +180,10 @@ def splat_world(
         fixed = np.random.default_rng(room)
         spots = _room_points(fixed, nodes * 2, room)
         features, kinds = fixed.normal(size=(nodes * 2, 16)), fixed.integers(0, 3, nodes * 2)
+        if symmetric:
+            half = spots[:, 0] < HALF_TURN.translation[0] / 2
+            spots = np.concatenate([spots[half], HALF_TURN.apply(spots[half])])
+            features, kinds = np.tile(features[half], (2, 1)), np.tile(kinds[half], 2)
         keep = inside(spots)
         spots, features, kinds = spots[keep], features[keep], kinds[keep]
         spots = spots + rng.normal(size=spots.shape) * 0.02

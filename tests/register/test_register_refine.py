@@ -9,6 +9,7 @@ from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
 from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
 from gsmap.register.correspondences import Correspondences
+from gsmap.register.covariance import Params as CovarianceParams
 from gsmap.register.covariance import in_scene_units, point_to_plane_jacobian, pose_covariance
 from gsmap.register.refiners import colored_icp, gicp, icp
 from gsmap.register.scale import vote_scales
@@ -152,6 +153,44 @@ def test_covariance_moves_with_the_source_frame(world, surfaces):
     a = point_to_plane_jacobian(world.S_target_source, np.tile(point, (3, 1)), np.eye(3))
     b = point_to_plane_jacobian(pose, np.tile(point + shift, (3, 1)), np.eye(3))
     assert np.allclose(a @ covariance @ a.T, b @ other @ b.T, rtol=0.05)
+
+
+def test_covariance_is_a_sandwich_over_cells_plus_a_floor(world, surfaces):
+    """Against the formula written out, at the source's origin: one gradient a cell, C / (C - 6), factor, floor."""
+    target, source = surfaces
+    pose, params = world.S_target_source, CovarianceParams(floor_m=0.0)
+    found, _ = pose_covariance(target, source, pose, params)
+    points = source.coarse[0]
+    distance, row = target.nearest(pose.apply(points), params.radius_m)
+    hit = np.isfinite(distance)
+    normals, moved = target.normals[row[hit]], pose.apply(points[hit])
+    residual = (normals * (moved - target.coarse[0][row[hit]])).sum(1)
+    jacobian = point_to_plane_jacobian(pose, points[hit], normals)[:, :6]
+    cells = np.floor(moved / params.cell_m).astype(int)
+    gradients = []
+    for cell in np.unique(cells, axis=0):
+        inside = (cells == cell).all(1)
+        gradients.append((jacobian[inside] * residual[inside, None]).sum(0))
+    g, inverse = np.array(gradients), np.linalg.inv(jacobian.T @ jacobian)
+    expected = 2.0 * inverse @ (g.T @ g) @ inverse * len(g) / (len(g) - 6)
+    assert np.allclose(found[:6, :6], expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+    assert found[6, 6] == pytest.approx(1e-12)
+    # The floor: a centimetre a cell, averaged over the cells, turns over the overlap's radius. It adds, never takes.
+    with_floor, sigmas = pose_covariance(target, source, pose)
+    assert np.linalg.eigvalsh(with_floor - found)[0] > -1e-12
+    least = 0.01 / np.sqrt(len(g))
+    assert sigmas[1] > least
+    spread = points[hit] - points[hit].mean(0)
+    assert sigmas[0] > least / np.sqrt((spread**2).sum(1).mean())
+
+
+def test_the_variance_of_the_scale_has_a_factor_of_its_own(world, surfaces):
+    found = [
+        pose_covariance(*surfaces, world.S_target_source, CovarianceParams(scale_factor=f), with_scale=True)
+        for f in (1.0, 9.0)
+    ]
+    assert found[1][1][2] == pytest.approx(3.0 * found[0][1][2])
+    assert found[1][1][:2] == found[0][1][:2]
 
 
 def test_covariance_in_scene_units_scales_translations_only():

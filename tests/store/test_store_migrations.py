@@ -1,4 +1,5 @@
 import sqlite3
+from pathlib import Path
 
 import pytest
 from store_samples import make_cameras, make_gaussians
@@ -102,3 +103,9 @@ def test_a_newer_map_is_left_alone(tmp_path):
     with pytest.raises(SchemaVersionError, match="upgrade gsmap"):
         Store.migrate(tmp_path / "m")
     assert (tmp_path / "m" / "map.sqlite").read_bytes() == before
+
+
+def test_the_storage_page_names_every_table_and_version():
+    page = (Path(__file__).parents[2] / "docs" / "storage.md").read_text()
+    for name in [*schema.metadata.tables, schema.CHUNK_BOXES, *(s.revision for s in scripts().walk_revisions())]:
+        assert f"`{name}`" in page, name

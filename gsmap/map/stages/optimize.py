@@ -75,7 +75,7 @@ def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
     previous: PoseGraph | None = store.revisions.get()
     answer = solver.optimize(given.scenes, given.edges, given.priors, previous, settings.optimize)
     answer = solver.gravity_align(
-        answer, given.ups, fixed={prior.scene for prior in given.priors}, params=settings.optimize
+        answer, given.ups, fixed={prior.scene for prior in given.priors}, params=settings.optimize.gravity
     )
     number = store.revisions.save(answer, given.key)
     progress("optimize", 1.0, f"revision {number}")

@@ -1,0 +1,36 @@
+"""Which rows share a cell, against a dictionary; and means, against numpy's."""
+
+import numpy as np
+
+from gsmap.geometry.cells import cell_labels, group_means
+
+
+def test_labels_count_cells_in_the_order_x_then_y_then_z():
+    cells = np.array([[1, 0, 0], [0, 5, 9], [0, 5, -9], [1, 0, 0], [0, -7, 100], [-3, 0, 0]])
+    labels, counts = cell_labels(cells)
+    order = sorted({tuple(cell) for cell in cells.tolist()})
+    assert [order[label] for label in labels] == [tuple(cell) for cell in cells.tolist()]
+    assert counts.tolist() == [1, 1, 1, 1, 2]
+
+
+def test_many_cells_are_told_apart():
+    cells = np.random.default_rng(0).integers(-50, 50, (5000, 3))
+    labels, counts = cell_labels(cells)
+    of = {tuple(cell): label for cell, label in zip(cells.tolist(), labels.tolist(), strict=True)}
+    assert len(of) == len(set(labels.tolist())) == len(counts)
+    assert [of[tuple(cell)] for cell in cells.tolist()] == labels.tolist()
+    np.testing.assert_array_equal(counts, np.bincount(labels))
+
+
+def test_means_are_those_of_each_group():
+    rng = np.random.default_rng(1)
+    values, labels = rng.normal(size=(200, 4)), rng.permutation(np.arange(200) % 13)
+    means = group_means(values, labels, np.bincount(labels))
+    for k in range(13):
+        np.testing.assert_allclose(means[k], values[labels == k].mean(0))
+
+
+def test_nothing_has_no_cells():
+    labels, counts = cell_labels(np.zeros((0, 3), int))
+    assert len(labels) == len(counts) == 0
+    assert group_means(np.zeros((0, 4)), labels, counts).shape == (0, 4)

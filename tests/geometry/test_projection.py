@@ -1,0 +1,43 @@
+"""Pinhole projection against points laid out by hand, and against homogeneous coordinates."""
+
+import numpy as np
+import pytest
+
+from gsmap.geometry.projection import in_image, project
+
+INTRINSICS = np.array([100.0, 200.0, 32.0, 24.0])
+
+
+def test_a_point_ahead_falls_on_the_principal_point_and_axes_are_right_and_down():
+    points = np.array([[0.0, 0, 2], [0.1, 0, 2], [0, 0.1, 2], [0, 0, -2]])
+    pixels, depth = project(points, np.eye(4), INTRINSICS)
+    np.testing.assert_allclose(pixels[:3], [[32, 24], [37, 24], [32, 34]])
+    np.testing.assert_array_equal(depth, [2, 2, 2, -2])
+
+
+def test_frame_to_camera_is_applied_before():
+    rng = np.random.default_rng(0)
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    T[:3, 3] = [0.3, -0.2, 5]
+    points = rng.uniform(-1, 1, (50, 3))
+    fx, fy, cx, cy = INTRINSICS
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    image = (K @ (T @ np.c_[points, np.ones(50)].T)[:3]).T
+    pixels, depth = project(points, T, INTRINSICS)
+    np.testing.assert_allclose(pixels, image[:, :2] / image[:, 2:], rtol=1e-12)
+    np.testing.assert_allclose(depth, image[:, 2], rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_answer_has_the_precision_of_the_points(dtype):
+    pixels, depth = project(np.array([[0.1, 0.2, 3]], dtype), np.eye(4), INTRINSICS)
+    assert pixels.dtype == depth.dtype == dtype
+
+
+def test_inside_means_before_the_camera_beyond_near_and_within_half_open_borders():
+    pixels = np.array([[0, 0], [63.9, 47.9], [64, 10], [10, 48], [-0.1, 5], [5, -0.1], [5, 5], [5, 5], [np.nan, 5]])
+    depth = np.array([1, 1, 1, 1, 1, 1, 0, -1, 1.0])
+    inside = in_image(pixels, depth, np.array([64, 48]))
+    assert inside.tolist() == [True, True, False, False, False, False, False, False, False]
+    assert in_image(pixels[:2], np.array([0.5, 2.0]), np.array([64, 48]), near=0.5).tolist() == [False, True]

@@ -1,0 +1,68 @@
+"""Methods are found in a folder and in installed packages, and are held to their contract."""
+
+import sys
+
+import pytest
+
+from gsmap.errors import ConfigError
+from gsmap.methods import Family, MethodParams, families
+
+
+def test_a_new_file_is_a_new_method_and_so_is_an_entry_point(toys):
+    assert toys.names() == ("bare", "glass", "loose", "stone", "torn", "wood")
+    assert toys.get("stone").build(3, toys.params_type("stone")()) == 6
+    assert toys.get("glass").VERSION == 12
+
+
+def test_a_built_in_method_goes_before_another_packages_of_its_name(toys):
+    assert toys.version("wood") == {"toy.wood": 3}
+
+
+def test_nothing_is_imported_before_it_is_asked_for(toys):
+    toys.names()
+    assert not {"toy_blocks.wood", "toy_added"} & set(sys.modules)
+    toys.get("wood")
+    assert "toy_blocks.wood" in sys.modules
+    assert "toy_blocks.stone" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("wod", "there is no toy 'wod' .did you mean 'wood'.*bare, glass"),
+        ("bare", "lacks Params, build: see the contract in gsmap.methods.toy"),
+        ("loose", "its Params must be a frozen dataclass"),
+        ("torn", "package toys cannot be loaded .ModuleNotFoundError"),
+    ],
+)
+def test_what_does_not_keep_the_contract_is_named(toys, name, message):
+    with pytest.raises(ConfigError, match=message):
+        toys.get(name)
+
+
+def test_a_table_lists_built_in_methods_that_need_no_params(toys):
+    table = Family("toy", "toy_blocks", (), (("a", "toy_blocks.bare"),), any_of=("build", "wreck"), has_params=False)
+    assert table.names() == ("a", "glass", "torn", "wood")
+    with pytest.raises(ConfigError, match="lacks build or wreck"):
+        table.get("a")
+    assert table.get("glass").VERSION == 12
+
+
+def test_params_of_a_family_hold_what_was_changed_and_defaults_for_the_rest(toys):
+    params = MethodParams("toy")
+    wood = toys.params_type("wood")
+    changed = params.with_params("wood", wood(size_m=0.25))
+    assert (changed["wood"].size_m, changed["stone"].size_m, params["wood"].size_m) == (0.25, 2.0, 0.5)
+    assert changed != params
+    assert hash(changed) == hash(params.with_params("wood", wood(size_m=0.25)))
+    assert changed.with_params("wood", wood()) == params
+    assert list(params) == list(toys.names())
+    with pytest.raises(ConfigError, match=r"toy 'wood' takes toy_blocks.wood.Params, got toy_blocks.stone.Params"):
+        params.with_params("wood", toys.params_type("stone")())
+
+
+def test_every_declared_family_finds_its_folder():
+    for family in families().values():
+        assert family.group == f"gsmap.{family.name}s"
+        if family.table:
+            assert family.names()

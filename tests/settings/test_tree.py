@@ -1,0 +1,105 @@
+"""Every setting by its dotted name: read, changed, refused."""
+
+from dataclasses import replace
+
+import pytest
+
+from gsmap.errors import ConfigError
+from gsmap.settings import changed, differences, leaves, parse
+
+
+def test_leaves_are_all_settings_with_meaning_and_unit(tree):
+    found = {leaf.name: leaf for leaf in leaves(tree)}
+    methods = [f"toys.{name}.{field}" for name in ("glass", "stone", "wood") for field in ("size_m", "label")]
+    assert list(found) == [
+        *("bars.near_m", "bars.far_m", "bars.turn_deg", "toy", *methods),
+        *("count", "budget_s", "loud", "mode", "weights", "names"),
+    ]
+    assert (found["bars.far_m"].value, found["bars.far_m"].unit) == (5.0, "m")
+    assert found["bars.far_m"].meaning == "how close and how far a thing may be."
+    assert (found["bars.turn_deg"].unit, found["budget_s"].unit, found["count"].unit) == ("deg", "s", "")
+    assert (found["toys.glass.size_m"].value, found["toys.glass.size_m"].meaning) == (7.0, "side of a block.")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kept"),
+    [
+        ("bars.near_m", 1, 1.0),
+        ("toys.stone.size_m", 0.25, 0.25),
+        ("toys.stone.label", "a", "a"),
+        ("count", 5, 5),
+        ("budget_s", 2, 2.0),
+        ("budget_s", None, None),
+        ("loud", True, True),
+        ("mode", "fast", "fast"),
+        ("weights", [3, 4], (3.0, 4.0)),
+        ("names", ["x", "y"], ("x", "y")),
+    ],
+)
+def test_a_setting_is_changed_and_nothing_else(tree, name, value, kept):
+    new = changed(tree, {name: value})
+    values = {leaf.name: leaf.value for leaf in leaves(new)}
+    assert values[name] == kept
+    assert type(values[name]) is type(kept)
+    assert values == {leaf.name: leaf.value for leaf in leaves(tree)} | {name: kept}
+    before = {leaf.name: leaf.value for leaf in leaves(tree)}
+    assert differences(new, tree) == ({} if before[name] == kept else {name: kept})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("bars.neer_m", 1.0, r"no setting 'bars.neer_m': did you mean bars.near_m\?"),
+        ("near_m", 1.0, r"did you mean bars.near_m\?"),
+        ("toys.wood.size", 1.0, r"did you mean toys.wood.size_m\?"),
+        ("count.more", 1, "no setting 'count.more'"),
+        ("qqq", 1, "no setting 'qqq': gsmap settings MAP lists them all"),
+        ("bars", 1, "bars holds several settings: set one of them, such as bars.near_m"),
+        ("toys.wood", 1, "such as toys.wood.size_m"),
+        ("count", 1.5, "count takes int, got 1.5"),
+        ("count", True, "count takes int, got True"),
+        ("loud", 1, "loud takes bool, got 1"),
+        ("bars.near_m", "wide", "bars.near_m takes float, got 'wide'"),
+        ("bars.near_m", None, "bars.near_m takes float, got None"),
+        ("budget_s", "long", "budget_s takes float | None, got 'long'"),
+        ("mode", "quick", "mode must be one of slow, fast, got 'quick'"),
+        ("weights", [1.0], "weights takes"),
+        ("weights", [1.0, "a"], "weights takes float, got 'a'"),
+        ("names", "xy", "names takes"),
+    ],
+)
+def test_what_is_wrong_is_refused_with_its_name(tree, name, value, message):
+    with pytest.raises(ConfigError, match=message.replace(" | ", r" \| ")):
+        changed(tree, {name: value})
+
+
+def test_differences_make_one_tree_from_another(tree):
+    new = replace(tree, count=9, bars=replace(tree.bars, far_m=1.0))
+    new = changed(new, {"toys.wood.label": "x"})
+    found = differences(new, tree)
+    assert found == {"count": 9, "bars.far_m": 1.0, "toys.wood.label": "x"}
+    assert changed(tree, found) == new
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "value"),
+    [
+        ("a.b=-6", "a.b", -6),
+        (" a.b = 1e-3 ", "a.b", 1e-3),
+        ("a=true", "a", True),
+        ("a=[1, 2]", "a", [1, 2]),
+        ("a='1'", "a", "1"),
+        ("a=fast", "a", "fast"),
+        ("a=None", "a", None),
+        ("a=b=c", "a", "b=c"),
+    ],
+)
+def test_settings_on_the_command_line(text, name, value):
+    assert parse(text) == (name, value)
+    assert type(parse(text)[1]) is type(value)
+
+
+@pytest.mark.parametrize("text", ["a.b", "=3", ""])
+def test_what_sets_nothing_is_refused(text):
+    with pytest.raises(ConfigError, match="name=value"):
+        parse(text)
