@@ -180,9 +180,7 @@ def test_exports_only_what_changed(copy: Path, tmp_path: Path) -> None:
         third = m.export(out, tile_size_m=4, merge="voxel")
         assert third.recomputed > 0
         assert third.removed + third.recomputed > 0
-        assert {row.path for row in m.tile_rows() if row.out == str(out)} == {
-            t.path for t in third.tiles if t.path
-        }
+        assert {row.path for row in m.tile_rows() if row.out == str(out)} == {t.path for t in third.tiles if t.path}
 
 
 def test_an_older_revision_can_be_exported(copy: Path, tmp_path: Path) -> None:
