@@ -169,9 +169,10 @@ def test_exports_only_what_changed(copy: Path, tmp_path: Path) -> None:
     out = tmp_path / "tiles"
     with gsmap.open(copy) as m:
         first = m.export(out, tile_size_m=4, merge="voxel")
-        assert first.recomputed == len(first.tiles) > 3
+        assert first.recomputed >= len(first.tiles) > 3  # those that turn out empty have no file
         again = m.export(out, tile_size_m=4, merge="voxel")
-        assert (again.recomputed, again.reused) == (0, len(first.tiles))
+        assert (again.recomputed, again.reused) == (0, first.recomputed)
+        assert [t.sha256 for t in again.tiles] == [t.sha256 for t in first.tiles]
         whole = m.export(tmp_path / "whole", tile_size_m=0, merge="voxel")
         assert sum(t.num_gaussians for t in first.tiles) == sum(t.num_gaussians for t in whole.tiles)
         assert {row.out for row in m.tile_rows()} == {str(out), str(tmp_path / "whole")}
