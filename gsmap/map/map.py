@@ -425,11 +425,11 @@ class Map(AbstractContextManager["Map"]):
             raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
         Image.fromarray(draw_graph(*self.read(scene.id), graph)).save(path)
 
-    def write_poses(self, out: str | os.PathLike[str], format: str) -> None:
-        """``gsmap poses MAP OUT --format F``: poses for other programs; see `gsmap.map.poses`."""
+    def write_poses(self, out: str | os.PathLike[str], format: str) -> list[Path]:
+        """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); returns what was written."""
         from gsmap.map.poses import write_poses
 
-        write_poses(self.store, Path(out), format)
+        return write_poses(self.store, Path(out), format)
 
     # --- upkeep ------------------------------------------------------------------------------------------------------
 
