@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,18 @@ def test_a_pair_is_registered_once_in_whichever_direction(site: Map, tried: list
     site.register("all")
     assert tried[3] == (stairs, hall)  # the direction that it has
     assert len(tried) == 6
+
+
+def test_jobs_see_the_map_that_lies_at_a_path_now(tmp_path: Path) -> None:
+    from gsmap.map.jobs import _store
+
+    path = tmp_path / "site.gsmap"
+    gsmap.map.create(path).close()
+    first = _store(str(path)).id
+    assert _store(str(path)).id == first
+    shutil.rmtree(path)
+    with gsmap.map.create(path) as m:
+        assert _store(str(path)).id == m.store.id != first
 
 
 def test_pairs_of_a_removed_scene_are_refused(site: Map, tried: list[tuple[str, str]]) -> None:
