@@ -105,28 +105,32 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
     """The named fields of rows as a table on stdout; numbers are right-aligned. A pipe gets every column in full."""
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=Text(title, "table.title"), title_justify="left", box=box.SIMPLE_HEAD)
     values = [[getattr(row, name) for name in columns] for row in rows]
     for i, heading in enumerate(columns.values()):
         numeric = any(isinstance(line[i], (int, float)) and not isinstance(line[i], bool) for line in values)
         table.add_column(heading, justify="right" if numeric else "left", overflow="fold")
     for line in values:
         cells = zip(columns, line, strict=True)
-        table.add_row(*[_shown(short(value) if name in _DIGESTS else text(value)) for name, value in cells])
+        table.add_row(*[Text(short(value) if name in _DIGESTS else text(value)) for name, value in cells])
     _print(table)
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
     """Facts, one a line, on stdout; those that are None or empty are left out."""
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title, title_justify="left", box=None, show_header=False, padding=(0, 2, 0, 0))
+    table = Table(
+        title=Text(title, "table.title"), title_justify="left", box=None, show_header=False, padding=(0, 2, 0, 0)
+    )
     table.add_column(overflow="fold")
     table.add_column(overflow="fold")
     for name, value in facts.items():
         if value is not None and text(value) != "":
-            table.add_row(_shown(name), _shown(text(value)))
+            table.add_row(Text(name), Text(text(value)))
     _print(table)
 
 
@@ -156,10 +160,6 @@ def text(value: Any) -> str:
 def short(value: Any) -> str:
     """As `text`, but of a content digest the first dozen digits."""
     return value[:_SHORT] if isinstance(value, str) and _DIGEST.fullmatch(value) else text(value)
-
-
-def _shown(value: str) -> str:
-    return value.replace("[", r"\[")
 
 
 # --- maps ------------------------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ def progress_bars() -> Iterator[StageProgress | None]:
         TextColumn("{task.percentage:>3.0f}%"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         console=Console(stderr=True),
     ) as bars:
         tasks: dict[str, TaskID] = {}
@@ -220,7 +220,7 @@ def progress_bars() -> Iterator[StageProgress | None]:
         def progress(stage: str, fraction: float, text: str = "") -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task("", total=1.0, stage=stage)
-            bars.update(tasks[stage], completed=fraction, description=_shown(text))
+            bars.update(tasks[stage], completed=fraction, description=text)
 
         yield progress
 

@@ -51,13 +51,13 @@ def command(
         sigmas[3:6] = sigma / (scale or 1.0)
     if scale is not None:
         sigmas[6] = _SCALE_SIGMA
+    row = None
     with opened(map) as m:
         if remove:
             m.remove_prior(scene)
         else:
             pose = Sim3(np.eye(3), np.array(position or (0.0, 0.0, 0.0)), scale or 1.0)
-            m.set_prior(Prior(scene, pose, sigmas, None if up is None else np.array(up)))
-        row = m.show_scene(scene).prior
+            row = m.set_prior(Prior(scene, pose, sigmas, None if up is None else np.array(up)))
     say(f"noted; run: gsmap optimize {map}")
     if json:
         print_rows("prior", row, json)

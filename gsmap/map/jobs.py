@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from functools import lru_cache
 
 from gsmap import describe as describing
 from gsmap import register as registering
 from gsmap.register import SceneView
-from gsmap.store import Store
+from gsmap.store import Store, sqlite
 from gsmap.types import Registration, SceneGraph
 from gsmap.types.model import ModelSpec
 
 
-@lru_cache(maxsize=1)
 def _store(path: str) -> Store:
-    return Store.open(path, "r")
+    """The map at a path, kept open for the jobs to come."""
+    return _opened(*_catalog_file(path))
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: str, inode: int) -> Store:
+    return Store.open(folder, "r")
+
+
+def _catalog_file(path: str) -> tuple[str, int]:
+    """The absolute folder of a map, and which file its catalog is: where jobs run in a person's own process, another
+    map may come to lie at the same path. (A file that is held open keeps its inode to itself.)"""
+    folder = os.path.abspath(path)
+    try:
+        return folder, os.stat(os.path.join(folder, sqlite.FILE)).st_ino
+    except FileNotFoundError:  # its catalog is a database elsewhere
+        return folder, 0
 
 
 @lru_cache(maxsize=4)
 def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
-    """Pairs come ordered by scene, so a few views kept save most of the reading."""
-    scenes, graphs = _store(path).scenes, _store(path).graphs
+    """Pairs come ordered by scene, so a few views kept save most of the reading; the key names their content."""
+    store = _store(path)
+    scenes, graphs = store.scenes, store.graphs
     graph = graphs.load(scene_id, graph_key)
     assert graph is not None, f"scene {scene_id} was to be registered before it was described"
     policy = scenes.get(scene_id).scale_policy

@@ -17,7 +17,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.map.logs import logged
 from gsmap.store import Store
-from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, Sim3
+from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
     CheckReport,
@@ -31,6 +31,7 @@ from gsmap.types.rows import (
     PairReport,
     PoseChangeRow,
     PoseRow,
+    PriorRow,
     PruneReport,
     RevisionRow,
     SceneReport,
@@ -92,11 +93,9 @@ class Map(AbstractContextManager["Map"]):
     @cached_property
     def settings(self) -> Settings:
         """The tree in force: defaults, the map's preset and settings, then those of this run (`with_settings`)."""
-        from gsmap.map.settings import read_settings, settings_of
+        from gsmap.map.settings import map_settings
 
-        preset, values = read_settings(self.store.folder)
-        run_preset, run_values = self._run
-        return settings_of({**(values if run_preset is None else {}), **run_values}, run_preset or preset)
+        return map_settings(self.store.folder, *self._run)
 
     def with_settings(self, values: Mapping[str, Any] | None = None, preset: str | None = None) -> Map:
         """Change settings for as long as this map is open, and not in ``settings.toml``; returns the map itself.
@@ -235,7 +234,7 @@ class Map(AbstractContextManager["Map"]):
                 return reports.update_report(self.store, ingested)
             optimize(self.store, self.settings, self._progress)  # scenes that now turn out to be neighbours come next
 
-    def set_prior(self, prior: Prior) -> None:
+    def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
 
         Raises:
@@ -245,6 +244,7 @@ class Map(AbstractContextManager["Map"]):
 
         check_priors([prior.scene], [prior])
         self.store.priors.set(prior)
+        return reports.prior_row(self.store, self.store.scenes.get(prior.scene))
 
     def remove_prior(self, scene: str) -> None:
         """Take back what was told of where a scene lies."""
@@ -375,16 +375,25 @@ class Map(AbstractContextManager["Map"]):
     def show_scene(self, ref: str) -> SceneReport:
         """``gsmap show MAP SCENE``: facts, nodes and edges of one scene."""
         scene = self.store.scenes.get(ref)
-        return reports.scene_report(self.store, scene, self._graph_of(scene))
+        return reports.scene_report(self.store, scene, *self._graph_of(scene))
 
     def show_pair(self, pair: str) -> PairReport:
         """``gsmap show MAP A:B``: the pair's edge, its evidence, and its history."""
         return reports.pair_report(self.store, *self._pair(pair))
 
-    def _graph_of(self, scene: Scene) -> Any:
+    def _graph_of(self, scene: Scene) -> tuple[SceneGraph | None, str]:
+        """A scene's graph under the settings in force, else its newest one; and what is to be known of that choice."""
         from gsmap.map.stages.describe import graph_keys
 
-        return self.store.graphs.load(scene.id, graph_keys(self.store, [scene], self.settings)[scene.id])
+        graph, note = None, "its graph was made by other settings or another version: run gsmap update"
+        try:
+            graph = self.store.graphs.load(scene.id, graph_keys(self.store, [scene], self.settings)[scene.id])
+        except ConfigError as error:  # what is in the map can be looked at whatever the settings say
+            note = f"its newest graph, since the map's settings cannot be read: {error}"
+        if graph is not None:
+            return graph, ""
+        newest = self.store.graphs.load(scene.id)
+        return newest, "" if newest is None else note
 
     def diff(self, before: int, after: int) -> list[PoseChangeRow]:
         """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""
@@ -420,7 +429,7 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.view.graph_picture import draw_graph
 
         scene = self.store.scenes.get(ref)
-        graph = self._graph_of(scene)
+        graph, _ = self._graph_of(scene)
         if graph is None:
             raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
         Image.fromarray(draw_graph(*self.read(scene.id), graph)).save(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -77,7 +77,8 @@ def scene_rows(
     since = _date(after)
     placed = store.revisions.get()
     nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
-    rows = [_scene_row(store, scene, placed, nodes.get(scene.id)) for scene in store.scenes.list()]
+    said = store.scenes.latest_notes()
+    rows = [_scene_row(scene, placed, nodes.get(scene.id), said.get(scene.id, "")) for scene in store.scenes.list()]
     return [
         row
         for row in rows
@@ -91,12 +92,11 @@ def scene_rows(
 def scene_row(store: Store, scene: Scene) -> SceneRow:
     """The row of one scene."""
     nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
-    return _scene_row(store, scene, store.revisions.get(), nodes.get(scene.id))
+    return _scene_row(scene, store.revisions.get(), nodes.get(scene.id), store.scenes.latest_notes().get(scene.id, ""))
 
 
-def _scene_row(store: Store, scene: Scene, placed: PoseGraph | None, num_nodes: int | None) -> SceneRow:
+def _scene_row(scene: Scene, placed: PoseGraph | None, num_nodes: int | None, note: str) -> SceneRow:
     pose = placed.poses.get(scene.id) if placed else None
-    said = [fact.value for fact in store.scenes.facts(scene.id) if fact.kind == "note"]
     return SceneRow(
         name=scene.name,
         id=scene.id,
@@ -109,28 +109,31 @@ def _scene_row(store: Store, scene: Scene, placed: PoseGraph | None, num_nodes: 
         ingested_at=scene.ingested_at,
         scale_policy=scene.scale_policy,
         tags=scene.tags,
-        note=said[-1] if said else "",
+        note=note,
     )
 
 
-def scene_report(store: Store, scene: Scene, graph: SceneGraph | None) -> SceneReport:
+def scene_report(store: Store, scene: Scene, graph: SceneGraph | None, graph_note: str = "") -> SceneReport:
     """Everything known of one scene.
 
     Args:
-        graph: the one that the present recipe made; None where there is none.
+        graph: its graph; None where there is none.
+        graph_note: what is to be known of which graph that is.
     """
     placed = store.revisions.get()
     pose = placed.poses.get(scene.id) if placed else None
     known = pose is not None and pose.covariance is not None
+    facts = store.scenes.facts(scene.id)
+    noted = next((fact.value for fact in reversed(facts) if fact.kind == "note"), "")
     return SceneReport(
-        **vars(_scene_row(store, scene, placed, graph.num_nodes if graph else None)),
+        **vars(_scene_row(scene, placed, graph.num_nodes if graph else None, noted)),
         origin=scene.source,
         sh_degree=scene.sh_degree,
         num_cameras=scene.num_cameras,
         cameras_synthesised=scene.cameras_synthesised,
         antialiased=scene.antialiased,
         bounds=scene.bounds,
-        notes=(*store.scenes.notes(scene.id), *(graph.notes if graph else ())),
+        notes=(*store.scenes.notes(scene.id), *(graph.notes if graph else ()), *([graph_note] if graph_note else ())),
         rotation_sigma_deg=_rotation_sigma_deg(pose) if pose and known else None,
         translation_sigma_m=_translation_sigma(pose) if pose and known else None,
         covariance=pose.covariance if pose else None,
@@ -141,8 +144,7 @@ def scene_report(store: Store, scene: Scene, graph: SceneGraph | None) -> SceneR
         edges=_edges_of(store, scene),
         nodes=_node_rows(graph) if graph else (),
         history=tuple(
-            FactRow(at=fact.created_at, fact=fact.kind, value=fact.value, author=fact.author)
-            for fact in store.scenes.facts(scene.id)
+            FactRow(at=fact.created_at, fact=fact.kind, value=fact.value, author=fact.author) for fact in facts
         ),
     )
 
@@ -303,10 +305,9 @@ def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
 
 
 def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
-    """The current edge of a pair, which was registered or measured."""
+    """The current edge of a pair; one that has none (a lone measurement was withdrawn) is ``never registered``."""
     current = store.registrations.get(a.id, b.id)
-    assert current is not None
-    return _edge_rows(store, [current])[0]
+    return EdgeRow(**_never_registered(a, b)) if current is None else _edge_rows(store, [current])[0]
 
 
 def _edge_rows(store: Store, edges: Iterable[StoredRegistration]) -> list[EdgeRow]:
@@ -350,10 +351,6 @@ _USED: dict[str, bool | str] = {"used": True, "tentative": "tentative", "unused"
 def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
     """Everything known of one pair: its current edge, the evidence it rests on, and all that was said before."""
     current = store.registrations.get(a.id, b.id)
-    if current is None:
-        return _never_registered(a, b)
-    placed, edge = store.revisions.get(), current.registration
-    outcome = placed.outcomes.get((edge.target, edge.source)) if placed else None
     events = [
         PairEventRow(at=old.created_at, what=old.registration.status, reason=old.registration.reason)
         for old in store.registrations.history(a.id, b.id)
@@ -362,34 +359,39 @@ def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
         PairEventRow(at=word.created_at, what=word.review, reason=word.note)
         for word in store.registrations.reviews(a.id, b.id)
     ]
+    history = tuple(sorted(events, key=lambda event: event.at))
+    if current is None:
+        return PairReport(**_never_registered(a, b), evidence={}, history=history)
+    placed, edge = store.revisions.get(), current.registration
+    outcome = placed.outcomes.get((edge.target, edge.source)) if placed else None
     return PairReport(
         **vars(_edge_row(current, placed, names(store))),
         exact=edge.exact,
         evidence=edge.evidence,
         residual_chi2=outcome.residual_chi2 if outcome else None,
         notes=edge.notes,
-        history=tuple(sorted(events, key=lambda event: event.at)),
+        history=history,
     )
 
 
-def _never_registered(a: Scene, b: Scene) -> PairReport:
-    return PairReport(
-        target=a.id,
-        target_name=a.name,
-        source=b.id,
-        source_name=b.name,
-        status="never registered",
-        reason="",
-        S_target_source=None,
-        scale=None,
-        information=None,
-        num_inliers=0,
-        num_correspondences=0,
-        overlap=0.0,
-        seconds={},
-        used=False,
-        evidence={},
-    )
+def _never_registered(a: Scene, b: Scene) -> dict[str, Any]:
+    """The fields of `EdgeRow` of a pair without an edge."""
+    return {
+        "target": a.id,
+        "target_name": a.name,
+        "source": b.id,
+        "source_name": b.name,
+        "status": "never registered",
+        "reason": "",
+        "S_target_source": None,
+        "scale": None,
+        "information": None,
+        "num_inliers": 0,
+        "num_correspondences": 0,
+        "overlap": 0.0,
+        "seconds": {},
+        "used": False,
+    }
 
 
 # --- revisions -------------------------------------------------------------------------------------------------------

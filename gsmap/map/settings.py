@@ -83,6 +83,34 @@ def read_settings(folder: Path) -> tuple[str, dict[str, Any]]:
     return str(values.pop(PRESET, "default")), values
 
 
+def map_settings(folder: Path, run_preset: str | None, run_values: Mapping[str, Any]) -> Settings:
+    """The tree in force: defaults, the map's preset and settings, then those of a run.
+
+    Args:
+        run_preset: takes the place of all that the map is set to.
+        run_values: by dotted name.
+
+    Raises:
+        ConfigError: a preset, name or value that cannot be; ``settings.toml`` is named where it is to blame.
+    """
+    if run_preset is not None:
+        return settings_of(run_values, run_preset)
+    preset, values = read_settings(folder)
+    return _combined(folder, preset, values, run_values)
+
+
+def _combined(folder: Path, preset: str, values: Mapping[str, Any], more: Mapping[str, Any]) -> Settings:
+    """The map's settings with more on top."""
+    try:
+        return settings_of({**values, **more}, preset)
+    except ConfigError:
+        try:
+            settings_of(values, preset)
+        except ConfigError as error:
+            raise ConfigError(f"{folder / FILE_NAME}: {error}") from error
+        raise
+
+
 def write_settings(
     folder: Path, values: Mapping[str, Any], *, preset: str | None = None, drop: tuple[str, ...] = ()
 ) -> None:
@@ -101,5 +129,5 @@ def write_settings(
     unknown = [name for name in drop if name not in old]
     if unknown:
         raise ConfigError(f"{unknown[0]} is not changed in {folder / FILE_NAME}: there is nothing to take back")
-    settings_of({**kept, **values}, preset or old_preset)
+    _combined(folder, preset or old_preset, kept, values)
     save(folder / FILE_NAME, {**({PRESET: preset} if preset else {}), **values}, drop)

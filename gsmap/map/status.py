@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable, Sequence
 
 from gsmap.map.settings import Settings
-from gsmap.map.stages.describe import graph_keys
+from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.map.stages.export import dirty_tiles
-from gsmap.map.stages.optimize import is_solved, pose_inputs
+from gsmap.map.stages.optimize import pose_inputs
 from gsmap.map.stages.register import stale
 from gsmap.store import Store
 from gsmap.types import Scene
@@ -16,7 +17,7 @@ from gsmap.types.rows import MapStatus, TodoRow
 
 def status(store: Store, settings: Settings) -> MapStatus:
     """``gsmap status MAP``, from the catalog alone: no array is read, nothing is computed."""
-    at = store.folder
+    at = shlex.quote(str(store.folder))
     scenes = store.scenes.list()
     graph = store.revisions.get()
     todo: list[TodoRow] = []
@@ -26,9 +27,9 @@ def status(store: Store, settings: Settings) -> MapStatus:
             todo.append(TodoRow(what=what, count=count, verb=verb, meaning=meaning))
 
     keys = graph_keys(store, scenes, settings)
-    described = {stored.scene for stored in store.graphs.list()}
-    lacking = [scene for scene in scenes if store.graphs.find(keys[scene.id]) is None]
-    bare = [scene for scene in lacking if scene.id not in described]
+    current = store.registrations.current()
+    lacking = without_graph(store, keys)
+    bare = set(lacking) - {stored.scene for stored in store.graphs.list()}
     add("undescribed", len(bare), f"gsmap update {at}", "scenes without a graph")
     add(
         "stale_graphs",
@@ -36,9 +37,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
         f"gsmap update {at}",
         "graphs made by other settings or another version",
     )
-    registered = {
-        scene for r in store.registrations.current() for scene in (r.registration.target, r.registration.source)
-    }
+    registered = {scene for stored in current for scene in (stored.registration.target, stored.registration.source)}
     alone = [scene for scene in scenes if scene.id not in registered]
     add(
         "unregistered",
@@ -46,22 +45,18 @@ def status(store: Store, settings: Settings) -> MapStatus:
         f"gsmap update {at}",
         "scenes that were never tried with another",
     )
-    add("stale_edges", len(stale(store, settings)), f"gsmap update {at}", "edges made by other settings or versions")
-    if scenes and not is_solved(store, settings):
-        revisions = store.revisions.list()
-        same_inputs = bool(revisions) and revisions[-1].recipe == pose_inputs(store, settings).key.recipe
-        if revisions and not same_inputs:
-            add("stale_poses", 1, f"gsmap optimize {at}", "poses solved by other settings or another version")
-        else:
-            add("unsolved", 1, f"gsmap optimize {at}", "scenes, edges, reviews or priors newer than the poses")
-    for target, count in dirty_tiles(store, settings).items():
-        add("dirty_tiles", count, f"gsmap export {at} {target}", f"tiles in {target} that are out of date")
+    aged = stale(current, keys, settings)
+    add("stale_edges", len(aged), f"gsmap update {at}", "edges made by other settings or versions")
+    _add_unsolved(store, settings, add, f"gsmap optimize {at}")
+    for target, (count, request) in dirty_tiles(store, settings).items():
+        verb = " ".join(["gsmap export", at, shlex.quote(target), *request.options()])
+        add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
     poses = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in keys]
     tentative = [pose for pose in poses if pose.status == "tentative"]
     add("tentative", len(tentative), f"gsmap list {at} scenes --status tentative", "scenes on edges no cycle confirms")
     undecided = [pair for pair in (graph.undecided if graph else ()) if set(pair) <= set(keys)]
     add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
-    outweighed = graph.provenance.contradicted_priors if graph else ()
+    outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in keys]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes that nothing ties to others")
@@ -75,6 +70,18 @@ def status(store: Store, settings: Settings) -> MapStatus:
         revision=store.revisions.current(),
         metres_per_unit=_metres_per_unit(scenes),
     )
+
+
+def _add_unsolved(store: Store, settings: Settings, add: Callable[[str, int, str, str], None], verb: str) -> None:
+    """Whether the newest poses are what these settings make of what the map knows now, and if not, why."""
+    given = pose_inputs(store, settings)
+    newest = next(reversed(store.revisions.list()), None)
+    if not given.scenes or (newest is not None and newest.key == given.key.digest):
+        return
+    if newest is not None and newest.recipe != given.key.recipe:
+        add("stale_poses", 1, verb, "poses solved by other settings or another version")
+    else:
+        add("unsolved", 1, verb, "scenes, edges, reviews or priors newer than the poses")
 
 
 def _metres_per_unit(scenes: Sequence[Scene]) -> float | None:

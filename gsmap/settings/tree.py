@@ -96,22 +96,38 @@ def _children(tree: Any) -> Iterator[tuple[str, Any, Any, str]]:
             yield name, tree[name], None, ""
         return
     cls: type = type(tree)
-    docs, hints = field_docs(cls), get_type_hints(cls)
-    for field in fields(tree):
-        if field.init:
-            yield field.name, getattr(tree, field.name), hints[field.name], docs.get(field.name, "")
+    docs = field_docs(cls)
+    for name, annotation in _annotations(cls).items():
+        yield name, getattr(tree, name), annotation, docs.get(name, "")
 
 
 @lru_cache(maxsize=512)
-def _hints(cls: type) -> dict[str, Any]:
-    return get_type_hints(cls)
+def _annotations(cls: type) -> dict[str, Any]:
+    """The annotation of each field that can be set."""
+    hints = get_type_hints(cls)
+    return {field.name: hints[field.name] for field in fields(cls) if field.init}
+
+
+def _child(tree: Any, name: str) -> tuple[Any, Any]:
+    """Value and annotation of one child; of a family only the method that is named is loaded.
+
+    Raises:
+        KeyError: no such child.
+    """
+    if isinstance(tree, MethodParams):
+        if name not in iter(tree):
+            raise KeyError(name)
+        return tree[name], None
+    cls: type = type(tree)
+    annotation = _annotations(cls)[name]
+    return getattr(tree, name), annotation
 
 
 def _set(tree: Any, path: list[str], value: Any, name: str, root: Any) -> Any:
-    found = {child: (below, annotation) for child, below, annotation, _ in _children(tree)}
-    if path[0] not in found:
-        raise _unknown(name, root)
-    below, annotation = found[path[0]]
+    try:
+        below, annotation = _child(tree, path[0])
+    except KeyError:
+        raise _unknown(name, root) from None
     if len(path) > 1:
         if not _is_node(below):
             raise _unknown(name, root)

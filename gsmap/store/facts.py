@@ -59,6 +59,12 @@ def tags(connection: Connection, scene: str | None = None) -> dict[str, tuple[st
     return {known: tuple(sorted(mine)) for known, mine in standing.items() if mine}
 
 
+def latest_notes(connection: Connection) -> dict[str, str]:
+    """The last note of each scene that has any, by scene id."""
+    query = select(scene_facts).where(scene_facts.c.kind == "note").order_by(scene_facts.c.number)
+    return {row.scene: row.value for row in connection.execute(query)}
+
+
 def checked_text(what: str, text: str, *, lines: bool = False) -> str:
     """A text that may be shown on a terminal: not empty, without control characters.
 

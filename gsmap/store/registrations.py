@@ -14,7 +14,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
-from gsmap.store.scenes import living_ids, resolve
+from gsmap.store.scenes import living_ids, resolve, scene_name
 from gsmap.store.schema import registrations, reviews
 from gsmap.types import Registration
 from gsmap.types.plain import plain
@@ -189,14 +189,17 @@ class Registrations:
             raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}")
         with self._catalog.write() as connection:
             found = self.get(a, b)
+            first, second = scene_name(connection, a), scene_name(connection, b)
             if found is None:
-                raise NotFoundError(f"{a} and {b} were never registered: gsmap register MAP --pairs {a}:{b}")
+                raise NotFoundError(
+                    f"{first} and {second} were never registered: gsmap register MAP --pairs {first}:{second}"
+                )
             if review == "confirm" and found.registration.S_target_source is None:
                 raise InputError(
-                    f"{a} and {b} have no pose to confirm: {found.registration.reason or 'none was found'}"
+                    f"{first} and {second} have no pose to confirm: {found.registration.reason or 'none was found'}"
                 )
             if review == "withdraw" and found.review is None and not found.manual:
-                raise InputError(f"nobody has reviewed {a} and {b}: there is nothing to withdraw")
+                raise InputError(f"nobody has reviewed {first} and {second}: there is nothing to withdraw")
             row = {"review": review, "registration": found.number, "note": note, "created_at": now()}
             connection.execute(insert(reviews), row | {"pair": _pair(connection, a, b)})
             return self.get(a, b)

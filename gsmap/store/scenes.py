@@ -194,6 +194,11 @@ class Scenes:
         with self._catalog.read() as connection:
             return facts.said(connection, _find(connection, ref).id)
 
+    def latest_notes(self) -> dict[str, str]:
+        """The last note that people made of each scene, by its id; scenes without one are left out."""
+        with self._catalog.read() as connection:
+            return facts.latest_notes(connection)
+
     def notes(self, ref: str) -> tuple[str, ...]:
         """What a person should know about how it was ingested."""
         with self._catalog.read() as connection:
@@ -280,6 +285,11 @@ def living_ids(connection: Connection) -> set[str]:
 def resolve(connection: Connection, ref: str) -> str:
     """The id that a ref means; see `Scenes.get`."""
     return str(_find(connection, ref).id)
+
+
+def scene_name(connection: Connection, ref: str) -> str:
+    """What people call the scene that a ref means."""
+    return str(_find(connection, ref).name)
 
 
 def _name_taken(connection: Connection, name: str) -> bool:

@@ -442,8 +442,8 @@ class EdgeRow(PairRef):
     """The current edge of one pair that was tried.
 
     Args:
-        status: ``accepted``, ``rejected`` (a pose was found and contradicted) or ``no_match``; what a person's review
-            says counts before what registration found.
+        status: ``accepted``, ``rejected`` (a pose was found and contradicted), ``no_match``, or ``never registered``
+            where the pair has no edge; what a person's review says counts before what registration found.
         reason: why it is not accepted, or why the last optimize did not use it; empty where there is nothing to say.
         S_target_source: how the source lies in the target; null where no pose was found.
         scale: of that pose; null as above.
@@ -456,8 +456,8 @@ class EdgeRow(PairRef):
         used: whether the last optimize used it: true, false, or ``"tentative"`` (no cycle confirms it).
         undecided: whether nothing could tell if it is right: another group of edges contradicts it.
         review: a person's standing word: ``confirm`` or ``reject``; null where there is none.
-        proposer: what proposed the pose (``landmarks``, ``objects``, ``kiss_matcher``), or ``manual`` where a person
-            measured it; empty where none was found.
+        proposer: what proposed the pose (``graph:landmarks``, ``graph:objects``, ``kiss_matcher``), or ``manual`` where
+            a person measured it; empty where none was found.
         registered_at: when it was registered, ISO 8601 with zone.
     """
 
@@ -506,7 +506,7 @@ class PairEventRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PairReport(EdgeRow):
-    """Everything known of one pair. One that was never tried has the status ``never registered``.
+    """Everything known of one pair.
 
     Args:
         exact: whether the clique search proved its answer largest.

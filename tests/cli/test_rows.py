@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gsmap.cli.console import json_object, print_rows, print_table, text
+from gsmap.cli.console import json_object, print_facts, print_rows, print_table, text
 from gsmap.types import Sim3, rows
 from gsmap.types.rows import Row
 
@@ -117,6 +117,15 @@ def test_tables_shorten_digests_and_escape_markup(capsys: pytest.CaptureFixture[
     assert digest[:12] in printed
     assert digest not in printed
     assert "[bold]x" in printed
+
+
+def test_names_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ["the:key:room", "a\\[/b]", "[red]", "50%"]
+    print_table("[red]", {"scene_name": "name"}, [rows.SceneRef(scene="", scene_name=name) for name in names])
+    print_facts(":key:", {"[red]": "[/]"})
+    printed = capsys.readouterr().out
+    assert all(text in printed for text in [*names, ":key:", "[/]"])
+    assert printed.count("[red]") == 3
 
 
 def test_an_empty_table_has_its_headings(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from settings_tree import Tree
 
 from gsmap.errors import ConfigError
 from gsmap.settings import changed, differences, leaves, parse
@@ -44,6 +45,13 @@ def test_a_setting_is_changed_and_nothing_else(tree, name, value, kept):
     assert values == {leaf.name: leaf.value for leaf in leaves(tree)} | {name: kept}
     before = {leaf.name: leaf.value for leaf in leaves(tree)}
     assert differences(new, tree) == ({} if before[name] == kept else {name: kept})
+
+
+def test_a_method_that_cannot_be_loaded_does_not_hinder_the_settings_of_another(toys):
+    new = changed(Tree(), {"toys.stone.size_m": 3.0})
+    assert new.toys["stone"].size_m == 3.0
+    with pytest.raises(ConfigError, match="torn"):
+        changed(Tree(), {"toys.torn.size_m": 3.0})
 
 
 @pytest.mark.parametrize(

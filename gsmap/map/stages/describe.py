@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from gsmap.describe import recipe_key
@@ -23,12 +23,19 @@ def graph_keys(store: Store, scenes: Sequence[Scene], settings: Settings) -> dic
     return {scene.id: recipe.of(scene.id, scene.scale_policy) for scene in scenes}
 
 
+def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
+    """Ids of the scenes that have no graph under their key, in the order of the keys; no array is read."""
+    present = {stored.key for stored in store.graphs.list()}
+    return [scene for scene, key in keys.items() if key.digest not in present]
+
+
 def describe(
     store: Store, scenes: Sequence[Scene], settings: Settings, progress: StageProgress
 ) -> dict[str, RecipeKey]:
     """Make the graphs that are missing, reading none of the others; returns the key of each scene's graph."""
     keys = graph_keys(store, scenes, settings)
-    missing = [scene for scene in scenes if store.graphs.find(keys[scene.id]) is None]
+    lacking = set(without_graph(store, keys))
+    missing = [scene for scene in scenes if scene.id in lacking]
     specs = models.specs(store)
     # A worker elsewhere must not choose another renderer than the one that the key names.
     rendered_by = backend(settings.describe.object.render_backend)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -20,6 +22,8 @@ from gsmap.store import Store
 from gsmap.types import MergeResult, Scene, ScenePose, Tile
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress
+
+_log = logging.getLogger("gsmap.export")
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,30 @@ class Request:
     steps: int | None = None
     budget_s: float | None = None
     provenance: bool = False
+
+    def options(self) -> list[str]:
+        """The options of ``gsmap export`` that ask for the same."""
+        default = Request()
+        words: list[str] = []
+        for name, option in _OPTIONS.items():
+            value = getattr(self, name)
+            if value != getattr(default, name):
+                values = [] if value is True else value if name == "bbox" else [value]
+                words += [option, *(shlex.quote(str(item)) for item in values)]
+        return words
+
+
+_OPTIONS = {
+    "format": "--format",
+    "tile_size_m": "--tile-size",
+    "bbox": "--bbox",
+    "merge": "--merge",
+    "revision": "--revision",
+    "component": "--component",
+    "steps": "--steps",
+    "budget_s": "--budget",
+    "provenance": "--provenance",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +98,7 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         params = with_steps(method, params, request.steps)
     recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
     _check(request, recipe)
-    revision = request.revision or store.revisions.current()
+    revision = store.revisions.current() if request.revision is None else request.revision
     placed = _placed(store, revision, request.component)
     scenes = {scene: store.scenes.get(scene) for scene in placed}
     if uses_dates(method, params):
@@ -88,13 +116,16 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
 
 
 def export(store: Store, out: Path, request: Request, settings: Settings, progress: Progress) -> ExportResult:
-    """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what."""
+    """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what.
+
+    A map that was opened for reading is exported too; then only the folder's own manifest says what was made.
+    """
     planned = plan(store, request, settings)
     asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
 
     def noted(tile: Tile) -> None:
-        if not tile.path:  # nothing lies there
+        if not tile.path or not store.catalog.writable:  # nothing lies there, or nothing can be noted
             return
         if not number:
             number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
@@ -113,6 +144,11 @@ def export(store: Store, out: Path, request: Request, settings: Settings, progre
     is_new = result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))
     if planned.recipe.is_tileset and is_new:
         write_tilesets(out, result.tiles, request.tile_size_m)
+    if not store.catalog.writable:
+        _log.warning(
+            "%s is read-only: it does not know of this export, so gsmap status cannot watch %s", store.folder, out
+        )
+        return result
     kept = {tile.path for tile in result.tiles}
     gone = [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]
     if gone:
@@ -120,18 +156,19 @@ def export(store: Store, out: Path, request: Request, settings: Settings, progre
     return result
 
 
-def dirty_tiles(store: Store, settings: Settings) -> dict[str, int]:
-    """Tiles that the same export would make again now or take away, by the folder exported to; from the catalog alone.
+def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Request]]:
+    """How many tiles the same export would make again now or take away, and that export, by the folder exported to.
 
-    A folder whose export named a revision stays as it is, whatever the map does.
+    Read from the catalog alone, which does not say which tiles are empty: new ones are not counted. A folder whose
+    export named a revision stays as it is, whatever the map does.
     """
     newest = {export.target: export for export in store.exports.list()}
-    found = {}
+    found: dict[str, tuple[int, Request]] = {}
+    known = {field.name for field in fields(Request)}
     for target in store.exports.targets():
-        asked = newest[target].settings
-        known = {field.name for field in fields(Request)}
+        request = Request(**{key: value for key, value in newest[target].settings.items() if key in known})
         try:
-            planned = plan(store, Request(**{key: value for key, value in asked.items() if key in known}), settings)
+            planned = plan(store, request, settings)
         except GsmapError:
             continue  # what was exported then cannot be now: its verb will say why
         old = {(tile.component, Path(tile.path).name.partition(".")[0]): tile for tile in store.exports.tiles(target)}
@@ -142,8 +179,9 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, int]:
             and dirty_reason(tile, made, planned.recipe, settings.export.moved_m)
         ]
         gone = set(old) - {(tile.component, tile.name) for tile in planned.tiles}
-        found[target] = len(again) + len(gone)
-    return {target: count for target, count in found.items() if count}
+        if again or gone:
+            found[target] = len(again) + len(gone), request
+    return found
 
 
 def _check(request: Request, recipe: TileRecipe) -> None:

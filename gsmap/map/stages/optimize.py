@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +38,8 @@ class PoseInputs:
 
 def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
     """Read what decides the poses."""
-    scenes, priors = [scene.id for scene in store.scenes.list()], store.priors.list()
+    living, priors = store.scenes.list(), store.priors.list()
+    scenes = [scene.id for scene in living]
     edges, named = [], []
     row = {scene: number for number, scene in enumerate(scenes)}
     # In the order of the scenes, not in that in which workers happened to finish: the same poses to the last bit.
@@ -57,18 +59,17 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
             )
         )
         named.append(f"{stored.key or stored.number} {stored.review}")
-    ups = _ups(store, settings)
+    ups = _ups(store, {key.digest for key in graph_keys(store, living, settings).values()})
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
     key = solver.recipe_key(settings.optimize).of(*scenes, *named, canonical(told), canonical(ups))
     return PoseInputs(scenes, edges, priors, ups, key)
 
 
-def _ups(store: Store, settings: Settings) -> dict[str, np.ndarray]:
-    """What each scene's present graph says is up; where it has none yet, its newest graph."""
-    present = {key.digest for key in graph_keys(store, store.scenes.list(), settings).values()}
+def _ups(store: Store, present: Collection[str]) -> dict[str, np.ndarray]:
+    """What each scene's present graph (by key) says is up; where it has none yet, its newest graph."""
     # Graphs come oldest first; the present one of a scene goes last.
-    graphs = sorted(store.graphs.list(), key=lambda graph: graph.key in present)
-    return {graph.scene: np.array(graph.up) for graph in graphs if graph.up is not None}
+    chosen = {graph.scene: graph.up for graph in sorted(store.graphs.list(), key=lambda graph: graph.key in present)}
+    return {scene: np.array(up) for scene, up in chosen.items() if up is not None}
 
 
 def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
@@ -87,5 +88,5 @@ def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
 
 def is_solved(store: Store, settings: Settings) -> bool:
     """Whether the newest revision is what this recipe makes of what the map knows now."""
-    revisions = store.revisions.list()
-    return bool(revisions) and revisions[-1].key == pose_inputs(store, settings).key.digest
+    newest = store.revisions.current()
+    return newest is not None and store.revisions.find(pose_inputs(store, settings).key) == newest

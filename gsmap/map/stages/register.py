@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map.jobs import register_scenes
 from gsmap.map.settings import Settings
-from gsmap.map.stages.describe import graph_keys
+from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, candidate_pairs
@@ -20,7 +21,8 @@ from gsmap.store.registrations import StoredRegistration
 from gsmap.types import PoseGraph, Registration, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 
-Pairs = str | Path | Sequence[tuple[str, str]]
+Pair = tuple[str, str]
+Pairs = str | Path | Sequence[Pair]
 """``auto``, ``all``, ``A:B``, a file of pairs, or the pairs themselves."""
 
 
@@ -33,45 +35,56 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     scenes = store.scenes.list()
     graphs = graph_keys(store, scenes, settings)
     recipe = recipe_key(settings.register)
-    wanted = _wanted(store, pairs, graphs, settings, recipe)
-    keys = [recipe.of(graphs[a].digest, graphs[b].digest) for a, b in wanted]
-    todo = list(range(len(wanted)))
+    wanted = _wanted(store, pairs, graphs, settings)
     if pairs in ("auto", "all"):
-        current = {frozenset((r.registration.target, r.registration.source)): r for r in store.registrations.current()}
-        todo = []
-        for i, key in enumerate(keys):
-            known, stands = store.registrations.find(key), current.get(frozenset(wanted[i]))
-            if known is None:
-                todo.append(i)
-            elif stands is not None and stands.key != key.digest and not stands.manual:
-                store.registrations.adopt(known.number)
-    jobs = [
-        (str(store.folder), (a, graphs[a].digest), (b, graphs[b].digest), settings.register)
-        for a, b in (wanted[i] for i in todo)
-    ]
+        wanted = _lacking(store, wanted, graphs, recipe)
+    jobs = [(str(store.folder), (a, graphs[a].digest), (b, graphs[b].digest), settings.register) for a, b in wanted]
     names = {scene.id: scene.name for scene in scenes}
     found: dict[int, Registration] = {}
-    for at, edge in run_jobs(register_scenes, jobs, settings.engine):
-        store.registrations.save(edge, keys[todo[at]])
-        found[at] = edge
+    for i, edge in run_jobs(register_scenes, jobs, settings.engine):
+        store.registrations.save(edge, _key(recipe, graphs, *wanted[i]))
+        found[i] = edge
         progress("register", len(found) / len(jobs), f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
     return [found[i] for i in sorted(found)]
 
 
-def stale(store: Store, settings: Settings) -> list[StoredRegistration]:
-    """The current edges that other settings or another version made; what a person measured is never stale."""
-    graphs = graph_keys(store, store.scenes.list(), settings)
+def _key(recipe: RecipeKey, graphs: Mapping[str, RecipeKey], target: str, source: str) -> RecipeKey:
+    """What names the registration of a pair; the other direction is another registration."""
+    return recipe.of(graphs[target].digest, graphs[source].digest)
+
+
+def _lacking(
+    store: Store, pairs: Sequence[tuple[str, str]], graphs: Mapping[str, RecipeKey], recipe: RecipeKey
+) -> list[tuple[str, str]]:
+    """Those of the pairs that this recipe has not registered, in the direction in which each was registered last."""
+    current = {frozenset((r.registration.target, r.registration.source)): r for r in store.registrations.current()}
+    lacking = []
+    for pair in pairs:
+        stands = current.get(frozenset(pair))
+        if stands is not None and not stands.manual:
+            pair = stands.registration.target, stands.registration.source
+        key = _key(recipe, graphs, *pair)
+        if stands is not None and stands.key == key.digest:
+            continue
+        known = store.registrations.find(key)
+        if known is None:
+            lacking.append(pair)
+        elif stands is not None and not stands.manual:
+            store.registrations.adopt(known.number)
+    return lacking
+
+
+def stale(current: Iterable[StoredRegistration], graphs: Mapping[str, RecipeKey], settings: Settings) -> list[Pair]:
+    """(target, source) of the edges that other settings or another version made; a person's own word is never stale.
+
+    Args:
+        current: the current edges.
+        graphs: the key of each living scene's graph.
+    """
     recipe = recipe_key(settings.register)
-
-    def made_by(stored: StoredRegistration) -> str:
-        edge = stored.registration
-        return recipe.of(graphs[edge.target].digest, graphs[edge.source].digest).digest
-
-    return [
-        stored
-        for stored in store.registrations.current()
-        if not stored.manual and stored.review != "confirm" and stored.key != made_by(stored)
-    ]
+    computed = [stored for stored in current if not stored.manual and stored.review != "confirm"]
+    ends = [(stored.registration.target, stored.registration.source, stored.key) for stored in computed]
+    return [(a, b) for a, b, key in ends if {a, b} <= set(graphs) and key != _key(recipe, graphs, a, b).digest]
 
 
 def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np.ndarray, note: str) -> None:
@@ -112,12 +125,12 @@ def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
     raise NotFoundError(f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows")
 
 
-def read_pairs(path: Path) -> list[tuple[str, str]]:
-    """Pairs of a text file, one a line: ``A B`` or ``A:B``; ``#`` begins a remark.
+def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
+    """Pairs of a text file, one a line: ``A B`` or ``A:B``; ``#`` begins a remark. A name with spaces needs the colon.
 
     Raises:
         NotFoundError: no such file.
-        InputError: a line that is no pair.
+        InputError: a line that names no two scenes.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -127,32 +140,41 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
         raise InputError(f"cannot read pairs from {path}: {error}") from error
     pairs = []
     for number, line in enumerate(lines, 1):
-        words = line.partition("#")[0].split()
-        if len(words) == 1 and words[0].count(":") == 1:
-            words = words[0].split(":")
-        if words and (len(words) != 2 or not all(words)):
-            raise InputError(f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}")
-        if words:
-            pairs.append((words[0], words[1]))
+        text = line.partition("#")[0].strip()
+        try:
+            if text:
+                pairs.append(_pair_on(store, text))
+        except NotFoundError as error:
+            raise InputError(
+                f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r} ({error})"
+            ) from error
     return pairs
 
 
-def _wanted(
-    store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], settings: Settings, recipe: RecipeKey
-) -> list[tuple[str, str]]:
+def _pair_on(store: Store, text: str) -> tuple[Scene, Scene]:
+    """The scenes of ``A B`` or ``A:B``; a space or colon may also belong to a name."""
+    words = text.split()
+    if len(words) == 2:
+        with suppress(NotFoundError):
+            return store.scenes.get(words[0]), store.scenes.get(words[1])
+    return pair_of(store, text)
+
+
+def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], settings: Settings) -> list[tuple[str, str]]:
     """The scene pairs that are asked for, each as (target, source), in a fixed order, each once."""
-    described = [scene for scene, key in graphs.items() if store.graphs.find(key) is not None]
+    lacking = set(without_graph(store, graphs))
+    described = [scene for scene in graphs if scene not in lacking]
     if pairs == "all":
         return [(a, b) for i, a in enumerate(described) for b in described[i + 1 :]]
     if pairs == "auto":
         loaded = [_graph(store, graphs[scene]) for scene in described]
         candidates = candidate_pairs(loaded, placed=placed_scenes(store), params=settings.retrieve)
         known = {frozenset(pair) for pair in candidates}
-        again = [(r.registration.target, r.registration.source) for r in stale(store, settings)]
-        return candidates + [pair for pair in again if frozenset(pair) not in known and set(pair) <= set(described)]
+        again = stale(store.registrations.current(), graphs, settings)
+        return candidates + [pair for pair in again if frozenset(pair) not in known and not set(pair) & lacking]
     if isinstance(pairs, Path):
-        pairs = read_pairs(pairs)
-    if isinstance(pairs, str):
+        named = read_pairs(store, pairs)
+    elif isinstance(pairs, str):
         named = [pair_of(store, pairs)]
     else:
         named = [(store.scenes.get(a), store.scenes.get(b)) for a, b in pairs]
@@ -161,7 +183,9 @@ def _wanted(
         if a.id == b.id:
             raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
         for scene in (a, b):
-            if scene.id not in described:
+            if scene.id not in graphs:
+                raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
+            if scene.id in lacking:
                 raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
         chosen.setdefault(frozenset((a.id, b.id)), (a.id, b.id))
     return list(chosen.values())

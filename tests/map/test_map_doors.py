@@ -1,0 +1,294 @@
+"""The doors of a map whose stages are stood in for: what is asked for, what is kept, and what is said."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gsmap.map
+from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
+from gsmap.map import Map
+from gsmap.map.stages.describe import graph_keys
+from gsmap.map.stages.export import Request
+from gsmap.map.stages.register import read_pairs
+from gsmap.store import Store
+from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Sim3
+
+NAMES = ("hall", "stairs", "attic:east")
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """The pairs that were registered, as (target, source) ids; each finds that they lie a metre apart."""
+    pairs: list[tuple[str, str]] = []
+
+    def jobs(job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
+        for i, (_, (target, _), (source, _), _) in enumerate(arguments):
+            pairs.append((target, source))
+            pose = Sim3(np.eye(3), np.array([1.0, 0, 0]))
+            yield i, Registration(target, source, "accepted", "", pose, 100.0 * np.eye(7), 50, 60, 0.5, "graph:objects")
+
+    monkeypatch.setattr("gsmap.map.stages.register.run_jobs", jobs)
+    return pairs
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Map]:
+    """Three described scenes."""
+    with gsmap.map.create(tmp_path / "site.gsmap") as m:
+        for i, name in enumerate(NAMES):
+            rng = np.random.default_rng(i)
+            m.ingest(_gaussians(rng), cameras=_cameras(), name=name, scale="known")
+        describe(m)
+        yield m
+
+
+def describe(m: Map) -> None:
+    for scene, key in graph_keys(m.store, m.scenes(), m.settings).items():
+        m.store.graphs.save(_graph(scene), key)
+
+
+def _gaussians(rng: np.random.Generator, n: int = 50) -> Gaussians:
+    return Gaussians(
+        rng.uniform(-1, 1, size=(n, 3)),
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.full((n, 3), -3.0),
+        np.zeros(n),
+        rng.normal(size=(n, 1, 3)),
+    )
+
+
+def _cameras() -> Cameras:
+    pose = np.eye(4)
+    pose[2, 3] = -4.0
+    return Cameras(pose[None], np.array([[40.0, 40, 16, 12]]), np.array([[32, 24]]), ("a",))
+
+
+def _graph(scene: str, n: int = 4) -> SceneGraph:
+    rng = np.random.default_rng(0)
+    embeddings = rng.normal(size=(n, 8)).astype(np.float32)
+    layer = NodeLayer(
+        positions=rng.normal(size=(n, 3)),
+        embeddings=embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True),
+        types=np.zeros(n, dtype=np.int32),
+        extents=np.zeros((n, 2, 3)),
+        weights=np.ones(n),
+        num_views=np.ones(n, dtype=np.int32),
+        features=np.zeros((n, 1)),
+        descriptor_id="test",
+    )
+    return SceneGraph(scene, {"objects": layer}, np.array([0.0, 0, 1]), 1.0)
+
+
+def test_a_pair_is_registered_once_in_whichever_direction(site: Map, tried: list[tuple[str, str]]) -> None:
+    hall, stairs, _ = (scene.id for scene in site.scenes())
+    site.register([("stairs", "hall")])
+    site.register("all")
+    assert tried[0] == (stairs, hall)
+    assert {frozenset(pair) for pair in tried} == {
+        frozenset((a.id, b.id)) for a in site.scenes() for b in site.scenes() if a.id != b.id
+    }
+    assert len(tried) == 3
+    assert site.register("all") == []
+    site.with_settings({"register.verdict.max_log_nfa": -9.5})
+    site.register("all")
+    assert tried[3] == (stairs, hall)  # the direction that it has
+    assert len(tried) == 6
+
+
+def test_jobs_see_the_map_that_lies_at_a_path_now(tmp_path: Path) -> None:
+    from gsmap.map.jobs import _store
+
+    path = tmp_path / "site.gsmap"
+    gsmap.map.create(path).close()
+    first = _store(str(path)).id
+    assert _store(str(path)).id == first
+    shutil.rmtree(path)
+    with gsmap.map.create(path) as m:
+        assert _store(str(path)).id == m.store.id != first
+
+
+def test_pairs_of_a_removed_scene_are_refused(site: Map, tried: list[tuple[str, str]]) -> None:
+    gone = site.remove("stairs").id
+    with pytest.raises(NotFoundError, match="stairs was removed"):
+        site.register([("hall", gone)])
+    assert tried == []
+
+
+def test_a_file_of_pairs_takes_names_with_spaces_and_colons(site: Map, tmp_path: Path) -> None:
+    site.edit("hall", name="the hall")
+    path = tmp_path / "pairs.txt"
+    path.write_text("the hall:attic:east  # seen\n\nstairs attic:east\nstairs:the hall\n")
+    found = [(a.name, b.name) for a, b in read_pairs(site.store, path)]
+    assert found == [("the hall", "attic:east"), ("stairs", "attic:east"), ("stairs", "the hall")]
+    path.write_text("stairs attic:east\nstairs nowhere\n")
+    with pytest.raises(InputError, match="line 2: a pair is written A B or A:B, got 'stairs nowhere'"):
+        read_pairs(site.store, path)
+
+
+@pytest.mark.parametrize("values", [{}, {"retrieve.top_k": 0}, {"register.verdict.max_log_nfa": -9.5}])
+def test_update_ends_whatever_people_said_and_settings_are(
+    site: Map, tried: list[tuple[str, str]], values: dict[str, Any]
+) -> None:
+    site.update()
+    site.confirm("hall:stairs")
+    site.reject("stairs:attic:east")
+    site.add_edge("hall:attic:east", Sim3(np.eye(3), np.array([2.0, 0, 0])), np.full(7, 0.1))
+    report = site.with_settings(values).update()
+    assert report.revision is not None
+    kept = {row.pair: (row.review, row.proposer) for row in report.edges}
+    assert kept["hall:stairs"] == ("confirm", "graph:objects")
+    assert kept["hall:attic:east"] == (None, "manual")
+    made = len(tried)
+    assert site.update().revision == report.revision
+    assert len(tried) == made
+    wrong = {row.what for row in site.status().todo} & {"stale_edges", "unsolved", "stale_poses", "unregistered"}
+    assert wrong == set()
+
+
+def test_a_confirmed_pose_stays_when_an_older_result_becomes_current_again(
+    site: Map, tried: list[tuple[str, str]]
+) -> None:
+    site.update()
+    site.with_settings({"register.verdict.max_log_nfa": -9.5}).update()
+    site.confirm("hall:stairs", "walked there")
+    site.with_settings({"register.verdict.max_log_nfa": -8.0}, "default").update()
+    row = next(row for row in site.edge_rows() if row.pair == "hall:stairs")
+    assert row.review == "confirm"
+    assert len(tried) == 6
+    site.confirm("hall:stairs", withdraw=True)
+    assert site.update().revision is not None
+    assert len(tried) == 6
+
+
+def test_a_lone_measurement_that_is_withdrawn_leaves_no_edge(site: Map) -> None:
+    site.add_edge("hall:stairs", Sim3(np.eye(3), np.zeros(3)), np.full(7, 0.1), "tape")
+    row = site.reject("hall:stairs", withdraw=True)
+    assert (row.status, row.S_target_source) == ("never registered", None)
+    report = site.show_pair("hall:stairs")
+    assert [event.what for event in report.history] == ["accepted", "withdraw"]
+    with pytest.raises(NotFoundError, match="hall and stairs were never registered"):
+        site.confirm("hall:stairs")
+
+
+def test_the_up_of_a_graph_that_does_not_know_it_is_not_taken_from_an_older_one(site: Map) -> None:
+    from gsmap.map.stages.optimize import pose_inputs
+
+    assert len(pose_inputs(site.store, site.settings).ups) == 3
+    site.with_settings({"describe.landmarks": False})
+    scene = site.scenes()[0]
+    graph = SceneGraph(scene.id, _graph(scene.id).layers, None, 1.0)
+    site.store.graphs.save(graph, graph_keys(site.store, [scene], site.settings)[scene.id])
+    assert set(pose_inputs(site.store, site.settings).ups) == {other.id for other in site.scenes()[1:]}
+
+
+@pytest.mark.parametrize(
+    "text", ["register.max_poses = 'many'", "[registr]\nmax_poses = 2", "preset = 'napkin'", "not toml"]
+)
+def test_a_map_can_be_looked_at_whatever_its_settings_say(
+    site: Map, tried: list[tuple[str, str]], text: str, tmp_path: Path
+) -> None:
+    site.update()
+    folder = site.store.folder
+    (folder / "settings.toml").write_text(text)
+    with gsmap.map.open(folder) as m:
+        assert len(m.scene_rows()) == len(m.pose_rows()) == 3
+        assert m.edge_rows()
+        assert len(m.revision_rows()) == len(m.store.revisions.list())
+        shown = m.show_scene("hall")
+        assert shown.num_nodes == 4
+        assert "settings.toml" in shown.notes[-1]
+        assert m.show_pair("hall:stairs").status == "accepted"
+        assert m.check().ok
+        m.prune(dry_run=True)
+        m.view().close()
+        m.edit("hall", note="wet")
+        m.remove("attic:east")
+        for door in (m.status, m.update, m.setting_rows, lambda: m.export(tmp_path / "out")):
+            with pytest.raises(ConfigError, match=r"settings\.toml"):
+                door()  # type: ignore[operator]
+
+
+def test_settings_that_cannot_be_are_named_and_taken_back(site: Map) -> None:
+    path = site.store.folder / "settings.toml"
+    path.write_text("[register]\nmax_poses = 'many'\n")
+    with pytest.raises(ConfigError, match=r"settings\.toml: register\.max_poses takes int"):
+        site.change_settings({"retrieve.top_k": 3})
+    assert "top_k" not in path.read_text()
+    assert site.with_settings({"register.max_poses": 2}).settings.register.max_poses == 2  # this run says otherwise
+    site.change_settings(unset=["register.max_poses"])
+    with gsmap.map.open(site.store.folder) as m:
+        assert m.settings.register.max_poses == 3
+
+
+def test_show_takes_the_newest_graph_where_the_present_one_is_missing(site: Map) -> None:
+    site.with_settings({"describe.landmarks": False})
+    shown = site.show_scene("hall")
+    assert (shown.num_nodes, shown.status) == (4, "described")
+    assert "run gsmap update" in shown.notes[-1]
+
+
+def test_a_map_that_is_read_only_is_shown_and_exported(
+    site: Map, tried: list[tuple[str, str]], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    site.update()
+    with Map(Store.open(site.store.folder, "r")) as m:
+        assert len(m.scene_rows()) == len(m.pose_rows()) == 3
+        assert m.show_scene("hall").edges
+        assert m.status().scenes == 3
+        assert m.setting_rows()
+        m.write_poses(tmp_path / "poses.json", "json")
+        caplog.set_level("WARNING", logger="gsmap.export")
+        made = m.export(tmp_path / "out", merge="union", tile_size_m=0)
+        assert made.recomputed == 1
+        assert "read-only" in caplog.text
+        assert m.export(tmp_path / "out", merge="union", tile_size_m=0).reused == 1
+        with pytest.raises(StoreError, match="reading"):
+            m.remove("hall")
+    assert site.tile_rows() == []
+
+
+def test_status_names_the_export_that_brings_a_folder_up_to_date(
+    site: Map, tried: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    site.update()
+    out = tmp_path / "my tiles"
+    site.export(out, merge="union", tile_size_m=2.0, bbox=[-3, -3, -3, 3, 3, 3], format="splat")
+    assert "dirty_tiles" not in {row.what for row in site.status().todo}
+    site.remove("attic:east")
+    site.optimize()
+    verb = next(row.verb for row in site.status().todo if row.what == "dirty_tiles")
+    assert verb == (
+        f"gsmap export {site.store.folder} '{out}' --format splat --tile-size 2.0 --bbox -3 -3 -3 3 3 3 --merge union"
+    )
+    with pytest.raises(NotFoundError, match="no revision 0"):
+        site.export(tmp_path / "none", revision=0)
+
+
+def test_the_options_of_an_export() -> None:
+    assert Request().options() == []
+    assert Request(merge="tto", component=0, provenance=True).options() == [
+        "--merge",
+        "tto",
+        "--component",
+        "0",
+        "--provenance",
+    ]
+
+
+def test_a_prior_is_answered_without_settings(site: Map) -> None:
+    from gsmap.types import Prior
+
+    (site.store.folder / "settings.toml").write_text("not toml")
+    sigmas = np.r_[np.full(3, np.inf), np.full(3, 0.1), np.inf]
+    row = site.set_prior(Prior("hall", Sim3(np.eye(3), np.ones(3)), sigmas))
+    assert row is not None
+    assert (row.scene_name, row.outcome) == ("hall", "not solved yet")
+    assert row.to_json()["sigmas"][0] is None
+    assert math.isinf(row.sigmas[0])
