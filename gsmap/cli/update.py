@@ -28,6 +28,9 @@ def command(
 
     Example: `gsmap update house.gsmap captures/*.ply`
     """
+    from gsmap.ingest import given_date
+
+    given_date(captured_at)  # refuses what is none before a map is made
     with opened(map, create=True, bars=True, sets=sets, preset=preset) as m:
         report = m.update(*(paths or ()), captured_at=captured_at)
     for row in report.ingested:

@@ -85,7 +85,7 @@ def read_capture(
     scale_policy: str = "auto",
 ) -> Capture:
     """Read and check one capture that `find_captures` found; see `read_captures`."""
-    given_date(captured_at)  # refused before a large file is read
+    given_date(captured_at)  # refuses what is none before a large file is read
     gaussians = formats.read(found.path)
     about = formats.info(found.path)
     source = Path(cameras) if cameras is not None else found.cameras

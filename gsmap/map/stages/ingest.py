@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsmap.errors import ConfigError
-from gsmap.ingest import Capture, find_captures, read_capture, take_capture
+from gsmap.ingest import Capture, find_captures, given_date, read_capture, take_capture
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import StageProgress
@@ -44,6 +44,7 @@ def ingest(
     progress: StageProgress,
 ) -> list[Ingested]:
     """Every capture found; see `gsmap.map.Map.ingest`."""
+    given_date(captured_at)  # refuses what is none before anything is searched
     dates = {scene.id: scene.captured_at for scene in store.scenes.list()}
     memory = [source for source in sources if isinstance(source, Gaussians)]
     if memory and len(sources) > 1:
