@@ -144,7 +144,8 @@ class Map(AbstractContextManager["Map"]):
         Args:
             captures: files and folders; or `Gaussians`, with `Cameras` or none.
             cameras, name: of the one capture given.
-            captured_at: ISO 8601; UTC where it has no zone.
+            captured_at: of every capture given, ISO 8601; UTC where it has no zone. Else each is dated by what lies
+                beside it: a sidecar, the EXIF of its frames, or its name (`gsmap.ingest.find_date`).
             scale: ``known`` (metres), ``unknown`` (any unit) or ``auto`` (registration finds out).
 
         Raises:
@@ -161,7 +162,7 @@ class Map(AbstractContextManager["Map"]):
             scale=scale,
             progress=self._progress,
         )
-        return [reports.ingest_row(*one) for one in added]
+        return [reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added]
 
     def describe(self, *scenes: str) -> list[GraphRow]:
         """The scene graph of every scene (or of those named), made where the present recipe has not made it yet."""
@@ -220,13 +221,19 @@ class Map(AbstractContextManager["Map"]):
         number = optimize(self.store, self.settings, self._progress)
         return reports.revision_row(self.store, number)
 
-    def update(self, *captures: str | os.PathLike[str]) -> UpdateReport:
-        """Ingest the captures, then describe, register and optimize whatever is missing."""
+    def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
+        """Ingest the captures, then describe, register and optimize whatever is missing.
+
+        Args:
+            captured_at: as in `ingest`.
+        """
         from gsmap.map.stages.describe import describe
         from gsmap.map.stages.optimize import is_solved, optimize
         from gsmap.map.stages.register import register
 
-        ingested = self.ingest(*captures) if captures else []
+        if captured_at is not None and not captures:
+            raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
+        ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
         describe(self.store, self.scenes(), self.settings, self._progress)
         while True:
             register(self.store, "auto", self.settings, self._progress)
@@ -452,13 +459,19 @@ class Map(AbstractContextManager["Map"]):
         tags: Sequence[str] = (),
         untag: Sequence[str] = (),
     ) -> SceneRow:
-        """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history."""
+        """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history.
+
+        Args:
+            captured_at: ISO 8601, UTC where it has no zone; ``none`` takes the date back.
+        """
         from gsmap.ingest import parse_date
 
+        if captured_at is not None:
+            captured_at = "" if captured_at.strip().lower() == "none" else parse_date(captured_at)
         scene = self.store.scenes.edit(
             ref,
             name=name,
-            captured_at=None if captured_at is None else parse_date(captured_at),
+            captured_at=captured_at,
             note=note,
             tags_add=tuple(tags),
             tags_remove=tuple(untag),

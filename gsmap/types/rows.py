@@ -243,7 +243,7 @@ class FactRow(Row):
         at: when it was said, ISO 8601 with zone.
         fact: ``name``, ``captured_at``, ``note``, ``tag`` or ``untag``.
         value: what was said; empty where a date was taken back.
-        author: who said it; empty where nobody is known.
+        author: who said it, or what did (such as the EXIF of a frame); empty where a person did and was not named.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"at": "said at", "fact": "fact", "value": "value", "author": "by"}
@@ -310,12 +310,15 @@ class IngestRow(Row):
         new: whether it was added; false where the map had the same content already.
         num_gaussians: how many Gaussians it has.
         notes: what a person should know of how it was read.
+        captured_at: when it was captured, ISO 8601 with zone; null where nobody knows. Notes say where it came from.
+        dated: whether the map had it already, and it has another date now.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
         "scene_name": "scene",
         "scene": "id",
         "num_gaussians": "Gaussians",
+        "captured_at": "captured",
         "outcome": "outcome",
     }
 
@@ -324,11 +327,17 @@ class IngestRow(Row):
     new: bool
     num_gaussians: int
     notes: tuple[str, ...] = ()
+    captured_at: str | None = None
+    dated: bool = False
 
     @property
     def outcome(self) -> str:
         """In words."""
-        return "added" if self.new else "already in the map, nothing changed"
+        if self.new:
+            return "added"
+        return (
+            f"already in the map, now dated {self.captured_at}" if self.dated else "already in the map, nothing changed"
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
