@@ -411,15 +411,35 @@ class Map(AbstractContextManager["Map"]):
         truth: str | os.PathLike[str],
         images: str | os.PathLike[str] | None = None,
         *,
+        tiles: str | os.PathLike[str] | None = None,
         lpips: str | os.PathLike[str] | None = None,
+        max_rre_deg: float = 1.0,
+        max_rte_m: float = 0.05,
     ) -> EvaluationReport:
-        """``gsmap evaluate MAP``: poses against ground truth, renders against the captures' own images."""
+        """``gsmap evaluate MAP``: edges and poses against ground truth, renders against the captures' own images.
+
+        Args:
+            truth: folder of ``NAME.json`` with ``T_scene_world`` (4x4), the world in metres.
+            images: folder of photographs named like the cameras.
+            tiles: folder that this map was exported to, to be compared with the photographs, too.
+            lpips: an LPIPS network to compare photographs with, too.
+            max_rre_deg, max_rte_m: an edge that is turned or off (at the source's middle) by more is wrong.
+
+        Raises:
+            ConfigError: tiles or a network without photographs to compare with, or bars that are not positive.
+            NotFoundError, InputError: see `gsmap.map.evaluating`.
+        """
+        from gsmap.evaluate.judge import Params
         from gsmap.map import evaluating
 
-        report = evaluating.poses(self.store, truth)
+        if images is None and (tiles is not None or lpips is not None):
+            raise ConfigError("tiles and LPIPS are of photographs: give the folder of images, too")
+        report = evaluating.poses(self.store, truth, Params(max_rre_deg=max_rre_deg, max_rte_m=max_rte_m))
         if images is None:
             return report
-        rows = evaluating.images(self.store, images, lambda f, text: self._progress("evaluate", f, text), lpips=lpips)
+        rows = evaluating.images(
+            self.store, images, lambda f, text: self._progress("evaluate", f, text), tiles=tiles, lpips=lpips
+        )
         return replace(report, images=rows)
 
     def view(self, *, port: int = 0) -> ViewServer:
