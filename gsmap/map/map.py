@@ -462,7 +462,7 @@ class Map(AbstractContextManager["Map"]):
         Image.fromarray(draw_graph(*self.read(scene.id), graph)).save(path)
 
     def write_poses(self, out: str | os.PathLike[str], format: str) -> list[Path]:
-        """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); returns what was written."""
+        """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); the files written."""
         from gsmap.map.poses import write_poses
 
         return write_poses(self.store, Path(out), format)
