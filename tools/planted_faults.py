@@ -23,6 +23,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import resource
 import shlex
 import shutil
 import subprocess
@@ -134,7 +135,7 @@ def main() -> int:
     if not faults:
         print("there are no such faults in tools/faults", file=sys.stderr)
         return 1
-    red = 0
+    red, began = 0, time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="planted_") as folder:
         copy = Path(folder) / "gsmap"
         shutil.copytree(args.root, copy, ignore=LEFT_OUT, symlinks=True)
@@ -143,7 +144,11 @@ def main() -> int:
             said = verdict(fault, copy)
             red += said == "red"
             print(f"{fault.room:10} {fault.name:60} {time.perf_counter() - start:5.1f} s  {said}", flush=True)
-    print(f"{red} of {len(faults)} planted faults are red")
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    print(
+        f"{red} of {len(faults)} planted faults are red "
+        f"({time.perf_counter() - began:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of CPU)"
+    )
     return 0 if red == len(faults) else 1
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.errors import MissingDependencyError
 from gsmap.methods import families
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -124,7 +125,12 @@ def _same(a: Mapping[str, Any] | None, b: Mapping[str, Any] | None) -> bool:
 def write() -> list[str]:
     """Store every case as it comes out now; the names whose entry changed."""
     before = json.loads(STORED.read_text()) if STORED.exists() else {}
-    after = {name: made(name, case) for name, case in sorted(cases().items())}
+    after = {}
+    for name, case in sorted(cases().items()):
+        try:
+            after[name] = made(name, case)
+        except MissingDependencyError:  # what cannot be made here stays as it was made elsewhere
+            after |= {name: before[name]} if name in before else {}
     STORED.write_text(json.dumps(after, indent=1) + "\n")
     return [name for name in sorted({*before, *after}) if not _equal(before.get(name), after.get(name))]
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from sketches import STORED, cases, differences, made, sketch
 
+from gsmap.errors import MissingDependencyError
+
 CASES = cases()
 KEPT = json.loads(STORED.read_text()) if STORED.exists() else {}
 
@@ -15,7 +17,10 @@ KEPT = json.loads(STORED.read_text()) if STORED.exists() else {}
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_output_is_that_of_its_version(name: str) -> None:
     assert name in KEPT, f"{name} has no stored output: run tools/make_golden.py"
-    now, kept = made(name, CASES[name]), KEPT[name]
+    try:
+        now, kept = made(name, CASES[name]), KEPT[name]
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
     changed = differences(kept, now)
     if now["version"] == kept["version"]:
         assert not changed, f"{name} gives other {', '.join(changed)} than before: raise VERSION or restore the output"
