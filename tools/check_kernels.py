@@ -38,7 +38,8 @@ def numbers(native: Any, name: str) -> dict[str, np.ndarray]:
     means = (rng.uniform(-1, 1, (COUNT, 3)) * [2, 1.5, 1] + [0, 0, 4]).astype(np.float32)
     quats = rng.normal(size=(COUNT, 4)).astype(np.float32)
     log_scales = rng.uniform(-4, -2.5, (COUNT, 3)).astype(np.float32)
-    logit_opacities = rng.uniform(-2, 3, COUNT).astype(np.float32)
+    # Up to where alpha is clamped at 0.99.
+    logit_opacities = rng.uniform(-2, 8, COUNT).astype(np.float32)
     sh = (0.3 * rng.normal(size=(COUNT, 4, 3))).astype(np.float32)
     arrays = means, quats, log_scales, logit_opacities, sh
     pose = np.eye(4)[:3].copy()
@@ -62,6 +63,8 @@ def numbers(native: Any, name: str) -> dict[str, np.ndarray]:
     )
     gradients = [np.zeros(array.shape, np.float32) for array in arrays]
     g_colour = rng.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+    g_depth, g_alpha = rng.normal(size=(2, HEIGHT, WIDTH)).astype(np.float32)
+    g_pose = np.zeros((3, 4))
     view.backward(
         *arrays,
         background=np.array([0.1, 0.2, 0.3], np.float32),
@@ -69,14 +72,14 @@ def numbers(native: Any, name: str) -> dict[str, np.ndarray]:
         depth=images["depth"],
         alpha=images["alpha"],
         g_colour=g_colour,
-        g_depth=None,
-        g_alpha=None,
+        g_depth=g_depth,
+        g_alpha=g_alpha,
         gradients=gradients,
-        g_pose=None,
+        g_pose=g_pose,
     )
-    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh", "pose")
     # Relative to the largest of each kind: most Gaussians hardly matter.
-    scaled = {f"gradient of {n}": g / np.abs(g).max() for n, g in zip(names, gradients, strict=True)}
+    scaled = {f"gradient of {n}": g / np.abs(g).max() for n, g in zip(names, [*gradients, g_pose], strict=True)}
     return images | scaled | {"clique": clique(native, rng)}
 
 

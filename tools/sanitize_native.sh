@@ -19,7 +19,9 @@ rm -f $BUILD/tree/gsmap/_native*.so
 $CMAKE --install $BUILD --prefix $BUILD/tree >/dev/null
 # Leaks are not looked for: the interpreter and torch keep memory to the end on purpose. -P keeps the working tree's own
 # package out of the way.
-export PYTHONPATH=$BUILD/tree ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1
-export LD_PRELOAD="$(${CXX:-g++} -print-file-name=libasan.so) $(${CXX:-g++} -print-file-name=libubsan.so)"
+# GSMAP_TEST_INSTALLED: that copy is what is tested, not the checkout.
+export PYTHONPATH=$BUILD/tree GSMAP_TEST_INSTALLED=1 ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1
+LD_PRELOAD="$(${CXX:-g++} -print-file-name=libasan.so) $(${CXX:-g++} -print-file-name=libubsan.so)"
+export LD_PRELOAD
 "$PYTHON" -P -c "import gsmap._native as m; assert 'sanitize' in m.__file__, m.__file__"
 exec "$PYTHON" -P -m pytest -q -p no:cacheprovider tests/render "$@"

@@ -65,7 +65,8 @@ if [ "${1:-}" = test ]; then
     pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint]" -e synthetic
     # Leave plain path files: the import hooks beside them would stand before PYTHONPATH, and tools/planted_faults.py
     # tests a copy that PYTHONPATH names.
-    sed -i '/^import /d' "$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"/_editable_skbc_gsmap*.pth
+    purelib=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+    find "$purelib" -maxdepth 1 -name '*gsmap*.pth' -exec sed -i '/^import /d' {} +
     PYTHON="$venv/bin/python" tools/build_native.sh >&2
 else
     pip install -q -c constraints.txt . ./synthetic

@@ -30,7 +30,8 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
     """Quaternions (..., 4) ``wxyz`` with w >= 0 of rotation matrices (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    matrices = np.asarray(matrices, dtype=np.float64)
+    # A copy, here and below: which arrays that cannot be written scipy takes has changed from release to release.
+    matrices = np.array(matrices, dtype=np.float64)
     xyzw = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
     wxyz = xyzw[:, [3, 0, 1, 2]]
     wxyz *= np.where(wxyz[:, :1] < 0, -1.0, 1.0)
@@ -72,7 +73,7 @@ def exp_so3(omega: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) of a rotation vector (3,) in radians."""
     from scipy.spatial.transform import Rotation
 
-    matrix: np.ndarray = Rotation.from_rotvec(np.asarray(omega, dtype=np.float64)).as_matrix()
+    matrix: np.ndarray = Rotation.from_rotvec(np.array(omega, dtype=np.float64)).as_matrix()
     return matrix
 
 

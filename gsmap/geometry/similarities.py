@@ -134,7 +134,7 @@ def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
     """Rotation vectors (N, 3) in radians, length at most pi, of rotation matrices (N, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    out: np.ndarray = Rotation.from_matrix(np.asarray(matrices, dtype=np.float64).reshape(-1, 3, 3)).as_rotvec()
+    out: np.ndarray = Rotation.from_matrix(np.array(matrices, dtype=np.float64).reshape(-1, 3, 3)).as_rotvec()
     return out
 
 

@@ -15,6 +15,7 @@ from gsmap.geometry.rotations import (
     retract,
     skew,
 )
+from gsmap.geometry.similarities import rotation_vectors
 from gsmap.geometry.umeyama import umeyama
 
 RNG = np.random.default_rng(3)
@@ -28,6 +29,14 @@ def test_quaternions_are_wxyz() -> None:
     assert (back[:, 0] >= 0).all()
     np.testing.assert_allclose(np.abs((back * WXYZ).sum(1)), 1, atol=1e-12)
     np.testing.assert_allclose(quats_to_matrices(np.zeros(4)), np.eye(3))
+
+
+def test_arrays_that_cannot_be_written_are_read() -> None:
+    matrices, vector = ROTATIONS.as_matrix(), ROTATIONS[0].as_rotvec()
+    matrices.flags.writeable = vector.flags.writeable = False
+    np.testing.assert_allclose(quats_to_matrices(matrices_to_quats(matrices)), matrices, atol=1e-12)
+    np.testing.assert_allclose(rotation_vectors(matrices)[0], vector, atol=1e-12)
+    np.testing.assert_allclose(exp_so3(vector), matrices[0], atol=1e-12)
 
 
 def test_product_of_quaternions_is_product_of_rotations() -> None:
