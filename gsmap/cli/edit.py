@@ -13,7 +13,9 @@ def command(
     map: MapPath,
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")],
     name: Annotated[str | None, typer.Option("--name", help="Call it this.")] = None,
-    captured_at: Annotated[str | None, typer.Option("--captured-at", help="When it was captured, ISO 8601.")] = None,
+    captured_at: Annotated[
+        str | None, typer.Option("--captured-at", help="When it was captured, ISO 8601; '' where nobody knows.")
+    ] = None,
     note: Annotated[str | None, typer.Option("--note", help="What people should know of it.")] = None,
     tag: Annotated[list[str] | None, typer.Option("--tag", help="Give it this tag; may be repeated.")] = None,
     untag: Annotated[list[str] | None, typer.Option("--untag", help="Take this tag away; may be repeated.")] = None,

@@ -432,7 +432,11 @@ class Map(AbstractContextManager["Map"]):
         graph, _ = self._graph_of(scene)
         if graph is None:
             raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
-        Image.fromarray(draw_graph(*self.read(scene.id), graph)).save(path)
+        picture = Image.fromarray(draw_graph(*self.read(scene.id), graph))
+        try:
+            picture.save(path)
+        except ValueError as error:  # a suffix that Pillow does not know
+            raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 
     def write_poses(self, out: str | os.PathLike[str], format: str) -> None:
         """``gsmap poses MAP OUT --format F``: poses for other programs; see `gsmap.map.poses`."""
@@ -452,13 +456,17 @@ class Map(AbstractContextManager["Map"]):
         tags: Sequence[str] = (),
         untag: Sequence[str] = (),
     ) -> SceneRow:
-        """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history."""
+        """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history.
+
+        Args:
+            captured_at: ISO 8601; empty where nobody knows any more.
+        """
         from gsmap.ingest import parse_date
 
         scene = self.store.scenes.edit(
             ref,
             name=name,
-            captured_at=None if captured_at is None else parse_date(captured_at),
+            captured_at=captured_at and parse_date(captured_at),
             note=note,
             tags_add=tuple(tags),
             tags_remove=tuple(untag),

@@ -116,13 +116,20 @@ def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
 
     Raises:
         NotFoundError: no two scenes are called so.
+        ConfigError: a scene with itself.
     """
     for at in (i for i, character in enumerate(pair) if character == ":"):
         try:
-            return store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :])
+            return _two(store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :]))
         except NotFoundError:
             continue
     raise NotFoundError(f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows")
+
+
+def _two(a: Scene, b: Scene) -> tuple[Scene, Scene]:
+    if a.id == b.id:
+        raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
+    return a, b
 
 
 def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
@@ -180,9 +187,7 @@ def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], setting
         named = [(store.scenes.get(a), store.scenes.get(b)) for a, b in pairs]
     chosen: dict[frozenset[str], tuple[str, str]] = {}
     for a, b in named:
-        if a.id == b.id:
-            raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
-        for scene in (a, b):
+        for scene in _two(a, b):
             if scene.id not in graphs:
                 raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
             if scene.id in lacking:
