@@ -14,7 +14,7 @@ def command(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")],
     name: Annotated[str | None, typer.Option("--name", help="Call it this.")] = None,
     captured_at: Annotated[
-        str | None, typer.Option("--captured-at", help="When it was captured, ISO 8601; '' where nobody knows.")
+        str | None, typer.Option("--captured-at", help="When it was captured, ISO 8601; `none` takes its date back.")
     ] = None,
     note: Annotated[str | None, typer.Option("--note", help="What people should know of it.")] = None,
     tag: Annotated[list[str] | None, typer.Option("--tag", help="Give it this tag; may be repeated.")] = None,

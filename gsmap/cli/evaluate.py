@@ -15,29 +15,44 @@ def command(
     images: Annotated[
         str | None, typer.Option("--images", help="Folder of NAME_CAMERA.jpg frames to compare renders with.")
     ] = None,
+    tiles: Annotated[
+        str | None,
+        typer.Option("--tiles", metavar="DIR", help="Also compare what `gsmap export` wrote there with the images."),
+    ] = None,
     lpips: Annotated[
         str | None,
         typer.Option("--lpips", metavar="FILE", help="Also compare images by this LPIPS network, an ONNX file."),
     ] = None,
+    max_rre: Annotated[
+        float, typer.Option("--max-rre", metavar="DEG", help="An edge that is turned by more is wrong.")
+    ] = 1.0,
+    max_rte: Annotated[
+        float, typer.Option("--max-rte", metavar="M", help="An edge that is off by more, in metres, is wrong.")
+    ] = 0.05,
     json: AsJson = False,
 ) -> None:
-    """Compare poses with ground truth (and renders with the captures' own images).
+    """Compare edges and poses with ground truth (and renders with the captures' own images).
 
     Example: `gsmap evaluate house.gsmap --truth captures/truth`
     """
     from gsmap.errors import ConfigError
 
-    if lpips is not None and images is None:
-        raise ConfigError("--lpips compares images: give --images too")
+    if images is None and (tiles is not None or lpips is not None):
+        option = "--tiles" if tiles is not None else "--lpips"
+        raise ConfigError(f"{option} compares images: give --images too")
     with opened(map, bars=images is not None) as m:
-        report = m.evaluate(truth, images=images, lpips=lpips)
+        report = m.evaluate(truth, images=images, tiles=tiles, lpips=lpips, max_rre_deg=max_rre, max_rte_m=max_rte)
     if json:
         print_rows("evaluate", report, json)
         return
-    if report.edges:
-        print_table("edges", report.edges[0].columns, report.edges)
-    if report.pairs:
-        print_table("pairs", report.pairs[0].columns, report.pairs)
-    if report.images:
-        print_table("images", report.images[0].columns, report.images)
+    for title, rows in {
+        "edges": report.edges,
+        "edges by true overlap": report.bands,
+        "pairs": report.pairs,
+        "components": report.components,
+        "covariances": report.nees,
+        "images": report.images,
+    }.items():
+        if rows:
+            print_table(title, rows[0].columns, rows)
     print_facts("summary", {heading: getattr(report, name) for name, heading in report.columns.items()})

@@ -55,9 +55,12 @@ def command(
             budget_s=budget,
             provenance=provenance,
         )
+    about: dict[str, list[str]] = {}
     for tile in report.tiles:
         for note in tile.notes:
-            say(f"{tile.path}: {note}")
+            about.setdefault(note, []).append(tile.path)
+    for note, paths in about.items():
+        say(f"{paths[0] if len(paths) == 1 else f'{len(paths)} tiles'}: {note}")
     if json:
         print_rows("export", report, json)
     else:

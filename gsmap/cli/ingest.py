@@ -11,7 +11,9 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 Paths = Annotated[list[str], typer.Argument(metavar="FILE_OR_FOLDER...", help="Captures: files or folders.")]
 CamerasFile = Annotated[str | None, typer.Option("--cameras", help="Cameras of the one capture given.")]
 Name = Annotated[str | None, typer.Option("--name", help="Name of the one capture given.")]
-CapturedAt = Annotated[str | None, typer.Option("--captured-at", help="When it was captured, ISO 8601.")]
+CapturedAt = Annotated[
+    str | None, typer.Option("--captured-at", help="When all of these were captured, ISO 8601; found beside each else.")
+]
 Scale = Annotated[
     str, typer.Option("--scale", help="`known` (metres), `unknown` (any unit) or `auto` (registration finds out).")
 ]

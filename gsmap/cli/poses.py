@@ -38,7 +38,7 @@ def command(
     with opened(map) as m:
         rows = m.pose_rows()
         if out is not None:
-            m.write_poses(out, format or "json")
-            say(f"wrote {out}")
+            for path in m.write_poses(out, format or "json"):
+                say(f"wrote {path}")
     if json or out is None:
         print_rows("poses", rows, json)

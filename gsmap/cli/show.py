@@ -70,7 +70,7 @@ def _print_scene(scene: SceneReport, nodes: bool) -> None:
         "pose in the map": _pose(scene.S_map_scene),
         "its sigmas": sigmas,
         "known from outside": prior and f"{_pose(prior.S_map_scene)}; {prior.outcome}",
-        "captured": scene.captured_at,
+        "captured": _captured(scene),
         "ingested": scene.ingested_at,
         "read from": scene.origin,
         "tags": scene.tags,
@@ -130,6 +130,14 @@ def _pose(pose: Sim3 | None) -> str | None:
     axis = f" about {text(np.round(np.copysign(1.0, w) * np.array(xyz) / sine, 3))}" if sine > 1e-9 else ""
     scale = "" if pose.is_rigid else f", scale {pose.scale:.5g}"
     return f"at {text(np.round(pose.translation, 4))}, turned {angle:.2f} deg{axis}{scale}"
+
+
+def _captured(scene: SceneReport) -> str | None:
+    """When, and who or what says so: whoever spoke of it last."""
+    if scene.captured_at is None:
+        return None
+    said = [fact.author for fact in scene.history if fact.fact == "captured_at"]
+    return f"{scene.captured_at}, said by {(said and said[-1]) or 'a person'}"
 
 
 def _layers(scene: SceneReport) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.ingest import CapturedAt
 
 if TYPE_CHECKING:
     from gsmap.types.rows import EdgeRow, SceneRow
@@ -18,6 +19,7 @@ def command(
     paths: Annotated[
         list[str] | None, typer.Argument(metavar="[FILE_OR_FOLDER...]", help="Captures to ingest first.")
     ] = None,
+    captured_at: CapturedAt = None,
     sets: Sets = None,
     preset: Preset = None,
     json: AsJson = False,
@@ -26,8 +28,11 @@ def command(
 
     Example: `gsmap update house.gsmap captures/*.ply`
     """
+    from gsmap.ingest import given_date
+
+    given_date(captured_at)  # refuses what is none before a map is made
     with opened(map, create=True, bars=True, sets=sets, preset=preset) as m:
-        report = m.update(*(paths or ()))
+        report = m.update(*(paths or ()), captured_at=captured_at)
     for row in report.ingested:
         for note in row.notes:
             say(f"{row.scene_name}: {note}")

@@ -90,14 +90,15 @@ def compare_renders(
     Raises:
         InputError: a picture whose shape is not its camera's.
     """
-    from gsmap.render import render
+    from gsmap.render import ChunkIndex, render
 
+    index = ChunkIndex.build(gaussians)
     figures = []
     for done, (at, image) in enumerate(sorted(images.items())):
         if isinstance(image, str | os.PathLike):
             image = read_image(image)
         camera = _at_size(cameras[at], image.shape[1], image.shape[0])
-        rendered = render(gaussians, camera).colour[0]
+        rendered = render(gaussians, camera, depth=False, dominant_id=False, index=index).colour[0]
         figures.append((psnr(rendered, image), ssim(rendered, image), lpips(rendered, image) if lpips else 0.0))
         if progress is not None:
             progress((done + 1) / len(images), f"image {done + 1} of {len(images)}")

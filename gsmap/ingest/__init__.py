@@ -1,14 +1,18 @@
 """Captures the way people have them -> Gaussians and cameras, checked."""
 
-from gsmap.ingest.capture import Capture, parse_date, read_capture, read_captures, take_capture
+from gsmap.ingest.capture import Capture, read_capture, read_captures, take_capture
+from gsmap.ingest.dates import CaptureDate, find_date, given_date, parse_date
 from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.synthesise import synthesise_cameras
 from gsmap.ingest.validate import validate
 
 __all__ = [
     "Capture",
+    "CaptureDate",
     "Found",
     "find_captures",
+    "find_date",
+    "given_date",
     "parse_date",
     "read_capture",
     "read_captures",

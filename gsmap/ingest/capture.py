@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 from gsmap import formats
 from gsmap.errors import ConfigError
+from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.find import Found, find_captures
 from gsmap.ingest.synthesise import synthesise_cameras
 from gsmap.ingest.validate import validate
@@ -27,6 +28,7 @@ class Capture:
         name: from the file or folder, or as given.
         source: the file it was read from.
         captured_at: ISO 8601 with zone, or None.
+        dated_by: what said so; empty where a person did.
         scale_policy: ``auto``, ``known`` or ``unknown``.
         antialiased: trained with the 2D Mip filter.
         notes: what a person should know.
@@ -40,6 +42,7 @@ class Capture:
     scale_policy: str = "auto"
     antialiased: bool = False
     notes: tuple[str, ...] = ()
+    dated_by: str = ""
 
 
 def read_captures(
@@ -55,7 +58,7 @@ def read_captures(
 
     Args:
         cameras, name: for a single capture only.
-        captured_at: ISO 8601; UTC where it has no zone.
+        captured_at: of all of them, ISO 8601; UTC where it has no zone. None finds it beside each (`find_date`).
 
     Raises:
         NotFoundError: no such file or folder.
@@ -82,6 +85,7 @@ def read_capture(
     scale_policy: str = "auto",
 ) -> Capture:
     """Read and check one capture that `find_captures` found; see `read_captures`."""
+    given_date(captured_at)  # refuses what is none before a large file is read
     gaussians = formats.read(found.path)
     about = formats.info(found.path)
     source = Path(cameras) if cameras is not None else found.cameras
@@ -95,7 +99,12 @@ def read_capture(
         cameras_source="" if source is None else str(source),
     )
     notes = (*about.notes, *([found.note] if found.note else []), *capture.notes)
-    return replace(capture, antialiased=about.antialiased, notes=notes)
+    capture = replace(capture, antialiased=about.antialiased, notes=notes)
+    if captured_at is not None:
+        return capture
+    date = find_date(found, source, () if source is None else capture.cameras.names)
+    notes = (*notes, *([date.note] if date.note else []))
+    return replace(capture, captured_at=date.when, dated_by=date.source, notes=notes)
 
 
 def take_capture(
@@ -116,7 +125,7 @@ def take_capture(
     """
     if scale_policy not in SCALE_POLICIES:
         raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
-    when = parse_date(captured_at)
+    date = given_date(captured_at)
     where = source or f"capture {name!r}"
     notes = list(validate(gaussians, where=where))
     if cameras is None:
@@ -124,19 +133,5 @@ def take_capture(
         notes.append(f"no cameras were found beside it: {len(cameras)} were synthesised in its free space")
     else:
         notes += validate(gaussians, cameras, where=f"{where} with {cameras_source}" if cameras_source else where)
-    return Capture(gaussians, cameras, name, source, when, scale_policy, notes=tuple(notes))
-
-
-def parse_date(when: str | datetime | None) -> str | None:
-    """ISO 8601 with its zone (UTC where it has none); None stays None.
-
-    Raises:
-        ConfigError: not a date.
-    """
-    if when is None:
-        return None
-    try:
-        parsed = datetime.fromisoformat(when) if isinstance(when, str) else when
-    except ValueError as error:
-        raise ConfigError(f"captured-at must be ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}") from error
-    return (parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)).isoformat()
+    notes += [date.note] if date.note else []
+    return Capture(gaussians, cameras, name, source, date.when, scale_policy, notes=tuple(notes))

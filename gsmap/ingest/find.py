@@ -28,12 +28,17 @@ class Found:
         cameras: the file or folder of its cameras, or None.
         name: from the file, or from the folder where the file is called as every other.
         note: why cameras that lie near were not taken; else empty.
+        names: what it goes by, each with the folder that this lies in: its file without the suffix, and the folders
+            around where those above are called as every other.
+        alone: whether no other capture lies in its folder.
     """
 
     path: Path
     cameras: Path | None
     name: str
     note: str = ""
+    names: tuple[tuple[Path, str], ...] = ()
+    alone: bool = True
 
 
 def find_captures(paths: Iterable[str | os.PathLike[str]]) -> list[Found]:
@@ -98,20 +103,30 @@ def _file(path: Path, *, alone: bool) -> Found:
             f"{path} has the unknown suffix {path.suffix!r}: gsmap can read {', '.join(formats.known('read'))}"
         )
     stem = path.name[: -len(suffix)]
-    name, folder = stem, path.resolve().parent
-    while not name or _GENERIC.fullmatch(name) or _GENERIC_FOLDER.fullmatch(name):
-        if not folder.name:
-            name = stem
-            break
-        name, folder = folder.name, folder.parent
+    names = _names(path, stem)
+    name = stem if _tells_nothing(names[-1][1]) else names[-1][1]
     own = path.with_name(f"{stem}.cameras.json")
     if own.is_file():
-        return Found(path, own, name)
+        return Found(path, own, name, names=names, alone=alone)
     shared = _shared_cameras(path)
     if shared is None or alone:
-        return Found(path, shared, name)
+        return Found(path, shared, name, names=names, alone=alone)
     note = f"{shared.name} was not taken: several captures lie beside it (call it {own.name}, or pass --cameras)"
-    return Found(path, None, name, note)
+    return Found(path, None, name, note, names, alone)
+
+
+def _names(path: Path, stem: str) -> tuple[tuple[Path, str], ...]:
+    """What a capture goes by; see `Found`."""
+    out = [(path.parent, stem)]
+    folder = path.resolve().parent
+    while _tells_nothing(out[-1][1]) and folder.name:
+        out.append((folder.parent, folder.name))
+        folder = folder.parent
+    return tuple(out)
+
+
+def _tells_nothing(name: str) -> bool:
+    return not name or bool(_GENERIC.fullmatch(name) or _GENERIC_FOLDER.fullmatch(name))
 
 
 def _shared_cameras(path: Path) -> Path | None:

@@ -1,104 +1,60 @@
-"""Comparing a map with ground truth, in the field's metrics."""
+"""Comparing a map with ground truth, in the field's metrics: loading for `gsmap.evaluate`."""
 
 from __future__ import annotations
 
 import json
 import os
-from itertools import combinations
+from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from gsmap import formats
 from gsmap.errors import InputError, NotFoundError
 from gsmap.evaluate.images import Lpips
-from gsmap.evaluate.registration import PoseError, absolute_trajectory_error, pose_error, scene_centroid, summarise
+from gsmap.evaluate.judge import JudgedScene, Params, judge
+from gsmap.evaluate.overlap import solid_centres, true_overlaps
+from gsmap.evaluate.registration import scene_centroid
 from gsmap.evaluate.renders import compare_renders, find_images
+from gsmap.export import manifest, tileset
+from gsmap.export.manifest import Manifest
+from gsmap.formats import tiles3d
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map import reports
 from gsmap.store import Store
-from gsmap.types import Cameras, Gaussians, PoseGraph, Scene, Sim3
+from gsmap.types import Cameras, Gaussians, Scene, ScenePose, Sim3, Tile
 from gsmap.types.progress import Progress
-from gsmap.types.rows import EvaluationReport, ImageErrorRow, PoseErrorRow
+from gsmap.types.rows import EvaluationReport, ImageErrorRow
+
+_TILES_KEPT = 8  # in memory at once, for the scene that has a part in them and the next one
 
 
-def poses(store: Store, truth: str | os.PathLike[str]) -> EvaluationReport:
-    """Errors of every accepted edge and of the optimised poses, pair by pair and over the whole map.
+def poses(store: Store, truth: str | os.PathLike[str], params: Params | None = None) -> EvaluationReport:
+    """Every accepted edge and the newest poses against the truth.
 
     Args:
-        truth: folder of ``NAME.json``, each with ``T_scene_world`` (4x4, a similarity): where the scene's frame lies.
+        truth: folder of ``NAME.json``, each with ``T_scene_world`` (4x4, a similarity): where the scene's frame lies;
+            the world is in metres.
 
     Raises:
         NotFoundError, InputError: no truth for any scene, or a file that holds none.
     """
-    scenes = {s.id: s for s in store.scenes.list()}
-    S_scene_world = {s.id: found for s in scenes.values() if (found := _read_truth(Path(truth), s.name)) is not None}
+    scenes = store.scenes.list()
+    S_scene_world = {s.id: found for s in scenes if (found := _read_truth(Path(truth), s.name)) is not None}
     if not S_scene_world:
         raise NotFoundError(f"no truth for any scene in {truth}: it needs NAME.json with T_scene_world for each scene")
-    centroids = {scene: scene_centroid(store.scenes.gaussians(scene)) for scene in S_scene_world}
 
-    def error(target: str, source: str, estimated: Sim3) -> PoseError:
-        true = S_scene_world[target] @ S_scene_world[source].inverse()
-        return pose_error(estimated, true, centroids[source])
+    def judged(scene: Scene) -> JudgedScene:
+        if scene.id not in S_scene_world:
+            return JudgedScene(scene.id, scene.name, None, np.zeros(3), np.zeros((0, 3)))
+        centroid, centers = scene_centroid(store.scenes.gaussians(scene.id)), store.scenes.cameras(scene.id).centers
+        return JudgedScene(scene.id, scene.name, S_scene_world[scene.id], centroid, centers)
 
-    edges = []
-    for stored in store.registrations.current():
-        edge = stored.registration
-        if edge.status == "accepted" and {edge.target, edge.source} <= set(S_scene_world):
-            assert edge.S_target_source is not None
-            edges.append((edge.target, edge.source, error(edge.target, edge.source, edge.S_target_source)))
-    placed = store.revisions.get()
-    pairs = []
-    if placed is not None:
-        for a, b in combinations([s for s in scenes if s in S_scene_world and s in placed.poses], 2):
-            pose_a, pose_b = placed.poses[a], placed.poses[b]
-            if pose_a.component == pose_b.component:
-                estimated = pose_a.S_map_scene.inverse() @ pose_b.S_map_scene
-                pairs.append((a, b, error(a, b, estimated)))
-    of_edges, of_pairs = (summarise([e for *_, e in found]) if found else None for found in (edges, pairs))
-    return EvaluationReport(
-        edges=_rows(edges, scenes),
-        pairs=_rows(pairs, scenes),
-        ate_m=None if placed is None else _ate(store, placed, S_scene_world),
-        edges_median_rre_deg=of_edges.median_rre_deg if of_edges else None,
-        edges_median_centroid_m=of_edges.median_centroid_m if of_edges else None,
-        edges_worst_rre_deg=of_edges.worst_rre_deg if of_edges else None,
-        edges_worst_centroid_m=of_edges.worst_centroid_m if of_edges else None,
-        pairs_median_rre_deg=of_pairs.median_rre_deg if of_pairs else None,
-        pairs_median_centroid_m=of_pairs.median_centroid_m if of_pairs else None,
-        pairs_worst_rre_deg=of_pairs.worst_rre_deg if of_pairs else None,
-        pairs_worst_centroid_m=of_pairs.worst_centroid_m if of_pairs else None,
+    overlaps = true_overlaps(
+        list(S_scene_world), lambda scene: solid_centres(store.scenes.gaussians(scene), S_scene_world[scene])
     )
-
-
-def _rows(found: list[tuple[str, str, PoseError]], scenes: dict[str, Scene]) -> tuple[PoseErrorRow, ...]:
-    return tuple(
-        PoseErrorRow(
-            target=a,
-            target_name=scenes[a].name,
-            source=b,
-            source_name=scenes[b].name,
-            rre_deg=e.rre_deg,
-            centroid_m=e.centroid_m,
-            rte=e.rte,
-            rse=e.rse,
-        )
-        for a, b, e in found
-    )
-
-
-def _ate(store: Store, placed: PoseGraph, S_scene_world: dict[str, Sim3]) -> float | None:
-    """Root mean square error of the camera centres, aligned once per component; None with fewer than 3 cameras."""
-    estimated, true, components = [], [], []
-    for scene, S in S_scene_world.items():
-        if scene in placed.poses:
-            centers = store.scenes.cameras(scene).centers
-            estimated.append(placed.poses[scene].S_map_scene.apply(centers))
-            true.append(S.inverse().apply(centers))
-            components.append(np.full(len(centers), placed.poses[scene].component))
-    component = np.concatenate(components)
-    segments = [np.flatnonzero(component == i) for i in np.unique(component)]
-    if min(len(s) for s in segments) < 3:
-        return None
-    return absolute_trajectory_error(np.concatenate(estimated), np.concatenate(true), segments=segments)
+    return judge([judged(s) for s in scenes], reports.edge_rows(store), store.revisions.get(), overlaps, params)
 
 
 def _read_truth(folder: Path, name: str) -> Sim3 | None:
@@ -114,24 +70,32 @@ def _read_truth(folder: Path, name: str) -> Sim3 | None:
 
 
 def images(
-    store: Store, folder: str | os.PathLike[str], progress: Progress, *, lpips: str | os.PathLike[str] | None = None
+    store: Store,
+    folder: str | os.PathLike[str],
+    progress: Progress,
+    *,
+    tiles: str | os.PathLike[str] | None = None,
+    lpips: str | os.PathLike[str] | None = None,
 ) -> tuple[ImageErrorRow, ...]:
-    """How well each scene alone, and the union of its component, reproduce the scene's own photographs.
+    """How well each scene alone, the union of it and its neighbours, and exported tiles reproduce its own photographs.
 
-    The difference between the two is what merging by concatenation costs; `tools/bench_merge.py` has the whole table.
+    What a photograph shows, its scene holds: so only what meets the scene is rendered, and the cost grows with the
+    photographs, whatever the size of the map.
 
     Args:
         folder: of photographs named like the cameras (suffixes may differ), in a folder per scene where the scenes'
             cameras share names.
+        tiles: folder that this map was exported to.
         lpips: an LPIPS network (`gsmap.evaluate.images.Lpips`) to compare with, too.
 
     Raises:
-        NotFoundError: no photograph is named like a camera.
+        NotFoundError: no photograph is named like a camera, or no export lies in ``tiles``.
+        ConfigError, InputError: the export of another map, or one that lacks a file.
     """
     network = None if lpips is None else Lpips(Path(lpips))
-    placed = store.revisions.get()
-    poses = placed.poses if placed else {}
+    exported = None if tiles is None else _Export(store, Path(tiles))
     scenes = store.scenes.list()
+    union = _union_of(store, scenes)
     rows = []
     for i, scene in enumerate(scenes):
         progress(i / len(scenes), scene.name)
@@ -139,16 +103,18 @@ def images(
         pictures = _pictures(scene, cameras, folder)
         if not pictures:
             continue
-        alone = compare_renders(store.scenes.gaussians(scene.id), cameras, pictures, lpips=network).means()
-        merged: dict[str, float] = {}
-        if scene.id in poses:
-            here = poses[scene.id]
-            members = [p for p in poses.values() if p.component == here.component]
-            union = Gaussians.concatenate(
-                [transform_gaussians(store.scenes.gaussians(p.scene), p.S_map_scene) for p in members]
-            )
-            moved = transform_cameras(cameras, here.S_map_scene)
-            merged = compare_renders(union, moved, pictures, lpips=network).means()
+
+        def likeness(gaussians: Gaussians, S_map_scene: Sim3 | None = None) -> dict[str, float]:
+            moved = cameras if S_map_scene is None else transform_cameras(cameras, S_map_scene)  # noqa: B023
+            return compare_renders(gaussians, moved, pictures, lpips=network).means()  # noqa: B023
+
+        own = store.scenes.gaussians(scene.id)
+        alone = likeness(own)
+        merged = union(scene)
+        of_union = {} if merged is None else likeness(*merged)
+        content = None if exported is None else exported.content(scene.id)
+        of_tiles = {} if content is None else likeness(*content)
+        cover = None if exported is None or content is None else exported.cover(scene.id, own)
         rows.append(
             ImageErrorRow(
                 scene=scene.id,
@@ -157,15 +123,94 @@ def images(
                 alone_psnr_db=alone["psnr_db"],
                 alone_ssim=alone["ssim"],
                 alone_lpips=alone.get("lpips"),
-                union_psnr_db=merged.get("psnr_db"),
-                union_ssim=merged.get("ssim"),
-                union_lpips=merged.get("lpips"),
+                union_psnr_db=of_union.get("psnr_db"),
+                union_ssim=of_union.get("ssim"),
+                union_lpips=of_union.get("lpips"),
+                tiles_psnr_db=of_tiles.get("psnr_db"),
+                tiles_ssim=of_tiles.get("ssim"),
+                tiles_lpips=of_tiles.get("lpips"),
+                tiles_cover=cover,
             )
         )
     if not rows:
         raise NotFoundError(f"no image in {folder} is named like a camera of a scene")
     progress(1.0, "")
     return tuple(rows)
+
+
+def _union_of(store: Store, scenes: list[Scene]) -> Callable[[Scene], tuple[Gaussians, Sim3] | None]:
+    """Gives the union of a scene and of those of its component whose boxes meet its own, and the scene's pose in it."""
+    graph = store.revisions.get()
+    placed = {s.id: graph.poses[s.id] for s in scenes if graph is not None and s.id in graph.poses}
+    boxes = {s.id: _map_box(s.bounds, placed[s.id]) for s in scenes if s.id in placed}
+
+    def union(scene: Scene) -> tuple[Gaussians, Sim3] | None:
+        if scene.id not in placed:
+            return None
+        here, (low, high) = placed[scene.id], boxes[scene.id]
+        near = [
+            pose
+            for s, pose in placed.items()
+            if pose.component == here.component and (boxes[s][0] <= high).all() and (boxes[s][1] >= low).all()
+        ]
+        parts = [transform_gaussians(store.scenes.gaussians(p.scene), p.S_map_scene) for p in near]
+        return Gaussians.concatenate(parts), here.S_map_scene
+
+    return union
+
+
+def _map_box(bounds: np.ndarray, pose: ScenePose) -> np.ndarray:
+    """(2, 3) box of a scene in the map."""
+    corners = pose.S_map_scene.apply(np.stack(np.meshgrid(*bounds.T), axis=-1).reshape(-1, 3))
+    return np.stack([corners.min(0), corners.max(0)])
+
+
+class _Export:
+    """The tiles in a folder that the map was exported to, by the scenes that have a part in them.
+
+    Raises:
+        NotFoundError: there is no export.
+        ConfigError, InputError: it is another map's, or a tile's file is missing or was cut short.
+    """
+
+    def __init__(self, store: Store, folder: Path) -> None:
+        if not (folder / manifest.FILE_NAME).is_file():
+            raise NotFoundError(f"no {manifest.FILE_NAME} in {folder}: give a folder that gsmap export wrote")
+        found = Manifest.load(folder, store.id)
+        self._folder = folder
+        self._tiles: dict[str, list[Tile]] = {}
+        for tile in found.tiles.values():
+            if not found.has_file(folder, tile):
+                raise InputError(f"{folder / tile.path} is missing or cut short: run gsmap export to {folder} again")
+            for scene in tile.poses:
+                self._tiles.setdefault(scene, []).append(tile)
+        asked = [export.settings for export in store.exports.list() if export.target == str(folder.resolve())]
+        self._format = asked[-1].get("format") if asked else None
+        self._read = lru_cache(_TILES_KEPT)(self._read_file)
+
+    def content(self, scene: str) -> tuple[Gaussians, Sim3] | None:
+        """All tiles that a scene has a part in, and the scene's pose as they were made with; None without any."""
+        tiles = [tile for tile in self._tiles.get(scene, []) if tile.path]
+        if not tiles:
+            return None
+        # Tiles of one export may differ in the pose by what `export.moved_m` lets pass: the fullest one decides.
+        fullest = max(tiles, key=lambda tile: tile.num_gaussians)
+        return Gaussians.concatenate([self._read(tile.path) for tile in tiles]), fullest.poses[scene]
+
+    def cover(self, scene: str, gaussians: Gaussians, min_opacity: float = 0.3) -> float:
+        """The share of a scene's opaque Gaussians that lie within its tiles."""
+        opaque = gaussians.means[gaussians.opacities > min_opacity]
+        inside = np.zeros(len(opaque), dtype=bool)
+        for tile in self._tiles[scene]:
+            moved = tile.poses[scene].apply(opaque)
+            inside |= ((moved >= tile.bounds[0]) & (moved <= tile.bounds[1])).all(1)
+        return float(inside.mean()) if len(opaque) else 0.0
+
+    def _read_file(self, path: str) -> Gaussians:
+        """A tile, in the frame of the map: leaves of a 3D Tiles tree have z up where other files have gsmap's axes."""
+        file = self._folder / path
+        is_tileset = (file.parent / tileset.FILE_NAME).exists() if self._format is None else self._format == "3dtiles"
+        return tiles3d.read_content(file) if is_tileset and file.suffix == ".glb" else formats.read(file)
 
 
 def _pictures(scene: Scene, cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, Path]:

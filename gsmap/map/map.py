@@ -144,7 +144,8 @@ class Map(AbstractContextManager["Map"]):
         Args:
             captures: files and folders; or `Gaussians`, with `Cameras` or none.
             cameras, name: of the one capture given.
-            captured_at: ISO 8601; UTC where it has no zone.
+            captured_at: of every capture given, ISO 8601; UTC where it has no zone. Else each is dated by what lies
+                beside it: a sidecar, the EXIF of its frames, or its name (`gsmap.ingest.find_date`).
             scale: ``known`` (metres), ``unknown`` (any unit) or ``auto`` (registration finds out).
 
         Raises:
@@ -161,7 +162,7 @@ class Map(AbstractContextManager["Map"]):
             scale=scale,
             progress=self._progress,
         )
-        return [reports.ingest_row(*one) for one in added]
+        return [reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added]
 
     def describe(self, *scenes: str) -> list[GraphRow]:
         """The scene graph of every scene (or of those named), made where the present recipe has not made it yet."""
@@ -220,13 +221,19 @@ class Map(AbstractContextManager["Map"]):
         number = optimize(self.store, self.settings, self._progress)
         return reports.revision_row(self.store, number)
 
-    def update(self, *captures: str | os.PathLike[str]) -> UpdateReport:
-        """Ingest the captures, then describe, register and optimize whatever is missing."""
+    def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
+        """Ingest the captures, then describe, register and optimize whatever is missing.
+
+        Args:
+            captured_at: as in `ingest`.
+        """
         from gsmap.map.stages.describe import describe
         from gsmap.map.stages.optimize import is_solved, optimize
         from gsmap.map.stages.register import register
 
-        ingested = self.ingest(*captures) if captures else []
+        if captured_at is not None and not captures:
+            raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
+        ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
         describe(self.store, self.scenes(), self.settings, self._progress)
         while True:
             register(self.store, "auto", self.settings, self._progress)
@@ -404,15 +411,35 @@ class Map(AbstractContextManager["Map"]):
         truth: str | os.PathLike[str],
         images: str | os.PathLike[str] | None = None,
         *,
+        tiles: str | os.PathLike[str] | None = None,
         lpips: str | os.PathLike[str] | None = None,
+        max_rre_deg: float = 1.0,
+        max_rte_m: float = 0.05,
     ) -> EvaluationReport:
-        """``gsmap evaluate MAP``: poses against ground truth, renders against the captures' own images."""
+        """``gsmap evaluate MAP``: edges and poses against ground truth, renders against the captures' own images.
+
+        Args:
+            truth: folder of ``NAME.json`` with ``T_scene_world`` (4x4), the world in metres.
+            images: folder of photographs named like the cameras.
+            tiles: folder that this map was exported to, to be compared with the photographs, too.
+            lpips: an LPIPS network to compare photographs with, too.
+            max_rre_deg, max_rte_m: an edge that is turned or off (at the source's middle) by more is wrong.
+
+        Raises:
+            ConfigError: tiles or a network without photographs to compare with, or bars that are not positive.
+            NotFoundError, InputError: see `gsmap.map.evaluating`.
+        """
+        from gsmap.evaluate.judge import Params
         from gsmap.map import evaluating
 
-        report = evaluating.poses(self.store, truth)
+        if images is None and (tiles is not None or lpips is not None):
+            raise ConfigError("tiles and LPIPS are of photographs: give the folder of images, too")
+        report = evaluating.poses(self.store, truth, Params(max_rre_deg=max_rre_deg, max_rte_m=max_rte_m))
         if images is None:
             return report
-        rows = evaluating.images(self.store, images, lambda f, text: self._progress("evaluate", f, text), lpips=lpips)
+        rows = evaluating.images(
+            self.store, images, lambda f, text: self._progress("evaluate", f, text), tiles=tiles, lpips=lpips
+        )
         return replace(report, images=rows)
 
     def view(self, *, port: int = 0) -> ViewServer:
@@ -438,11 +465,11 @@ class Map(AbstractContextManager["Map"]):
         except ValueError as error:  # a suffix that Pillow does not know
             raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 
-    def write_poses(self, out: str | os.PathLike[str], format: str) -> None:
-        """``gsmap poses MAP OUT --format F``: poses for other programs; see `gsmap.map.poses`."""
+    def write_poses(self, out: str | os.PathLike[str], format: str) -> list[Path]:
+        """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); returns the files."""
         from gsmap.map.poses import write_poses
 
-        write_poses(self.store, Path(out), format)
+        return write_poses(self.store, Path(out), format)
 
     # --- upkeep ------------------------------------------------------------------------------------------------------
 
@@ -459,14 +486,16 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history.
 
         Args:
-            captured_at: ISO 8601; empty where nobody knows any more.
+            captured_at: ISO 8601, UTC where it has no zone; ``none`` takes the date back.
         """
         from gsmap.ingest import parse_date
 
+        if captured_at is not None:
+            captured_at = "" if captured_at.strip().lower() == "none" else parse_date(captured_at)
         scene = self.store.scenes.edit(
             ref,
             name=name,
-            captured_at=captured_at and parse_date(captured_at),
+            captured_at=captured_at,
             note=note,
             tags_add=tuple(tags),
             tags_remove=tuple(untag),

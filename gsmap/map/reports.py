@@ -222,10 +222,16 @@ def _node_rows(graph: SceneGraph) -> tuple[NodeRow, ...]:
     )
 
 
-def ingest_row(scene: Scene, new: bool, notes: Sequence[str]) -> IngestRow:
+def ingest_row(scene: Scene, *, new: bool, dated: bool, notes: Sequence[str]) -> IngestRow:
     """What became of one capture that was given."""
     return IngestRow(
-        scene=scene.id, scene_name=scene.name, new=new, num_gaussians=scene.num_gaussians, notes=tuple(notes)
+        scene=scene.id,
+        scene_name=scene.name,
+        new=new,
+        num_gaussians=scene.num_gaussians,
+        notes=tuple(notes),
+        captured_at=scene.captured_at,
+        dated=dated,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from gsmap.errors import InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import checked_params, merge, merger
-from gsmap.merge.placed import inside
+from gsmap.merge.placed import inside, overlapping
 from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
 from gsmap.types.progress import Progress
 
@@ -59,7 +59,22 @@ def merge_tile(
     how, params = merger(method), checked_params(method, params)
     margin_m, min_cameras = how.reading_m(params), how.min_cameras(params)
     placed = [_read(scene, bounds, margin_m, min_cameras) for scene in scenes]
-    return merge(placed, method, params, bounds=bounds, budget_s=budget_s, progress=progress)
+    result = merge(placed, method, params, bounds=bounds, budget_s=budget_s, progress=progress)
+    return replace(result, notes=(*result.notes, *_undated(placed))) if how.uses_dates(params) else result
+
+
+def _undated(placed: Sequence[PlacedScene]) -> list[str]:
+    """A remark where captures that overlap cannot all be put in order of time."""
+    if all(scene.captured_at is not None for scene in placed):
+        return []
+    meeting = [scene for scene in placed if any(scene is not other and overlapping(scene, other) for other in placed)]
+    count = sum(scene.captured_at is None for scene in meeting)
+    if not count:
+        return []
+    return [
+        f"{count} of {len(meeting)} captures have no date: which one is newer is not known "
+        "(gsmap edit MAP SCENE --captured-at DATE tells)"
+    ]
 
 
 def _read(scene: LazyScene, bounds: np.ndarray | None, margin_m: float, min_cameras: int) -> PlacedScene:

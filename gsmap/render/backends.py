@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+from typing import Literal
 
 from gsmap.errors import ConfigError
 
 
-def backend(name: str = "auto") -> str:
+def backend(name: str = "auto") -> Literal["native", "gsplat"]:
     """The backend that a name stands for here: ``native`` or ``gsplat``.
 
     The two do not give the same bits, so the answer belongs to the recipe of whatever is rendered. torch is imported
@@ -22,9 +23,9 @@ def backend(name: str = "auto") -> str:
     """
     if name not in ("auto", "native", "gsplat"):
         raise ConfigError(f"backend must be auto, native or gsplat, got {name!r}")
-    if name == "auto":
-        return "gsplat" if gsplat_available() else "native"
-    return name
+    if name == "gsplat" or (name == "auto" and gsplat_available()):
+        return "gsplat"
+    return "native"
 
 
 @functools.cache

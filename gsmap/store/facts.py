@@ -22,7 +22,7 @@ class SceneFact:
     Args:
         kind: ``name``, ``captured_at``, ``note``, ``tag`` or ``untag``.
         value: the text; empty for a ``captured_at`` that was taken back.
-        author: who said it; empty where nobody was named (an ingest).
+        author: who said it, or what did (such as the EXIF of a frame); empty where a person did and was not named.
         created_at: when it was said.
     """
 

@@ -55,6 +55,7 @@ class Scenes:
         source: str = "",
         antialiased: bool = False,
         notes: tuple[str, ...] = (),
+        dated_by: str = "",
         rename: bool = True,
         progress: Progress | None = None,
     ) -> tuple[Scene, bool]:
@@ -63,11 +64,13 @@ class Scenes:
         Args:
             gaussians, cameras: in the scene's own frame; validated before (`gsmap.ingest.validate`).
             captured_at: ISO 8601; UTC where it has no zone.
+            dated_by: what the date was read from; empty where a person said it.
             rename: where another scene has the name, take ``name-2`` and so on; else refuse.
 
         Returns:
             The scene, and whether its content was written. Content that the map has already is not (False), though a
-            date that is given becomes the scene's; content that was removed comes back under the new name, and content
+            date that a person gives becomes the scene's, and one that was read somewhere does where the scene never had
+            any; content that was removed comes back under the new name, and content
             whose bytes were damaged is mended.
 
         Raises:
@@ -83,7 +86,7 @@ class Scenes:
             files = manifest(connection, new_id)
         stored = bool(files) and not self._arrays.problems(KIND, new_id, files)
         if row is not None and row.removed_at is None and stored:
-            return self._dated(row.id, captured_at), False
+            return self._dated(row.id, captured_at, dated_by), False
         fields: dict[str, Any] = {
             "name": name,
             "num_gaussians": len(gaussians),
@@ -100,7 +103,7 @@ class Scenes:
         if stored:  # removed, but not yet pruned
             with self._catalog.write() as connection:
                 if has_group(connection, new_id):
-                    return self._enter(connection, new_id, fields, rename), True
+                    return self._enter(connection, new_id, fields, rename, dated_by), True
         if progress:
             progress(0.1, f"sorting {name}")
         ordered = gaussians[morton_order(gaussians.means)]
@@ -111,12 +114,12 @@ class Scenes:
         with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
             row = _by_id(connection, new_id)
             if row is not None and row.removed_at is None:
-                scene = self._dated(new_id, captured_at)
+                scene = self._dated(new_id, captured_at, dated_by)
                 if manifest(connection, new_id) != files:  # another process was faster
                     return scene, False
                 # else its bytes are damaged
             else:
-                scene = self._enter(connection, new_id, fields, rename)
+                scene = self._enter(connection, new_id, fields, rename, dated_by)
             publish(connection, self._arrays, staged, KIND, new_id)
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
             _put_boxes(connection, number, boxes)
@@ -254,11 +257,16 @@ class Scenes:
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
             return _with_tags(connection, row)
 
-    def _dated(self, known_id: str, captured_at: str | None) -> Scene:
-        """A living scene that was ingested again, with the date that was given this time."""
-        return self.get(known_id) if captured_at is None else self.edit(known_id, captured_at=captured_at)
+    def _dated(self, known_id: str, captured_at: str | None, dated_by: str) -> Scene:
+        """A living scene that was ingested again, with the date that came this time.
 
-    def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool) -> Scene:
+        What a file says does not overrule what was said before: a person may have corrected it or taken it back.
+        """
+        if captured_at is None or (dated_by and any(fact.kind == "captured_at" for fact in self.facts(known_id))):
+            return self.get(known_id)
+        return self.edit(known_id, captured_at=captured_at, author=dated_by)
+
+    def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str) -> Scene:
         """The row of a new or returning scene, under a name that is free."""
         name, number = fields["name"], 2
         while _name_taken(connection, fields["name"]):
@@ -274,7 +282,7 @@ class Scenes:
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(**fields))
         facts.say(connection, new_id, [("name", fields["name"])])
         if fields["captured_at"] or (before is not None and before.captured_at):
-            facts.say(connection, new_id, [("captured_at", fields["captured_at"] or "")])
+            facts.say(connection, new_id, [("captured_at", fields["captured_at"] or "")], dated_by)
         return _with_tags(connection, _find(connection, new_id))
 
 

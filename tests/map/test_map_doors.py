@@ -338,4 +338,4 @@ def test_what_cannot_be_asked_for_changes_nothing(
 
 def test_a_date_is_taken_back(site: Map) -> None:
     assert site.edit("hall", captured_at="2024-05-31").captured_at == "2024-05-31T00:00:00+00:00"
-    assert site.edit("hall", captured_at="").captured_at is None
+    assert site.edit("hall", captured_at="none").captured_at is None

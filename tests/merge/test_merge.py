@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -143,3 +145,21 @@ def test_a_tile_reads_no_more_than_its_merger_says():
     # Cameras however far away, and what stands between them and the tile; the whole capture for nobody here.
     assert asked["tto"][0][1].min() >= 50
     assert [len(boxes) for boxes in asked.values()] == [1, 1, 1]
+
+
+def test_captures_without_a_date_are_told_where_dates_decide():
+    def notes(dates, method="tto", params=None, shift=0.0):
+        """Of captures that lie in one place, or each ``shift`` to the side of the one before."""
+        parts = [cloud(i, n=300) for i in range(len(dates))]
+        scenes = [
+            LazyScene(str(i), Sim3(np.eye(3), [shift * i, 0, 0]), lambda box, part=part: part, None, date)
+            for i, (part, date) in enumerate(zip(parts, dates, strict=True))
+        ]
+        return [note for note in merge_tile(scenes, method, params).notes if "no date" in note]
+
+    dates = ["2026-01-01T00:00:00+00:00", "2026-01-02T00:00:00+00:00", None]
+    (note,) = notes(dates)
+    assert note.startswith("1 of 3 captures have no date: which one is newer is not known")
+    assert notes(dates[:2]) == notes([None]) == []
+    assert notes(dates, shift=5.0) == []  # they do not meet
+    assert notes(dates, "voxel") == notes(dates, params=replace(default_params("tto"), newer_wins=False)) == []

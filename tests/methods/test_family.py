@@ -40,6 +40,13 @@ def test_what_does_not_keep_the_contract_is_named(toys, name, message):
         toys.get(name)
 
 
+def test_a_method_without_a_version_is_refused(toys, tmp_path):
+    wood = tmp_path / "site" / "toy_blocks" / "wood.py"
+    (wood.parent / "clay.py").write_text(wood.read_text().replace("VERSION = 3", ""))
+    with pytest.raises(ConfigError, match="toy 'clay' lacks VERSION: see the contract"):
+        toys.get("clay")
+
+
 def test_a_table_lists_built_in_methods_that_need_no_params(toys):
     table = Family("toy", "toy_blocks", (), (("a", "toy_blocks.bare"),), any_of=("build", "wreck"), has_params=False)
     assert table.names() == ("a", "glass", "torn", "wood")

@@ -122,3 +122,25 @@ def test_what_was_said_outlives_a_removal(store):
     back, _ = store.scenes.add(make_gaussians(), make_cameras(), name="b")
     assert (back.id, back.tags, back.captured_at) == (scene.id, ("x",), None)
     assert [kind for kind, _, _ in said(store, "b")] == ["name", "captured_at", "tag", "name", "captured_at"]
+
+
+def test_a_date_read_from_a_file_fills_a_gap_and_overrules_nobody(store):
+    def add(when: str | None, dated_by: str = ""):
+        return store.scenes.add(make_gaussians(), make_cameras(), name="a", captured_at=when, dated_by=dated_by)[0]
+
+    assert add(None).captured_at is None
+    assert add("2026-01-01", "a.json").captured_at == "2026-01-01T00:00:00+00:00"
+    assert add("2026-01-02", "a.json").captured_at == "2026-01-01T00:00:00+00:00"
+    assert add("2026-01-03").captured_at == "2026-01-03T00:00:00+00:00"
+    store.scenes.edit("a", captured_at="")
+    assert add("2026-01-01", "a.json").captured_at is None  # it was taken back
+    assert [(value[:10], author) for kind, value, author in said(store, "a") if kind == "captured_at"] == [
+        ("2026-01-01", "a.json"),
+        ("2026-01-03", ""),
+        ("", ""),
+    ]
+
+
+def test_a_new_scene_keeps_what_its_date_was_read_from(store):
+    store.scenes.add(make_gaussians(), make_cameras(), name="a", captured_at="2026-01-01", dated_by="a.json")
+    assert said(store, "a")[-1] == ("captured_at", "2026-01-01T00:00:00+00:00", "a.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from gsmap.describe import recipe_key
 from gsmap.engine import run_jobs
@@ -10,6 +11,7 @@ from gsmap.map import models
 from gsmap.map.jobs import describe_scene
 from gsmap.map.settings import Settings
 from gsmap.methods import RecipeKey
+from gsmap.render import backend
 from gsmap.store import Store
 from gsmap.types import Scene
 from gsmap.types.progress import StageProgress
@@ -35,7 +37,10 @@ def describe(
     lacking = set(without_graph(store, keys))
     missing = [scene for scene in scenes if scene.id in lacking]
     specs = models.specs(store)
-    jobs = [(str(store.folder), scene.id, specs, settings.describe) for scene in missing]
+    # A worker elsewhere must not choose another renderer than the one that the key names.
+    rendered_by = backend(settings.describe.object.render_backend)
+    params = replace(settings.describe, object=replace(settings.describe.object, render_backend=rendered_by))
+    jobs = [(str(store.folder), scene.id, specs, params) for scene in missing]
     for done, (i, graph) in enumerate(run_jobs(describe_scene, jobs, settings.engine), 1):
         store.graphs.save(graph, keys[graph.scene_id])
         progress("describe", done / len(missing), f"{missing[i].name}: {graph.num_nodes} nodes")

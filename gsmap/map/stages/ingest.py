@@ -4,15 +4,33 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsmap.errors import ConfigError
-from gsmap.ingest import Capture, find_captures, read_capture, take_capture
+from gsmap.ingest import Capture, find_captures, given_date, read_capture, take_capture
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import StageProgress
 
 Source = str | os.PathLike[str] | Gaussians
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """What became of one capture.
+
+    Args:
+        scene: as it is in the map now.
+        new: whether it was added.
+        dated: whether the map had it already, and it has another date now.
+        notes: what a person should know.
+    """
+
+    scene: Scene
+    new: bool
+    dated: bool
+    notes: tuple[str, ...]
 
 
 def ingest(
@@ -24,8 +42,10 @@ def ingest(
     captured_at: str | None,
     scale: str,
     progress: StageProgress,
-) -> list[tuple[Scene, bool, tuple[str, ...]]]:
-    """Scene, whether it is new to the map, and notes, of every capture found; see `gsmap.map.Map.ingest`."""
+) -> list[Ingested]:
+    """Every capture found; see `gsmap.map.Map.ingest`."""
+    given_date(captured_at)  # refuses what is none before anything is searched
+    dates = {scene.id: scene.captured_at for scene in store.scenes.list()}
     memory = [source for source in sources if isinstance(source, Gaussians)]
     if memory and len(sources) > 1:
         raise ConfigError("Gaussians in memory are ingested one capture at a time")
@@ -33,7 +53,7 @@ def ingest(
         if cameras is not None and not isinstance(cameras, Cameras):
             raise ConfigError("Gaussians in memory go with gsmap.Cameras, or with none")
         capture = take_capture(memory[0], cameras, name=name or "capture", captured_at=captured_at, scale_policy=scale)
-        return [_add(store, capture)]
+        return [_add(store, capture, dates)]
     if isinstance(cameras, Cameras):
         raise ConfigError("cameras in memory go with Gaussians in memory; for a file name a file of cameras")
     found = find_captures([Path(source) for source in sources if not isinstance(source, Gaussians)])
@@ -43,12 +63,13 @@ def ingest(
     for i, files in enumerate(found):
         progress("ingest", i / len(found), files.name)
         capture = read_capture(files, cameras=cameras, name=name, captured_at=captured_at, scale_policy=scale)
-        results.append(_add(store, capture))
+        results.append(_add(store, capture, dates))
     progress("ingest", 1.0, f"{len(results)} captures")
     return results
 
 
-def _add(store: Store, capture: Capture) -> tuple[Scene, bool, tuple[str, ...]]:
+def _add(store: Store, capture: Capture, dates: dict[str, str | None]) -> Ingested:
+    """Store a capture; ``dates`` of the scenes in the map are brought up to date."""
     scene, new = store.scenes.add(
         capture.gaussians,
         capture.cameras,
@@ -58,5 +79,11 @@ def _add(store: Store, capture: Capture) -> tuple[Scene, bool, tuple[str, ...]]:
         source=capture.source,
         antialiased=capture.antialiased,
         notes=capture.notes,
+        dated_by=capture.dated_by,
     )
-    return scene, new, capture.notes
+    dated = scene.id in dates and scene.captured_at != dates[scene.id]
+    dates[scene.id] = scene.captured_at
+    notes = capture.notes
+    if not new and not dated and capture.captured_at not in (None, scene.captured_at):
+        notes = (*notes, f"its date stays {scene.captured_at or 'unknown'}, as was said before; --captured-at sets it")
+    return Ingested(scene, new, dated and not new, notes)

@@ -1,0 +1,114 @@
+"""How honest covariances are: normalised squared errors (NEES) against the chi-square they should follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.similarities import Similarities
+from gsmap.types import Sim3
+from gsmap.types.rows import NeesRow
+
+SURE_LOG_SCALE = 1e-6
+"""Standard deviation at which a rigid pose is taken to claim its scale, as a rigid edge's stiff row does."""
+_SAME_SCALE = 1e-9
+_THREE_SIGMA = 0.9973002039367398  # of a normal distribution
+
+
+@dataclass(frozen=True)
+class Nees:
+    """One squared error over its covariance.
+
+    Args:
+        value: follows a chi-square with ``dof`` degrees of freedom where the covariance is honest.
+        dof: 7, or 6 where both the pose and the truth are rigid, so that there is no scale to be wrong in.
+    """
+
+    value: float
+    dof: int
+
+
+def nees_of_edge(estimated: Sim3, information: np.ndarray, true: Sim3) -> Nees:
+    """NEES of ``S_target_source`` from its (7, 7) information on the source side.
+
+    A rigid edge between captures whose scales truly differ is judged by its stiff scale row, too: it claimed to know.
+    """
+    error = _error(estimated, true)
+    dof = 6 if estimated.is_rigid and _is_one(true.scale) else 7
+    return Nees(float(error[:dof] @ information[:dof, :dof] @ error[:dof]), dof)
+
+
+def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3) -> Nees:
+    """NEES of a scene's pose in the scene that holds the frame, ``S_anchor_scene``.
+
+    Args:
+        covariance: (7, 7) relative to the anchor (`relative_covariance`), on the scene's side.
+    """
+    covariance = np.array(covariance, dtype=np.float64)
+    error = _error(estimated, true)
+    knows_scale = covariance[6, 6] > SURE_LOG_SCALE**2
+    dof = 6 if not knows_scale and _is_one(true.scale) and _is_one(estimated.scale) else 7
+    if not knows_scale:
+        covariance[6, :] = covariance[:, 6] = 0.0
+        covariance[6, 6] = SURE_LOG_SCALE**2
+    covariance = covariance[:dof, :dof]
+    return Nees(float(error[:dof] @ np.linalg.solve(covariance, error[:dof])), dof)
+
+
+def relative_covariance(estimated: Sim3, covariance: np.ndarray, of_anchor: np.ndarray) -> np.ndarray | None:
+    """(7, 7) covariance of ``S_anchor_scene`` on the scene's side, from those of the scene and its anchor in the map.
+
+    The optimiser holds an anchor by a prior that is a little soft, which every other scene's covariance contains.
+
+    Returns:
+        None where the anchor is not held so: where priors hold the frame, scenes share an error of unknown size.
+    """
+    if not _is_held(of_anchor):
+        return None
+    carry = Similarities.stack([estimated.inverse()]).adjoint()[0]
+    relative: np.ndarray = covariance - carry @ of_anchor @ carry.T
+    known = 7 if relative[6, 6] > 0 else 6
+    return relative if np.linalg.eigvalsh(relative[:known, :known])[0] > 0 else None
+
+
+def _is_held(covariance: np.ndarray) -> bool:
+    """Whether a covariance is a gauge's: the same in every direction, and nothing correlated."""
+    variances = np.diag(covariance)
+    off = covariance - np.diag(variances)
+    small = np.abs(off) <= 1e-3 * np.sqrt(np.outer(variances, variances)) + 1e-15
+    return bool(
+        small.all() and np.ptp(variances[:3]) <= 1e-3 * variances[0] and np.ptp(variances[3:6]) <= 1e-3 * variances[3]
+    )
+
+
+def nees_rows(of: str, found: Sequence[Nees]) -> tuple[NeesRow, ...]:
+    """A row for each number of degrees of freedom: what was measured beside what an honest covariance would show."""
+    from scipy.stats import chi2
+
+    rows = []
+    for dof in sorted({one.dof for one in found}):
+        values = np.array([one.value for one in found if one.dof == dof])
+        rows.append(
+            NeesRow(
+                of=of,
+                dof=dof,
+                num=len(values),
+                median=float(np.median(values)),
+                expected_median=float(chi2.ppf(0.5, dof)),
+                within_3_sigma=float((values <= chi2.ppf(_THREE_SIGMA, dof)).mean()),
+                expected_within_3_sigma=_THREE_SIGMA,
+            )
+        )
+    return tuple(rows)
+
+
+def _error(estimated: Sim3, true: Sim3) -> np.ndarray:
+    """(7,) the tangent on the source side that makes the estimated pose the true one."""
+    error: np.ndarray = (Similarities.stack([estimated]).inverse() @ Similarities.stack([true])).log()[0]
+    return error
+
+
+def _is_one(scale: float) -> bool:
+    return abs(scale - 1) < _SAME_SCALE

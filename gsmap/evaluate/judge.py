@@ -1,0 +1,315 @@
+"""A map's edges and poses against the truth, as one report that says plainly what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import ConfigError
+from gsmap.evaluate.calibration import Nees, nees_of_edge, nees_of_pose, nees_rows, relative_covariance
+from gsmap.evaluate.registration import absolute_trajectory_error, pose_error
+from gsmap.types import PoseGraph, Sim3
+from gsmap.types.rows import (
+    BandRow,
+    ComponentErrorRow,
+    EdgeErrorRow,
+    EdgeRow,
+    EvaluationReport,
+    NeesRow,
+    PairRef,
+    PoseErrorRow,
+)
+
+_METRIC = 1e-6  # a truth's scale this near to 1 says that the scene is in metres
+
+
+@dataclass(frozen=True)
+class Params:
+    """When an edge is wrong, and how edges are counted.
+
+    Args:
+        max_rre_deg: an edge that is turned by more is wrong,
+        max_rte_m: and so is one that puts the source's middle farther off than this, in metres.
+        bands: true overlaps at which a band of pairs ends and the next begins.
+    """
+
+    max_rre_deg: float = 1.0
+    max_rte_m: float = 0.05
+    bands: tuple[float, ...] = (0.1, 0.25, 0.5)
+
+    def __post_init__(self) -> None:
+        if not (self.max_rre_deg > 0 and self.max_rte_m > 0):
+            raise ConfigError(
+                f"an edge is wrong beyond a positive angle and distance, got {self.max_rre_deg} deg, {self.max_rte_m} m"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedScene:
+    """A living scene of the map.
+
+    Args:
+        id, name: of the scene.
+        S_scene_world: its truth, metres in the world; None where there is none.
+        centroid: (3,) where its errors are measured, scene frame; any where there is no truth.
+        centers: (C, 3) of its cameras, scene frame; any where there is no truth.
+    """
+
+    id: str
+    name: str
+    S_scene_world: Sim3 | None
+    centroid: np.ndarray
+    centers: np.ndarray
+
+
+def judge(
+    scenes: Sequence[JudgedScene],
+    edges: Sequence[EdgeRow],
+    graph: PoseGraph | None,
+    overlaps: Mapping[frozenset[str], float],
+    params: Params | None = None,
+) -> EvaluationReport:
+    """Everything that the truth says of a map's edges and newest poses.
+
+    Args:
+        scenes: all living scenes, in the map's order.
+        edges: the current edge of every pair that was tried.
+        graph: the newest poses; None before the first.
+        overlaps: true overlap by pair, of all pairs of scenes that have a truth.
+    """
+    return _Judge(scenes, edges, graph, overlaps, params or Params()).report()
+
+
+class _Judge:
+    def __init__(
+        self,
+        scenes: Sequence[JudgedScene],
+        edges: Sequence[EdgeRow],
+        graph: PoseGraph | None,
+        overlaps: Mapping[frozenset[str], float],
+        params: Params,
+    ) -> None:
+        self.scenes = {scene.id: scene for scene in scenes}
+        self.truth = {scene.id: scene.S_scene_world for scene in scenes if scene.S_scene_world is not None}
+        self.all_edges = edges
+        self.graph = graph
+        self.overlaps = overlaps
+        self.params = params
+        poses = {} if graph is None else {s: pose for s, pose in graph.poses.items() if s in self.scenes}
+        sizes: dict[int, int] = {}
+        for pose in poses.values():
+            if pose.status != "isolated":
+                sizes[pose.component] = sizes.get(pose.component, 0) + 1
+        # A scene whose every neighbour was removed since is tied to nothing any more.
+        self.tied = {
+            s: poses[s]
+            for s in self.scenes
+            if s in poses and poses[s].status != "isolated" and sizes[poses[s].component] > 1
+        }
+        self.components: dict[int, list[str]] = {}
+        for s, pose in self.tied.items():
+            self.components.setdefault(pose.component, []).append(s)
+
+    def report(self) -> EvaluationReport:
+        accepted = [edge for edge in self.all_edges if edge.status == "accepted" and edge.S_target_source is not None]
+        known = [edge for edge in accepted if edge.target in self.truth and edge.source in self.truth]
+        edges = tuple(self._edge(edge) for edge in known)
+        pairs = tuple(
+            self._error(a, b, self.tied[a].S_map_scene.inverse() @ self.tied[b].S_map_scene)
+            for members in self.components.values()
+            for a, b in combinations([s for s in members if s in self.truth], 2)
+        )
+        components = tuple(self._component(k, members) for k, members in sorted(self.components.items()))
+        ate_m, ate_reason = self._ate(components)
+        statuses = [pose.status for pose in self.tied.values()]
+        in_use = [edge for edge in edges if edge.used]
+        return EvaluationReport(
+            num_scenes=len(self.scenes),
+            num_placed=statuses.count("placed"),
+            num_tentative=statuses.count("tentative"),
+            edges=edges,
+            pairs=pairs,
+            edges_in_use=len(in_use),
+            edges_without_truth=len(accepted) - len(known),
+            false_edges=tuple(
+                PairRef(target=e.target, target_name=e.target_name, source=e.source, source_name=e.source_name)
+                for e in in_use
+                if not e.right
+            ),
+            max_rre_deg=self.params.max_rre_deg,
+            max_rte_m=self.params.max_rte_m,
+            bands=self._bands(edges),
+            components=components,
+            nees=self._nees(edges),
+            notes=self._notes(),
+            ate_m=ate_m,
+            ate_reason=ate_reason,
+            **_summary("edges", edges),
+            **_summary("pairs", pairs),
+        )
+
+    # --- edges and pairs ---------------------------------------------------------------------------------------------
+
+    def _true(self, target: str, source: str) -> Sim3:
+        return self.truth[target] @ self.truth[source].inverse()
+
+    def _error(self, target: str, source: str, estimated: Sim3) -> PoseErrorRow:
+        error = pose_error(estimated, self._true(target, source), self.scenes[source].centroid)
+        return PoseErrorRow(
+            target=target,
+            target_name=self.scenes[target].name,
+            source=source,
+            source_name=self.scenes[source].name,
+            rre_deg=error.rre_deg,
+            centroid_m=error.centroid_m / self.truth[target].scale,
+            rte=error.rte,
+            rse=error.rse,
+        )
+
+    def _edge(self, edge: EdgeRow) -> EdgeErrorRow:
+        assert edge.S_target_source is not None
+        error = self._error(edge.target, edge.source, edge.S_target_source)
+        nees = None
+        if edge.information is not None:
+            nees = nees_of_edge(edge.S_target_source, edge.information, self._true(edge.target, edge.source))
+        return EdgeErrorRow(
+            **vars(error),
+            true_overlap=self.overlaps[frozenset((edge.target, edge.source))],
+            used=edge.used,
+            right=error.rre_deg <= self.params.max_rre_deg and error.centroid_m <= self.params.max_rte_m,
+            nees=None if nees is None else nees.value,
+            nees_dof=None if nees is None else nees.dof,
+        )
+
+    def _bands(self, edges: Sequence[EdgeErrorRow]) -> tuple[BandRow, ...]:
+        """Recall and precision by true overlap; a band's lower end belongs to it."""
+        ends = (0.0, *self.params.bands, 1.0)
+        pairs = np.array([self.overlaps[frozenset(pair)] for pair in combinations(self.truth, 2)])
+        pair_band = np.searchsorted(self.params.bands, pairs, side="right")
+        edge_band = np.searchsorted(self.params.bands, [e.true_overlap for e in edges], side="right")
+        right = np.array([e.right for e in edges], dtype=bool)
+        rows = []
+        for k, (low, high) in enumerate(pairwise(ends)):
+            num_pairs, num_accepted = int((pair_band == k).sum()), int((edge_band == k).sum())
+            num_right = int(right[edge_band == k].sum())
+            rows.append(
+                BandRow(
+                    overlap_from=low,
+                    overlap_to=high,
+                    num_pairs=num_pairs,
+                    num_accepted=num_accepted,
+                    num_right=num_right,
+                    recall=num_right / num_pairs if num_pairs else None,
+                    precision=num_right / num_accepted if num_accepted else None,
+                )
+            )
+        return tuple(rows)
+
+    # --- poses -------------------------------------------------------------------------------------------------------
+
+    def _component(self, component: int, members: Sequence[str]) -> ComponentErrorRow:
+        known = [s for s in members if s in self.truth]
+        # Where the truth says that captures are in metres, so must the map be: a scale that is off is an error then.
+        metric = all(abs(self.truth[s].scale - 1) < _METRIC for s in known)
+        alignment = "rigid" if metric else "similarity"
+        reason, ate_m = "", None
+        count = sum(len(self.scenes[s].centers) for s in known)
+        if len(known) < 2:
+            reason = f"{len(known)} of its {len(members)} scenes has a truth: two are needed"
+        elif count < 3:
+            reason = f"{count} cameras fix no alignment: three are needed"
+        else:
+            estimated = [self.tied[s].S_map_scene.apply(self.scenes[s].centers) for s in known]
+            true = [self.truth[s].inverse().apply(self.scenes[s].centers) for s in known]
+            ate_m = absolute_trajectory_error(np.concatenate(estimated), np.concatenate(true), align=alignment)
+        return ComponentErrorRow(
+            component=component,
+            scene_names=tuple(self.scenes[s].name for s in members),
+            num_cameras=count,
+            alignment=alignment,
+            ate_m=ate_m,
+            ate_reason=reason,
+        )
+
+    def _ate(self, components: Sequence[ComponentErrorRow]) -> tuple[float | None, str]:
+        """Over all components that have one, and why there is none."""
+        found = [(row.num_cameras, row.ate_m) for row in components if row.ate_m is not None]
+        if found:
+            squares = sum(count * ate_m**2 for count, ate_m in found)
+            return float(np.sqrt(squares / sum(count for count, _ in found))), ""
+        if self.graph is None:
+            return None, "the map has no poses yet: run gsmap optimize"
+        if not components:
+            return None, "no two scenes are tied to each other"
+        return None, "; ".join(f"component {row.component}: {row.ate_reason}" for row in components)
+
+    def _nees(self, edges: Sequence[EdgeErrorRow]) -> tuple[NeesRow, ...]:
+        of_edges = [Nees(e.nees, e.nees_dof) for e in edges if e.nees is not None and e.nees_dof is not None]
+        of_poses = [one for k in self.components for one in self._nees_of_component(k) or ()]
+        return (*nees_rows("edges", of_edges), *nees_rows("poses", of_poses))
+
+    def _nees_of_component(self, component: int) -> list[Nees] | None:
+        """Of each of its scenes relative to the one that holds its frame; None where its covariances do not say."""
+        known = {
+            s: covariance
+            for s in self.components[component]
+            if s in self.truth and (covariance := self.tied[s].covariance) is not None
+        }
+        if len(known) < 2:
+            return None
+        anchor = min(known, key=lambda s: float(np.trace(known[s][:3, :3])))
+        inverse = self.tied[anchor].S_map_scene.inverse()
+        found = []
+        for s in known.keys() - {anchor}:
+            estimated = inverse @ self.tied[s].S_map_scene
+            covariance = relative_covariance(estimated, known[s], known[anchor])
+            if covariance is None:
+                return None
+            found.append(nees_of_pose(estimated, covariance, self._true(anchor, s)))
+        return found
+
+    def _notes(self) -> tuple[str, ...]:
+        notes = []
+        lacking = [scene.name for scene in self.scenes.values() if scene.id not in self.truth]
+        if lacking:
+            notes.append(f"without a truth, and so not judged: {_listed(lacking)}")
+        if self.graph is not None:
+            new = [scene.name for scene in self.scenes.values() if scene.id not in self.graph.poses]
+            if new:
+                notes.append(f"newer than the newest poses: {_listed(new)}; run gsmap optimize")
+        silent = [str(k) for k in sorted(self.components) if self._nees_of_component(k) is None]
+        if silent:
+            notes.append(
+                f"no NEES of poses in component {_listed(silent)}: covariances or a truth are missing, or priors hold "
+                "its frame"
+            )
+        stale = [edge.pair for edge in self.all_edges if edge.used and edge.status != "accepted"]
+        if stale:
+            notes.append(
+                f"the newest poses use edges that are no longer accepted: {_listed(stale)}; run gsmap optimize"
+            )
+        return tuple(notes)
+
+
+def _listed(names: Sequence[str], most: int = 10) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _summary(of: str, rows: Sequence[PoseErrorRow]) -> dict[str, Any]:
+    """The report's medians and worst of some rows; None where there are none."""
+
+    def over(function: Callable[[list[float]], Any], name: str) -> float | None:
+        return float(function([getattr(row, name) for row in rows])) if rows else None
+
+    return {
+        f"{of}_median_rre_deg": over(np.median, "rre_deg"),
+        f"{of}_median_centroid_m": over(np.median, "centroid_m"),
+        f"{of}_median_rte": over(np.median, "rte"),
+        f"{of}_median_rse": over(np.median, "rse"),
+        f"{of}_worst_rre_deg": over(max, "rre_deg"),
+        f"{of}_worst_centroid_m": over(max, "centroid_m"),
+    }

@@ -1,0 +1,81 @@
+"""True overlap: how much of two captures is one surface, by their true poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from gsmap.types import Gaussians, Sim3
+
+_KEPT = 32  # search trees in memory at once
+
+
+@dataclass(frozen=True)
+class Params:
+    """What counts as the same surface.
+
+    Args:
+        radius_m: a Gaussian coincides with another capture that has one within this distance.
+        min_opacity: Gaussians must be more opaque than this,
+        max_scale_m: and their largest standard deviation smaller than this, to count as surface.
+    """
+
+    radius_m: float = 0.08
+    min_opacity: float = 0.3
+    max_scale_m: float = 0.3
+
+
+def solid_centres(gaussians: Gaussians, S_scene_world: Sim3, params: Params | None = None) -> np.ndarray:
+    """(N, 3) centres of the opaque, not huge Gaussians in the truth's world, in metres."""
+    params = params or Params()
+    size_m = gaussians.scales.max(1, initial=0) / S_scene_world.scale
+    keep = (gaussians.opacities > params.min_opacity) & (size_m < params.max_scale_m)
+    return S_scene_world.inverse().apply(gaussians.means[keep])
+
+
+def true_overlaps(
+    scenes: Sequence[str], centres: Callable[[str], np.ndarray], params: Params | None = None
+) -> dict[frozenset[str], float]:
+    """True overlap of each pair: the smaller of both directions' share of centres that coincide with the other capture.
+
+    Only pairs whose boxes meet are searched, so the cost of a large place grows with its pairs that could overlap.
+
+    Args:
+        scenes: their ids.
+        centres: gives `solid_centres` of one.
+    """
+    from scipy.spatial import cKDTree
+
+    radius_m = (params or Params()).radius_m
+
+    @lru_cache(_KEPT)
+    def tree_of(scene: str) -> Any:
+        return cKDTree(centres(scene))
+
+    boxes = np.full((len(scenes), 2, 3), np.nan)  # of a scene without solid centres: meets nothing
+    for row, scene in enumerate(scenes):
+        points = tree_of(scene).data
+        if len(points):
+            boxes[row] = points.min(0), points.max(0)
+    out = {}
+    for i, a in enumerate(scenes):
+        meets = ((boxes[:, 0] <= boxes[i, 1] + radius_m) & (boxes[:, 1] >= boxes[i, 0] - radius_m)).all(1)
+        for j in range(i + 1, len(scenes)):
+            overlap = 0.0
+            if meets[j]:
+                one, other = tree_of(a), tree_of(scenes[j])
+                overlap = min(_share(one, other, radius_m), _share(other, one, radius_m))
+            out[frozenset((a, scenes[j]))] = overlap
+    return out
+
+
+def _share(tree: Any, other: Any, radius_m: float) -> float:
+    """The share of one's points that lie within the radius of a point of the other."""
+    points, low, high = tree.data, other.mins - radius_m, other.maxes + radius_m
+    inside = points[((points >= low) & (points <= high)).all(1)]
+    distance, _ = other.query(inside, distance_upper_bound=radius_m)
+    return float(np.isfinite(distance).sum()) / len(points)

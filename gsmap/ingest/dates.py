@@ -1,0 +1,308 @@
+"""When a capture was taken, from what lies beside it. A file's modification time is never asked: copying changes it."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gsmap.errors import ConfigError, InputError
+from gsmap.ingest.find import Found
+
+MAX_FRAMES = 32
+"""How many photographs are opened at most to date one capture."""
+
+_T = TypeVar("_T")
+_MAX_SIDECAR_BYTES = 1 << 20  # what is larger is something else that happens to have the name
+_FIRST_YEAR = 1990  # a digital camera that says less lost its clock
+_PHOTOGRAPHS = ("JPEG", "MPO", "TIFF", "WEBP")
+_SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+_EXIF_IFD, _TAKEN, _TAKEN_OFFSET = 0x8769, 0x9003, 0x9011
+# Compact dates stand alone, since eight digits are often a number or part of a digest.
+_DATE = re.compile(
+    r"""(?: (?<!\d) (?P<y>\d{4}) (?P<s>[-_]) (?P<m>\d\d) (?P=s) (?P<d>\d\d) (?!\d)
+          | (?<![A-Za-z0-9.]) (?P<day>\d{8}) (?![0-9A-SU-Za-z]) )
+        (?: [T_\ ] (?!\d{4}[-_]\d\d[-_]\d\d)  # another date is no time
+            (?P<h>\d\d) (?P<t>[-_:]?) (?P<min>\d\d) (?:(?P=t)(?P<sec>\d\d))? (?P<z>Z|\+\d\d:?\d\d)? (?![0-9A-Za-z]) )?
+    """,
+    re.VERBOSE | re.ASCII,
+)
+
+
+@dataclass(frozen=True)
+class CaptureDate:
+    """When a capture was taken, as far as it can be told.
+
+    Args:
+        when: ISO 8601 with zone; None where nothing says it.
+        source: what said it; empty where nothing did, or where a person did.
+        note: what a person should know of it; empty where there is nothing to say.
+    """
+
+    when: str | None = None
+    source: str = ""
+    note: str = ""
+
+
+def parse_date(when: str | datetime | None) -> str | None:
+    """ISO 8601 with its zone (UTC where it has none); None stays None.
+
+    Raises:
+        ConfigError: not a date.
+    """
+    date = _parsed(when)
+    return None if date is None else _zoned(date).isoformat()
+
+
+def given_date(when: str | datetime | None) -> CaptureDate:
+    """The date that a person gives.
+
+    Raises:
+        ConfigError: not a date.
+    """
+    date = _parsed(when)
+    if date is None:
+        return CaptureDate()
+    known = _zoned(date).isoformat()
+    return CaptureDate(known, "", "" if date.tzinfo else f"dated {known} as told: no zone was given, taken as UTC")
+
+
+def find_date(
+    found: Found, cameras: Path | None = None, frames: Sequence[str] = (), *, now: datetime | None = None
+) -> CaptureDate:
+    """The date of a capture on disk.
+
+    In this order: a sidecar beside it (``NAME.json`` or ``NAME.meta.json`` with ``captured_at``), where NAME is its
+    file's or, as for the output of trainers, its folder's; the first EXIF ``DateTimeOriginal`` of its frames; a date in
+    the name of its file, or of the folders that it is named by or lies in.
+
+    Args:
+        cameras: the file or folder its cameras were read from.
+        frames: the names that its cameras have, which may be those of picture files.
+        now: to refuse what lies more than a day after it.
+
+    Raises:
+        InputError: a sidecar whose date is none.
+    """
+    latest = (now or datetime.now(UTC)) + timedelta(days=1)
+    return (
+        _from_sidecar(found, latest)
+        or _from_frames(_photographs(found, cameras, frames), latest)
+        or _from_names(found, latest)
+        or CaptureDate()
+    )
+
+
+def date_in_name(name: str, *, now: datetime | None = None) -> tuple[datetime | None, str]:
+    """The date in a name such as ``hall_2026-05-31T14-00``, UTC where it has no zone, and what to know of it.
+
+    None where there is no date, or where there are several.
+    """
+    latest = (now or datetime.now(UTC)) + timedelta(days=1)
+    dates = [date for match in _DATE.finditer(name) if (date := _matched(match, latest)) is not None]
+    if len({day.date() for day, _ in dates}) > 1:
+        return None, f"the name {shown(name)} has several dates: none of them was taken"
+    return max(dates, key=lambda date: not date[1], default=(None, ""))
+
+
+def shown(name: str) -> str:
+    """A file's name as it may be written to a terminal and a catalog."""
+    return "".join(c if c.isprintable() else "?" for c in name)
+
+
+# --- sidecars --------------------------------------------------------------------------------------------------------
+
+
+def _from_sidecar(found: Found, latest: datetime) -> CaptureDate | None:
+    for folder, name in _names(found):
+        for path in (folder / f"{name}.json", folder / f"{name}.meta.json"):
+            said = _captured_at(path) if name else None
+            if said is None:
+                continue
+            try:
+                date = datetime.fromisoformat(said)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"{path}: captured_at must be ISO 8601 text such as 2026-05-31T14:00:00+02:00, got {said!r}: "
+                    "correct it, or give --captured-at"
+                ) from error
+            if _zoned(date) > latest:
+                raise InputError(f"{path}: captured_at {said} lies in the future: correct it, or give --captured-at")
+            return _dated(date, shown(path.name), "" if date.tzinfo else "no zone was given, taken as UTC")
+    return None
+
+
+def _captured_at(path: Path) -> Any:
+    """What a sidecar says; None where there is none, or one that is about other things."""
+    try:
+        if not path.is_file() or path.stat().st_size > _MAX_SIDECAR_BYTES:
+            return None
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    if b"captured_at" not in data:
+        return None
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not JSON: {error}: correct it, or give --captured-at") from error
+    return content.get("captured_at") if isinstance(content, dict) else None
+
+
+# --- photographs -----------------------------------------------------------------------------------------------------
+
+
+def _photographs(found: Found, cameras: Path | None, frames: Sequence[str]) -> list[Path]:
+    """Some of the pictures that a capture was made from, evenly chosen: those its cameras name.
+
+    Where they name none, those in ``images/`` beside it, unless other captures lie there too.
+    """
+    folders = [] if cameras is None else _picture_folders(cameras)
+    named = [path for name in _evenly(sorted(frames)) if (path := _picture(name, folders)) is not None]
+    if named:
+        return named
+    folder = found.path.resolve().parent / "images"
+    if not found.alone or not folder.is_dir():
+        return []
+    return _evenly(sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file()))
+
+
+def _picture_folders(cameras: Path) -> list[Path]:
+    """Where the pictures of a file of cameras, or of a COLMAP model's folder, may lie."""
+    root = cameras.resolve()
+    root = root if root.is_dir() else root.parent
+    while root.name in ("0", "sparse", "colmap"):
+        root = root.parent
+    return [root, root / "images"]
+
+
+def _picture(name: str, folders: Sequence[Path]) -> Path | None:
+    """The file that a camera's name means; gaussian-splatting leaves the suffix out."""
+    if not name or "\0" in name:
+        return None
+    for folder in folders:
+        for ending in ("", *_SUFFIXES, ".JPG", ".JPEG"):
+            path = folder / f"{name}{ending}"
+            try:
+                if path.is_file():
+                    return path
+            except OSError:  # a name too long for a file
+                return None
+    return None
+
+
+def _from_frames(pictures: Sequence[Path], latest: datetime) -> CaptureDate | None:
+    taken = [(*date, path) for path in pictures if (date := _exif_date(path, latest)) is not None]
+    if not taken:
+        return None
+    first, has_zone, path = min(taken, key=lambda one: one[0])
+    last = max(one[0] for one in taken)
+    note = f"the first of {len(taken)} dates in {len(pictures)} frames read, the last is {last.isoformat()}"
+    if not has_zone:
+        note += "; no zone was given, taken as UTC"
+    return _dated(first, f"the EXIF of {shown(path.name)}", note)
+
+
+def _exif_date(path: Path, latest: datetime) -> tuple[datetime, bool] | None:
+    """When a photograph was taken, and whether its zone is known; None where it does not say so or cannot be right."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large pictures and of damaged tags: only the header is read
+            with Image.open(path, formats=_PHOTOGRAPHS) as picture:
+                tags = picture.getexif().get_ifd(_EXIF_IFD)
+        said = str(tags.get(_TAKEN, "")).strip("\0 ")
+        offset = str(tags.get(_TAKEN_OFFSET, "")).strip("\0 ")
+        date = datetime.strptime(said, "%Y:%m:%d %H:%M:%S")
+    except Exception:  # damaged pictures raise whatever their readers do, and none of it is an answer
+        return None
+    zoned = re.fullmatch(r"[+-]\d\d:\d\d|Z", offset) is not None
+    if zoned:
+        try:
+            date = datetime.fromisoformat(date.isoformat() + offset)
+        except ValueError:  # an offset of more than a day
+            zoned = False
+    date = _zoned(date)
+    return (date, zoned) if _plausible(date, latest) else None
+
+
+# --- names -----------------------------------------------------------------------------------------------------------
+
+
+def _from_names(found: Found, latest: datetime) -> CaptureDate | None:
+    for name in _telling_names(found):
+        date, note = date_in_name(name, now=latest - timedelta(days=1))
+        if date is not None:
+            return _dated(date, f"the name {shown(name)}", note)
+        if note:
+            return CaptureDate(note=f"no date: {note}")
+    return None
+
+
+def _names(found: Found) -> Sequence[tuple[Path, str]]:
+    """See `Found.names`; one that was made by hand may have none."""
+    return found.names or ((found.path.parent, found.name),)
+
+
+def _telling_names(found: Found) -> Iterator[str]:
+    """The names that a capture goes by, and that of the folder these lie in."""
+    names = _names(found)
+    around = names[-1][0].resolve()
+    for folder, name in (*names, (around.parent, around.name)):
+        if not (folder / name / "nerfstudio_models").is_dir():  # such a folder is named by when its training began
+            yield name
+
+
+def _matched(match: re.Match[str], latest: datetime) -> tuple[datetime, str] | None:
+    """The date of a match and what to know of it; None where there is no such day."""
+    day = match["day"] or match["y"] + match["m"] + match["d"]
+    try:
+        date = datetime.strptime(day, "%Y%m%d")
+    except ValueError:
+        return None
+    note = "no time of day was given, taken as 00:00 UTC"
+    if match["h"]:
+        try:
+            date = date.replace(hour=int(match["h"]), minute=int(match["min"]), second=int(match["sec"] or 0))
+            note = "" if match["z"] else "no zone was given, taken as UTC"
+            date = datetime.fromisoformat(date.isoformat() + (match["z"] or ""))
+        except ValueError:  # a number that follows, and no time
+            date, note = datetime.strptime(day, "%Y%m%d"), "no time of day was given, taken as 00:00 UTC"
+    date = _zoned(date)
+    return (date, note) if _plausible(date, latest) else None
+
+
+# --- what they share -------------------------------------------------------------------------------------------------
+
+
+def _parsed(when: str | datetime | None) -> datetime | None:
+    try:
+        return datetime.fromisoformat(when) if isinstance(when, str) else when
+    except ValueError as error:
+        raise ConfigError(f"captured-at must be ISO 8601 such as 2026-05-31T14:00:00+02:00, got {when!r}") from error
+
+
+def _dated(date: datetime, source: str, note: str) -> CaptureDate:
+    when = _zoned(date).isoformat()
+    return CaptureDate(when, source, f"dated {when} by {source}" + (f": {note}" if note else ""))
+
+
+def _zoned(date: datetime) -> datetime:
+    return date if date.tzinfo else date.replace(tzinfo=UTC)
+
+
+def _plausible(date: datetime, latest: datetime) -> bool:
+    return date.year >= _FIRST_YEAR and date <= latest
+
+
+def _evenly(things: Sequence[_T]) -> list[_T]:
+    """At most `MAX_FRAMES` of them, the first and the last among them."""
+    if len(things) <= MAX_FRAMES:
+        return list(things)
+    return [things[round(i * (len(things) - 1) / (MAX_FRAMES - 1))] for i in range(MAX_FRAMES)]
