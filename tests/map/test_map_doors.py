@@ -128,7 +128,10 @@ def test_a_file_of_pairs_takes_names_with_spaces_and_colons(site: Map, tmp_path:
     found = [(a.name, b.name) for a, b in read_pairs(site.store, path)]
     assert found == [("the hall", "attic:east"), ("stairs", "attic:east"), ("stairs", "the hall")]
     path.write_text("stairs attic:east\nstairs nowhere\n")
-    with pytest.raises(InputError, match="line 2: a pair is written A B or A:B, got 'stairs nowhere'"):
+    with pytest.raises(NotFoundError, match="line 2: no two scenes are called 'stairs nowhere'"):
+        read_pairs(site.store, path)
+    path.write_text("stairs\n")
+    with pytest.raises(InputError, match="line 1: a pair is written A B or A:B, got 'stairs'"):
         read_pairs(site.store, path)
 
 

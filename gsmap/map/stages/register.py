@@ -136,8 +136,8 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
     """Pairs of a text file, one a line: ``A B`` or ``A:B``; ``#`` begins a remark. A name with spaces needs the colon.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: a line that names no two scenes.
+        NotFoundError: no such file, or a line that names a scene which is not there.
+        InputError: a line that is no pair.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -148,13 +148,16 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
     pairs = []
     for number, line in enumerate(lines, 1):
         text = line.partition("#")[0].strip()
+        if not text:
+            continue
         try:
-            if text:
-                pairs.append(_pair_on(store, text))
+            pairs.append(_pair_on(store, text))
         except NotFoundError as error:
-            raise InputError(
-                f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r} ({error})"
-            ) from error
+            if len(text.split()) != 2 and ":" not in text:
+                raise InputError(
+                    f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}"
+                ) from error
+            raise NotFoundError(f"{path}, line {number}: {error}") from error
     return pairs
 
 
