@@ -37,6 +37,7 @@ from registration_methods import ABLATIONS, METHODS, Answer, Capture, Method
 from scipy.stats import chi2
 
 import gsmap.map
+from gsmap.evaluate.overlap import solid_centres, true_overlaps
 from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid, summarise
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -142,18 +143,11 @@ def rescaled(gaussians: Gaussians, cameras: Cameras, S_scene_world: Sim3, factor
 
 def true_overlap(a: Capture, b: Capture) -> float:
     """The smaller of both directions' share of opaque, not huge Gaussians within 8 cm of one of the other's."""
-    from scipy.spatial import cKDTree
-
     if a.place != b.place:
         return 0.0
-    points = []
-    for c in (a, b):
-        g, unit = c.view.gaussians, 1.0 / c.S_scene_world.scale
-        keep = (g.opacities > 0.3) & (g.scales.max(1) * unit < 0.3)
-        points.append(c.S_scene_world.inverse().apply(g.means[keep]))
-    trees = [cKDTree(p) for p in points]
-    both = zip(trees, points[::-1], strict=True)
-    return float(min(np.isfinite(t.query(p, distance_upper_bound=0.08)[0]).mean() for t, p in both))
+    centres = {c.view.id: solid_centres(c.view.gaussians, c.S_scene_world) for c in (a, b)}
+    (overlap,) = true_overlaps(list(centres), centres.__getitem__).values()
+    return overlap
 
 
 # --- measuring -----------------------------------------------------------------------------------------------------

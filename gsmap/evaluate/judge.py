@@ -113,6 +113,7 @@ class _Judge:
         self.components: dict[int, list[str]] = {}
         for s, pose in self.tied.items():
             self.components.setdefault(pose.component, []).append(s)
+        self.nees = {component: self._nees_of_component(component) for component in sorted(self.components)}
 
     def report(self) -> EvaluationReport:
         accepted = [edge for edge in self.all_edges if edge.status == "accepted" and edge.S_target_source is not None]
@@ -249,7 +250,7 @@ class _Judge:
 
     def _nees(self, edges: Sequence[EdgeErrorRow]) -> tuple[NeesRow, ...]:
         of_edges = [Nees(e.nees, e.nees_dof) for e in edges if e.nees is not None and e.nees_dof is not None]
-        of_poses = [one for k in self.components for one in self._nees_of_component(k) or ()]
+        of_poses = [one for found in self.nees.values() for one in found or ()]
         return (*nees_rows("edges", of_edges), *nees_rows("poses", of_poses))
 
     def _nees_of_component(self, component: int) -> list[Nees] | None:
@@ -264,7 +265,7 @@ class _Judge:
         anchor = min(known, key=lambda s: float(np.trace(known[s][:3, :3])))
         inverse = self.tied[anchor].S_map_scene.inverse()
         found = []
-        for s in known.keys() - {anchor}:
+        for s in (s for s in known if s != anchor):
             estimated = inverse @ self.tied[s].S_map_scene
             covariance = relative_covariance(estimated, known[s], known[anchor])
             if covariance is None:
@@ -281,7 +282,7 @@ class _Judge:
             new = [scene.name for scene in self.scenes.values() if scene.id not in self.graph.poses]
             if new:
                 notes.append(f"newer than the newest poses: {_listed(new)}; run gsmap optimize")
-        silent = [str(k) for k in sorted(self.components) if self._nees_of_component(k) is None]
+        silent = [str(component) for component, found in self.nees.items() if found is None]
         if silent:
             notes.append(
                 f"no NEES of poses in component {_listed(silent)}: covariances or a truth are missing, or priors hold "

@@ -466,7 +466,7 @@ class Map(AbstractContextManager["Map"]):
             raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 
     def write_poses(self, out: str | os.PathLike[str], format: str) -> list[Path]:
-        """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); returns the files."""
+        """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); the files written."""
         from gsmap.map.poses import write_poses
 
         return write_poses(self.store, Path(out), format)

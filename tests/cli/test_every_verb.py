@@ -256,6 +256,27 @@ def test_reviews_count_and_can_be_withdrawn(site: Path, cli: Run) -> None:
     assert events == ["accepted", "reject", "withdraw", "confirm"]
 
 
+def test_evaluate_says_plainly_that_a_map_failed(site: Path, captures: Path, cli: Run) -> None:
+    truth = ("--truth", captures / "truth")
+    good = cli("evaluate", site, *truth)
+    assert "placed, 2 tentative, ATE 0.0" in good.stdout
+    assert "0 of 1 false, beyond 1 deg or 0.05 m" in good.stdout
+    assert "1 of 1 false, beyond 1 deg or 1e-09 m: left:right" in " ".join(
+        cli("evaluate", site, *truth, "--max-rte", 1e-9).stdout.split()
+    )
+    cli("reject", site, "left:right")
+    cli("optimize", site)
+    failed = cli("evaluate", site, *truth)
+    assert failed.code == 0
+    assert "0 of 3 placed, no ATE: no two scenes are tied to each other" in failed.stdout
+    report = cli("evaluate", site, *truth, "--json").json
+    assert (report["num_scenes"], report["num_placed"], report["ate_m"], report["edges"]) == (3, 0, None, [])
+    for option in ("--tiles", "--lpips"):
+        refused = cli("evaluate", site, *truth, option, site)
+        assert (refused.code, refused.stdout) == (2, "")
+        assert f"{option} compares images: give --images too" in refused.stderr
+
+
 def test_a_measurement_of_ones_own_places_a_scene(site: Path, cli: Run, tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = [20, 0, 0]
