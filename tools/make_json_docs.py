@@ -4,6 +4,8 @@ python tools/make_json_docs.py            write the page
 python tools/make_json_docs.py --check    exit 1 where the page is not what would be written
 """
 
+# ruff: noqa: E402
+
 from __future__ import annotations
 
 import argparse
@@ -16,12 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # the rows of this checkout, whichever one is installed
+
 from gsmap.cli.objects import OBJECTS, Many, Maybe, Object
 from gsmap.settings import field_docs
 from gsmap.types.rows import SCHEMA, Row
 from gsmap.types.sim3 import Sim3
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "json.md"
+PAGE = ROOT / "docs" / "json.md"
 
 HEAD = f"""# What `--json` prints
 

@@ -31,6 +31,7 @@ def command(
     synthetic = _synthetic()
     root = Path(folder)
     map_path = root / "demo.gsmap"
+    root.mkdir(parents=True, exist_ok=True)  # refused now, and not after a minute of making captures
     with progress_bars() as progress:
         draw = progress or (lambda stage, fraction, text: None)
         captures = synthetic.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))

@@ -23,6 +23,9 @@ class Params:
     executor: str = "local"
     executors: MethodParams = field(default_factory=lambda: MethodParams("executor"))
 
+    def __post_init__(self) -> None:
+        family("executor").get(self.executor)
+
 
 def run_jobs(
     job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Params | None = None

@@ -139,13 +139,14 @@ class _Box:
 
 
 def _cells(extent: np.ndarray, tile_size_m: float, max_tiles: int) -> list[tuple[int, int, int]]:
-    first = np.floor(extent[0] / tile_size_m).astype(int)
-    last = np.ceil(extent[1] / tile_size_m).astype(int)
-    count = np.prod((last - first).astype(float))
-    if count > max_tiles:
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = np.floor(extent[0] / tile_size_m), np.ceil(extent[1] / tile_size_m)
+        count = np.prod(high - low)
+    if not count <= max_tiles:
         raise ConfigError(
             f"tiles of {tile_size_m} m would be {count:.3g} over {_text(extent)}: use larger tiles or a box"
         )
+    first, last = low.astype(int), high.astype(int)
     return [
         (x, y, z) for x in range(first[0], last[0]) for y in range(first[1], last[1]) for z in range(first[2], last[2])
     ]

@@ -43,7 +43,8 @@ class TileRecipe:
 
     def __post_init__(self) -> None:
         if self.format != _TILES_3D and f".{self.format}" not in formats.known("write"):
-            known = ", ".join([*formats.known("write"), _TILES_3D])
+            suffixes = [name[1:] for name in formats.known("write") if name.startswith(".")]
+            known = ", ".join([*suffixes, _TILES_3D])
             raise ConfigError(f"cannot write {self.format!r}: choose one of {known}")
         if self.provenance and self.format != "ply":
             raise ConfigError(f"provenance is a property of .ply files, the format asked for is {self.format}")

@@ -459,7 +459,11 @@ class Map(AbstractContextManager["Map"]):
         graph, _ = self._graph_of(scene)
         if graph is None:
             raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
-        Image.fromarray(draw_graph(*self.read(scene.id), graph)).save(path)
+        picture = Image.fromarray(draw_graph(*self.read(scene.id), graph))
+        try:
+            picture.save(path)
+        except ValueError as error:  # a suffix that Pillow does not know
+            raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 
     def write_poses(self, out: str | os.PathLike[str], format: str) -> list[Path]:
         """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); the files written."""

@@ -126,6 +126,8 @@ def write_settings(
     """
     old_preset, old = read_settings(folder)
     kept = {name: value for name, value in old.items() if name not in drop}
+    if preset is not None:
+        settings_of({}, preset)
     unknown = [name for name in drop if name not in old]
     if unknown:
         raise ConfigError(f"{unknown[0]} is not changed in {folder / FILE_NAME}: there is nothing to take back")

@@ -53,6 +53,9 @@ class Params:
     method: str = "tto"
     mergers: MethodParams = field(default_factory=lambda: MethodParams("merger"))
 
+    def __post_init__(self) -> None:
+        merger(self.method)
+
     def chosen(self) -> Any:
         """The settings of the merger that is used."""
         return self.mergers[self.method]

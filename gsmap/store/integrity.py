@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, delete, not_, select, text, update
 
+from gsmap.errors import ConfigError
 from gsmap.store import sqlite
 from gsmap.store.arrays import CHUNK_ROWS, Arrays
 from gsmap.store.catalog import Catalog, explained, now
@@ -89,7 +90,12 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
     Args:
         keep_revisions: keep only this many of the newest; older ones stay listed but lose their claim. None: all.
         dry_run: only say what would go (also of a map that was opened for reading).
+
+    Raises:
+        ConfigError: a negative number of revisions.
     """
+    if keep_revisions is not None and keep_revisions < 0:
+        raise ConfigError(f"the number of revisions to keep must not be negative, got {keep_revisions}")
     with contextlib.nullcontext() if dry_run else catalog.lock():
         with contextlib.ExitStack() as stack:
             connection = stack.enter_context(catalog.read() if dry_run else catalog.write())

@@ -128,7 +128,10 @@ def test_a_file_of_pairs_takes_names_with_spaces_and_colons(site: Map, tmp_path:
     found = [(a.name, b.name) for a, b in read_pairs(site.store, path)]
     assert found == [("the hall", "attic:east"), ("stairs", "attic:east"), ("stairs", "the hall")]
     path.write_text("stairs attic:east\nstairs nowhere\n")
-    with pytest.raises(InputError, match="line 2: a pair is written A B or A:B, got 'stairs nowhere'"):
+    with pytest.raises(NotFoundError, match="line 2: no two scenes are called 'stairs nowhere'"):
+        read_pairs(site.store, path)
+    path.write_text("stairs\n")
+    with pytest.raises(InputError, match="line 1: a pair is written A B or A:B, got 'stairs'"):
         read_pairs(site.store, path)
 
 
@@ -292,3 +295,50 @@ def test_a_prior_is_answered_without_settings(site: Map) -> None:
     assert (row.scene_name, row.outcome) == ("hall", "not solved yet")
     assert row.to_json()["sigmas"][0] is None
     assert math.isinf(row.sigmas[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("merge.method", "merger"),
+        ("engine.executor", "executor"),
+        ("register.refiner", "refiner"),
+        ("describe.object.segmenter", "segmenter"),
+        ("describe.object.embedder", "embedder"),
+    ],
+)
+def test_a_method_that_does_not_exist_is_refused_when_it_is_set(site: Map, name: str, kind: str) -> None:
+    with pytest.raises(ConfigError, match=f"there is no {kind} 'nope'"):
+        site.change_settings({name: "nope"})
+    assert not (site.store.folder / "settings.toml").exists()
+
+
+def test_a_preset_that_does_not_exist_is_not_blamed_on_the_file(site: Map) -> None:
+    with pytest.raises(ConfigError, match=r"^there is no preset 'napkin'"):
+        site.change_settings(preset="napkin")
+
+
+def test_what_cannot_be_asked_for_changes_nothing(
+    site: Map, tried: list[tuple[str, str]], tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    site.update()
+    with pytest.raises(ConfigError, match="must not be negative, got -1"):
+        site.prune(-1)
+    assert site.revision_rows()[-1].dropped_at is None
+    with pytest.raises(ConfigError, match="use larger tiles"):
+        site.export(tmp_path / "out", tile_size_m=1e-300)
+    with pytest.raises(ConfigError, match=r"choose one of compressed\.ply, glb, ply, splat, spz, 3dtiles"):
+        site.export(tmp_path / "out", format="doc")
+    assert not (tmp_path / "out").exists()
+    for door in (site.confirm, site.show_pair, site.register):
+        with pytest.raises(ConfigError, match="hall with itself is no pair"):
+            door("hall:hall")  # type: ignore[operator]
+    with pytest.raises(ConfigError, match=r"\.png"):
+        site.draw_graph("hall", tmp_path / "hall.doc")
+    assert not list(tmp_path.glob("hall*"))
+    assert [str(warning.message) for warning in recwarn] == []
+
+
+def test_a_date_is_taken_back(site: Map) -> None:
+    assert site.edit("hall", captured_at="2024-05-31").captured_at == "2024-05-31T00:00:00+00:00"
+    assert site.edit("hall", captured_at="none").captured_at is None

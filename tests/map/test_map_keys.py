@@ -234,7 +234,7 @@ def test_another_date_of_a_capture_makes_again_what_depends_on_dates(watched: Wa
     m.edit("capture_a", captured_at="2024-05-31")
     assert watched.todo()["dirty_tiles"] == 1
     assert [row.verb for row in m.status().todo if row.what == "dirty_tiles"] == [
-        f"gsmap export {m.store.folder} {tmp_path / 'tto'}"
+        f"gsmap export {m.store.folder} {tmp_path / 'tto'} --tile-size 0 --merge tto"
     ]
     m.edit("capture_a", name="hall", tags=["spring"])
     assert watched.todo()["dirty_tiles"] == 1

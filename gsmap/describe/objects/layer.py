@@ -77,6 +77,11 @@ class Params:
     context_weight: float = 0.5
     word_sharpness: float = 20.0
 
+    def __post_init__(self) -> None:
+        for kind, name in (("segmenter", self.segmenter), ("embedder", self.embedder)):
+            if name != "auto":
+                family(kind).get(name)
+
 
 @dataclass(frozen=True)
 class Resolved:

@@ -116,21 +116,28 @@ def pair_of(store: Store, pair: str) -> tuple[Scene, Scene]:
 
     Raises:
         NotFoundError: no two scenes are called so.
+        ConfigError: a scene with itself.
     """
     for at in (i for i, character in enumerate(pair) if character == ":"):
         try:
-            return store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :])
+            return _two(store.scenes.get(pair[:at]), store.scenes.get(pair[at + 1 :]))
         except NotFoundError:
             continue
     raise NotFoundError(f"no two scenes are called {pair!r}: write A:B with names that gsmap list MAP scenes shows")
+
+
+def _two(a: Scene, b: Scene) -> tuple[Scene, Scene]:
+    if a.id == b.id:
+        raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
+    return a, b
 
 
 def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
     """Pairs of a text file, one a line: ``A B`` or ``A:B``; ``#`` begins a remark. A name with spaces needs the colon.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: a line that names no two scenes.
+        NotFoundError: no such file, or a line that names a scene which is not there.
+        InputError: a line that is no pair.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -141,13 +148,16 @@ def read_pairs(store: Store, path: Path) -> list[tuple[Scene, Scene]]:
     pairs = []
     for number, line in enumerate(lines, 1):
         text = line.partition("#")[0].strip()
+        if not text:
+            continue
         try:
-            if text:
-                pairs.append(_pair_on(store, text))
+            pairs.append(_pair_on(store, text))
         except NotFoundError as error:
-            raise InputError(
-                f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r} ({error})"
-            ) from error
+            if len(text.split()) != 2 and ":" not in text:
+                raise InputError(
+                    f"{path}, line {number}: a pair is written A B or A:B, got {line.strip()!r}"
+                ) from error
+            raise NotFoundError(f"{path}, line {number}: {error}") from error
     return pairs
 
 
@@ -180,9 +190,7 @@ def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], setting
         named = [(store.scenes.get(a), store.scenes.get(b)) for a, b in pairs]
     chosen: dict[frozenset[str], tuple[str, str]] = {}
     for a, b in named:
-        if a.id == b.id:
-            raise ConfigError(f"{a.name} with itself is no pair: name two scenes")
-        for scene in (a, b):
+        for scene in _two(a, b):
             if scene.id not in graphs:
                 raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
             if scene.id in lacking:
