@@ -24,11 +24,12 @@ def command(
         typer.Option("--lpips", metavar="FILE", help="Also compare images by this LPIPS network, an ONNX file."),
     ] = None,
     max_rre: Annotated[
-        float, typer.Option("--max-rre", metavar="DEG", help="An edge that is turned by more is wrong.")
-    ] = 1.0,
+        float | None, typer.Option("--max-rre", metavar="DEG", help="An edge that is turned by more is wrong; 1 else.")
+    ] = None,
     max_rte: Annotated[
-        float, typer.Option("--max-rte", metavar="M", help="An edge that is off by more, in metres, is wrong.")
-    ] = 0.05,
+        float | None,
+        typer.Option("--max-rte", metavar="M", help="An edge off by more metres is wrong; 0.05 else."),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Compare edges and poses with ground truth (and renders with the captures' own images).

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 
 from gsmap.errors import ConfigError
+from gsmap.evaluate import overlap
 from gsmap.evaluate.calibration import Nees, nees_of_edge, nees_of_pose, nees_rows, relative_covariance
 from gsmap.evaluate.registration import absolute_trajectory_error, pose_error
 from gsmap.types import PoseGraph, Sim3
@@ -35,11 +36,13 @@ class Params:
         max_rre_deg: an edge that is turned by more is wrong,
         max_rte_m: and so is one that puts the source's middle farther off than this, in metres.
         bands: true overlaps at which a band of pairs ends and the next begins.
+        overlap: what the true overlap of a pair is.
     """
 
     max_rre_deg: float = 1.0
     max_rte_m: float = 0.05
     bands: tuple[float, ...] = (0.1, 0.25, 0.5)
+    overlap: overlap.Params = field(default_factory=overlap.Params)
 
     def __post_init__(self) -> None:
         if not (self.max_rre_deg > 0 and self.max_rte_m > 0):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -51,10 +51,14 @@ def poses(store: Store, truth: str | os.PathLike[str], params: Params | None = N
         centroid, centers = scene_centroid(store.scenes.gaussians(scene.id)), store.scenes.cameras(scene.id).centers
         return JudgedScene(scene.id, scene.name, S_scene_world[scene.id], centroid, centers)
 
-    overlaps = true_overlaps(
-        list(S_scene_world), lambda scene: solid_centres(store.scenes.gaussians(scene), S_scene_world[scene])
-    )
+    params = params or Params()
+    solid = partial(_solid, store, S_scene_world, params)
+    overlaps = true_overlaps(list(S_scene_world), solid, params.overlap)
     return judge([judged(s) for s in scenes], reports.edge_rows(store), store.revisions.get(), overlaps, params)
+
+
+def _solid(store: Store, S_scene_world: Mapping[str, Sim3], params: Params, scene: str) -> np.ndarray:
+    return solid_centres(store.scenes.gaussians(scene), S_scene_world[scene], params.overlap)
 
 
 def _read_truth(folder: Path, name: str) -> Sim3 | None:

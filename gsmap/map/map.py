@@ -413,8 +413,8 @@ class Map(AbstractContextManager["Map"]):
         *,
         tiles: str | os.PathLike[str] | None = None,
         lpips: str | os.PathLike[str] | None = None,
-        max_rre_deg: float = 1.0,
-        max_rte_m: float = 0.05,
+        max_rre_deg: float | None = None,
+        max_rte_m: float | None = None,
     ) -> EvaluationReport:
         """``gsmap evaluate MAP``: edges and poses against ground truth, renders against the captures' own images.
 
@@ -423,18 +423,23 @@ class Map(AbstractContextManager["Map"]):
             images: folder of photographs named like the cameras.
             tiles: folder that this map was exported to, to be compared with the photographs, too.
             lpips: an LPIPS network to compare photographs with, too.
-            max_rre_deg, max_rte_m: an edge that is turned or off (at the source's middle) by more is wrong.
+            max_rre_deg, max_rte_m: an edge that is turned or off (at the source's middle) by more is wrong; by default
+                what the settings ``evaluate.*`` say.
 
         Raises:
             ConfigError: tiles or a network without photographs to compare with, or bars that are not positive.
             NotFoundError, InputError: see `gsmap.map.evaluating`.
         """
-        from gsmap.evaluate.judge import Params
         from gsmap.map import evaluating
 
         if images is None and (tiles is not None or lpips is not None):
             raise ConfigError("tiles and LPIPS are of photographs: give the folder of images, too")
-        report = evaluating.poses(self.store, truth, Params(max_rre_deg=max_rre_deg, max_rte_m=max_rte_m))
+        params = self.settings.evaluate
+        if max_rre_deg is not None:
+            params = replace(params, max_rre_deg=max_rre_deg)
+        if max_rte_m is not None:
+            params = replace(params, max_rte_m=max_rte_m)
+        report = evaluating.poses(self.store, truth, params)
         if images is None:
             return report
         rows = evaluating.images(

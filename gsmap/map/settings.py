@@ -9,6 +9,7 @@ from typing import Any
 
 from gsmap import describe, engine, export, merge, optimize, register, retrieve
 from gsmap.errors import ConfigError
+from gsmap.evaluate import judge
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
 
@@ -49,6 +50,7 @@ class Settings:
         optimize: how poses are solved.
         merge: how captures become one.
         export: how tiles are planned and kept.
+        evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
 
@@ -58,6 +60,7 @@ class Settings:
     optimize: optimize.Params = field(default_factory=optimize.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)
+    evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 
 

@@ -44,7 +44,7 @@ ALTERNATIVES: dict[str, Any] = {
 }
 """Another value of a setting that takes only certain words."""
 
-NAMES_NOTHING = ("retrieve.", "export.", "engine.", "merge.method")
+NAMES_NOTHING = ("retrieve.", "export.", "evaluate.", "engine.", "merge.method")
 """Settings that choose work (which pairs, which tiles, where it runs), and change no result."""
 
 
