@@ -7,11 +7,13 @@ Run it after raising the VERSION of a method whose output has changed on purpose
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
 
 def main() -> int:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "contracts"))
     import sketches
 

@@ -30,7 +30,7 @@ PAGE = ROOT / "docs" / "json.md"
 
 HEAD = f"""# What `--json` prints
 
-<!-- Written by tools/make_json_docs.py from gsmap/types/rows.py: change the rows, then run it. -->
+<!-- Written by tools/make_json_docs.py from gsmap/types/rows/: change the rows, then run it. -->
 
 Every verb takes `--json`: one JSON object on stdout, `"schema": {SCHEMA}` first; progress and remarks stay on stderr,
 and the exit code is that of the verb without it. Keys are added as gsmap grows; where one goes or changes its meaning,

@@ -1,0 +1,92 @@
+"""What the map answers: one frozen dataclass for every row and report.
+
+Each is defined once. Its fields are what Python reads and, by the same names, the keys of the JSON that ``--json``
+prints; ``columns`` says which of them a table shows, and under which headings; ``Args:`` says what each means
+(``docs/json.md`` is made from that).
+
+Ids and names go together under the same keys everywhere: ``scene`` and ``scene_name``, ``target`` and ``target_name``,
+``source`` and ``source_name``. Only `SceneRow`, which is the scene, calls them ``id`` and ``name``.
+"""
+
+from gsmap.types.rows.base import SCHEMA, Row
+from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.maps import (
+    CheckReport,
+    ConvertReport,
+    DemoReport,
+    InitReport,
+    MapStatus,
+    MigrateReport,
+    ModelRow,
+    PruneReport,
+    SettingRow,
+    TodoRow,
+    ViewReport,
+)
+from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairRef, PairReport
+from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
+from gsmap.types.rows.scenes import (
+    FactRow,
+    GraphRow,
+    IngestRow,
+    LayerRow,
+    NodeRow,
+    PoseRow,
+    PriorRow,
+    SceneEdgeRow,
+    SceneRef,
+    SceneReport,
+    SceneRow,
+)
+from gsmap.types.rows.truth import (
+    BandRow,
+    ComponentErrorRow,
+    EdgeErrorRow,
+    EvaluationReport,
+    ImageErrorRow,
+    NeesRow,
+    PoseErrorRow,
+)
+
+__all__ = [
+    "SCHEMA",
+    "BandRow",
+    "CheckReport",
+    "ComponentErrorRow",
+    "ConvertReport",
+    "DemoReport",
+    "EdgeErrorRow",
+    "EdgeRow",
+    "EvaluationReport",
+    "ExportReport",
+    "FactRow",
+    "GraphRow",
+    "ImageErrorRow",
+    "IngestRow",
+    "InitReport",
+    "LayerRow",
+    "MapStatus",
+    "MigrateReport",
+    "ModelRow",
+    "NeesRow",
+    "NodeRow",
+    "PairEventRow",
+    "PairRef",
+    "PairReport",
+    "PoseChangeRow",
+    "PoseErrorRow",
+    "PoseRow",
+    "PriorRow",
+    "PruneReport",
+    "RevisionRow",
+    "Row",
+    "SceneEdgeRow",
+    "SceneRef",
+    "SceneReport",
+    "SceneRow",
+    "SettingRow",
+    "TileRow",
+    "TodoRow",
+    "UpdateReport",
+    "ViewReport",
+]

@@ -1,0 +1,49 @@
+"""What all rows and reports can do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gsmap.types.plain import plain
+from gsmap.types.sim3 import Sim3
+
+SCHEMA = 1
+"""The number under ``schema`` in everything that ``--json`` prints; raised when a key goes or changes its meaning."""
+
+
+class Row:
+    """What all rows and reports can do; each is a frozen dataclass, and two are equal where their JSON is."""
+
+    columns: ClassVar[Mapping[str, str]] = {}
+    """The heading of each field (or property) that a table shows, in order."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Every field as JSON can hold it: poses are 4x4 matrices, arrays lists, NaN and infinity null."""
+        return {field.name: _json(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
+
+    def cells(self) -> list[Any]:
+        """The values of a table's line, in the order of ``columns``."""
+        return [getattr(self, name) for name in self.columns]
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and isinstance(other, Row) and self.to_json() == other.to_json()
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _json(value: Any) -> Any:
+    if isinstance(value, Row):
+        return value.to_json()
+    if isinstance(value, Sim3):
+        return _json(value.matrix())
+    if isinstance(value, Mapping):
+        return {str(key): _json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_json(item) for item in value]
+    value = plain(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value

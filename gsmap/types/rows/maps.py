@@ -1,0 +1,255 @@
+"""A map as a whole: what is to do, settings, models, upkeep."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from gsmap.types.rows.base import Row
+from gsmap.types.rows.exports import TileRow
+from gsmap.types.rows.pairs import EdgeRow
+from gsmap.types.rows.scenes import SceneRow
+from gsmap.types.rows.truth import EvaluationReport
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TodoRow(Row):
+    """Something that is stale or wants a person.
+
+    Args:
+        what: ``undescribed`` scenes; ``stale_graphs``, made by other settings or another version; ``unregistered``
+            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews or priors are
+            newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes; ``undecided``
+            edges; ``contradicted_priors``; ``isolated`` scenes.
+        count: how many; 1 for ``unsolved`` and ``stale_poses``.
+        verb: the command that helps.
+        meaning: the same in words.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"count": "count", "meaning": "what", "verb": "helps"}
+
+    what: str
+    count: int
+    verb: str
+    meaning: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapStatus(Row):
+    """What is stale or wants a person, most urgent first.
+
+    Args:
+        todo: what is to be done; empty where all is well.
+        scenes: how many scenes the map has.
+        components: connected components of the newest poses.
+        islands: the same number under an older name.
+        tentative: scenes that rest on edges which no cycle confirms.
+        revision: number of the newest revision; null before the first.
+        metres_per_unit: metres in a unit of the map; null where no scene's scale is known.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "scenes": "scenes",
+        "components": "components",
+        "tentative": "tentative",
+        "revision": "revision",
+        "metres_per_unit": "metres per unit",
+    }
+
+    todo: tuple[TodoRow, ...]
+    scenes: int
+    components: int
+    islands: int
+    tentative: int
+    revision: int | None
+    metres_per_unit: float | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SettingRow(Row):
+    """One setting.
+
+    Args:
+        name: dotted, as ``--set`` takes it.
+        value: what it is in this map.
+        default: what it is where nobody changes it.
+        unit: of the value; empty where it has none.
+        doc: what it means.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "name": "setting",
+        "value": "value",
+        "default": "default",
+        "unit": "unit",
+        "doc": "meaning",
+    }
+
+    name: str
+    value: Any
+    default: Any
+    unit: str
+    doc: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ModelRow(Row):
+    """One ONNX model of the map.
+
+    Args:
+        kind: ``sam-encoder``, ``sam-decoder`` or ``clip``.
+        name: what the map calls it.
+        sha256: of the file.
+        preset: how pixels are scaled for it.
+        path: where the file is.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "kind": "kind",
+        "name": "name",
+        "preset": "preset",
+        "sha256": "sha256",
+        "path": "file",
+    }
+
+    kind: str
+    name: str
+    sha256: str
+    preset: str | None
+    path: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CheckReport(Row):
+    """What reading every byte of the map found.
+
+    Args:
+        ok: whether nothing is wrong.
+        problems: one line each.
+        orphans: folders that an interrupted step left; no harm, `gsmap prune` removes them.
+        num_groups: how many groups of arrays were read.
+        num_bytes: how many bytes were read.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"num_groups": "groups", "num_bytes": "bytes", "ok": "ok"}
+
+    ok: bool
+    problems: tuple[str, ...]
+    orphans: tuple[str, ...]
+    num_groups: int
+    num_bytes: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PruneReport(Row):
+    """What was reclaimed, or would be.
+
+    Args:
+        dry_run: whether nothing was deleted.
+        scene_names: names of removed scenes whose arrays go.
+        revisions: numbers of revisions that can no longer be exported.
+        num_graphs: graphs that go.
+        num_orphans: folders left by interrupted work that go.
+        num_bytes: bytes on disk that this frees.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "num_graphs": "graphs",
+        "num_orphans": "left over",
+        "num_bytes": "bytes",
+    }
+
+    dry_run: bool
+    scene_names: tuple[str, ...]
+    revisions: tuple[int, ...]
+    num_graphs: int
+    num_orphans: int
+    num_bytes: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InitReport(Row):
+    """The map that was made.
+
+    Args:
+        map: its folder.
+        catalog: URL of the database that holds its catalog, without a password; null where the folder holds it.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"map": "map", "catalog": "catalog"}
+
+    map: str
+    catalog: str | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MigrateReport(Row):
+    """The schema of a map.
+
+    Args:
+        map: its folder.
+        before: the schema it had; null where it had none.
+        after: the schema it has now.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"map": "map", "before": "before", "after": "after"}
+
+    map: str
+    before: str | None
+    after: str | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ConvertReport(Row):
+    """The file that was written.
+
+    Args:
+        input: the file read.
+        output: the file written.
+        num_gaussians: how many Gaussians it holds.
+        sh_degree: degree of their spherical harmonics as they were read.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"output": "file", "num_gaussians": "Gaussians", "sh_degree": "SH degree"}
+
+    input: str
+    output: str
+    num_gaussians: int
+    sh_degree: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewReport(Row):
+    """The page that is being served.
+
+    Args:
+        url: where it is, on this machine only.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"url": "page"}
+
+    url: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DemoReport(Row):
+    """What the demo made.
+
+    Args:
+        map: the map's folder.
+        picture: a picture of the map.
+        scenes: the captures.
+        edges: what ties them.
+        tiles: the merged tiles.
+        truth: how close the map comes to the truth.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"map": "map", "picture": "picture"}
+
+    map: str
+    picture: str
+    scenes: tuple[SceneRow, ...]
+    edges: tuple[EdgeRow, ...]
+    tiles: tuple[TileRow, ...]
+    truth: EvaluationReport
