@@ -80,7 +80,9 @@ class Family:
     def _built_in(self) -> dict[str, str]:
         if self.table:
             return dict(self.table)
-        return {name: f"{self.folder}.{name}" for name in _modules_of(self.folder, tuple(sys.path))}
+        spec = importlib.util.find_spec(self.folder)
+        places = tuple((spec.submodule_search_locations if spec else None) or ())
+        return {name: f"{self.folder}.{name}" for name in _modules_in(places)}
 
     def _added(self) -> dict[str, EntryPoint]:
         return {point.name: point for point in _entry_points(self.group, tuple(sys.path))}
@@ -170,10 +172,8 @@ def _is_frozen(params: Any) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _modules_of(folder: str, path: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the methods that a package holds, for a search path: listing takes a while, and nothing changes it."""
-    spec = importlib.util.find_spec(folder)
-    places = (spec.submodule_search_locations if spec else None) or []
+def _modules_in(places: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the methods that lie in the folders of a package: listing takes a while, so once."""
     found = [module.name for module in pkgutil.iter_modules(list(places))]
     return tuple(name for name in found if not name.startswith("_") and name != "base")
 

@@ -266,9 +266,8 @@ def test_no_cameras_no_objects_but_a_note():
 
 @pytest.mark.parametrize("name", ["segmenter", "embedder"])
 def test_back_ends_that_do_not_exist_are_refused(name):
-    params = Params(landmarks=False, object=ObjectParams(**{name: "magic"}))
     with pytest.raises(ConfigError, match="magic"):
-        describe("x", *room(n=500), params)
+        describe("x", *room(n=500), Params(landmarks=False, object=ObjectParams(**{name: "magic"})))
 
 
 @pytest.mark.parametrize("name", ["sam", "clip"])
