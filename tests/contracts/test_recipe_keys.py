@@ -21,7 +21,7 @@ from gsmap.errors import ConfigError
 from gsmap.export import PlannedTile, TileRecipe
 from gsmap.map.settings import PRESETS, Settings, settings_of
 from gsmap.methods import families
-from gsmap.settings import changed, leaves
+from gsmap.settings import changed, leaves, load, parse, save
 from gsmap.types import Sim3
 
 GRAPH, EDGE, POSES = "graph", "edge", "poses"
@@ -172,6 +172,17 @@ def test_every_field_of_every_params_is_reachable() -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_settings(preset: str) -> None:
     assert (settings_of({}, preset) == Settings()) == (preset == "default")
+
+
+def test_none_is_a_word_where_a_method_is_called_so(tmp_path: Path) -> None:
+    """The refiner ``none`` can be chosen from the command line and stays readable in a map's file."""
+    for name in ("register.refiner", "register.coarse_refiner"):
+        path = tmp_path / f"{name}.toml"
+        values = dict([parse(f"{name}=none")])
+        wanted = changed(Settings(), {name: "none"})
+        assert changed(Settings(), values) == wanted
+        save(path, {name: "none"})
+        assert changed(Settings(), load(path)) == wanted
 
 
 def _versions() -> list[Any]:
