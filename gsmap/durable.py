@@ -26,6 +26,11 @@ def sync_file(path: Path) -> None:
         os.close(handle)
 
 
+def write_text_whole(path: Path, text: str) -> None:
+    """Replace a text file (UTF-8) in one step; see `write_whole`."""
+    write_whole(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
+
+
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill a file under a passing name, synchronise it, and put it in its place by one rename.
 

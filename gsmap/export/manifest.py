@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import write_whole
+from gsmap.durable import write_text_whole
 from gsmap.errors import ConfigError, InputError
 from gsmap.types import Sim3, Tile
 from gsmap.types.plain import plain
@@ -102,12 +102,8 @@ class Manifest:
             _entry(name, tile, self.num_bytes.get(tile.path, 0)) for (_, name), tile in sorted(self.tiles.items())
         ]
         text = json.dumps({"version": _VERSION, "map_id": self.map_id, "tiles": entries}, indent=1)
-        write_whole(folder / FILE_NAME, lambda staged: _write(staged, text))
+        write_text_whole(folder / FILE_NAME, text)
         self._saved_at = time.monotonic()
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
 
 
 def _entry(name: str, tile: Tile, num_bytes: int) -> dict[str, object]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import write_whole
+from gsmap.durable import write_text_whole
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import colmap, g2o, nerfstudio, tum
 from gsmap.geometry.transforms import transform_cameras
@@ -47,7 +47,7 @@ def write_poses(store: Store, out: Path, format: str) -> list[Path]:
     if format == "json":
         rows = [row.to_json() for row in reports.pose_rows(store)]
         text = json.dumps({"schema": SCHEMA, "poses": rows}, indent=1)
-        write_whole(out, lambda path: _write(path, text))
+        write_text_whole(out, text)
         return [out]
     components = sorted({pose.component for pose in placed})
     written = []
@@ -98,7 +98,3 @@ def _cameras(store: Store, members: Sequence[ScenePose], scenes: dict[str, Scene
         np.concatenate([cameras.sizes_px for _, cameras in moved]),
         tuple(f"{scenes[pose.scene].name}/{name}" for pose, cameras in moved for name in cameras.names),
     )
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")

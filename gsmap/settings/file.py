@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsmap.durable import write_whole
+from gsmap.durable import write_text_whole
 from gsmap.errors import ConfigError
 from gsmap.types.plain import plain
 
@@ -60,11 +60,7 @@ def save(path: Path, values: Mapping[str, Any], drop: tuple[str, ...] = ()) -> N
         else:
             table[last] = plain(value)
     text = tomlkit.dumps(document)
-    write_whole(path, lambda staged: _write(staged, text))
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    write_text_whole(path, text)
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
