@@ -21,7 +21,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeDecorator, TypeEngine
 
-HEAD = "0002"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0003"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
@@ -200,6 +200,7 @@ revisions = _table(
     Column("note", Text, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("dropped_at", Text),  # prune may reclaim what only this revision names
+    Column("origin", Json),  # {"map": id, "number": n} of a revision that another map solved; null where this one did
 )
 poses = _table(
     "poses",
@@ -280,4 +281,34 @@ tiles = _table(
     Column("sha256", Text, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
+)
+
+# Who is at work on what: the map, a job, another folder. A lease that is not renewed in time is nobody's.
+leases = _table(
+    "leases",
+    Column("what", Text, primary_key=True),
+    Column("token", Text, nullable=False),  # of the one holder; random
+    Column("host", Text, nullable=False),
+    Column("process", Text, nullable=False),  # its number, and what tells it from a later process of that number
+    Column("task", Text, nullable=False),  # the verb, for people
+    Column("since", Text, nullable=False),
+    Column("expires_at", Text, nullable=False),
+)
+
+backups = _table(
+    "backups",
+    Column("number", Integer, primary_key=True),
+    Column("target", Text, nullable=False),  # where it went; no password
+    Column("snapshot", Text, nullable=False),  # its name there
+    Column("created_at", Text, nullable=False),
+    Column("num_bytes", Bytes, nullable=False),  # that it added there
+)
+
+# Scenes that were forgotten on demand: nothing of them is kept but that it happened.
+purges = _table(
+    "purges",
+    Column("number", Integer, primary_key=True),
+    Column("scene", Text, nullable=False),  # its id: a digest
+    Column("receipt", Json, nullable=False),  # what went, and where else it may live
+    Column("created_at", Text, nullable=False),
 )
