@@ -17,6 +17,7 @@ from gsmap.store import catalog as _catalog
 from gsmap.store import integrity, migrate, schema, sqlite
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
+from gsmap.store.copying import empty_catalog
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
@@ -178,16 +179,7 @@ def _is_map(folder: Path) -> bool:
 
 
 def _make_catalog(folder: Path, url: str | None) -> None:
-    if url is None:
-        sqlite.create_file(folder / sqlite.FILE)
-        engine = sqlite.engine(folder / sqlite.FILE, writable=True)
-    else:
-        engine = _catalog.url_engine(url)
-        if migrate.version(engine, folder) is not None:
-            raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
-        (folder / _catalog.URL_FILE).write_text(_catalog.url_without_password(url) + "\n")
-    made = Catalog(folder, engine, writable=True)
-    migrate.upgrade(made)
+    made = empty_catalog(folder, url)
     with made.write() as connection:
         row = {"id": uuid.uuid4().hex, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)
