@@ -59,14 +59,13 @@ def create(
 
 
 def open(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
-    """Open a map; read-only where its folder cannot be written."""
-    mode = "r" if os.path.isdir(path) and not os.access(path, os.W_OK) else "w"
-    return Map(Store.open(path, mode), progress)
+    """Open a map, or a branch or tag of one (``MAP@NAME``); read-only where its folder cannot be written."""
+    return Map(Store.open(path, "w" if Store.can_write(path) else "r"), progress)
 
 
 def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
     """Open a map, making it first where there is none."""
-    return open(path, progress) if os.path.exists(path) else create(path, progress)
+    return open(path, progress) if Store.exists(path) else create(path, progress)
 
 
 def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:

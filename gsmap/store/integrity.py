@@ -60,12 +60,12 @@ class Pruned:
     dry_run: bool = False
 
 
-def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) -> Check:
+def check(catalog: Catalog, arrays: Arrays, home: Path, progress: Progress | None = None) -> Check:
     """Read every byte of the map and compare it with what was written; see `Check`."""
     with catalog.read() as connection:
         named = {row.id: row.kind for row in connection.execute(select(groups).order_by(groups.c.id))}
         manifests = {group: manifest(connection, group) for group in named}
-        problems = _row_problems(connection, catalog.folder)
+        problems = _row_problems(connection, home)
     if catalog.is_sqlite:
         with explained(catalog.folder):
             problems += sqlite.integrity_problems(catalog.engine)
@@ -84,7 +84,9 @@ def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) ->
     return Check(tuple(problems), orphans, len(named), num_bytes)
 
 
-def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
+def prune(
+    catalog: Catalog, arrays: Arrays, home: Path, *, keep_revisions: int | None = None, dry_run: bool = False
+) -> Pruned:
     """Reclaim the arrays of removed scenes that no kept revision names, their graphs, and what crashes left.
 
     Args:
@@ -125,7 +127,7 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
                 connection.execute(delete(groups).where(groups.c.id.in_(ids)))
         # The rows are gone for good: a crash from here on leaves orphans for the next prune.
         with explained(catalog.folder):
-            forgotten = _forgotten_models(catalog)
+            forgotten = _forgotten_models(catalog, home)
             num_bytes += sum(path.stat().st_size for path in forgotten)
             if not dry_run:
                 for group in [*doomed, *orphans]:
@@ -144,7 +146,7 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
     )
 
 
-def _row_problems(connection: Connection, folder: Path) -> list[str]:
+def _row_problems(connection: Connection, home: Path) -> list[str]:
     out = []
     for row in connection.execute(select(scenes).where(scenes.c.removed_at.is_(None))):
         if row.group_id is None:
@@ -154,7 +156,7 @@ def _row_problems(connection: Connection, folder: Path) -> list[str]:
         if boxes != -(-row.num_gaussians // CHUNK_ROWS):
             out.append(f"scene {row.name} has {boxes} chunk boxes, not one for every {CHUNK_ROWS} Gaussians")
     for row in connection.execute(select(models).where(models.c.removed_at.is_(None))):
-        path = folder / row.path if row.copied else Path(row.path)
+        path = home / row.path if row.copied else Path(row.path)
         if not path.is_file():
             out.append(f"model {row.name} is missing: {path}")
             continue
@@ -172,8 +174,8 @@ def _revisions_to_keep(connection: Connection, keep: int | None) -> tuple[list[i
     return numbers[cut:], numbers[:cut]
 
 
-def _forgotten_models(catalog: Catalog) -> list[Path]:
+def _forgotten_models(catalog: Catalog, home: Path) -> list[Path]:
     """Copies of models that no row names any more."""
     with catalog.read() as connection:
         standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
-    return [path for path in sorted((catalog.folder / FOLDER).glob("*")) if f"{FOLDER}/{path.name}" not in standing]
+    return [path for path in sorted((home / FOLDER).glob("*")) if f"{FOLDER}/{path.name}" not in standing]

@@ -46,10 +46,15 @@ class Model:
 
 
 class Models:
-    """The models of a map."""
+    """The models of a map.
 
-    def __init__(self, catalog: Catalog) -> None:
+    Args:
+        home: the folder that holds their copies.
+    """
+
+    def __init__(self, catalog: Catalog, home: Path) -> None:
         self._catalog = catalog
+        self._home = home
 
     def add(
         self,
@@ -80,7 +85,7 @@ class Models:
         row |= {"sha256": sha256, "size_bytes": source.stat().st_size, "options": plain(dict(options or {}))}
         with self._catalog.write() as connection:
             if copy:
-                _copy(source, self._catalog.folder / relative)
+                _copy(source, self._home / relative)
             standing = (models.c.name == name) & models.c.removed_at.is_(None)
             connection.execute(update(models).where(standing).values(removed_at=now()))
             connection.execute(insert(models), row | {"created_at": now()})
@@ -111,7 +116,7 @@ class Models:
             connection.execute(update(models).where(standing).values(removed_at=now()))
 
     def _model(self, row: Row[Any]) -> Model:
-        path = self._catalog.folder / row.path if row.copied else Path(row.path)
+        path = self._home / row.path if row.copied else Path(row.path)
         return Model(
             row.name, row.kind, path, bool(row.copied), row.sha256, row.size_bytes, row.created_at, row.options
         )

@@ -13,9 +13,10 @@ from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
+from gsmap.store import branches, integrity, migrate, schema, sqlite
 from gsmap.store import catalog as _catalog
-from gsmap.store import integrity, migrate, schema, sqlite
 from gsmap.store.arrays import Arrays
+from gsmap.store.branches import Place
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import empty_catalog
 from gsmap.store.exports import Exports
@@ -39,15 +40,25 @@ class Store:
     `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes
     open their own.
 
+    A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
+
+    Args:
+        place: ``home`` is the map's folder, with arrays and models; ``folder`` is where this catalog, its
+            ``settings.toml`` and its writer lock lie: the same, or that of a branch; ``location`` opens it again.
+        catalog: open on the database.
+
     Example::
 
         with Store.create("site.gsmap") as store:
             scene, is_new = store.scenes.add(gaussians, cameras, name="monday")
     """
 
-    def __init__(self, folder: Path, catalog: Catalog) -> None:
-        self.folder = folder
-        self.arrays = Arrays(folder / "arrays")
+    def __init__(self, place: Place, catalog: Catalog) -> None:
+        self.home = place.home
+        self.folder = place.folder
+        self.branch = place.branch
+        self.location = place.location
+        self.arrays = Arrays(place.home / "arrays")
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
         self.recipes = Recipes(catalog)
@@ -55,7 +66,7 @@ class Store:
         self.registrations = Registrations(catalog)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
-        self.models = Models(catalog)
+        self.models = Models(catalog, place.home)
         self.exports = Exports(catalog)
 
     @classmethod
@@ -72,9 +83,9 @@ class Store:
             StoreError: the folder is not empty, or cannot be written.
             NotFoundError: the folder it should lie in does not exist.
         """
-        folder = Path(path).absolute()
+        folder = branches.find(Path(path).absolute()).folder
         if folder.is_dir() and any(folder.iterdir()):
-            is_map = "is a map already" if _is_map(folder) else "is not empty"
+            is_map = "is a map already" if branches.holds_catalog(folder) else "is not empty"
             raise StoreError(f"{path} {is_map}: open it, or choose another name")
         if folder.exists() and not folder.is_dir():
             raise StoreError(f"{path} is a file: a map is a folder; choose another name")
@@ -114,6 +125,21 @@ class Store:
             raise
         return store
 
+    @staticmethod
+    def exists(path: str | os.PathLike[str]) -> bool:
+        """Whether anything lies there, or the branch does that a path names.
+
+        Raises:
+            NotFoundError: the path names a branch that its map lacks.
+        """
+        return branches.find(path).folder.exists()
+
+    @staticmethod
+    def can_write(path: str | os.PathLike[str]) -> bool:
+        """Whether `open` with mode ``w`` makes sense there: not of a read-only folder."""
+        folder = branches.find(path).folder
+        return not folder.is_dir() or os.access(folder, os.W_OK)
+
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
         """Bring an older map to this gsmap's schema; returns the version before and after."""
@@ -125,10 +151,11 @@ class Store:
     def _connect(cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
-        folder = Path(path)
+        place = branches.find(path)
+        folder = place.folder
         if not folder.exists():
             raise NotFoundError(f"no map at {path}: make one with gsmap init {path}")
-        if not _is_map(folder):
+        if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
         if mode == "w" and not os.access(folder, os.W_OK):
@@ -138,7 +165,7 @@ class Store:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        return cls(folder, Catalog(folder, engine, writable=mode == "w"))
+        return cls(place, Catalog(folder, engine, writable=mode == "w"))
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -154,11 +181,11 @@ class Store:
 
     def check(self, progress: Progress | None = None) -> Check:
         """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`."""
-        return integrity.check(self.catalog, self.arrays, progress)
+        return integrity.check(self.catalog, self.arrays, self.home, progress)
 
     def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
         """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
-        return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
+        return integrity.prune(self.catalog, self.arrays, self.home, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def close(self) -> None:
         self.catalog.close()
@@ -170,12 +197,7 @@ class Store:
         self.close()
 
     def __repr__(self) -> str:
-        return f"Store({str(self.folder)!r}, mode={'w' if self.catalog.writable else 'r'!r})"
-
-
-def _is_map(folder: Path) -> bool:
-    has_catalog = (folder / sqlite.FILE).is_file() or (folder / _catalog.URL_FILE).is_file()
-    return has_catalog and (folder / "arrays").is_dir()
+        return f"Store({self.location!r}, mode={'w' if self.catalog.writable else 'r'!r})"
 
 
 def _make_catalog(folder: Path, url: str | None) -> None:

@@ -38,7 +38,7 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     wanted = _wanted(store, pairs, graphs, settings)
     if pairs in ("auto", "all"):
         wanted = _lacking(store, wanted, graphs, recipe)
-    jobs = [(str(store.folder), (a, graphs[a].digest), (b, graphs[b].digest), settings.register) for a, b in wanted]
+    jobs = [(store.location, (a, graphs[a].digest), (b, graphs[b].digest), settings.register) for a, b in wanted]
     names = {scene.id: scene.name for scene in scenes}
     found: dict[int, Registration] = {}
     for i, edge in run_jobs(register_scenes, jobs, settings.engine):
