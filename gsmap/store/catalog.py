@@ -151,6 +151,8 @@ def explained(folder: Path) -> Iterator[None]:
     except GsmapError:
         raise
     except SQLAlchemyError as error:
+        if isinstance(getattr(error, "orig", None), GsmapError):  # a value that a column type refused
+            raise error.orig from None  # type: ignore[attr-defined]
         said = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
         low = said.lower()
         if "locked" in low or "busy" in low:
