@@ -37,6 +37,8 @@ VERBS = (
     "convert",
     "models",
     "evaluate",
+    "branch",
+    "tag",
     "remove",
     "check",
     "prune",

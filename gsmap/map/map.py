@@ -15,11 +15,13 @@ import numpy as np
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
+from gsmap.map import values as as_values
 from gsmap.map.logs import logged
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
+    BranchRow,
     CheckReport,
     EdgeRow,
     EvaluationReport,
@@ -121,7 +123,8 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap settings MAP --set``: change the map's own settings; nothing is written if any makes no sense."""
         from gsmap.map.settings import write_settings
 
-        write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
+        with self.store.catalog.lock():
+            write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
         self.__dict__.pop("settings", None)
 
     def setting_rows(self) -> list[SettingRow]:
@@ -510,6 +513,31 @@ class Map(AbstractContextManager["Map"]):
         """Take a scene out; older revisions keep it."""
         row = reports.scene_row(self.store, self.store.scenes.get(ref))
         self.store.scenes.remove(ref)
+        return row
+
+    def branch(self, name: str) -> BranchRow:
+        """``gsmap branch MAP NAME``: another catalog over the same arrays; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name))
+
+    def tag(self, name: str) -> BranchRow:
+        """``gsmap tag MAP NAME``: the map as it is now, which cannot change; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name, tag=True))
+
+    def branches(self, kind: str | None = None) -> list[BranchRow]:
+        """The map's branches and tags, or those of one kind (``branch``, ``tag``)."""
+        rows = [as_values.branch_row(branch) for branch in self.store.branches.list()]
+        return [row for row in rows if kind in (None, row.kind)]
+
+    def delete_branch(self, name: str, kind: str | None = None) -> BranchRow:
+        """``gsmap branch MAP NAME --delete``: forget a branch or tag; what only it named is reclaimed by `prune`.
+
+        Raises:
+            NotFoundError: none of that kind is called so.
+        """
+        row = as_values.branch_row(self.store.branches.get(name))
+        if kind not in (None, row.kind):
+            raise NotFoundError(f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete")
+        self.store.branches.delete(name)
         return row
 
     def check(self) -> CheckReport:

@@ -14,6 +14,8 @@ import fcntl
 import hashlib
 import os
 import stat
+import threading
+import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_folder
-from gsmap.errors import CorruptError
+from gsmap.errors import BusyError, CorruptError
 from gsmap.store.columns import KINDS, is_digest
 
 CHUNK_ROWS = 16_384
@@ -60,6 +62,7 @@ class Arrays:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.staging = root / "staging"
+        self._held = threading.local()
 
     @contextlib.contextmanager
     def stage(self, arrays: Mapping[str, np.ndarray]) -> Iterator[Staged]:
@@ -73,8 +76,40 @@ class Arrays:
                 with contextlib.suppress(OSError):  # there is nothing where it was published
                     self._remove_staged(folder.name)
 
+    @contextlib.contextmanager
+    def lock(self, patience_s: float = 120.0) -> Iterator[None]:
+        """Held by the one who puts groups into their places, until a committed row names them, or who reclaims them.
+
+        Several catalogs may name these arrays (`gsmap.store.branches`), so that the writer lock of one does not do. Who
+        holds it takes no writer lock of a catalog that others know. Again in the same thread: nothing.
+
+        Raises:
+            BusyError: another process kept it for ``patience_s``.
+        """
+        if getattr(self._held, "depth", 0):
+            yield
+            return
+        handle = os.open(self.root, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            deadline = time.monotonic() + patience_s
+            while True:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() > deadline:
+                        raise BusyError(
+                            f"{self.root}: others have been writing arrays for {patience_s:g} s; try again later"
+                        ) from None
+                    time.sleep(0.01)
+            self._held.depth = 1
+            yield
+        finally:
+            self._held.depth = 0
+            os.close(handle)
+
     def publish(self, staged: Staged, kind: str, name: str) -> None:
-        """Move a staged group into its place; only under the writer lock, and only where no row names that place."""
+        """Move a staged group into its place; only under `lock`, and only where no row names that place."""
         place = self._place(kind, name)
         fresh = not place.parent.exists()
         place.parent.mkdir(parents=True, exist_ok=True)

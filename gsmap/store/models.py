@@ -15,6 +15,7 @@ from sqlalchemy import Row, insert, select, update
 
 from gsmap.durable import open_file, refuse_links, write_whole
 from gsmap.errors import CorruptError, NotFoundError
+from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.columns import is_relative
 from gsmap.store.facts import checked_text
@@ -51,12 +52,13 @@ class Models:
     """The models of a map.
 
     Args:
-        home: the folder that holds their copies.
+        arrays: of the same map; the copies lie beside them, for all its branches.
     """
 
-    def __init__(self, catalog: Catalog, home: Path) -> None:
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
-        self._home = home
+        self._arrays = arrays
+        self._home = arrays.root.parent
 
     def add(
         self,
@@ -86,6 +88,7 @@ class Models:
         row |= {"sha256": sha256, "size_bytes": source.stat().st_size, "options": plain(dict(options or {}))}
         with self._catalog.write() as connection:
             if copy:
+                self._catalog.hold(self._arrays.lock())
                 _copy(source, self._home / relative)
             standing = (models.c.name == name) & models.c.removed_at.is_(None)
             connection.execute(update(models).where(standing).values(removed_at=now()))

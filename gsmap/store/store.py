@@ -7,16 +7,17 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
-from gsmap.store import branches, integrity, migrate, schema, sqlite
+from gsmap.store import branches, integrity, migrate, schema
 from gsmap.store import catalog as _catalog
-from gsmap.store.arrays import Arrays
-from gsmap.store.branches import Place
+from gsmap.store.arrays import Arrays, StoredFile
+from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import empty_catalog
 from gsmap.store.exports import Exports
@@ -36,9 +37,9 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models`` and ``exports``. Every method that changes something is one transaction, durable when it returns;
-    `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes
-    open their own.
+    ``models``, ``exports`` and ``branches``. Every method that changes something is one transaction, durable when it
+    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
+    processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -66,8 +67,9 @@ class Store:
         self.registrations = Registrations(catalog)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
-        self.models = Models(catalog, place.home)
+        self.models = Models(catalog, self.arrays)
         self.exports = Exports(catalog)
+        self.branches = Branches(place, catalog, self.arrays)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
@@ -136,19 +138,24 @@ class Store:
 
     @staticmethod
     def can_write(path: str | os.PathLike[str]) -> bool:
-        """Whether `open` with mode ``w`` makes sense there: not of a read-only folder."""
-        folder = branches.find(path).folder
-        return not folder.is_dir() or os.access(folder, os.W_OK)
+        """Whether `open` with mode ``w`` makes sense there: not of a read-only folder, and not of a tag."""
+        place = branches.find(path)
+        return not place.is_tag and (not place.folder.is_dir() or os.access(place.folder, os.W_OK))
 
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
-        """Bring an older map to this gsmap's schema; returns the version before and after."""
-        store = cls._connect(path, "w", None)
-        with store:
-            return migrate.upgrade(store.catalog)
+        """Bring an older map (and its branches and tags) to this gsmap's schema; the version before and after."""
+        with cls._connect(path, "w", None, even_tags=True) as store:
+            versions = migrate.upgrade(store.catalog)
+        for place in branches.places(store.home) if not store.branch else ():
+            with cls._connect(place.location, "w", None, even_tags=True) as branch:
+                migrate.upgrade(branch.catalog)
+        return versions
 
     @classmethod
-    def _connect(cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None) -> Store:
+    def _connect(
+        cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None, *, even_tags: bool = False
+    ) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
         place = branches.find(path)
@@ -158,6 +165,9 @@ class Store:
         if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
+        refusal = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
+        if mode == "w" and place.is_tag and not even_tags:
+            raise StoreError(refusal)
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
         with _catalog.explained(folder):
@@ -165,7 +175,7 @@ class Store:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        return cls(place, Catalog(folder, engine, writable=mode == "w"))
+        return cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -180,12 +190,30 @@ class Store:
             return str(connection.execute(select(schema.about.c.id)).scalar_one())
 
     def check(self, progress: Progress | None = None) -> Check:
-        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`."""
-        return integrity.check(self.catalog, self.arrays, self.home, progress)
+        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`.
+
+        With the map itself its branches and tags are checked, too; a branch alone where that is what is open.
+        """
+        read: set[tuple[str, tuple[StoredFile, ...]]] = set()
+        found = integrity.check(self.catalog, self.arrays, progress, read=read)
+        for place in branches.places(self.home) if not self.branch else ():
+            try:
+                with Store.open(place.location, "r") as other:
+                    more = integrity.check(other.catalog, other.arrays, progress, read=read)
+            except StoreError as error:
+                more = Check((str(error),), (), 0, 0)
+            problems = tuple(f"{place.branch}: {problem}" for problem in more.problems)
+            found = replace(
+                found,
+                problems=found.problems + problems,
+                num_groups=found.num_groups + more.num_groups,
+                num_bytes=found.num_bytes + more.num_bytes,
+            )
+        return found
 
     def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
         """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
-        return integrity.prune(self.catalog, self.arrays, self.home, keep_revisions=keep_revisions, dry_run=dry_run)
+        return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def close(self) -> None:
         self.catalog.close()

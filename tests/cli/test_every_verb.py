@@ -61,6 +61,8 @@ RUNS = {
     "models add": "models add MAP clip TMP/encoder.onnx --preset unit",
     "models list": "models list MAP",
     "evaluate": "evaluate MAP --truth CAPTURES/truth",
+    "branch": "branch MAP what-if",
+    "tag": "tag MAP v1",
     "remove": "remove MAP odd:one",
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
@@ -68,7 +70,7 @@ RUNS = {
     "view": "view MAP --no-browser",
     "demo": "demo TMP/demo",
 }
-SILENT = {"init", "prior", "convert", "models add", "remove", "check", "migrate", "view"}
+SILENT = {"init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view"}
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""
 
 

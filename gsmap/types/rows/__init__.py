@@ -47,10 +47,12 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
+from gsmap.types.rows.values import BranchRow
 
 __all__ = [
     "SCHEMA",
     "BandRow",
+    "BranchRow",
     "CheckReport",
     "ComponentErrorRow",
     "ConvertReport",
