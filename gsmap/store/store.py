@@ -16,6 +16,7 @@ from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import catalog as _catalog
 from gsmap.store import integrity, migrate, schema, sqlite
 from gsmap.store.arrays import Arrays
+from gsmap.store.backups import Backups
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import empty_catalog
 from gsmap.store.exports import Exports
@@ -35,9 +36,9 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models`` and ``exports``. Every method that changes something is one transaction, durable when it returns;
-    `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes
-    open their own.
+    ``models``, ``exports`` and ``backups``. Every method that changes something is one transaction, durable when it
+    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
+    processes open their own.
 
     Example::
 
@@ -57,6 +58,7 @@ class Store:
         self.priors = Priors(catalog)
         self.models = Models(catalog)
         self.exports = Exports(catalog)
+        self.backups = Backups(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
