@@ -41,6 +41,9 @@ VERBS = (
     "check",
     "prune",
     "migrate",
+    "backup",
+    "restore",
+    "clone",
     "view",
     "demo",
 )

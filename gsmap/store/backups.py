@@ -42,4 +42,6 @@ class Backups:
     def list(self) -> list[StoredBackup]:
         """All, oldest first."""
         with self._catalog.read() as connection:
-            return [StoredBackup(**row) for row in connection.execute(select(backups).order_by(backups.c.number)).mappings()]
+            return [
+                StoredBackup(**row) for row in connection.execute(select(backups).order_by(backups.c.number)).mappings()
+            ]

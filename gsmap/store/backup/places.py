@@ -202,9 +202,9 @@ class FolderPlace:
             raise
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise StoreError(f"{self.url}: the disk is full; make room and run it again: what is there is kept") from (
-                    error
-                )
+                raise StoreError(
+                    f"{self.url}: the disk is full; make room and run it again: what is there is kept"
+                ) from (error)
             if error.errno == errno.ELOOP:
                 raise StoreError(f"{error.filename} is a link: a backup has none; it may lead anywhere") from error
             raise StoreError(f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})") from error
@@ -292,11 +292,13 @@ class ObjectPlace:
         try:
             yield
         except (PermissionDeniedError, UnauthenticatedError) as error:
-            raise _Refused(f"{self.url}: not allowed to {what} ({_first_line(error)}): see AWS_ACCESS_KEY_ID") from error
+            raise _Refused(
+                f"{self.url}: not allowed to {what} ({_first_line(error)}): see AWS_ACCESS_KEY_ID"
+            ) from error
         except (BaseError, OSError) as error:
-            raise _Refused(f"{self.url}: cannot {what} ({_first_line(error)}): see AWS_ENDPOINT_URL, and try again") from (
-                error
-            )
+            raise _Refused(
+                f"{self.url}: cannot {what} ({_first_line(error)}): see AWS_ENDPOINT_URL, and try again"
+            ) from (error)
 
 
 class _Refused(StoreError):

@@ -28,7 +28,6 @@ FORMAT = 1
 MARKER = "gsmap-backup.json"
 OBJECTS = "objects/"
 SNAPSHOTS = "snapshots/"
-_TIME = re.compile(r"\d{8}T\d{6}\.\d{6}")
 _NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-[0-9a-f]{16}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _LINE = re.compile(r"([0-9a-f]{64}) (\d{1,18}) (.+)")
@@ -112,13 +111,15 @@ class Backup:
         except NotFoundError:
             other = place.anything()
             if other is not None:
-                raise StoreError(f"{place.url} holds other things ({other}): give the backup a place of its own") from None
+                raise StoreError(
+                    f"{place.url} holds other things ({other}): give the backup a place of its own"
+                ) from None
             text = json.dumps({"format": FORMAT, "map_id": map_id}, indent=1).encode() + b"\n"
             place.put(MARKER, [text], len(text))
             found = cls.at(place)  # another backup may have begun there at the same moment
         if found.map_id != map_id:
             raise StoreError(
-                f"{place.url} is a backup of another map ({found.map_id}, not {map_id}): give each map a place of its own"
+                f"{place.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place"
             )
         return found
 
@@ -139,7 +140,7 @@ class Backup:
             raise CorruptError(f"{where} is damaged: restore an earlier one, and delete it")
         data = _object(text, where)
         kinds: dict[str, Any] = {"revision": int | None, "counts": dict}
-        kinds |= {key: int for key in ("files_bytes", "num_files", "num_bytes", "num_bytes_new")}
+        kinds |= dict.fromkeys(("files_bytes", "num_files", "num_bytes", "num_bytes_new"), int)
         keys = [key for key in Snapshot.__dataclass_fields__ if key != "name"]
         found = Snapshot(name=name, **{key: _field(data, key, kinds.get(key, str), where) for key in keys})
         counts = all(key.isidentifier() and isinstance(count, int) for key, count in found.counts.items())
@@ -153,11 +154,12 @@ class Backup:
         """All snapshots, oldest first."""
         return [self.snapshot(name) for name in self.names()]
 
-    def find(self, at: str | None = None) -> Snapshot:
-        """A snapshot: the newest one; the last one at or before a time; or one by the beginning of name or digest.
+    def find(self, name: str | None = None, *, at: str | None = None) -> Snapshot:
+        """A snapshot: the newest one, or the one that is asked for.
 
         Args:
-            at: a time as in ``created_at``, a snapshot, or None.
+            name: its name, or six digits or more of the digest at its end.
+            at: the last one at or before this time, ISO 8601 in UTC.
 
         Raises:
             NotFoundError: there is none such.
@@ -165,18 +167,16 @@ class Backup:
         names = self.names()
         if not names:
             raise NotFoundError(f"{self.place.url} has no snapshot yet: a backup was begun there and never finished")
-        if at is None:
-            return self.snapshot(names[-1])
-        named = [name for name in names if name == at or (len(at) >= 4 and at in (name[: len(at)], name[-16:][: len(at)]))]
-        if len(named) == 1:
-            return self.snapshot(named[0])
-        moment = _compact(at)
-        if _TIME.fullmatch(moment):
-            earlier = [name for name in names if name.split("Z-")[0] <= moment]
-            if earlier:
-                return self.snapshot(earlier[-1])
+        if name is not None:
+            found = [one for one in names if name == one or (len(name) >= 6 and one[-16:].startswith(name))]
+            if len(found) != 1:
+                hint = "gsmap backup MAP DEST --list shows what there is"
+                raise NotFoundError(f"{self.place.url} has no snapshot {name!r}, and it is no time either: {hint}")
+            return self.snapshot(found[0])
+        earlier = [one for one in names if at is None or one.split("Z-")[0] <= _compact(at)]
+        if not earlier:
             raise NotFoundError(f"{self.place.url} has no snapshot at or before {at}: the first one is {names[0]}")
-        raise NotFoundError(f"{self.place.url} has no snapshot {at!r}: gsmap backup MAP DEST --list shows what there is")
+        return self.snapshot(earlier[-1])
 
     def files(self, snapshot: Snapshot) -> list[StoredFile]:
         """The files of a snapshot: relative to the map, inside it, each once.

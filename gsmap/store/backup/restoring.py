@@ -23,7 +23,7 @@ from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
-from gsmap.store.backup.states import ARRAYS, BRANCHES, State, Vanished, capture, read_file, read_state
+from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
 from gsmap.store.catalog import Catalog, explained
 from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.store import Store
@@ -71,6 +71,7 @@ def restore(
     place: Place,
     path: str | os.PathLike[str],
     *,
+    snapshot: str | None = None,
     at: str | None = None,
     catalog_url: str | None = None,
     progress: Progress = silent,
@@ -79,7 +80,7 @@ def restore(
 
     Args:
         path: a folder that does not exist.
-        at: see `Backup.find`; the newest snapshot by default.
+        snapshot, at: which one; see `Backup.find`.
         catalog_url: an empty database to keep the catalog in, as in `Store.create`, instead of ``map.sqlite``.
 
     Raises:
@@ -88,20 +89,20 @@ def restore(
         StoreError: there is something at ``path``, or it cannot be written.
     """
     backup = Backup.at(place)
-    snapshot = backup.find(at)
+    chosen = backup.find(snapshot, at=at)
     target = _free(path)
-    files = backup.files(snapshot)
+    files = backup.files(chosen)
     _require_room(target.parent, sum(file.size_bytes for file in files))
     with _staged(target) as folder, contextlib.ExitStack() as undo:
         _fetch_all(backup, files, folder, progress)
-        state = _compared(folder, files, snapshot)
+        state = _compared(folder, files, chosen)
         _settle(folder)
         if catalog_url is not None:
             state = _move_catalog(folder, catalog_url, undo)
         _synchronise(folder)
         _put_in_place(folder, target)
         undo.pop_all()
-    return Restored(target, snapshot, state.schema)
+    return Restored(target, chosen, state.schema)
 
 
 def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> Cloned:
@@ -161,7 +162,7 @@ def _fetch_all(backup: Backup, files: list[StoredFile], folder: Path, progress: 
         try:
             for done, future in enumerate(waiting, 1):
                 future.result()
-                progress(done / len(files), f"restored {done} of {len(files)} files")
+                progress(done / len(files), f"reading, {done} of {len(files)} files")
         except BaseException:
             for future in waiting:
                 future.cancel()
@@ -185,7 +186,7 @@ def _link_all(store: Store, state: State, folder: Path, target: Path, progress: 
         except OSError:  # another disk, or one without links; or it is gone, which `read_file` explains
             _write(place, read_file(store, file, folder))
             copied, num_bytes = copied + 1, num_bytes + file.size_bytes
-        progress(i / len(state.files), f"{i} of {len(state.files)} files")
+        progress(i / len(state.files), f"sharing, {i} of {len(state.files)} files")
     return Cloned(target, uuid.uuid4().hex, linked, copied, num_bytes)
 
 
@@ -239,7 +240,9 @@ def _rename(folder: Path, map_id: str) -> None:
             solved = select(schema.revisions.c.number).where(schema.revisions.c.origin.is_(null()))
             for number in list(connection.execute(solved).scalars()):
                 mine = schema.revisions.c.number == number
-                connection.execute(update(schema.revisions).where(mine).values(origin={"map": before, "number": number}))
+                connection.execute(
+                    update(schema.revisions).where(mine).values(origin={"map": before, "number": number})
+                )
     finally:
         catalog.close()
     (folder / _catalog.LOCK_FILE).unlink(missing_ok=True)

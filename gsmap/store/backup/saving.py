@@ -160,14 +160,14 @@ class _Run:
                 with contextlib.suppress(Vanished):
                     self._send(state, folder)
                     return self._write(state)
-        raise StoreError(
-            f"{self.store.catalog.folder}: others pruned it faster than it could be read; what was sent is kept, run it again"
-        )
+        name = self.store.catalog.folder
+        raise StoreError(f"{name}: others pruned it faster than it could be read; run it again, what was sent is kept")
 
     def verify(self) -> _Found:
-        """Read every object that is there and compare it with its name; hold the lists of all snapshots against them."""
+        """Read every object that is there and compare it with its name, and with what the snapshots need."""
         there = {sha: about for name, about in self.backup.place.list(OBJECTS).items() if (sha := digest_of(name))}
-        damaged, needed = {}, {}
+        damaged: dict[str, str] = {}
+        needed: dict[str, tuple[StoredFile, list[str]]] = {}
 
         def problem(sha256: str) -> str | None:
             file = StoredFile("", there[sha256].size_bytes, sha256)
@@ -180,7 +180,7 @@ class _Run:
 
         with ThreadPoolExecutor(TRANSFERS) as pool:
             for i, (sha256, said) in enumerate(zip(there, pool.map(problem, there), strict=True)):
-                self.progress(i / len(there), f"read {i} of {len(there)} objects")
+                self.progress(i / len(there), f"reading what is there, {i} of {len(there)}")
                 if said is not None:
                     damaged[sha256] = said
         for name in self.backup.names():
@@ -239,7 +239,7 @@ class _Run:
             try:
                 for done, future in enumerate(as_completed(sent), 1):
                     future.result()
-                    self.progress(done / len(sent), f"sent {done} of {len(sent)} files")
+                    self.progress(done / len(sent), f"sending, {done} of {len(sent)} files")
             except BaseException:
                 for future in sent:
                     future.cancel()

@@ -18,10 +18,10 @@ from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import catalog as _catalog
 from gsmap.store import sqlite
 from gsmap.store.arrays import StoredFile
+from gsmap.store.backup.places import CHUNK_BYTES
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.models import FOLDER as MODELS
-from gsmap.store.backup.places import CHUNK_BYTES
 
 if TYPE_CHECKING:
     from gsmap.store.store import Store
@@ -48,7 +48,7 @@ class State:
         schema: of its catalog.
         files: paths relative to the map, with sizes and digests: arrays, models, settings and the catalogs.
         revision: the newest one; None before the first.
-        counts: how many ``scenes`` (living), ``removed`` ones, ``graphs``, ``registrations``, ``revisions``, ``groups``.
+        counts: how many ``scenes`` (``removed`` ones apart), ``groups``, ``graphs``, ``registrations``, ``revisions``.
     """
 
     map_id: str
