@@ -43,6 +43,9 @@ VERBS = (
     "check",
     "prune",
     "migrate",
+    "backup",
+    "restore",
+    "clone",
     "view",
     "demo",
 )

@@ -21,8 +21,10 @@ from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
+    BackupReport,
     BranchRow,
     CheckReport,
+    CloneReport,
     EdgeRow,
     EvaluationReport,
     ExportReport,
@@ -35,10 +37,12 @@ from gsmap.types.rows import (
     PoseRow,
     PriorRow,
     PruneReport,
+    RestoreReport,
     RevisionRow,
     SceneReport,
     SceneRow,
     SettingRow,
+    SnapshotRow,
     TileRow,
     UpdateReport,
 )
@@ -73,6 +77,37 @@ def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None 
 def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
     """Bring an older map to this version's schema; returns the schema before and after."""
     return Store.migrate(path)
+
+
+def restore(
+    target: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    at: str | None = None,
+    progress: StageProgress | None = None,
+    *,
+    catalog_url: str | None = None,
+) -> RestoreReport:
+    """``gsmap restore DEST MAP``: make a map from a backup, whole or not at all; it is the same map, with its id.
+
+    Args:
+        target: the backup: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
+        path: a folder that does not exist.
+        at: the last snapshot at or before this time, or one by the beginning of its name; the newest by default.
+        catalog_url: SQLAlchemy URL of an empty PostgreSQL database to keep the catalog in.
+    """
+    from gsmap.map import backing
+
+    told = logged(progress)
+    return backing.restore(
+        target, path, at=at, catalog_url=catalog_url, progress=lambda f, text: told("restore", f, text)
+    )
+
+
+def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
+    """``gsmap backup MAP DEST --list``: the states in a backup, oldest first."""
+    from gsmap.map import backing
+
+    return backing.snapshots(target)
 
 
 class Map(AbstractContextManager["Map"]):
@@ -547,6 +582,27 @@ class Map(AbstractContextManager["Map"]):
     def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
         """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
         return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
+
+    def backup(self, target: str | os.PathLike[str], *, verify: bool = False, keep: int | None = None) -> BackupReport:
+        """``gsmap backup MAP DEST``: save the map as it is now, while others go on; only what is new is sent.
+
+        Args:
+            target: a folder, ``file:///folder`` or ``s3://bucket/prefix``; of this map alone.
+            verify: read again what is there, and send again what is damaged.
+            keep: delete all but this many of the newest snapshots, and what only they needed.
+        """
+        from gsmap.map import backing
+
+        told = self._progress
+        return backing.save(
+            self.store, target, verify=verify, keep=keep, progress=lambda f, text: told("backup", f, text)
+        )
+
+    def clone(self, path: str | os.PathLike[str]) -> CloneReport:
+        """``gsmap clone MAP NEW``: another map, of its own id, that begins with what this one holds now."""
+        from gsmap.map import backing
+
+        return backing.clone(self.store, path, lambda f, text: self._progress("clone", f, text))
 
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""

@@ -17,6 +17,7 @@ from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import branches, integrity, migrate, schema
 from gsmap.store import catalog as _catalog
 from gsmap.store.arrays import Arrays, StoredFile
+from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import empty_catalog
@@ -37,9 +38,9 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models``, ``exports`` and ``branches``. Every method that changes something is one transaction, durable when it
-    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
-    processes open their own.
+    ``models``, ``exports``, ``branches`` and ``backups``. Every method that changes something is one transaction,
+    durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may
+    share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -70,6 +71,7 @@ class Store:
         self.models = Models(catalog, self.arrays)
         self.exports = Exports(catalog)
         self.branches = Branches(place, catalog, self.arrays)
+        self.backups = Backups(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
