@@ -1,5 +1,7 @@
 """Candidate pairs: true partners are found among many scenes, few others are."""
 
+from dataclasses import replace
+
 import numpy as np
 from retrieve_worlds import layer, walk
 
@@ -20,6 +22,18 @@ def test_true_partners_are_found_among_many_scenes():
     assert len(pairs) < 80 * 5
     assert len(set(pairs)) == len(pairs)
     assert all(a < b for a, b in pairs)
+
+
+def test_any_order_of_scenes_gives_the_same_pairs():
+    rng, params = np.random.default_rng(0), Params(top_k=2, num_spatial=1)
+    graphs = walk(30)
+    graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
+    placed = {graph.scene_id: Placed(0, np.zeros(3), 1.0) for graph in graphs[:9]}
+    first = candidate_pairs(graphs, placed=placed, params=params)
+    for _ in range(5):
+        other = [graphs[k] for k in rng.permutation(len(graphs))]
+        assert candidate_pairs(other, placed=placed, params=params) == first
+    assert all(a < b for a, b in first)
 
 
 def test_only_pairs_of_new_scenes_are_asked_for():
