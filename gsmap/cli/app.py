@@ -41,6 +41,7 @@ VERBS = (
     "check",
     "prune",
     "migrate",
+    "trust",
     "view",
     "demo",
 )

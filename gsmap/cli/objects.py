@@ -64,6 +64,7 @@ OBJECTS: dict[str, Object] = {
     "check": One(rows.CheckReport),
     "prune": One(rows.PruneReport),
     "migrate": One(rows.MigrateReport),
+    "trust": One(rows.TrustReport),
     "view": One(rows.ViewReport),
     "demo": One(rows.DemoReport),
 }

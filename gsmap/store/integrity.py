@@ -12,7 +12,7 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 
 from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, GsmapError
-from gsmap.store import sqlite
+from gsmap.store import sqlite, staging
 from gsmap.store.arrays import CHUNK_ROWS, Arrays
 from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.groups import manifest
@@ -130,12 +130,15 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
         # The rows are gone for good: a crash from here on leaves orphans for the next prune.
         with explained(catalog.folder):
             forgotten = _forgotten_models(catalog)
-            num_bytes += sum(path.stat().st_size for path in forgotten)
+            abandoned = staging.abandoned_files(catalog.folder)
+            num_bytes += sum(path.stat().st_size for path in forgotten) + sum(abandoned.values())
             if not dry_run:
                 for group in [*doomed, *orphans]:
                     arrays.drop(*group)
                 for path in forgotten:
                     remove_file(catalog.folder, FOLDER, path.name)
+                for name in abandoned:
+                    remove_file(catalog.folder, name)
             num_bytes += arrays.drop_leftovers(dry_run=dry_run)
     return Pruned(
         scenes=tuple(row.name for row in dead),

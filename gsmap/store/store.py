@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
-import shutil
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +12,9 @@ from pathlib import Path
 from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
-from gsmap.errors import ConfigError, NotFoundError, StoreError
+from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
 from gsmap.store import catalog as _catalog
-from gsmap.store import integrity, migrate, schema, sqlite
+from gsmap.store import integrity, migrate, schema, sqlite, staging, trust
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
 from gsmap.store.exports import Exports
@@ -28,6 +28,8 @@ from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
+
+_log = logging.getLogger("gsmap.store")
 
 
 class Store:
@@ -65,7 +67,7 @@ class Store:
             path: a folder that does not exist or is empty.
             catalog_url: an SQLAlchemy URL (an empty PostgreSQL database, for many writers) to use instead of
                 ``map.sqlite``. It is remembered in ``catalog.url`` without its password, which the driver then takes
-                from its usual places (``PGPASSWORD``, ``~/.pgpass``).
+                from its usual places (``PGPASSWORD``, ``~/.pgpass``), and this user trusts it from now on.
 
         Raises:
             StoreError: the folder is not empty, or cannot be written.
@@ -79,17 +81,18 @@ class Store:
             raise StoreError(f"{path} is a file: a map is a folder; choose another name")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist")
-        staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
-        try:
-            with _catalog.explained(folder):
-                staged.mkdir()
-                (staged / "arrays").mkdir()
-                _make_catalog(staged, catalog_url)
-                sync_folder(staged)
-                os.rename(staged, folder)
-                sync_folder(folder.parent)
-        finally:
-            shutil.rmtree(staged, ignore_errors=True)
+        remembered: trust.Remembered | None = None
+        with _catalog.explained(folder), staging.beside(folder) as staged:
+            (staged / "arrays").mkdir()
+            remembered = _make_catalog(staged, catalog_url)
+            sync_folder(staged)
+            os.rename(staged, folder)
+            sync_folder(folder.parent)
+        if remembered is not None and remembered.map_id is not None:
+            try:
+                trust.trust(remembered.map_id, remembered.url)
+            except StoreError as error:  # the map is made; it is opened by naming its catalog again
+                _log.warning("%s", error)
         return cls.open(path, "w", catalog_url=catalog_url)
 
     @classmethod
@@ -98,16 +101,20 @@ class Store:
 
         Args:
             mode: ``r`` to read only (works on a read-only disk), ``w`` to change it too.
-            catalog_url: in place of the remembered one.
+            catalog_url: in place of the remembered one, which is used only where the user trusts it
+                (`gsmap.store.trust`).
 
         Raises:
             NotFoundError: no such folder.
-            StoreError: not a map, or not writable.
+            StoreError: not a map, not writable, or its catalog lies on a server that the user has not trusted.
+            CorruptError: it holds links or other things that gsmap never puts there, or another map's catalog.
             SchemaVersionError: written by a newer gsmap, or an older one (``gsmap migrate``).
         """
         store = cls._connect(path, mode, catalog_url)
         try:
             migrate.require_current(store.catalog.engine, store.folder)
+            if not store.catalog.is_sqlite:
+                store._check_id()
         except BaseException:
             store.close()
             raise
@@ -130,6 +137,7 @@ class Store:
         if not _is_map(folder):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
+        _refuse_strange_entries(folder)
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
         with _catalog.explained(folder):
@@ -150,6 +158,15 @@ class Store:
         """The map's own random id."""
         with self.catalog.read() as connection:
             return str(connection.execute(select(schema.about.c.id)).scalar_one())
+
+    def _check_id(self) -> None:
+        """Refuse a database that holds another map than the folder says."""
+        known = trust.remembered(self.folder).map_id if (self.folder / trust.URL_FILE).exists() else None
+        if known is not None and known != self.id:
+            raise CorruptError(
+                f"{self.folder} belongs to map {known[:12]}, but the database named for it holds map {self.id[:12]}: "
+                f"name the right one in {trust.ENVIRONMENT}"
+            )
 
     def check(self, progress: Progress | None = None) -> Check:
         """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`."""
@@ -173,11 +190,28 @@ class Store:
 
 
 def _is_map(folder: Path) -> bool:
-    has_catalog = (folder / sqlite.FILE).is_file() or (folder / _catalog.URL_FILE).is_file()
+    has_catalog = (folder / sqlite.FILE).is_file() or (folder / trust.URL_FILE).is_file()
     return has_catalog and (folder / "arrays").is_dir()
 
 
-def _make_catalog(folder: Path, url: str | None) -> None:
+def _refuse_strange_entries(folder: Path) -> None:
+    """Refuse a map with a link in it, which could make gsmap read or write elsewhere, or with a pipe or a device.
+
+    The folder itself may be a link. What lies deeper is looked at where it is used.
+    """
+    with _catalog.explained(folder), os.scandir(folder) as entries:
+        for entry in entries:
+            if not (entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)):
+                what = "a link" if entry.is_symlink() else "a pipe or a device"
+                raise CorruptError(
+                    f"{entry.path} is {what}: gsmap makes none in a map; put what belongs there in its place"
+                )
+    sqlite.refuse_super_journal(folder / sqlite.FILE)
+
+
+def _make_catalog(folder: Path, url: str | None) -> trust.Remembered | None:
+    map_id = uuid.uuid4().hex
+    remembered: trust.Remembered | None = None
     if url is None:
         sqlite.create_file(folder / sqlite.FILE)
         engine = sqlite.engine(folder / sqlite.FILE, writable=True)
@@ -185,10 +219,12 @@ def _make_catalog(folder: Path, url: str | None) -> None:
         engine = _catalog.url_engine(url)
         if migrate.version(engine, folder) is not None:
             raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
-        (folder / _catalog.URL_FILE).write_text(_catalog.url_without_password(url) + "\n")
+        remembered = trust.Remembered(_catalog.url_without_password(url), map_id)
+        trust.write(folder, remembered.url, map_id)
     made = Catalog(folder, engine, writable=True)
     migrate.upgrade(made)
     with made.write() as connection:
-        row = {"id": uuid.uuid4().hex, "created_at": _catalog.now(), "gsmap_version": __version__}
+        row = {"id": map_id, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)
     made.close()
+    return remembered

@@ -38,6 +38,7 @@ from gsmap.types.rows.scenes import (
     SceneReport,
     SceneRow,
 )
+from gsmap.types.rows.trust import TrustReport
 from gsmap.types.rows.truth import (
     BandRow,
     ComponentErrorRow,
@@ -87,6 +88,7 @@ __all__ = [
     "SettingRow",
     "TileRow",
     "TodoRow",
+    "TrustReport",
     "UpdateReport",
     "ViewReport",
 ]
