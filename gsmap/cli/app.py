@@ -46,6 +46,7 @@ VERBS = (
     "backup",
     "restore",
     "clone",
+    "trust",
     "view",
     "demo",
 )

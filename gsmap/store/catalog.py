@@ -14,12 +14,18 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DBAPIError,
+    MultipleResultsFound,
+    NoResultFound,
+    NoSuchModuleError,
+    SQLAlchemyError,
+)
 
 from gsmap.errors import BusyError, ConfigError, CorruptError, GsmapError, MissingDependencyError, StoreError
-from gsmap.store import sqlite
+from gsmap.store import sqlite, trust
 
-URL_FILE = "catalog.url"
 LOCK_FILE = "lock"
 
 
@@ -97,7 +103,7 @@ class Catalog:
             yield
             return
         try:
-            handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         except OSError as error:
             raise StoreError(f"cannot write to {self.folder}: {error.strerror}") from error
         try:
@@ -132,14 +138,19 @@ class Catalog:
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:
-    """The engine of a map: its own ``map.sqlite``, or what ``catalog.url`` names."""
+    """The engine of a map: its own ``map.sqlite``, or what ``catalog.url`` names if the user trusts that."""
     if (folder / sqlite.FILE).is_file():
         return sqlite.engine(folder / sqlite.FILE, writable=writable)
-    return url_engine((folder / URL_FILE).read_text().strip())
+    return url_engine(trust.named_url(folder))
 
 
 def url_engine(url: str) -> Engine:
+    """The engine of a catalog on a server that the user named or trusts; nothing is connected to yet."""
     try:
+        if make_url(url).get_backend_name() != "postgresql":
+            raise ConfigError(
+                f"{url_without_password(url)!r} is not a PostgreSQL database URL (postgresql+psycopg://...)"
+            )
         return create_engine(url, pool_pre_ping=True)
     except (ArgumentError, NoSuchModuleError) as error:
         raise ConfigError(f"{url!r} is not a database URL that SQLAlchemy knows: {error}") from error
@@ -149,7 +160,8 @@ def url_engine(url: str) -> Engine:
 
 def url_without_password(url: str) -> str:
     """What may lie in a file: the password comes from the driver's own places (``PGPASSWORD``, ``~/.pgpass``)."""
-    return make_url(url)._replace(password=None).render_as_string(hide_password=False)
+    known = make_url(url).difference_update_query(["password"])._replace(password=None)
+    return known.render_as_string(hide_password=False)
 
 
 @contextlib.contextmanager
@@ -162,6 +174,10 @@ def explained(folder: Path) -> Iterator[None]:
     except SQLAlchemyError as error:
         if isinstance(getattr(error, "orig", None), GsmapError):  # a value that a column type refused
             raise error.orig from None  # type: ignore[attr-defined]
+        if isinstance(error, (NoResultFound, MultipleResultsFound)):
+            raise CorruptError(
+                f"{folder}: the catalog lacks a row, or has it twice: restore it from a backup"
+            ) from error
         said = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
         low = said.lower()
         if "locked" in low or "busy" in low:

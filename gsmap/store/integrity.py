@@ -12,7 +12,7 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 
 from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, GsmapError, StoreError
-from gsmap.store import sqlite
+from gsmap.store import sqlite, staging
 from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
 from gsmap.store.catalog import Catalog, explained, now
@@ -157,12 +157,15 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
             named_still = (known - set(doomed) if dry_run else known) | others.groups()
             bodies = [group for group in arrays.groups() if group not in named_still]
             num_bytes = sum(arrays.size_bytes(*group) for group in bodies)
-            num_bytes += sum(path.stat().st_size for path in forgotten)
+            abandoned = staging.abandoned_files(catalog.folder)
+            num_bytes += sum(path.stat().st_size for path in forgotten) + sum(abandoned.values())
             if not dry_run:
                 for group in bodies:
                     arrays.drop(*group)
                 for path in forgotten:
                     remove_file(arrays.root.parent, FOLDER, path.name)
+                for name in abandoned:
+                    remove_file(catalog.folder, name)
                 bury_leftovers(arrays.root.parent)
             num_bytes += arrays.drop_leftovers(dry_run=dry_run)
     return Pruned(

@@ -11,11 +11,13 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, PoolProxiedConnection, create_engine, event
 
-from gsmap.errors import StoreError
+from gsmap.durable import open_file
+from gsmap.errors import CorruptError, StoreError
 
 FILE = "map.sqlite"
 DIGEST_FILE = "map.sqlite.sha256"
 CHECKPOINT_BYTES = 4 << 20
+_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")  # ends a journal that names a super-journal
 
 
 def engine(file: Path, *, writable: bool) -> Engine:
@@ -53,6 +55,22 @@ def create_file(file: Path) -> None:
     connection = sqlite3.connect(file)
     connection.execute("PRAGMA journal_mode = WAL")
     connection.close()
+
+
+def refuse_super_journal(file: Path) -> None:
+    """Refuse a rollback journal that names a super-journal: SQLite would delete the file that it names.
+
+    gsmap's databases are in WAL mode and never attached to one another, so it is not of its making.
+    """
+    journal = file.with_name(f"{file.name}-journal")
+    try:
+        with open(open_file(journal), "rb") as opened:
+            opened.seek(-min(len(_JOURNAL_MAGIC), journal.stat().st_size), os.SEEK_END)
+            ends = opened.read()
+    except FileNotFoundError:
+        return
+    if ends == _JOURNAL_MAGIC:
+        raise CorruptError(f"{journal} names another file for SQLite to delete: gsmap writes no such thing; remove it")
 
 
 def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
