@@ -23,7 +23,7 @@ from sqlalchemy.exc import ArgumentError
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store.columns import is_digest
-from gsmap.types.texts import control_characters
+from gsmap.texts import control_characters
 
 _log = logging.getLogger("gsmap.store")
 

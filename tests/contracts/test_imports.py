@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = {"gsmap": ROOT / "gsmap", "gsmap_synthetic": ROOT / "synthetic" / "gsmap_synthetic"}
 
 LAYERS = [
-    {"version", "errors"},
+    {"version", "errors", "texts"},
     {"durable"},
     {"types"},
     {"geometry"},
