@@ -12,7 +12,8 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 from gsmap.errors import ConfigError
 from gsmap.store import sqlite
 from gsmap.store.arrays import CHUNK_ROWS, Arrays
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
 from gsmap.store.models import FOLDER
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes

@@ -15,7 +15,8 @@ from sqlalchemy import Row, insert, select, update
 
 from gsmap.durable import write_whole
 from gsmap.errors import InputError, NotFoundError
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.schema import models
 from gsmap.types.plain import plain
 
@@ -120,7 +121,7 @@ class Models:
 def _copy(source: Path, target: Path) -> None:
     """Copy a file durably; it appears whole or not at all."""
     target.parent.mkdir(exist_ok=True)
-    with explained(target.parent):
+    with explained(target.parent, NOT_KEPT):
         write_whole(target, partial(_fill, source))
 
 

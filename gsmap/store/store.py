@@ -17,6 +17,7 @@ from gsmap.store import catalog as _catalog
 from gsmap.store import integrity, migrate, schema, sqlite
 from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog
+from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
@@ -81,7 +82,7 @@ class Store:
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist")
         staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
         try:
-            with _catalog.explained(folder):
+            with explained(folder, "no map was made"):
                 staged.mkdir()
                 (staged / "arrays").mkdir()
                 _make_catalog(staged, catalog_url)
@@ -132,7 +133,7 @@ class Store:
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
-        with _catalog.explained(folder):
+        with explained(folder):
             if catalog_url is not None:
                 engine = _catalog.url_engine(catalog_url)
             else:
