@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sqlalchemy import Connection, Engine, create_engine
+from sqlalchemy import Connection, Engine, RootTransaction, create_engine
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
@@ -75,7 +75,7 @@ class Catalog:
                         self._held.connection = connection
                         yield connection
                         with explained(self.folder, NOT_KEPT, committing=True):
-                            transaction.commit()
+                            commit(connection, transaction)
                 finally:
                     self._held.connection = None
             self._fold(at_bytes=sqlite.CHECKPOINT_BYTES)
@@ -133,6 +133,15 @@ class Catalog:
                 sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
         except StoreError as error:
             _log.warning("what was written is kept, but not yet folded into map.sqlite: %s", error)
+
+
+def commit(connection: Connection, transaction: RootTransaction) -> None:
+    """Commit, or leave nothing open: a connection that could not commit is not used again."""
+    try:
+        transaction.commit()
+    except BaseException:
+        connection.invalidate()
+        raise
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, Engine, inspect, text
 
 from gsmap.errors import CorruptError, SchemaVersionError, StoreError
 from gsmap.store import schema, sqlite
-from gsmap.store.catalog import Catalog
+from gsmap.store.catalog import Catalog, commit
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.version import __version__
 
@@ -73,9 +73,9 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
                     if catalog.is_sqlite and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
                         raise StoreError(f"{catalog.folder}: the migration would break references: it was not kept")
                     with explained(catalog.folder, NOT_KEPT, committing=True):
-                        transaction.commit()
+                        commit(connection, transaction)
             finally:
-                if catalog.is_sqlite:
+                if catalog.is_sqlite and not connection.invalidated:
                     _driver(connection).execute("PRAGMA foreign_keys = ON")
     return before, version(catalog.engine, catalog.folder)
 
