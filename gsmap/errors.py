@@ -9,12 +9,17 @@
     ├── StoreError                         the map on disk
     │   ├── CorruptError                   bytes differ from what was written
     │   ├── SchemaVersionError             the map was made by another version of gsmap
-    │   └── BusyError                      another process holds the map
+    │   ├── BusyError                      another process holds the map
+    │   ├── DiskFullError                  the disk, or a quota, is used up
+    │   ├── ReadOnlyError                  the disk or the folder cannot be written
+    │   └── DiskError                      the disk failed: an I/O error
     └── MissingDependencyError (ImportError)   an optional package is not installed
 
-A message says what is wrong, where, and what to do, in one line. "No overlap", "ambiguous" and "not enough nodes" are
-results with a status and a reason, never errors.
+`of_system` tells which of them an error of the operating system is. A message says what is wrong, where, and what to
+do, in one line. "No overlap", "ambiguous" and "not enough nodes" are results with a status and a reason, never errors.
 """
+
+import errno
 
 
 class GsmapError(Exception):
@@ -49,5 +54,26 @@ class BusyError(StoreError):
     """Another process holds the map."""
 
 
+class DiskFullError(StoreError):
+    """The disk, or a quota on it, is used up."""
+
+
+class ReadOnlyError(StoreError):
+    """The disk or the folder cannot be written."""
+
+
+class DiskError(StoreError):
+    """The disk failed: an I/O error."""
+
+
 class MissingDependencyError(GsmapError, ImportError):
     """An optional package is not installed."""
+
+
+def of_system(error: OSError) -> type[StoreError]:
+    """Which error of ours an error of the operating system is, by its code."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DiskFullError
+    if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+        return ReadOnlyError
+    return DiskError if error.errno == errno.EIO else StoreError

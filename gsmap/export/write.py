@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmap import formats
 from gsmap.durable import refuse_links, remove_empty_folder, remove_file, remove_tree, sync_folder
-from gsmap.errors import GsmapError, StoreError
+from gsmap.errors import GsmapError, of_system
 from gsmap.export.manifest import Manifest
 from gsmap.export.plan import Params, PlannedTile
 from gsmap.export.recipe import TileRecipe, dirty_reason
@@ -75,8 +75,8 @@ def export_tiles(
 
     Raises:
         ConfigError: the folder belongs to another map or holds other files.
-        StoreError: the folder cannot be written (read-only, full).
         CorruptError: a link lies in it where a folder of tiles belongs: it would lead elsewhere.
+        DiskFullError, ReadOnlyError, DiskError, StoreError: the folder cannot be written.
     """
     params = params or Params()
     out = Path(out)
@@ -114,7 +114,7 @@ def export_tiles(
         with suppress(OSError):
             manifest.save(out)
         if isinstance(error, OSError):
-            raise StoreError(
+            raise of_system(error)(
                 f"cannot write the export to {out}: {error.strerror or error}; finished tiles are kept, "
                 "run the same export again to go on"
             ) from error

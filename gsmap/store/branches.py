@@ -23,7 +23,8 @@ from gsmap.durable import sync_file, sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
-from gsmap.store.catalog import Catalog, explained, now, open_engine
+from gsmap.store.catalog import Catalog, now, open_engine
+from gsmap.store.explained import explained
 from gsmap.store.schema import about, exports, files, groups, leases, models, revisions, scenes, tiles
 
 FOLDER = "branches"

@@ -12,7 +12,8 @@ from sqlalchemy.types import TypeDecorator
 from gsmap.errors import StoreError
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, trust
-from gsmap.store.catalog import Catalog, explained
+from gsmap.store.catalog import Catalog
+from gsmap.store.explained import explained
 from gsmap.store.schema import CHUNK_BOXES
 
 BATCH_ROWS = 2000  # rows in memory at a time; poses with covariances are some kilobytes each

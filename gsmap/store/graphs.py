@@ -12,7 +12,8 @@ from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import has_group, manifest, publish
 from gsmap.store.matrices import from_array, to_array
 from gsmap.store.scenes import resolve
@@ -82,7 +83,7 @@ class Graphs:
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
         staging = self._arrays.stage(arrays)
-        with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             old = connection.execute(select(graphs).where(mine)).first()
             if old is not None and old.group_id == group_id:
                 return _stored(old)

@@ -15,7 +15,8 @@ from gsmap.errors import ConfigError, GsmapError, StoreError
 from gsmap.store import sqlite, staging
 from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes

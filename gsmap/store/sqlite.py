@@ -91,6 +91,22 @@ def integrity_problems(engine: Engine) -> list[str]:
     return out + [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in _raw(engine, "PRAGMA foreign_key_check")]
 
 
+def damage(file: Path) -> list[str]:
+    """What SQLite finds wrong with a file when it looks at all of its structure; empty also where it cannot look."""
+    if not file.is_file():
+        return [f"{file} is missing"]
+    try:
+        connection = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
+        try:
+            rows = [str(row[0]) for row in connection.execute("PRAGMA quick_check(10)")]
+        finally:
+            connection.close()
+    except sqlite3.Error as error:
+        corrupt = getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+        return [str(error)] if corrupt else []
+    return [] if rows == ["ok"] else rows
+
+
 def digest_problems(file: Path) -> list[str]:
     """Whether the file still has the bytes of the last `checkpoint`; nothing is known of one touched since then.
 

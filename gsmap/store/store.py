@@ -20,6 +20,7 @@ from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import empty_catalog
+from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
@@ -94,7 +95,7 @@ class Store:
             raise StoreError(f"{path} is a file: a map is a folder; choose another name")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist")
-        with _catalog.explained(folder), staging.beside(folder) as staged:
+        with explained(folder, "no map was made"), staging.beside(folder) as staged:
             (staged / "arrays").mkdir()
             _make_catalog(staged, catalog_url)
             sync_folder(staged)
@@ -174,7 +175,7 @@ class Store:
             raise StoreError(refusal)
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
-        with _catalog.explained(folder):
+        with explained(folder):
             if catalog_url is not None:
                 engine = _catalog.url_engine(catalog_url)
             else:
@@ -246,7 +247,7 @@ def _refuse_strange_entries(folder: Path) -> None:
 
     The folder itself may be a link. What lies deeper is looked at where it is used.
     """
-    with _catalog.explained(folder), os.scandir(folder) as entries:
+    with explained(folder), os.scandir(folder) as entries:
         for entry in entries:
             if not (entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)):
                 what = "a link" if entry.is_symlink() else "a pipe or a device"

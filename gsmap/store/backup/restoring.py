@@ -24,8 +24,9 @@ from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
 from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
-from gsmap.store.catalog import Catalog, explained
+from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
+from gsmap.store.explained import explained
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
