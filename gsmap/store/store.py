@@ -20,6 +20,7 @@ from gsmap.store.catalog import Catalog
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
+from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.priors import Priors
 from gsmap.store.recipes import Recipes
@@ -34,9 +35,9 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models`` and ``exports``. Every method that changes something is one transaction, durable when it returns;
-    `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes
-    open their own.
+    ``models``, ``exports`` and ``leases``. Every method that changes something is one transaction, durable when it
+    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
+    processes open their own.
 
     Example::
 
@@ -56,6 +57,7 @@ class Store:
         self.priors = Priors(catalog)
         self.models = Models(catalog)
         self.exports = Exports(catalog)
+        self.leases = Leases(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
@@ -160,6 +162,7 @@ class Store:
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def close(self) -> None:
+        self.leases.close()
         self.catalog.close()
 
     def __enter__(self) -> Store:
