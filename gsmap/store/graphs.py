@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -123,6 +124,11 @@ class Graphs:
             }
             layers[name] = NodeLayer(**own, **layer["rest"])
         return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
+
+    def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
+        """Those of the keys (as digests) that a graph is kept under."""
+        with self._catalog.read() as connection:
+            return recipes.kept(connection, graphs.c.key, keys)
 
     def list(self) -> list[StoredGraph]:
         """The graphs of all living scenes, oldest first."""

@@ -24,6 +24,7 @@ from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
+from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.priors import Priors
 from gsmap.store.recipes import Recipes
@@ -38,8 +39,8 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models``, ``exports``, ``branches`` and ``backups``. Every method that changes something is one transaction,
-    durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may
+    ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that changes something is one
+    transaction, durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may
     share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
@@ -72,6 +73,7 @@ class Store:
         self.exports = Exports(catalog)
         self.branches = Branches(place, catalog, self.arrays)
         self.backups = Backups(catalog)
+        self.leases = Leases(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
@@ -230,6 +232,7 @@ class Store:
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def close(self) -> None:
+        self.leases.close()
         self.catalog.close()
 
     def __enter__(self) -> Store:
