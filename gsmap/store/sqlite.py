@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sqlite3
@@ -13,6 +12,7 @@ from sqlalchemy import Connection, Engine, PoolProxiedConnection, create_engine,
 
 from gsmap.durable import open_file
 from gsmap.errors import CorruptError, StoreError
+from gsmap.store import held
 
 FILE = "map.sqlite"
 DIGEST_FILE = "map.sqlite.sha256"
@@ -117,8 +117,7 @@ def digest_problems(file: Path) -> list[str]:
         noted = json.loads(file.with_name(DIGEST_FILE).read_text())
         if not _same_stamp(file, noted):
             return []
-        with open(file, "rb") as opened:
-            found = hashlib.file_digest(opened, "sha256").hexdigest()
+        found = held.sha256(file)
         return (
             []
             if found == noted["sha256"] or not _same_stamp(file, noted)
@@ -156,9 +155,7 @@ def _driver(connection: PoolProxiedConnection) -> Any:
 
 def _note_digest(file: Path) -> None:
     before = file.stat()
-    with open(file, "rb") as opened:
-        sha256 = hashlib.file_digest(opened, "sha256").hexdigest()
-    note = {"sha256": sha256, "size_bytes": before.st_size, "mtime_ns": before.st_mtime_ns}
+    note = {"sha256": held.sha256(file), "size_bytes": before.st_size, "mtime_ns": before.st_mtime_ns}
     staged = file.with_name(f".{DIGEST_FILE}")
     staged.write_text(json.dumps(note))
     os.replace(staged, file.with_name(DIGEST_FILE))

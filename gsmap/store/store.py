@@ -40,8 +40,8 @@ class Store:
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
     ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that changes something is one
-    transaction, durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may
-    share a store; processes open their own.
+    transaction, durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole.
+    Threads may share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
