@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.durable import write_text_whole
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.types import Sim3, Tile
 from gsmap.types.plain import plain
 
@@ -58,13 +58,13 @@ class Manifest:
             return cls(map_id)
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            version, owner = content["version"], content["map_id"]
+            version, owner = content["version"], str(content["map_id"])
             if version not in (_NAMELESS, _VERSION):
                 raise ConfigError(
                     f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
             raise InputError(f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder") from error
@@ -88,7 +88,7 @@ class Manifest:
             return True
         try:
             return (folder / tile.path).stat().st_size == self.num_bytes[tile.path]
-        except OSError:
+        except (OSError, ValueError):
             return False
 
     def save_sometimes(self, folder: Path) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.durable import write_whole
+from gsmap.errors import MALFORMED
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
 from gsmap.types import Gaussians, Tile
@@ -126,7 +127,7 @@ def _known_boxes(folder: Path) -> dict[str, tuple[np.ndarray, float]]:
 
     try:
         walk(json.loads((folder / FILE_NAME).read_text())["root"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, *MALFORMED):
         return {}  # none yet, or not ours: everything is read again
     return known
 
