@@ -21,9 +21,24 @@ do, in one line. "No overlap", "ambiguous" and "not enough nodes" are results wi
 
 import errno
 
+MALFORMED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
+"""What Python raises where parsed JSON or TOML is damaged, nested without end or of another shape than expected."""
+
+_MAX_MESSAGE = 1000  # characters; beyond it a message quotes what somebody put into a file
+
 
 class GsmapError(Exception):
-    """Root of every error that gsmap raises on purpose."""
+    """Root of every error that gsmap raises on purpose; its message is one printable line, whatever it quotes."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(_one_line(arg) if isinstance(arg, str) else arg for arg in args))
+
+
+def _one_line(text: str) -> str:
+    """The text without control characters, and without its middle where it is long: what to do stands at its end."""
+    if not text.isprintable():
+        text = " ".join("".join(c if c.isprintable() or c.isspace() else "?" for c in text).split())
+    return text if len(text) <= _MAX_MESSAGE else f"{text[:600]} ... {text[605 - _MAX_MESSAGE :]}"
 
 
 class InputError(GsmapError, ValueError):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.durable import is_file, open_file, write_text_whole
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.texts import control_characters
 from gsmap.types import Sim3, Tile
 from gsmap.types.plain import plain
@@ -62,13 +62,13 @@ class Manifest:
             return cls(map_id)
         try:
             content = json.loads(_text(path))
-            version, owner = content["version"], content["map_id"]
+            version, owner = content["version"], str(content["map_id"])
             if version not in (_NAMELESS, _VERSION):
                 raise ConfigError(
                     f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
             raise InputError(f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder") from error
@@ -91,7 +91,10 @@ class Manifest:
         if not tile.path:
             return True
         path = folder / tile.path
-        return is_file(path) and path.lstat().st_size == self.num_bytes[tile.path]
+        try:
+            return is_file(path) and path.lstat().st_size == self.num_bytes[tile.path]
+        except (OSError, ValueError):
+            return False
 
     def save_sometimes(self, folder: Path) -> None:
         """Save, unless that was done a moment ago: an interrupted export loses seconds, a large one does not crawl."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.durable import is_file, open_file, refuse_links, remove_file, write_whole
-from gsmap.errors import CorruptError
+from gsmap.errors import MALFORMED, CorruptError
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
 from gsmap.types import Gaussians, Tile
@@ -129,7 +129,7 @@ def _known_boxes(folder: Path) -> dict[str, tuple[np.ndarray, float]]:
     try:
         with open(open_file(folder / FILE_NAME), "rb") as file:
             walk(json.loads(file.read())["root"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, CorruptError):
+    except (OSError, *MALFORMED, CorruptError):
         return {}  # none yet, or not ours: everything is read again
     return known
 
