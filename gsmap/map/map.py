@@ -15,12 +15,16 @@ import numpy as np
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
+from gsmap.map import values as as_values
 from gsmap.map.logs import logged
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
+    BackupReport,
+    BranchRow,
     CheckReport,
+    CloneReport,
     EdgeRow,
     EvaluationReport,
     ExportReport,
@@ -33,10 +37,12 @@ from gsmap.types.rows import (
     PoseRow,
     PriorRow,
     PruneReport,
+    RestoreReport,
     RevisionRow,
     SceneReport,
     SceneRow,
     SettingRow,
+    SnapshotRow,
     TileRow,
     UpdateReport,
 )
@@ -59,19 +65,49 @@ def create(
 
 
 def open(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
-    """Open a map; read-only where its folder cannot be written."""
-    mode = "r" if os.path.isdir(path) and not os.access(path, os.W_OK) else "w"
-    return Map(Store.open(path, mode), progress)
+    """Open a map, or a branch or tag of one (``MAP@NAME``); read-only where its folder cannot be written."""
+    return Map(Store.open(path, "w" if Store.can_write(path) else "r"), progress)
 
 
 def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
     """Open a map, making it first where there is none."""
-    return open(path, progress) if os.path.exists(path) else create(path, progress)
+    return open(path, progress) if Store.exists(path) else create(path, progress)
 
 
 def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
     """Bring an older map to this version's schema; returns the schema before and after."""
     return Store.migrate(path)
+
+
+def restore(
+    target: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    at: str | None = None,
+    progress: StageProgress | None = None,
+    *,
+    catalog_url: str | None = None,
+) -> RestoreReport:
+    """``gsmap restore DEST MAP``: make a map from a backup, whole or not at all; it is the same map, with its id.
+
+    Args:
+        target: the backup: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
+        path: a folder that does not exist.
+        at: the last snapshot at or before this time, or one by the beginning of its name; the newest by default.
+        catalog_url: SQLAlchemy URL of an empty PostgreSQL database to keep the catalog in.
+    """
+    from gsmap.map import backing
+
+    told = logged(progress)
+    return backing.restore(
+        target, path, at=at, catalog_url=catalog_url, progress=lambda f, text: told("restore", f, text)
+    )
+
+
+def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
+    """``gsmap backup MAP DEST --list``: the states in a backup, oldest first."""
+    from gsmap.map import backing
+
+    return backing.snapshots(target)
 
 
 class Map(AbstractContextManager["Map"]):
@@ -122,7 +158,8 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap settings MAP --set``: change the map's own settings; nothing is written if any makes no sense."""
         from gsmap.map.settings import write_settings
 
-        write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
+        with self.store.catalog.lock():
+            write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
         self.__dict__.pop("settings", None)
 
     def setting_rows(self) -> list[SettingRow]:
@@ -513,6 +550,31 @@ class Map(AbstractContextManager["Map"]):
         self.store.scenes.remove(ref)
         return row
 
+    def branch(self, name: str) -> BranchRow:
+        """``gsmap branch MAP NAME``: another catalog over the same arrays; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name))
+
+    def tag(self, name: str) -> BranchRow:
+        """``gsmap tag MAP NAME``: the map as it is now, which cannot change; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name, tag=True))
+
+    def branches(self, kind: str | None = None) -> list[BranchRow]:
+        """The map's branches and tags, or those of one kind (``branch``, ``tag``)."""
+        rows = [as_values.branch_row(branch) for branch in self.store.branches.list()]
+        return [row for row in rows if kind in (None, row.kind)]
+
+    def delete_branch(self, name: str, kind: str | None = None) -> BranchRow:
+        """``gsmap branch MAP NAME --delete``: forget a branch or tag; what only it named is reclaimed by `prune`.
+
+        Raises:
+            NotFoundError: none of that kind is called so.
+        """
+        row = as_values.branch_row(self.store.branches.get(name))
+        if kind not in (None, row.kind):
+            raise NotFoundError(f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete")
+        self.store.branches.delete(name)
+        return row
+
     def check(self) -> CheckReport:
         """Read every byte of the map and compare it with what was written."""
         return reports.check_report(self.store.check(lambda f, text: self._progress("check", f, text)))
@@ -520,6 +582,27 @@ class Map(AbstractContextManager["Map"]):
     def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
         """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
         return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
+
+    def backup(self, target: str | os.PathLike[str], *, verify: bool = False, keep: int | None = None) -> BackupReport:
+        """``gsmap backup MAP DEST``: save the map as it is now, while others go on; only what is new is sent.
+
+        Args:
+            target: a folder, ``file:///folder`` or ``s3://bucket/prefix``; of this map alone.
+            verify: read again what is there, and send again what is damaged.
+            keep: delete all but this many of the newest snapshots, and what only they needed.
+        """
+        from gsmap.map import backing
+
+        told = self._progress
+        return backing.save(
+            self.store, target, verify=verify, keep=keep, progress=lambda f, text: told("backup", f, text)
+        )
+
+    def clone(self, path: str | os.PathLike[str]) -> CloneReport:
+        """``gsmap clone MAP NEW``: another map, of its own id, that begins with what this one holds now."""
+        from gsmap.map import backing
+
+        return backing.clone(self.store, path, lambda f, text: self._progress("clone", f, text))
 
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine
 from sqlalchemy.engine import make_url
@@ -30,10 +31,14 @@ class Catalog:
         engine: on its database.
         writable: whether `write` may be called.
         patience_s: how long a writer waits for the others before `BusyError`.
+        refusal: what to tell who would write where that may not be; by default, that it was opened for reading.
     """
 
-    def __init__(self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0) -> None:
+    def __init__(
+        self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0, refusal: str = ""
+    ) -> None:
         self.folder = folder
+        self._refusal = refusal or f"{folder} was opened for reading: open it with mode 'w' to change it"
         self.engine = engine
         self.writable = writable
         self.patience_s = patience_s
@@ -67,12 +72,16 @@ class Catalog:
             return
         with self.lock(), explained(self.folder), self.engine.connect() as connection:
             try:
-                with connection.execution_options(gsmap_write=True).begin():
-                    self._held.connection = connection
+                with contextlib.ExitStack() as until_end, connection.execution_options(gsmap_write=True).begin():
+                    self._held.connection, self._held.until_end = connection, until_end
                     yield connection
             finally:
                 self._held.connection = None
             self._checkpoint(at_bytes=sqlite.CHECKPOINT_BYTES)
+
+    def hold(self, context: contextlib.AbstractContextManager[Any]) -> None:
+        """Inside `write`: hold a lock from now until the transaction has been committed or undone."""
+        self._held.until_end.enter_context(context)
 
     @contextlib.contextmanager
     def lock(self, patience_s: float | None = None) -> Iterator[None]:
@@ -83,7 +92,7 @@ class Catalog:
             BusyError: another process kept it for ``patience_s``.
         """
         if not self.writable:
-            raise StoreError(f"{self.folder} was opened for reading: open it with mode 'w' to change it")
+            raise StoreError(self._refusal)
         if getattr(self._held, "depth", 0):
             yield
             return
@@ -151,6 +160,8 @@ def explained(folder: Path) -> Iterator[None]:
     except GsmapError:
         raise
     except SQLAlchemyError as error:
+        if isinstance(getattr(error, "orig", None), GsmapError):  # a value that a column type refused
+            raise error.orig from None  # type: ignore[attr-defined]
         said = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
         low = said.lower()
         if "locked" in low or "busy" in low:

@@ -88,7 +88,7 @@ class Graphs:
                 return _stored(old)
             resolve(connection, graph.scene_id)
             if not has_group(connection, group_id):
-                publish(connection, self._arrays, staged, KIND, group_id)
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
             connection.execute(delete(graphs).where(mine))
             made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": now()}
             connection.execute(insert(graphs), row | made)

@@ -120,7 +120,7 @@ class Scenes:
                 # else its bytes are damaged
             else:
                 scene = self._enter(connection, new_id, fields, rename, dated_by)
-            publish(connection, self._arrays, staged, KIND, new_id)
+            publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
             _put_boxes(connection, number, boxes)
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))

@@ -96,6 +96,15 @@ def digest_problems(file: Path) -> list[str]:
         return [f"{file.with_name(DIGEST_FILE)} is damaged"]
 
 
+def file_problems(file: Path) -> list[str]:
+    """As `integrity_problems`, of a file that nobody has open."""
+    frozen = create_engine("sqlite://", creator=lambda: _connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1"))
+    try:
+        return integrity_problems(frozen)
+    finally:
+        frozen.dispose()
+
+
 def backup(engine: Engine, target: Path) -> None:
     """A consistent copy of the catalog, whatever else is going on."""
     connection = engine.raw_connection()

@@ -7,16 +7,20 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
+from gsmap.store import branches, integrity, migrate, schema
 from gsmap.store import catalog as _catalog
-from gsmap.store import integrity, migrate, schema, sqlite
-from gsmap.store.arrays import Arrays
+from gsmap.store.arrays import Arrays, StoredFile
+from gsmap.store.backups import Backups
+from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
+from gsmap.store.copying import empty_catalog
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
@@ -34,9 +38,16 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models`` and ``exports``. Every method that changes something is one transaction, durable when it returns;
-    `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes
-    open their own.
+    ``models``, ``exports``, ``branches`` and ``backups``. Every method that changes something is one transaction,
+    durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may
+    share a store; processes open their own.
+
+    A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
+
+    Args:
+        place: ``home`` is the map's folder, with arrays and models; ``folder`` is where this catalog, its
+            ``settings.toml`` and its writer lock lie: the same, or that of a branch; ``location`` opens it again.
+        catalog: open on the database.
 
     Example::
 
@@ -44,9 +55,12 @@ class Store:
             scene, is_new = store.scenes.add(gaussians, cameras, name="monday")
     """
 
-    def __init__(self, folder: Path, catalog: Catalog) -> None:
-        self.folder = folder
-        self.arrays = Arrays(folder / "arrays")
+    def __init__(self, place: Place, catalog: Catalog) -> None:
+        self.home = place.home
+        self.folder = place.folder
+        self.branch = place.branch
+        self.location = place.location
+        self.arrays = Arrays(place.home / "arrays")
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
         self.recipes = Recipes(catalog)
@@ -54,8 +68,10 @@ class Store:
         self.registrations = Registrations(catalog)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
-        self.models = Models(catalog)
+        self.models = Models(catalog, self.arrays)
         self.exports = Exports(catalog)
+        self.branches = Branches(place, catalog, self.arrays)
+        self.backups = Backups(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
@@ -71,9 +87,9 @@ class Store:
             StoreError: the folder is not empty, or cannot be written.
             NotFoundError: the folder it should lie in does not exist.
         """
-        folder = Path(path).absolute()
+        folder = branches.find(Path(path).absolute()).folder
         if folder.is_dir() and any(folder.iterdir()):
-            is_map = "is a map already" if _is_map(folder) else "is not empty"
+            is_map = "is a map already" if branches.holds_catalog(folder) else "is not empty"
             raise StoreError(f"{path} {is_map}: open it, or choose another name")
         if folder.exists() and not folder.is_dir():
             raise StoreError(f"{path} is a file: a map is a folder; choose another name")
@@ -113,23 +129,47 @@ class Store:
             raise
         return store
 
-    @classmethod
-    def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
-        """Bring an older map to this gsmap's schema; returns the version before and after."""
-        store = cls._connect(path, "w", None)
-        with store:
-            return migrate.upgrade(store.catalog)
+    @staticmethod
+    def exists(path: str | os.PathLike[str]) -> bool:
+        """Whether anything lies there, or the branch does that a path names.
+
+        Raises:
+            NotFoundError: the path names a branch that its map lacks.
+        """
+        return branches.find(path).folder.exists()
+
+    @staticmethod
+    def can_write(path: str | os.PathLike[str]) -> bool:
+        """Whether `open` with mode ``w`` makes sense there: not of a read-only folder, and not of a tag."""
+        place = branches.find(path)
+        return not place.is_tag and (not place.folder.is_dir() or os.access(place.folder, os.W_OK))
 
     @classmethod
-    def _connect(cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None) -> Store:
+    def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
+        """Bring an older map (and its branches and tags) to this gsmap's schema; the version before and after."""
+        with cls._connect(path, "w", None, even_tags=True) as store:
+            versions = migrate.upgrade(store.catalog)
+        for place in branches.places(store.home) if not store.branch else ():
+            with cls._connect(place.location, "w", None, even_tags=True) as branch:
+                migrate.upgrade(branch.catalog)
+        return versions
+
+    @classmethod
+    def _connect(
+        cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None, *, even_tags: bool = False
+    ) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
-        folder = Path(path)
+        place = branches.find(path)
+        folder = place.folder
         if not folder.exists():
             raise NotFoundError(f"no map at {path}: make one with gsmap init {path}")
-        if not _is_map(folder):
+        if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
+        refusal = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
+        if mode == "w" and place.is_tag and not even_tags:
+            raise StoreError(refusal)
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
         with _catalog.explained(folder):
@@ -137,7 +177,7 @@ class Store:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        return cls(folder, Catalog(folder, engine, writable=mode == "w"))
+        return cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -152,8 +192,26 @@ class Store:
             return str(connection.execute(select(schema.about.c.id)).scalar_one())
 
     def check(self, progress: Progress | None = None) -> Check:
-        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`."""
-        return integrity.check(self.catalog, self.arrays, progress)
+        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`.
+
+        With the map itself its branches and tags are checked, too; a branch alone where that is what is open.
+        """
+        read: set[tuple[str, tuple[StoredFile, ...]]] = set()
+        found = integrity.check(self.catalog, self.arrays, progress, read=read)
+        for place in branches.places(self.home) if not self.branch else ():
+            try:
+                with Store.open(place.location, "r") as other:
+                    more = integrity.check(other.catalog, other.arrays, progress, read=read)
+            except StoreError as error:
+                more = Check((str(error),), (), 0, 0)
+            problems = tuple(f"{place.branch}: {problem}" for problem in more.problems)
+            found = replace(
+                found,
+                problems=found.problems + problems,
+                num_groups=found.num_groups + more.num_groups,
+                num_bytes=found.num_bytes + more.num_bytes,
+            )
+        return found
 
     def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
         """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
@@ -169,25 +227,11 @@ class Store:
         self.close()
 
     def __repr__(self) -> str:
-        return f"Store({str(self.folder)!r}, mode={'w' if self.catalog.writable else 'r'!r})"
-
-
-def _is_map(folder: Path) -> bool:
-    has_catalog = (folder / sqlite.FILE).is_file() or (folder / _catalog.URL_FILE).is_file()
-    return has_catalog and (folder / "arrays").is_dir()
+        return f"Store({self.location!r}, mode={'w' if self.catalog.writable else 'r'!r})"
 
 
 def _make_catalog(folder: Path, url: str | None) -> None:
-    if url is None:
-        sqlite.create_file(folder / sqlite.FILE)
-        engine = sqlite.engine(folder / sqlite.FILE, writable=True)
-    else:
-        engine = _catalog.url_engine(url)
-        if migrate.version(engine, folder) is not None:
-            raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
-        (folder / _catalog.URL_FILE).write_text(_catalog.url_without_password(url) + "\n")
-    made = Catalog(folder, engine, writable=True)
-    migrate.upgrade(made)
+    made = empty_catalog(folder, url)
     with made.write() as connection:
         row = {"id": uuid.uuid4().hex, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)

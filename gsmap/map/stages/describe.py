@@ -40,7 +40,7 @@ def describe(
     # A worker elsewhere must not choose another renderer than the one that the key names.
     rendered_by = backend(settings.describe.object.render_backend)
     params = replace(settings.describe, object=replace(settings.describe.object, render_backend=rendered_by))
-    jobs = [(str(store.folder), scene.id, specs, params) for scene in missing]
+    jobs = [(store.location, scene.id, specs, params) for scene in missing]
     for done, (i, graph) in enumerate(run_jobs(describe_scene, jobs, settings.engine), 1):
         store.graphs.save(graph, keys[graph.scene_id])
         progress("describe", done / len(missing), f"{missing[i].name}: {graph.num_nodes} nodes")

@@ -41,10 +41,9 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
     living, priors = store.scenes.list(), store.priors.list()
     scenes = [scene.id for scene in living]
     edges, named = [], []
-    row = {scene: number for number, scene in enumerate(scenes)}
-    # In the order of the scenes, not in that in which workers happened to finish: the same poses to the last bit.
+    # By id, not in the order in which workers happened to finish: the same key whenever they were made.
     current = store.registrations.current()
-    for stored in sorted(current, key=lambda r: (row[r.registration.target], row[r.registration.source])):
+    for stored in sorted(current, key=lambda r: (r.registration.target, r.registration.source)):
         registration = stored.registration
         usable = stored.review == "confirm" or (registration.status == "accepted" and stored.review != "reject")
         if not usable or registration.S_target_source is None or registration.information is None:

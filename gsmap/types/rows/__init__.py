@@ -8,6 +8,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 ``source`` and ``source_name``. Only `SceneRow`, which is the scene, calls them ``id`` and ``name``.
 """
 
+from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.maps import (
@@ -47,11 +48,15 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
+from gsmap.types.rows.values import BranchRow
 
 __all__ = [
     "SCHEMA",
+    "BackupReport",
     "BandRow",
+    "BranchRow",
     "CheckReport",
+    "CloneReport",
     "ComponentErrorRow",
     "ConvertReport",
     "DemoReport",
@@ -78,6 +83,7 @@ __all__ = [
     "PoseRow",
     "PriorRow",
     "PruneReport",
+    "RestoreReport",
     "RevisionRow",
     "Row",
     "SceneEdgeRow",
@@ -85,6 +91,7 @@ __all__ = [
     "SceneReport",
     "SceneRow",
     "SettingRow",
+    "SnapshotRow",
     "TileRow",
     "TodoRow",
     "UpdateReport",
