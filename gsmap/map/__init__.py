@@ -1,5 +1,5 @@
 """The map: load from the store, call a pure stage, save. `Map` is the doors, `stages` the work behind them."""
 
-from gsmap.map.map import Map, create, migrate, open, open_or_create
+from gsmap.map.map import Map, accept_catalog, create, migrate, open, open_or_create
 
-__all__ = ["Map", "create", "migrate", "open", "open_or_create"]
+__all__ = ["Map", "accept_catalog", "create", "migrate", "open", "open_or_create"]

@@ -28,12 +28,14 @@ class Check:
         problems: one line each; empty for a sound map.
         orphans: folders that no row names (a crash left them; `prune` removes them); no harm.
         num_groups, num_bytes: what was read.
+        unverified: what cannot be compared with what was written, and why.
     """
 
     problems: tuple[str, ...]
     orphans: tuple[str, ...]
     num_groups: int
     num_bytes: int
+    unverified: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -67,10 +69,11 @@ def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) ->
         named = {row.id: row.kind for row in connection.execute(select(groups).order_by(groups.c.id))}
         manifests = {group: manifest(connection, group) for group in named}
         problems = _row_problems(connection, catalog.folder)
+        if catalog.is_sqlite:
+            problems += sqlite.integrity_problems(connection)
     if catalog.is_sqlite:
-        with explained(catalog.folder):
-            problems += sqlite.integrity_problems(catalog.engine)
-            problems += sqlite.digest_problems(catalog.folder / sqlite.FILE)
+        problems += catalog.page_problems()
+    unverified = tuple(catalog.unverified())
     for i, (group, kind) in enumerate(named.items()):
         if progress:
             progress(i / len(named), f"{kind}/{group[:12]}")
@@ -82,7 +85,7 @@ def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) ->
     num_bytes = sum(f.size_bytes for files in manifests.values() for f in files)
     if progress:
         progress(1.0, "checked")
-    return Check(tuple(problems), orphans, len(named), num_bytes)
+    return Check(tuple(problems), orphans, len(named), num_bytes, unverified)
 
 
 def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:

@@ -122,7 +122,22 @@ class Store:
             return migrate.upgrade(store.catalog)
 
     @classmethod
-    def _connect(cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None) -> Store:
+    def accept_catalog(cls, path: str | os.PathLike[str]) -> list[str]:
+        """Take a catalog that differs from what was written as it is, and note new digests: what differed, in words.
+
+        For salvage: SQLite must find it sound, but nobody knows whether its values are those that were written.
+
+        Raises:
+            CorruptError: SQLite cannot make sense of it.
+            ConfigError: the catalog is no file of the map.
+        """
+        with cls._connect(path, "w", None, verify=False) as store:
+            return store.catalog.accept()
+
+    @classmethod
+    def _connect(
+        cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None, *, verify: bool = True
+    ) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
         folder = Path(path)
@@ -138,7 +153,14 @@ class Store:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        return cls(folder, Catalog(folder, engine, writable=mode == "w"))
+        store = cls(folder, Catalog(folder, engine, writable=mode == "w"))
+        try:
+            if verify:
+                store.catalog.verify()
+        except BaseException:
+            store.catalog.close(fold=False)
+            raise
+        return store
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
