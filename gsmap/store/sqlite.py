@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sqlite3
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, PoolProxiedConnection, create_engine, event
+from sqlalchemy import Connection, Engine, NullPool, PoolProxiedConnection, QueuePool, create_engine, event
 
 from gsmap.errors import StoreError
 from gsmap.store import held
@@ -24,11 +25,11 @@ def engine(file: Path, *, writable: bool) -> Engine:
     Write transactions (`WRITE` in the execution options) begin IMMEDIATE: a deferred one that turns into a writer
     fails at once when another has written meanwhile, whatever the busy timeout.
     """
-    uri = f"{file.resolve().as_uri()}?mode={'rw' if writable else 'ro'}"
+    mode = f"mode={'rw' if writable else 'ro'}"
 
     def connect() -> sqlite3.Connection:
         try:
-            return _connect(uri)
+            return _connect(file, mode)
         except sqlite3.OperationalError:
             if writable or os.access(file.parent, os.W_OK):
                 raise
@@ -36,9 +37,11 @@ def engine(file: Path, *, writable: bool) -> Engine:
         log = file.with_name(file.name + "-wal")
         if log.exists() and log.stat().st_size:
             raise StoreError(f"{file.parent} was not closed cleanly: open it once where it can be written")
-        return _connect(f"{uri}&immutable=1")
+        return _connect(file, f"{mode}&immutable=1")
 
-    made = create_engine("sqlite://", creator=connect)
+    # Named, since for an address without a file it would be a pool that closes a thread's connection under its hands
+    # when more than five threads use the engine.
+    made = create_engine("sqlite://", creator=connect, poolclass=QueuePool, max_overflow=-1)
 
     @event.listens_for(made, "begin")
     def begin(connection: Connection) -> None:
@@ -97,7 +100,7 @@ def digest_problems(file: Path) -> list[str]:
 
 def file_problems(file: Path) -> list[str]:
     """As `integrity_problems`, of a file that nobody has open."""
-    frozen = create_engine("sqlite://", creator=lambda: _connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1"))
+    frozen = create_engine("sqlite://", creator=lambda: _connect(file, "mode=ro&immutable=1"), poolclass=NullPool)
     try:
         return integrity_problems(frozen)
     finally:
@@ -132,8 +135,44 @@ def _same_stamp(file: Path, noted: dict[str, Any]) -> bool:
     return (now.st_size, now.st_mtime_ns) == (noted["size_bytes"], noted["mtime_ns"])
 
 
-def _connect(uri: str) -> sqlite3.Connection:
-    connection = sqlite3.connect(uri, uri=True, timeout=60.0, isolation_level=None, check_same_thread=False)
+class _Connection(sqlite3.Connection):
+    """Counted, so that whoever looks at the file beside SQLite knows that it is open (`gsmap.store.held`)."""
+
+    key: held.Key | None = None
+
+    def close(self) -> None:
+        super().close()
+        key, self.key = self.key, None
+        if key is not None:
+            held.leave(key)
+
+
+def _connect(file: Path, options: str) -> sqlite3.Connection:
+    key = None
+    with contextlib.suppress(OSError):  # SQLite says it better
+        key = held.enter(file)
+    try:
+        connection = sqlite3.connect(
+            f"{file.resolve().as_uri()}?{options}",
+            uri=True,
+            timeout=60.0,
+            isolation_level=None,
+            check_same_thread=False,
+            factory=_Connection,
+        )
+    except BaseException:
+        if key is not None:
+            held.leave(key)
+        raise
+    connection.key = key
+    try:
+        return _prepared(connection)
+    except BaseException:
+        connection.close()
+        raise
+
+
+def _prepared(connection: _Connection) -> _Connection:
     connection.execute("PRAGMA foreign_keys = ON")
     connection.execute("PRAGMA synchronous = FULL")
     connection.execute("PRAGMA wal_autocheckpoint = 0")  # `checkpoint` does it under the writer lock

@@ -8,7 +8,7 @@ import os
 import re
 import sqlite3
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -154,7 +154,7 @@ def check_path(path: object) -> str:
     return path
 
 
-def read_file(store: Store, file: StoredFile, folder: Path) -> Iterator[bytes]:
+def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, None, None]:
     """The bytes of a file that a state names, compared with its digest while they are read.
 
     Args:
