@@ -103,6 +103,8 @@ def file_problems(file: Path) -> list[str]:
     frozen = create_engine("sqlite://", creator=lambda: _connect(file, "mode=ro&immutable=1"), poolclass=NullPool)
     try:
         return integrity_problems(frozen)
+    except sqlite3.DatabaseError as error:
+        return [str(error)]
     finally:
         frozen.dispose()
 

@@ -60,11 +60,11 @@ def put(place: Place, content: bytes) -> str:
 
 
 def make_snapshot(
-    place: Place, map_id: str, files: dict[str, bytes], lines: bytes | None = None, **changed: Any
+    place: Place, map_id: str, content: dict[str, bytes], lines: bytes | None = None, /, **changed: Any
 ) -> Snapshot:
     """A snapshot with these files, whatever they are; and with another list of files, or other fields, than is true."""
     Backup.at_or_new(place, map_id)
-    stored = [StoredFile(path, len(content), put(place, content)) for path, content in files.items()]
+    stored = [StoredFile(path, len(data), put(place, data)) for path, data in content.items()]
     text = listed(stored) if lines is None else lines
     fields: dict[str, Any] = {
         "name": "",
@@ -74,8 +74,8 @@ def make_snapshot(
         "gsmap_version": "0.0",
         "files": put(place, text),
         "files_bytes": len(text),
-        "num_files": len(files),
-        "num_bytes": sum(len(content) for content in files.values()),
+        "num_files": len(content),
+        "num_bytes": sum(len(data) for data in content.values()),
         "num_bytes_new": 0,
         "revision": None,
         "counts": {},

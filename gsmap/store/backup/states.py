@@ -164,12 +164,12 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
         Vanished: the map has it no longer, and its catalog says the same.
         CorruptError: it is missing or differs from what was written. Then what was read so far is of no use.
     """
-    copied = folder / file.path
-    path = copied if copied.is_file() else home_of(store) / file.path
+    immutable = file.path.split("/")[0] in (ARRAYS, MODELS)
+    path = (home_of(store) if immutable else folder) / file.path
     try:
         yield from checked(_chunks(path), file, str(path))
     except (CorruptError, FileNotFoundError, NotADirectoryError) as error:
-        if path != copied and not _still_named(store, file):
+        if immutable and not _still_named(store, file):
             raise Vanished(file.path) from error
         if isinstance(error, CorruptError):
             raise CorruptError(f"{error}: run gsmap check, and ingest the scene again") from error
