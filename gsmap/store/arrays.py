@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import sync_folder
+from gsmap.durable import sync_file, sync_folder
 from gsmap.errors import BusyError, CorruptError
 
 CHUNK_ROWS = 16_384
@@ -72,6 +72,31 @@ class Arrays:
             finally:
                 if folder.exists():  # not published
                     shutil.rmtree(folder, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def stage_copies(
+        self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
+    ) -> Iterator[dict[tuple[str, str], Staged]]:
+        """Bring groups of another map beside their places; dropped at the end unless `publish` took them.
+
+        Files are linked where the disk allows, since no map ever writes to one again, and else copied.
+
+        Args:
+            groups: manifest by (kind, name).
+
+        Raises:
+            CorruptError: a file is missing, or differs from what was written.
+        """
+        with self._lock_staging(fcntl.LOCK_SH):
+            folder = self.staging / uuid.uuid4().hex
+            try:
+                folder.mkdir()
+                yield {
+                    group: Staged(_take(source.root.joinpath(*group), folder / "-".join(group), files), tuple(files))
+                    for group, files in groups.items()
+                }
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
 
     @contextlib.contextmanager
     def lock(self, patience_s: float = 120.0) -> Iterator[None]:
@@ -246,6 +271,33 @@ def _write(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
         )
         if array.size:
             made[...] = array
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Another name for a file that is never written again, or a copy where the disk has no such thing."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+        sync_file(target)
+
+
+def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
+    """Another map's group as one of our own, every byte compared; returns ``target``."""
+    target.mkdir()
+    for file in files:
+        path, mine = place / file.path, target / file.path
+        if path.is_symlink() or not path.is_file() or path.stat().st_size != file.size_bytes:
+            raise CorruptError(f"{path} is missing or cut off: run gsmap check on that map, and repair it first")
+        mine.parent.mkdir(parents=True, exist_ok=True)
+        link_or_copy(path, mine)
+        if _sha256(mine) != file.sha256:
+            raise CorruptError(
+                f"{path} differs from what was written: run gsmap check on that map, and repair it first"
+            )
+    for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
+        sync_folder(path)
+    return target
 
 
 def _rows(array: Any, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:

@@ -47,7 +47,7 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
-from gsmap.types.rows.values import BranchRow
+from gsmap.types.rows.values import BranchRow, MergeReport, SplitReport
 
 __all__ = [
     "SCHEMA",
@@ -68,6 +68,7 @@ __all__ = [
     "InitReport",
     "LayerRow",
     "MapStatus",
+    "MergeReport",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -87,6 +88,7 @@ __all__ = [
     "SceneReport",
     "SceneRow",
     "SettingRow",
+    "SplitReport",
     "TileRow",
     "TodoRow",
     "UpdateReport",
