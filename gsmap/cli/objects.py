@@ -69,6 +69,11 @@ OBJECTS: dict[str, Object] = {
     "check": One(rows.CheckReport),
     "prune": One(rows.PruneReport),
     "migrate": One(rows.MigrateReport),
+    "backup": One(rows.BackupReport),
+    "backup --list": Many("snapshots", rows.SnapshotRow),
+    "restore": One(rows.RestoreReport),
+    "clone": One(rows.CloneReport),
+    "trust": One(rows.TrustReport),
     "view": One(rows.ViewReport),
     "demo": One(rows.DemoReport),
 }

@@ -17,12 +17,15 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.map import values as as_values
 from gsmap.map.logs import logged
+from gsmap.map.sharing import at_work
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
+    BackupReport,
     BranchRow,
     CheckReport,
+    CloneReport,
     EdgeRow,
     EvaluationReport,
     ExportReport,
@@ -36,10 +39,12 @@ from gsmap.types.rows import (
     PoseRow,
     PriorRow,
     PruneReport,
+    RestoreReport,
     RevisionRow,
     SceneReport,
     SceneRow,
     SettingRow,
+    SnapshotRow,
     SplitReport,
     TileRow,
     UpdateReport,
@@ -75,6 +80,37 @@ def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None 
 def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
     """Bring an older map to this version's schema; returns the schema before and after."""
     return Store.migrate(path)
+
+
+def restore(
+    target: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    at: str | None = None,
+    progress: StageProgress | None = None,
+    *,
+    catalog_url: str | None = None,
+) -> RestoreReport:
+    """``gsmap restore DEST MAP``: make a map from a backup, whole or not at all; it is the same map, with its id.
+
+    Args:
+        target: the backup: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
+        path: a folder that does not exist.
+        at: the last snapshot at or before this time, or one by the beginning of its name; the newest by default.
+        catalog_url: SQLAlchemy URL of an empty PostgreSQL database to keep the catalog in.
+    """
+    from gsmap.map import backing
+
+    told = logged(progress)
+    return backing.restore(
+        target, path, at=at, catalog_url=catalog_url, progress=lambda f, text: told("restore", f, text)
+    )
+
+
+def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
+    """``gsmap backup MAP DEST --list``: the states in a backup, oldest first."""
+    from gsmap.map import backing
+
+    return backing.snapshots(target)
 
 
 class Map(AbstractContextManager["Map"]):
@@ -173,7 +209,8 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.stages.describe import describe
 
         wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
-        keys = describe(self.store, wanted, self.settings, self._progress)
+        with at_work(self.store, "describe"):
+            keys = describe(self.store, wanted, self.settings, self._progress)
         return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
 
     def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:
@@ -185,7 +222,8 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.stages.register import register
 
-        made = register(self.store, pairs, self.settings, self._progress)
+        with at_work(self.store, "register"):
+            made = register(self.store, pairs, self.settings, self._progress)
         return reports.rows_of_edges(self.store, made)
 
     def add_edge(self, pair: str, S_target_source: Sim3, sigmas: np.ndarray, note: str = "") -> EdgeRow:
@@ -222,7 +260,8 @@ class Map(AbstractContextManager["Map"]):
         """Solve for all scene poses and keep the answer as a new revision."""
         from gsmap.map.stages.optimize import optimize
 
-        number = optimize(self.store, self.settings, self._progress)
+        with at_work(self.store, "optimize"):
+            number = optimize(self.store, self.settings, self._progress)
         return reports.revision_row(self.store, number)
 
     def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
@@ -232,18 +271,19 @@ class Map(AbstractContextManager["Map"]):
             captured_at: as in `ingest`.
         """
         from gsmap.map.stages.describe import describe
-        from gsmap.map.stages.optimize import is_solved, optimize
+        from gsmap.map.stages.optimize import solve
         from gsmap.map.stages.register import register
 
         if captured_at is not None and not captures:
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
-        ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-        describe(self.store, self.scenes(), self.settings, self._progress)
-        while True:
+        with at_work(self.store, "update"):
+            ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
+            describe(self.store, self.scenes(), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
-            if is_solved(self.store, self.settings):
-                return reports.update_report(self.store, ingested)
-            optimize(self.store, self.settings, self._progress)  # scenes that now turn out to be neighbours come next
+            while solve(self.store, self.settings, self._progress):
+                # Scenes that now turn out to be neighbours.
+                register(self.store, "auto", self.settings, self._progress)
+        return reports.update_report(self.store, ingested)
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
@@ -574,6 +614,27 @@ class Map(AbstractContextManager["Map"]):
     def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
         """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
         return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
+
+    def backup(self, target: str | os.PathLike[str], *, verify: bool = False, keep: int | None = None) -> BackupReport:
+        """``gsmap backup MAP DEST``: save the map as it is now, while others go on; only what is new is sent.
+
+        Args:
+            target: a folder, ``file:///folder`` or ``s3://bucket/prefix``; of this map alone.
+            verify: read again what is there, and send again what is damaged.
+            keep: delete all but this many of the newest snapshots, and what only they needed.
+        """
+        from gsmap.map import backing
+
+        told = self._progress
+        return backing.save(
+            self.store, target, verify=verify, keep=keep, progress=lambda f, text: told("backup", f, text)
+        )
+
+    def clone(self, path: str | os.PathLike[str]) -> CloneReport:
+        """``gsmap clone MAP NEW``: another map, of its own id, that begins with what this one holds now."""
+        from gsmap.map import backing
+
+        return backing.clone(self.store, path, lambda f, text: self._progress("clone", f, text))
 
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""

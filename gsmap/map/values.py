@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import shutil
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import sync_file, sync_folder
+from gsmap.durable import sync_folder, write_text_whole
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.settings import FILE_NAME
-from gsmap.store import Store, merging
+from gsmap.store import Store, merging, staging
 from gsmap.store.branches import Branch
 from gsmap.types import Scene
 from gsmap.types.rows import BranchRow, MergeReport, SplitReport
@@ -62,19 +60,14 @@ def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> S
     folder = Path(out).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise StoreError(f"{out} exists already: choose another name")
-    staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
-    try:
+    with staging.beside(folder) as staged:
         with Store.create(staged) as part:
             merged = merging.split(store, part, chosen)
             names = tuple(scene.name for scene in part.scenes.list())
         if (store.folder / FILE_NAME).is_file():
-            shutil.copyfile(store.folder / FILE_NAME, staged / FILE_NAME)
-            sync_file(staged / FILE_NAME)
-            sync_folder(staged)
+            write_text_whole(staged / FILE_NAME, (store.folder / FILE_NAME).read_text(encoding="utf-8"))
         os.rename(staged, folder)
         sync_folder(folder.parent)
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
     return SplitReport(
         map=os.fspath(out),
         source=store.location,

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import Connection, delete, not_, select, text, update
 
-from gsmap.errors import ConfigError, StoreError
-from gsmap.store import sqlite
+from gsmap.durable import is_file, is_folder, remove_file
+from gsmap.errors import ConfigError, GsmapError, StoreError
+from gsmap.store import sqlite, staging
 from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
-from gsmap.store.models import FOLDER
+from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress
 
@@ -80,6 +83,8 @@ def check(
         manifests = {group: manifest(connection, group) for group in named}
         unread = {group: kind for group, kind in named.items() if (group, manifests[group]) not in read}
         problems = _row_problems(connection, home)
+    problems += [f"{arrays.root / name} does not belong there: remove it" for name in arrays.strangers()]
+    problems += _odd_models(home)
     if catalog.is_sqlite:
         with explained(catalog.folder):
             problems += sqlite.integrity_problems(catalog.engine)
@@ -153,12 +158,15 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
             named_still = (known - set(doomed) if dry_run else known) | others.groups()
             bodies = [group for group in arrays.groups() if group not in named_still]
             num_bytes = sum(arrays.size_bytes(*group) for group in bodies)
-            num_bytes += sum(path.stat().st_size for path in forgotten)
+            abandoned = staging.abandoned_files(catalog.folder)
+            num_bytes += sum(path.stat().st_size for path in forgotten) + sum(abandoned.values())
             if not dry_run:
                 for group in bodies:
                     arrays.drop(*group)
                 for path in forgotten:
-                    path.unlink()
+                    remove_file(arrays.root.parent, FOLDER, path.name)
+                for name in abandoned:
+                    remove_file(catalog.folder, name)
                 bury_leftovers(arrays.root.parent)
             num_bytes += arrays.drop_leftovers(dry_run=dry_run)
     return Pruned(
@@ -182,11 +190,16 @@ def _row_problems(connection: Connection, home: Path) -> list[str]:
         if boxes != -(-row.num_gaussians // CHUNK_ROWS):
             out.append(f"scene {row.name} has {boxes} chunk boxes, not one for every {CHUNK_ROWS} Gaussians")
     for row in connection.execute(select(models).where(models.c.removed_at.is_(None))):
-        path = home / row.path if row.copied else Path(row.path)
-        if not path.is_file():
-            out.append(f"model {row.name} is missing: {path}")
+        try:
+            path = model_path(home, row)
+            opened = open_model(home, row)
+        except FileNotFoundError as error:
+            out.append(f"model {row.name} is missing: {error.filename}")
             continue
-        with open(path, "rb") as file:
+        except (OSError, GsmapError) as error:
+            out.append(f"model {row.name} cannot be read: {error}")
+            continue
+        with open(opened, "rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != row.sha256:
                 out.append(f"model {row.name} differs from what was added: {path}")
     return out
@@ -201,8 +214,20 @@ def _revisions_to_keep(connection: Connection, keep: int | None) -> tuple[list[i
 
 
 def _forgotten_models(catalog: Catalog, others: Others, home: Path) -> list[Path]:
-    """Copies of models that no row of any catalog names any more."""
+    """Copies of models that no row of any catalog names any more. What is no plain file is no copy of ours."""
     with catalog.read() as connection:
         standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
     standing |= others.models()
-    return [path for path in sorted((home / FOLDER).glob("*")) if f"{FOLDER}/{path.name}" not in standing]
+    return [path for path in _in_models(home) if is_file(path) and f"{FOLDER}/{path.name}" not in standing]
+
+
+def _odd_models(home: Path) -> list[str]:
+    place = home / FOLDER
+    if os.path.lexists(place) and not is_folder(place):
+        return [f"{place} is no folder (a link, perhaps): put a folder in its place"]
+    return [f"{path} does not belong there: remove it" for path in _in_models(home) if not is_file(path)]
+
+
+def _in_models(home: Path) -> list[Path]:
+    place = home / FOLDER
+    return sorted(place.iterdir()) if is_folder(place) else []

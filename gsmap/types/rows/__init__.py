@@ -8,6 +8,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 ``source`` and ``source_name``. Only `SceneRow`, which is the scene, calls them ``id`` and ``name``.
 """
 
+from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.maps import (
@@ -38,6 +39,7 @@ from gsmap.types.rows.scenes import (
     SceneReport,
     SceneRow,
 )
+from gsmap.types.rows.trust import TrustReport
 from gsmap.types.rows.truth import (
     BandRow,
     ComponentErrorRow,
@@ -51,9 +53,11 @@ from gsmap.types.rows.values import BranchRow, MergeReport, SplitReport
 
 __all__ = [
     "SCHEMA",
+    "BackupReport",
     "BandRow",
     "BranchRow",
     "CheckReport",
+    "CloneReport",
     "ComponentErrorRow",
     "ConvertReport",
     "DemoReport",
@@ -81,6 +85,7 @@ __all__ = [
     "PoseRow",
     "PriorRow",
     "PruneReport",
+    "RestoreReport",
     "RevisionRow",
     "Row",
     "SceneEdgeRow",
@@ -88,9 +93,11 @@ __all__ = [
     "SceneReport",
     "SceneRow",
     "SettingRow",
+    "SnapshotRow",
     "SplitReport",
     "TileRow",
     "TodoRow",
+    "TrustReport",
     "UpdateReport",
     "ViewReport",
 ]
