@@ -65,6 +65,7 @@ OBJECTS: dict[str, Object] = {
     "merge": One(rows.MergeReport),
     "split": One(rows.SplitReport),
     "remove": One(rows.SceneRow),
+    "remove --purge": One(rows.PurgeReport),
     "restore-scene": One(rows.SceneRow),
     "check": One(rows.CheckReport),
     "prune": One(rows.PruneReport),

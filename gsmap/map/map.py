@@ -39,6 +39,7 @@ from gsmap.types.rows import (
     PoseRow,
     PriorRow,
     PruneReport,
+    PurgeReport,
     RestoreReport,
     RevisionRow,
     SceneReport,
@@ -602,6 +603,16 @@ class Map(AbstractContextManager["Map"]):
             scenes: those of these names.
         """
         return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))
+
+    def purge(self, ref: str, *, branches: bool = False) -> PurgeReport:
+        """``gsmap remove MAP SCENE --purge``: forget a scene for good: rows, arrays, tiles that were made with it.
+
+        Args:
+            branches: in the map's other branches and tags, too; else they are told of.
+        """
+        from gsmap.map.stages.purge import purge
+
+        return as_values.purge_report(purge(self.store, ref, branches=branches))
 
     def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
         """``gsmap restore-scene MAP SCENE``: bring back a removed scene, or (``source``) take one of another map."""

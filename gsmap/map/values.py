@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.settings import FILE_NAME
 from gsmap.store import Store, merging, staging
 from gsmap.store.branches import Branch
+from gsmap.store.purging import Purge
 from gsmap.types import Scene
-from gsmap.types.rows import BranchRow, MergeReport, SplitReport
+from gsmap.types.rows import BranchRow, MergeReport, PurgeReport, SplitReport
 
 
 def branch_row(branch: Branch) -> BranchRow:
@@ -113,6 +115,36 @@ def restore_scene(store: Store, ref: str, source: str | os.PathLike[str] | None)
         scene = other.scenes.find_any(ref).id
         merging.bring_scene(store, other, scene)
     return store.scenes.get(scene)
+
+
+def purge_report(purged: Sequence[tuple[str, Purge]]) -> PurgeReport:
+    """The receipt of a purge, over all catalogs that it took the scene out of."""
+
+    def every(key: str) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(text for _, one in purged for text in one.receipt[key]))
+
+    def total(key: str) -> int:
+        return sum(one.receipt[key] for _, one in purged)
+
+    rows: Counter[str] = Counter()
+    for _, one in purged:
+        rows.update(one.receipt["rows"])
+    maps = tuple(dict.fromkeys(location for location, _ in purged))
+    return PurgeReport(
+        scene=purged[0][1].scene,
+        maps=maps,
+        num_rows=dict(rows),
+        num_groups=total("num_groups"),
+        num_bytes=total("num_bytes"),
+        num_tiles=total("tile_files"),
+        exports=every("cleaned"),
+        unreachable=every("unreachable"),
+        catalog_copies=every("catalog_copies"),
+        branches=tuple(name for name in every("branches") if name not in maps),
+        backups=every("backups"),
+        linked_files=max(one.receipt["linked_files"] for _, one in purged),
+        mentions=every("mentions"),
+    )
 
 
 def _corners(scene: Scene) -> np.ndarray:

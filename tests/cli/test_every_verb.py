@@ -68,6 +68,7 @@ RUNS = {
     "merge": "merge MAP SITE",
     "split": "split MAP TMP/part.gsmap --island 0",
     "remove": "remove MAP odd:one",
+    "remove --purge": "remove MAP odd:one --purge",
     "restore-scene": "restore-scene MAP left --from SITE",
     "check": "check MAP",
     "prune": "prune MAP --dry-run",

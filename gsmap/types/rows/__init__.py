@@ -49,7 +49,7 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
-from gsmap.types.rows.values import BranchRow, MergeReport, SplitReport
+from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
 
 __all__ = [
     "SCHEMA",
@@ -85,6 +85,7 @@ __all__ = [
     "PoseRow",
     "PriorRow",
     "PruneReport",
+    "PurgeReport",
     "RestoreReport",
     "RevisionRow",
     "Row",

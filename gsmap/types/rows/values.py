@@ -125,3 +125,48 @@ class SplitReport(Row):
     revision: int | None
     num_bytes: int
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PurgeReport(Row):
+    """The receipt of a scene that was forgotten: what went, and where else it may live.
+
+    Args:
+        scene: its id; nothing else of it is kept.
+        maps: the map and the branches that it was taken out of.
+        num_rows: rows that went, by what they were.
+        num_groups: groups of arrays that were deleted.
+        num_bytes: bytes on disk of these.
+        num_tiles: files of tiles made with it that were deleted; `gsmap export` makes those places again without it.
+        exports: the folders that these lay in.
+        unreachable: folders that were exported to and could not be looked into, and why.
+        catalog_copies: copies of the catalog, left by migrations, that were deleted.
+        branches: branches and tags of the map that still have it: the arrays stay for these. `--branches` purges them.
+        backups: snapshots, taken since it came, that may hold it.
+        linked_files: how many of its files had other names on the same disk: a map that it was merged or split into, or
+            a clone, has it.
+        mentions: what people wrote elsewhere in the map with its name or id in it.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "scene": "scene",
+        "num_groups": "groups",
+        "num_bytes": "bytes",
+        "num_tiles": "tiles",
+        "branches": "still in",
+        "backups": "perhaps in",
+    }
+
+    scene: str
+    maps: tuple[str, ...]
+    num_rows: Mapping[str, int]
+    num_groups: int
+    num_bytes: int
+    num_tiles: int
+    exports: tuple[str, ...]
+    unreachable: tuple[str, ...]
+    catalog_copies: tuple[str, ...]
+    branches: tuple[str, ...]
+    backups: tuple[str, ...]
+    linked_files: int
+    mentions: tuple[str, ...]
