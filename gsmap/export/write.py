@@ -23,7 +23,7 @@ from gsmap.formats import tiles3d
 from gsmap.types import MergeResult, Tile
 from gsmap.types.progress import Progress, silent
 
-_STAGING = ".partial"
+STAGING = ".partial"
 Make = Callable[[PlannedTile, Progress], MergeResult]
 _At = tuple[int, str]  # component and name of a tile
 
@@ -95,8 +95,8 @@ def export_tiles(
     news: dict[_At, Tile] = {}
     try:
         if out.exists():
-            remove_tree(out, _STAGING)  # what an interrupted export left; it may not be ours, and hold links
-        (out / _STAGING).mkdir(parents=True)
+            remove_tree(out, STAGING)  # what an interrupted export left; it may not be ours, and hold links
+        (out / STAGING).mkdir(parents=True)
         with closing(_finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers)) as finished:
             for at, tile, num_bytes in finished:
                 _remove(out, old.get(at), unless=tile.path)
@@ -121,7 +121,7 @@ def export_tiles(
         raise
     finally:
         with suppress(OSError):
-            remove_tree(out, _STAGING)
+            remove_tree(out, STAGING)
     tiles = [manifest.tiles[at] for at in sorted(planned)]
     return ExportResult(tiles, len(todo), reused, len(gone), manifest.notes + _told(news))
 
@@ -140,7 +140,7 @@ def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, repor
     path, digest, num_bytes = "", "", 0
     if len(content.gaussians):
         path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
-        staged = out / _STAGING / path.replace("/", "_")
+        staged = out / STAGING / path.replace("/", "_")
         try:
             _write(staged, content, recipe)
         except GsmapError as error:

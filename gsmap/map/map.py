@@ -32,18 +32,21 @@ from gsmap.types.rows import (
     GraphRow,
     IngestRow,
     MapStatus,
+    MergeReport,
     ModelRow,
     PairReport,
     PoseChangeRow,
     PoseRow,
     PriorRow,
     PruneReport,
+    PurgeReport,
     RestoreReport,
     RevisionRow,
     SceneReport,
     SceneRow,
     SettingRow,
     SnapshotRow,
+    SplitReport,
     TileRow,
     UpdateReport,
 )
@@ -590,6 +593,41 @@ class Map(AbstractContextManager["Map"]):
             raise NotFoundError(f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete")
         self.store.branches.delete(name)
         return row
+
+    def merge(self, source: str | os.PathLike[str]) -> MergeReport:
+        """``gsmap merge MAP SOURCE``: take all that another map, branch or tag knows; nothing is computed."""
+        return as_values.merge(self.store, source)
+
+    def split(
+        self,
+        out: str | os.PathLike[str],
+        *,
+        island: int | None = None,
+        box: Sequence[float] | None = None,
+        scenes: Sequence[str] | None = None,
+    ) -> SplitReport:
+        """``gsmap split MAP OUT``: a new map of some scenes, with all that is known of and among them.
+
+        Args:
+            island: those of this component.
+            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of the island, else of component 0.
+            scenes: those of these names.
+        """
+        return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))
+
+    def purge(self, ref: str, *, branches: bool = False) -> PurgeReport:
+        """``gsmap remove MAP SCENE --purge``: forget a scene for good: rows, arrays, tiles that were made with it.
+
+        Args:
+            branches: in the map's other branches and tags, too; else they are told of.
+        """
+        from gsmap.map.stages.purge import purge
+
+        return as_values.purge_report(purge(self.store, ref, branches=branches))
+
+    def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
+        """``gsmap restore-scene MAP SCENE``: bring back a removed scene, or (``source``) take one of another map."""
+        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source))
 
     def check(self) -> CheckReport:
         """Read every byte of the map and compare it with what was written."""

@@ -13,6 +13,7 @@ import contextlib
 import fcntl
 import hashlib
 import os
+import shutil
 import stat
 import threading
 import time
@@ -24,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_folder
+from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_file, sync_folder
 from gsmap.errors import BusyError, CorruptError
 from gsmap.store.columns import KINDS, is_digest
 
@@ -74,6 +75,32 @@ class Arrays:
                 yield Staged(folder, _synchronise(folder))
             finally:
                 with contextlib.suppress(OSError):  # there is nothing where it was published
+                    self._remove_staged(folder.name)
+
+    @contextlib.contextmanager
+    def stage_copies(
+        self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
+    ) -> Iterator[dict[tuple[str, str], Staged]]:
+        """Bring groups of another map beside their places; dropped at the end unless `publish` took them.
+
+        Files are linked where the disk allows, since no map ever writes to one again, and else copied.
+
+        Args:
+            groups: manifest by (kind, name).
+
+        Raises:
+            CorruptError: a file is missing, or differs from what was written.
+        """
+        with self._lock_staging(fcntl.LOCK_SH):
+            folder = self.staging / uuid.uuid4().hex
+            try:
+                folder.mkdir()
+                yield {
+                    group: Staged(_take(source._place(*group), folder / "-".join(group), files), tuple(files))
+                    for group, files in groups.items()
+                }
+            finally:
+                with contextlib.suppress(OSError):
                     self._remove_staged(folder.name)
 
     @contextlib.contextmanager
@@ -285,6 +312,34 @@ def _write(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
         )
         if array.size:
             made[...] = array
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Another name for a file that is never written again, or a copy where the disk has no such thing."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+        sync_file(target)
+
+
+def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
+    """Another map's group as one of our own, every byte compared; returns ``target``."""
+    target.mkdir()
+    present = files_below(place)
+    for file in files:
+        path, mine, found = place / file.path, target / file.path, present.get(file.path)
+        if found is None or not stat.S_ISREG(found.st_mode) or found.st_size != file.size_bytes:
+            raise CorruptError(f"{path} is missing or cut off: run gsmap check on that map, and repair it first")
+        mine.parent.mkdir(parents=True, exist_ok=True)
+        link_or_copy(path, mine)
+        if _sha256(mine) != file.sha256:
+            raise CorruptError(
+                f"{path} differs from what was written: run gsmap check on that map, and repair it first"
+            )
+    for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
+        sync_folder(path)
+    return target
 
 
 def _rows(array: Any, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:

@@ -49,7 +49,7 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
-from gsmap.types.rows.values import BranchRow
+from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
 
 __all__ = [
     "SCHEMA",
@@ -72,6 +72,7 @@ __all__ = [
     "InitReport",
     "LayerRow",
     "MapStatus",
+    "MergeReport",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -84,6 +85,7 @@ __all__ = [
     "PoseRow",
     "PriorRow",
     "PruneReport",
+    "PurgeReport",
     "RestoreReport",
     "RevisionRow",
     "Row",
@@ -93,6 +95,7 @@ __all__ = [
     "SceneRow",
     "SettingRow",
     "SnapshotRow",
+    "SplitReport",
     "TileRow",
     "TodoRow",
     "TrustReport",
