@@ -13,9 +13,10 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, GsmapError
 from gsmap.store import sqlite, staging
-from gsmap.store.arrays import CHUNK_ROWS, Arrays
+from gsmap.store.arrays import Arrays
 from gsmap.store.catalog import Catalog, explained, now
 from gsmap.store.groups import manifest
+from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress
