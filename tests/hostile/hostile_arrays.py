@@ -85,7 +85,7 @@ def a_chunk_that_is_a_pipe(w: World) -> None:
         w.set("UPDATE files SET size_bytes = 0 WHERE path = 'sh/c/0/0/0'")
 
 
-@case(r"no plain file", works=("list MAP scenes", "remove MAP b"))
+@case(r"is a link", works=("list MAP scenes", "remove MAP b"))
 def a_model_that_is_a_link(w: World) -> None:
     for model in (w.map / "models").iterdir():
         w.replaced(model, w.home / "thesis.txt")

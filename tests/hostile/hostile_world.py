@@ -64,7 +64,8 @@ def make_world(root: Path) -> None:
         store.priors.set(Prior("a", pose, np.ones(7)))
         store.scenes.edit("a", note="wet floor", tags_add=["hall"])
         (root / "net.onnx").write_bytes(b"no network, but nobody runs it")
-        store.models.add("net", root / "net.onnx", kind="clip")
+        options = {"kind": "clip", "sha256": "0" * 64, "preset": "unit", "mean": [0.0] * 3, "std": [1.0] * 3}
+        store.models.add("net", root / "net.onnx", kind="clip", options=options | {"inputs": [], "outputs": []})
     with gsmap.map.open(root / "site.gsmap") as m:
         m.export(root / "tiles", merge="union", tile_size_m=0)
     (root / "captures").mkdir()
@@ -199,17 +200,29 @@ class Case:
 
 VERBS = (
     "list MAP scenes",
-    "list MAP edges",
     "show MAP a",
-    "status MAP",
     "models list MAP",
-    "look MAP",
     "check MAP",
-    "prune MAP --dry-run",
-    "export MAP TILES --tile-size 0 --merge voxel",
     "remove MAP b",
     "prune MAP --keep-revisions 0",
-    "export MAP TILES --tile-size 0 --merge union",
+    "export MAP TILES --tile-size 0 --merge voxel",
+)
+ALL = (
+    *VERBS,
+    "list MAP edges",
+    "list MAP revisions",
+    "list MAP tiles",
+    "status MAP",
+    "poses MAP",
+    "settings MAP",
+    "diff MAP 1 2",
+    "look MAP",
+    "check MAP --json",
+    "prune MAP --dry-run",
+    "migrate MAP",
+    "edit MAP a --note dry",
+    "settings MAP --set merge.method=union",
+    "export MAP TILES",
 )
 CASES: list[Case] = []
 

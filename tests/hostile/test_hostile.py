@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import resource
 import signal
@@ -21,6 +22,7 @@ import gsmap.map
 from gsmap.cli import app as command_line
 from gsmap.errors import GsmapError
 from gsmap.map.viewing import view_of
+from gsmap.texts import escaped
 
 assert hostile_arrays
 assert hostile_catalogs
@@ -58,12 +60,7 @@ def run(
         signal.alarm(_LIMIT_S)
         try:
             with pytest.raises(SystemExit) as exit:
-                if arguments[0] == "look":
-                    _look(arguments[1])
-                    raise SystemExit
-                command_line.run(arguments)
-        except GsmapError as error:  # the page shows it
-            return 1, str(error).encode()
+                (_look if arguments[0] == "look" else command_line.run)(arguments)
         finally:
             signal.alarm(0)
             resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
@@ -75,14 +72,19 @@ def run(
     logger.level, logger.handlers, logger.propagate = before
 
 
-def _look(folder: str) -> None:
-    """What a browser would ask the page of `gsmap view` for."""
-    with gsmap.map.open(folder) as m:
-        view = view_of(m.store)
-        view.summary()
-        for index in range(len(view.scenes)):
-            view.splats(index)
-            view.extras(index)
+def _look(arguments: list[str]) -> NoReturn:
+    """Make what a browser would ask the page of `gsmap view` for; an error goes to the page as it is."""
+    try:
+        with gsmap.map.open(arguments[1]) as m:
+            view = view_of(m.store)
+            view.summary()
+            for index in range(len(view.scenes)):
+                view.splats(index)
+                view.extras(index)
+    except GsmapError as error:
+        print(escaped(str(error)))
+        raise SystemExit(1) from error
+    raise SystemExit(0)
 
 
 @pytest.fixture
@@ -100,10 +102,8 @@ def server() -> Iterator[tuple[int, list[bytes]]]:
             with connection:
                 received.append(b"connected")
                 connection.settimeout(1)
-                try:
+                with contextlib.suppress(OSError):
                     received.append(connection.recv(1000))
-                except OSError:
-                    pass
 
     thread = threading.Thread(target=listen, daemon=True)
     thread.start()
