@@ -6,6 +6,7 @@ import os
 from typing import Any
 
 from gsmap.describe.onnx.check import check_model
+from gsmap.errors import CorruptError
 from gsmap.store import Store
 from gsmap.types.model import ModelSpec, Tensor
 
@@ -26,13 +27,18 @@ def _spec(options: dict[str, Any], path: str) -> ModelSpec:
     def tensors(rows: list[dict[str, Any]]) -> tuple[Tensor, ...]:
         return tuple(Tensor(row["name"], tuple(row["shape"]), row["dtype"]) for row in rows)
 
-    return ModelSpec(
-        kind=options["kind"],
-        path=path,
-        sha256=options["sha256"],
-        preset=options["preset"],
-        mean=tuple(options["mean"]),
-        std=tuple(options["std"]),
-        inputs=tensors(options["inputs"]),
-        outputs=tensors(options["outputs"]),
-    )
+    try:
+        return ModelSpec(
+            kind=options["kind"],
+            path=path,
+            sha256=options["sha256"],
+            preset=options["preset"],
+            mean=tuple(options["mean"]),
+            std=tuple(options["std"]),
+            inputs=tensors(options["inputs"]),
+            outputs=tensors(options["outputs"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise CorruptError(
+            f"what the catalog says of the model {path} makes no sense ({error!r}): add it again"
+        ) from error

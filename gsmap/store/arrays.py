@@ -27,10 +27,10 @@ import numpy as np
 
 from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_file, sync_folder
 from gsmap.errors import BusyError, CorruptError
+from gsmap.store import layout
 from gsmap.store.columns import KINDS, is_digest
+from gsmap.store.layout import CHUNK_ROWS, SHARD_ROWS
 
-CHUNK_ROWS = 16_384
-SHARD_ROWS = 16 * CHUNK_ROWS
 _ZSTD_LEVEL = 1
 
 
@@ -154,6 +154,7 @@ class Arrays:
         *,
         only: Sequence[str] | None = None,
         rows: Sequence[tuple[int, int]] | None = None,
+        shapes: Mapping[str, layout.Shape] | None = None,
     ) -> dict[str, np.ndarray]:
         """Read arrays of a group.
 
@@ -161,9 +162,10 @@ class Arrays:
             files: its manifest; a missing or short file is found before zarr turns it into zeros.
             only: names of the arrays to read.
             rows: ranges ``[start, stop)`` of rows, in order; all where None.
+            shapes: what the catalog says of the arrays; None for a length that it does not know.
 
         Raises:
-            CorruptError: a file is missing, short, or fails its checksum.
+            CorruptError: a file is missing, short, or fails its checksum, or gsmap does not write arrays so.
         """
         import zarr
 
@@ -175,9 +177,11 @@ class Arrays:
                 raise CorruptError(f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it")
             if found is None or found.st_size != file.size_bytes:
                 raise CorruptError(f"{path} is missing or cut off: run gsmap check, and ingest the scene again")
+        names = _arrays_in(files) if only is None else only
+        layout.check(place, {file.path: file.size_bytes for file in files}, names, shapes)
         try:
-            group = zarr.open_group(str(place), mode="r", zarr_format=3)
-            return {key: _rows(group[key], rows) for key in (group.array_keys() if only is None else only)}
+            group = zarr.open_group(str(place), mode="r", zarr_format=3, use_consolidated=False)
+            return {name: _rows(group[name], rows) for name in names}
         except Exception as error:  # zarr and its codecs raise whatever they stumbled over
             raise CorruptError(
                 f"{place} cannot be read ({type(error).__name__}: {error}): run gsmap check, and ingest the scene again"
@@ -198,6 +202,11 @@ class Arrays:
                 out.append(f"{path} has {found.st_size} bytes, {file.size_bytes} were written")
             elif _sha256(path) != file.sha256:
                 out.append(f"{path} differs from what was written")
+        if not out:
+            try:
+                layout.check(place, {file.path: file.size_bytes for file in files}, _arrays_in(files))
+            except CorruptError as error:
+                out.append(str(error))
         extra = sorted(set(present) - {file.path for file in files})
         return out + [f"{place / name} does not belong there" for name in extra]
 
@@ -340,6 +349,12 @@ def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
     for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
         sync_folder(path)
     return target
+
+
+def _arrays_in(files: Sequence[StoredFile]) -> list[str]:
+    """The names of a group's arrays, by its manifest."""
+    found = (file.path.rpartition("/") for file in files)
+    return sorted(above for above, _, name in found if name == "zarr.json" and above)
 
 
 def _rows(array: Any, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:

@@ -14,11 +14,12 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, GsmapError, StoreError
 from gsmap.store import sqlite, staging
-from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
+from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
+from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress

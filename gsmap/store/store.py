@@ -187,6 +187,12 @@ class Store:
             return store.catalog.accept()
 
     @classmethod
+    def id_at(cls, path: str | os.PathLike[str], catalog_url: str) -> str:
+        """The id of the map whose catalog is at a URL, whatever its schema; see `open` for the errors."""
+        with cls._connect(path, "r", catalog_url) as store:
+            return store.id
+
+    @classmethod
     def _connect(
         cls,
         path: str | os.PathLike[str],
