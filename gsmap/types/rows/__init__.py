@@ -10,6 +10,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -50,6 +51,7 @@ from gsmap.types.rows.truth import (
 
 __all__ = [
     "SCHEMA",
+    "AtWorkRow",
     "BandRow",
     "CheckReport",
     "ComponentErrorRow",
