@@ -1,4 +1,4 @@
-"""Who is at work: one holder at a time, seen to end at once on this machine, and by the clock of the catalog elsewhere."""
+"""Who is at work: one holder at a time; a process that ended holds nothing, one of another machine for a while."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ def _text(seconds: float) -> str:
 
 
 def test_one_holds_and_the_other_is_told_who(store: Store, another: subprocess.Popen[str]) -> None:
-    with pytest.raises(BusyError, match=rf"gsmap optimize \(process {another.pid} on \S+, since \d\d:\d\d\)"):
-        with store.leases.hold("poses", "update"):
-            pass
+    who = rf"gsmap optimize \(process {another.pid} on \S+, since \d\d:\d\d\)"
+    with pytest.raises(BusyError, match=who), store.leases.hold("poses", "update"):
+        pass
     assert [lease.pid for lease in store.leases.others()] == [another.pid]
     with store.leases.hold("graph k", "update"):
         assert {lease.what: lease.task for lease in store.leases.list()} == {"poses": "optimize", "graph k": "update"}
