@@ -40,10 +40,8 @@ def folder_lock(out: Path, *, wait: bool = False, waiting: Callable[[str], None]
     if out.exists() and not out.is_dir():
         yield
         return
-    fresh = not out.exists()
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        handle = _locked(out, wait, waiting)
+        handle, fresh = _locked(out, wait, waiting)
     except OSError as error:
         raise StoreError(f"cannot write the export to {out}: {error.strerror or error}") from error
     try:
@@ -58,13 +56,19 @@ def folder_lock(out: Path, *, wait: bool = False, waiting: Callable[[str], None]
                 out.rmdir()
 
 
-def _locked(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> int | None:
-    """The open lock file; None where there can be none."""
-    path, told = out / LOCK_FILE, False
+def _locked(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> tuple[int | None, bool]:
+    """The open lock file, None where there can be none; and whether the folder was made for it."""
+    path, told, fresh = out / LOCK_FILE, False, False
     while True:
-        handle = _opened(path)
+        with suppress(FileExistsError):
+            out.mkdir(parents=True)
+            fresh = True
+        try:
+            handle = _opened(path)
+        except FileNotFoundError:
+            continue  # who made the folder took it away again
         if handle is None:
-            return None
+            return None, fresh
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -83,7 +87,7 @@ def _locked(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> int
             with suppress(OSError):  # opened for reading, or a full disk: who it is stays untold
                 os.ftruncate(handle, 0)
                 os.write(handle, json.dumps(asdict(this_process("export"))).encode())
-            return handle
+            return handle, fresh
         os.close(handle)  # its last holder took it away between the two calls
 
 
