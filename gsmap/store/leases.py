@@ -213,11 +213,10 @@ class Leases:
             "expires_at": _text(now + timedelta(seconds=self._lease_s)),
         }
         insert = sqlite_dialect.insert if self._catalog.is_sqlite else postgresql.insert
-        ours = []
+        ours: set[str] = set()
         for what in sorted(whats):  # in one order for all, or two servers' connections wait for each other
-            made = insert(leases).values({"what": what, **row}).on_conflict_do_nothing()
-            if connection.execute(made).rowcount == 1:
-                ours.append(what)
+            made = insert(leases).values({"what": what, **row}).on_conflict_do_nothing().returning(leases.c.what)
+            ours.update(connection.execute(made).scalars())
         return [what for what in whats if what in ours]
 
     def _judged(self, connection: Connection, now: datetime) -> tuple[list[Lease], list[Lease]]:

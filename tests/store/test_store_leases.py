@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta, tzinfo
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -68,8 +71,6 @@ def of_another_machine(store: Store, what: str, *, seconds_left: float) -> None:
 
 
 def _text(seconds: float) -> str:
-    from datetime import UTC, datetime
-
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="microseconds")
 
 
@@ -187,18 +188,19 @@ def test_no_more_are_taken_than_asked_for_and_none_that_is_done(store: Store) ->
         assert set(rows(store)) == {"a", "b", "c", "e"}
 
 
-def test_of_many_threads_one_gets_each(store: Store) -> None:
+def compete(openers: Sequence[Callable[[], Store]]) -> None:
+    """Several take three of twelve at a time until there are none: each is got by one."""
     won: list[str] = []
+    everyone = threading.Barrier(len(openers))
 
-    def compete() -> None:
-        with Store.open(store.folder) as mine:
-            for _ in range(3):
-                won.extend(mine.leases.take([str(i) for i in range(12)], "update", limit=3).ours)
-            time.sleep(0.5)  # all hold what they have while others ask
+    def take(opener: Callable[[], Store]) -> None:
+        with opener() as mine:
             everyone.wait()
+            for _ in range(4):
+                won.extend(mine.leases.take([str(i) for i in range(12)], "update", limit=3).ours)
+            everyone.wait()  # all hold what they have while others ask
 
-    everyone = threading.Barrier(4)
-    threads = [threading.Thread(target=compete) for _ in range(4)]
+    threads = [threading.Thread(target=take, args=(opener,)) for opener in openers]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -206,5 +208,45 @@ def test_of_many_threads_one_gets_each(store: Store) -> None:
     assert sorted(won, key=int) == [str(i) for i in range(12)]
 
 
+def test_of_many_one_gets_each(store: Store) -> None:
+    compete([lambda: Store.open(store.folder)] * 4)
+
+
 def test_words_of_a_stranger_do_not_reach_the_terminal_raw() -> None:
     assert "\x1b" not in Holder("up\x1b[2Jdate", "h\nost", "1 2 3", "\x1b]0;x\x07").who
+
+
+def test_on_postgres_the_server_s_clock_counts(
+    tmp_path: Path, postgres_database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Wrong(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:
+            return datetime.now(tz) + timedelta(days=1)
+
+    with Store.create(tmp_path / "m", catalog_url=postgres_database) as first, Store.open(tmp_path / "m") as second:
+        assert first.leases.take(["x", "y"], "update").ours == ("x", "y")
+        monkeypatch.setattr("gsmap.store.leases.datetime", Wrong)  # this machine's clock is a day ahead
+        assert second.leases.take(["x", "z"], "update").ours == ("z",)
+        assert {lease.what for lease in second.leases.others()} == {"x", "y"}
+        first.leases.release(["x"])
+        assert second.leases.try_hold("x", "update")
+        of_another_machine(first, "w", seconds_left=1.0)
+        assert not first.leases.try_hold("w", "update")
+        time.sleep(1.1)
+        assert first.leases.try_hold("w", "update")
+        mine = Leases(first.catalog, lease_s=1.0, heartbeat_s=0.2)
+        assert mine.try_hold("v", "update")
+        before = rows(first)["v"]
+        time.sleep(0.6)
+        assert rows(first)["v"] > before
+        mine.close()
+        assert "v" not in rows(first)
+
+
+def test_of_many_on_postgres_one_gets_each(tmp_path: Path, postgres_database: str) -> None:
+    """Machines that share the server and no lock file."""
+    Store.create(tmp_path / "m", catalog_url=postgres_database).close()
+    for i in range(4):
+        shutil.copytree(tmp_path / "m", tmp_path / f"m{i}")
+    compete([partial(Store.open, tmp_path / f"m{i}", catalog_url=postgres_database) for i in range(4)])
