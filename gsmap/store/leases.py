@@ -20,7 +20,7 @@ from sqlalchemy import ColumnElement, Connection, delete, func, select, update
 from sqlalchemy.dialects import postgresql
 from sqlalchemy.dialects import sqlite as sqlite_dialect
 
-from gsmap.errors import BusyError, GsmapError
+from gsmap.errors import BusyError, GsmapError, StoreError
 from gsmap.store.catalog import Catalog
 from gsmap.store.schema import leases
 from gsmap.types.holder import Holder, this_process
@@ -104,7 +104,10 @@ class Leases:
             self._verb = self._verb or task
         try:
             if is_first:
-                self.take([mine], task)
+                try:
+                    self.take([mine], task)
+                except StoreError as error:  # a full disk: what is to be done may need nothing written here
+                    _log.info("others are not told that this process is at work: %s", error)
             yield [lease for lease in self.others() if lease.what == what]
         finally:
             with self._lock:

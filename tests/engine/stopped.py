@@ -40,6 +40,8 @@ def main() -> None:
 
         ctypes.CDLL(None).sleep(int(seconds))
         return
+    if word == "hog here":
+        hog(seconds)
     if word == "clean-up":  # that never ends
         try:
             time.sleep(seconds)

@@ -111,7 +111,7 @@ def test_workers_end_with_a_parent_that_is_killed(start: Start, word: str) -> No
     assert process.communicate()[1] == ""
 
 
-@pytest.mark.parametrize("word", ["here", "clean-up"])
+@pytest.mark.parametrize("word", ["here", "hog here", "clean-up"])
 def test_neither_native_code_nor_clean_up_holds_the_end_up(start: Start, word: str) -> None:
     process = start(word)
     time.sleep(0.2)

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import insert, select, update
 
-from gsmap.errors import BusyError
+from gsmap.errors import BusyError, StoreError
 from gsmap.store import Store, schema
 from gsmap.store.leases import Leases
 from gsmap.types.holder import Holder, this_process
@@ -175,6 +175,17 @@ def test_a_map_opened_for_reading_is_told_nothing(store: Store) -> None:
         with reader.leases.attend("status") as others:
             assert [lease.task for lease in others] == ["update"]
             assert rows(store) == before
+
+
+def test_what_cannot_be_told_is_no_error(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk: what a verb does may need nothing written there."""
+
+    def full(*_: object, **__: object) -> None:
+        raise StoreError("the disk is full")
+
+    monkeypatch.setattr(store.catalog, "write", full)
+    with store.leases.attend("export") as others:
+        assert others == []
 
 
 def test_no_more_are_taken_than_asked_for_and_none_that_is_done(store: Store) -> None:
