@@ -97,7 +97,8 @@ def export_tiles(
         if out.exists():
             remove_tree(out, STAGING)  # what an interrupted export left; it may not be ours, and hold links
         (out / STAGING).mkdir(parents=True)
-        with closing(_finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers)) as finished:
+        work = _finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers, report.give_up)
+        with closing(work) as finished:
             for at, tile, num_bytes in finished:
                 _remove(out, old.get(at), unless=tile.path)
                 manifest.tiles[at], manifest.num_bytes[tile.path] = tile, num_bytes
@@ -201,9 +202,12 @@ def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
 
 
 def _finished(
-    todo: Sequence[PlannedTile], make: Callable[[PlannedTile], tuple[_At, Tile, int]], workers: int
+    todo: Sequence[PlannedTile],
+    make: Callable[[PlannedTile], tuple[_At, Tile, int]],
+    workers: int,
+    give_up: Callable[[], None],
 ) -> Generator[tuple[_At, Tile, int], None, None]:
-    """Results of ``make`` as they come; the first error ends it, and what has not begun is never begun."""
+    """Results of ``make`` as they come; the first error ends it: what has not begun never does, the rest gives up."""
     if workers == 1 or len(todo) < 2:
         yield from map(make, todo)
         return
@@ -212,6 +216,7 @@ def _finished(
         for future in as_completed([pool.submit(make, planned) for planned in todo]):
             yield future.result()
     finally:
+        give_up()
         pool.shutdown(cancel_futures=True)
 
 
@@ -221,8 +226,15 @@ class _Report:
     def __init__(self, progress: Progress, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done
         self._lock = Lock()
+        self._given_up = False
+
+    def give_up(self) -> None:
+        """End the making of tiles that are still being made: their result is not wanted any more."""
+        self._given_up = True
 
     def within_tile(self, fraction: float, text: str) -> None:
+        if self._given_up:
+            raise GsmapError("this tile was given up")
         with self._lock:
             at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
             self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")

@@ -328,6 +328,7 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        wait: bool = False,
     ) -> ExportReport:
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
 
@@ -342,8 +343,10 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            wait: where another export is at work in the folder, until it has ended.
 
         Raises:
+            BusyError: another export is at work in the folder; it is named.
             ConfigError, InputError, StoreError: see `gsmap.export`; no half-written tile is left.
         """
         from gsmap.map.stages.export import Request, export
@@ -359,7 +362,11 @@ class Map(AbstractContextManager["Map"]):
             budget_s=budget_s,
             provenance=provenance,
         )
-        made = export(self.store, Path(out), request, self.settings, lambda f, text: self._progress("export", f, text))
+
+        def progress(fraction: float, text: str) -> None:
+            self._progress("export", fraction, text)
+
+        made = export(self.store, Path(out), request, self.settings, progress, wait=wait)
         return reports.export_report(self.store, Path(out), made)
 
     # --- look --------------------------------------------------------------------------------------------------------

@@ -104,9 +104,10 @@ def test_a_damaged_catalog_is_not_backed_up(tmp_path, place):
     catalog = tmp_path / "m" / "map.sqlite"
     data = bytearray(catalog.read_bytes())
     data[data.rindex(b"settings") + 3] ^= 1  # in a text, which SQLite itself does not notice
-    with Store.open(tmp_path / "m", "r") as store, pytest.raises(CorruptError, match=r"map\.sqlite"):
+    with Store.open(tmp_path / "m", "r") as store:
         catalog.write_bytes(data)
-        save(store, place)
+        with pytest.raises(CorruptError, match=r"map\.sqlite"):
+            save(store, place)
 
 
 class Meddling(FolderPlace):
