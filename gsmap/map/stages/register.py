@@ -55,9 +55,7 @@ def _key(recipe: RecipeKey, graphs: Mapping[str, RecipeKey], target: str, source
     return recipe.of(graphs[target].digest, graphs[source].digest)
 
 
-def _lacking(
-    store: Store, pairs: Sequence[Pair], graphs: Mapping[str, RecipeKey], recipe: RecipeKey
-) -> list[Pair]:
+def _lacking(store: Store, pairs: Sequence[Pair], graphs: Mapping[str, RecipeKey], recipe: RecipeKey) -> list[Pair]:
     """Those of the pairs that this recipe has not registered, in either direction: older maps hold both."""
     current = {frozenset((r.registration.target, r.registration.source)): r for r in store.registrations.current()}
     lacking = []
