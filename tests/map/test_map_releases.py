@@ -6,6 +6,7 @@ import tarfile
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from sqlite3 import connect
 
@@ -100,7 +101,7 @@ def test_everything_in_it_is_listed_and_shown(opened: Map) -> None:
     assert edges
     for edge in edges:
         assert opened.show_pair(f"{edge.target_name}:{edge.source_name}").history
-    for before, after in zip(revisions[:-1], revisions[1:], strict=True):
+    for before, after in pairwise(revisions):
         opened.diff(before.number, after.number)
     assert opened.status().scenes == len(scenes)
 

@@ -1,8 +1,8 @@
 """A map that schema 0001 wrote, and what is in it.
 
-``releases/0.1.0.tar.xz`` was made by gsmap 0.1.0 (commit 0ff8db8): two scenes (the first with a date and a note), a graph
-of each, two registrations of the pair with a confirmation that was withdrawn, three revisions, an export with one tile,
-and a prior.
+``releases/0.1.0.tar.xz`` was made by gsmap 0.1.0 (commit 0ff8db8): two scenes (the first with a date and a note), a
+graph of each, two registrations of the pair with a confirmation that was withdrawn, three revisions, an export with one
+tile, and a prior.
 """
 
 import tarfile
