@@ -29,6 +29,10 @@ def last_line(out: str) -> str:
     return next((line.strip() for line in reversed(out.splitlines()) if line.strip()), "said nothing")
 
 
+def every_line(out: str) -> str:
+    return "; ".join(line.strip() for line in out.splitlines() if line.strip())
+
+
 def total(out: str) -> str:
     """The sums of a sweep: what is not zero, and what must be."""
     try:
@@ -81,6 +85,7 @@ PROMISES = (
         "100 % of 200 found, three ways",
         "tools/check_flips.py --count 200",
         "tools/check_flips.py --count 20",
+        every_line,
     ),
     Promise(
         "mutants",
