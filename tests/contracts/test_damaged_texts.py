@@ -46,7 +46,7 @@ def test_a_tile_whose_path_is_no_name_has_no_file(tmp_path: Path) -> None:
     assert not any(found.has_file(tmp_path, tile) for tile in found.tiles.values())
 
 
-@pytest.mark.parametrize("text", [DEEP, '{"root": {"boundingVolume": {"box": [%d, 0, 0]}}}' % HUGE, '{"root": 7}'])
+@pytest.mark.parametrize("text", [DEEP, f'{{"root": {{"boundingVolume": {{"box": [{HUGE}, 0]}}}}}}', '{"root": 7}'])
 def test_levels_of_a_tileset_that_is_not_ours_are_made_again(tmp_path: Path, text: str) -> None:
     (tmp_path / "tileset.json").write_text(text)
     assert tileset._known_boxes(tmp_path) == {}

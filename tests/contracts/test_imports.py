@@ -23,7 +23,7 @@ LAYERS = [
     {"geometry"},
     {"methods"},
     {"settings"},
-    {"formats", "render"},
+    {"formats", "render", "networks"},
     {
         "store",
         "retrieve",
@@ -54,7 +54,7 @@ HOMES = {
     "zarr": {"store"},
     "gtsam": {"optimize"},
     "networkx": {"optimize"},
-    "onnxruntime": {"describe", "evaluate"},
+    "onnxruntime": {"networks"},
     "small_gicp": {"register"},
     "kiss_matcher": {"register"},
     "open3d": {"gsmap_synthetic"},
