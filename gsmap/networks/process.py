@@ -21,6 +21,7 @@ from gsmap.networks import child
 from gsmap.types.model import ModelLimits, Tensor
 
 _MIB = 1 << 20
+_MOST_S, _MOST_BYTES = 1e6, 1 << 50  # what the system takes for a timeout and a limit
 _PER_ARRAY_BYTES = 64  # of shared memory, so that each can be aligned
 
 
@@ -43,13 +44,15 @@ class ModelProcess:
 
     def __init__(self, path: str, limits: ModelLimits) -> None:
         self.path, self.limits = path, limits
+        self._memory_bytes = min(limits.memory_mb * _MIB, _MOST_BYTES)
+        self._time_s = min(limits.time_s, _MOST_S)
         self._lock = threading.Lock()
         self._given_bytes = 0
         link, theirs = socket.socketpair()
         shared = _shared_memory()
         command = [sys.executable, "-P", child.__file__, str(theirs.fileno()), str(shared)]
         self._process = subprocess.Popen(
-            [*command, path, str(limits.memory_mb * _MIB)],
+            [*command, path, str(self._memory_bytes)],
             stdin=subprocess.PIPE,  # nothing is written to it: it closes when this process ends
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -65,6 +68,10 @@ class ModelProcess:
             self.close()
             raise InputError(f"{path} is not an ONNX model that can be run: {said['error']}")
         self.inputs, self.outputs = (_tensors(said[end]) for end in ("inputs", "outputs"))
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
 
     @property
     def is_alive(self) -> bool:
@@ -93,14 +100,14 @@ class ModelProcess:
         self, what: str, outputs: list[str] | None, feed: Mapping[str, np.ndarray]
     ) -> tuple[dict[str, Any], list[np.ndarray]]:
         """Its answer to inputs, or what it says when it has loaded; it is ended where there is none in time."""
-        deadline = time.monotonic() + self.limits.time_s
+        deadline = time.monotonic() + self._time_s
         try:
             if feed:
                 taken = sum(array.nbytes + _PER_ARRAY_BYTES for array in feed.values())
                 self._channel.reserve(max(taken, self._given_bytes))
-                self._channel.link.settimeout(self.limits.time_s)
+                self._channel.link.settimeout(self._time_s)
                 self._channel.send({"outputs": outputs, "names": list(feed)}, list(feed.values()))
-            said, arrays = self._channel.receive(self.limits.memory_mb * _MIB, deadline)
+            said, arrays = self._channel.receive(self._memory_bytes, deadline)
         except TimeoutError as error:
             self.close()
             raise InputError(

@@ -68,7 +68,10 @@ def test_pose(tmp_path: Path, text: str) -> None:
         read_pose(tmp_path / "pose.json")
 
 
-@pytest.mark.parametrize("text", ["a = " + "9" * 5000, "a = " + DEEP, "a = nan", "[describe]\nobjects = 2099-99-99"])
+@pytest.mark.parametrize(
+    "text",
+    ["a = " + "9" * 5000, "a = " + DEEP, "a = nan", f"[merge]\nnear_m = {HUGE}", "[describe]\nobjects = 2099-99-99"],
+)
 def test_settings(tmp_path: Path, text: str) -> None:
     (tmp_path / "settings.toml").write_text(text)
     with pytest.raises(ConfigError, match=r"settings\.toml"):

@@ -81,6 +81,8 @@ def test_a_model_that_takes_all_memory_is_ended(tmp_path, network):
 def test_memory_is_held_to_the_limit_and_what_fits_runs(tmp_path):
     path = networks.image_encoder(tmp_path / "m.onnx", side="side")
     small, large = ModelProcess(str(path), ModelLimits(60, 100)), ModelProcess(str(path), ModelLimits(60, 2000))
+    endless = ModelProcess(str(path), ModelLimits(float("inf"), 2**60))
+    np.testing.assert_allclose(endless.run(None, PICTURE)[0], 1)
     pictures = np.ones((60, 3, 512, 512), np.float32)  # 189 MB
     assert large.run(None, {"pixels": pictures})[0].shape == (60, 3)
     with pytest.raises(InputError, match=r"more than 100 MB with --set describe\.object\.model_memory_mb"):
@@ -143,7 +145,7 @@ def test_a_signal_ends_both_at_once(tmp_path, how):
         "from gsmap.types.model import ModelLimits\n"
         "import numpy as np\n"
         "model = ModelProcess(sys.argv[1], ModelLimits(600))\n"
-        "print(model._process.pid, flush=True)\n"
+        "print(model.pid, flush=True)\n"
         "model.run(None, {'pixels': np.ones((1, 3, 8, 8), np.float32)})\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -165,7 +167,7 @@ def test_a_signal_ends_both_at_once(tmp_path, how):
 @linux
 def test_it_writes_no_files(tmp_path):
     model = ModelProcess(str(networks.image_encoder(tmp_path / "m.onnx")), ModelLimits())
-    limits = Path(f"/proc/{model._process.pid}/limits").read_text()
+    limits = Path(f"/proc/{model.pid}/limits").read_text()
     assert [line.split()[3:5] for line in limits.splitlines() if line.startswith("Max file size")] == [["0", "0"]]
 
 
