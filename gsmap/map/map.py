@@ -506,7 +506,12 @@ class Map(AbstractContextManager["Map"]):
         if images is None:
             return report
         rows = evaluating.images(
-            self.store, images, lambda f, text: self._progress("evaluate", f, text), tiles=tiles, lpips=lpips
+            self.store,
+            images,
+            lambda f, text: self._progress("evaluate", f, text),
+            tiles=tiles,
+            lpips=lpips,
+            limits=self.settings.describe.object.limits,
         )
         return replace(report, images=rows)
 
@@ -669,4 +674,4 @@ class Map(AbstractContextManager["Map"]):
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""
         from gsmap.map import models
 
-        models.add(self.store, kind, path, preset, copy)
+        models.add(self.store, kind, path, preset, copy, self.settings.describe.object.limits)
