@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ FILE_NAME = "tiles.json"
 _VERSION = 2
 _NAMELESS = 1  # its tiles had a free text instead of a recipe, so that nobody knows what made them
 _SAVE_EVERY_S = 2.0
+_PATH = re.compile(r"component_\d+/[^/\\]+")
 
 
 @dataclass
@@ -31,12 +33,14 @@ class Manifest:
         tiles: those that are finished.
         num_bytes: size of each tile's file, by path.
         notes: what a person should know about the folder as it was found.
+        doomed: paths of files that are no longer a tile's and are still to be deleted.
     """
 
     map_id: str
     tiles: dict[tuple[int, str], Tile] = field(default_factory=dict)
     num_bytes: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    doomed: set[str] = field(default_factory=set)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
 
     @classmethod
@@ -64,6 +68,7 @@ class Manifest:
                     f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
+            doomed = {_checked_path(p) for p in content.get("doomed", ())}
         except (OSError, ValueError, KeyError, TypeError) as error:
             if isinstance(error, ConfigError):
                 raise
@@ -80,6 +85,7 @@ class Manifest:
             {(tile.component, name): tile for name, tile, _ in entries},
             {tile.path: size for _, tile, size in entries},
             notes,
+            doomed,
         )
 
     def has_file(self, folder: Path, tile: Tile) -> bool:
@@ -101,8 +107,10 @@ class Manifest:
         entries = [
             _entry(name, tile, self.num_bytes.get(tile.path, 0)) for (_, name), tile in sorted(self.tiles.items())
         ]
-        text = json.dumps({"version": _VERSION, "map_id": self.map_id, "tiles": entries}, indent=1)
-        write_text_whole(folder / FILE_NAME, text)
+        content = {"version": _VERSION, "map_id": self.map_id, "tiles": entries}
+        if self.doomed:
+            content["doomed"] = sorted(self.doomed)
+        write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
         self._saved_at = time.monotonic()
 
 
@@ -124,6 +132,15 @@ def _entry(name: str, tile: Tile, num_bytes: int) -> dict[str, object]:
     }
 
 
+def _checked_path(path: Any) -> str:
+    """A tile's path: a file in a component's folder, as every export writes it; empty where the tile holds nothing."""
+    if not isinstance(path, str) or (path and _PATH.fullmatch(path) is None):
+        raise ValueError(f"the path {path!r} of a tile is not component_N/NAME")
+    if path.rpartition("/")[2] in (".", ".."):
+        raise ValueError(f"the path {path!r} of a tile leads out of its folder")
+    return path
+
+
 def _tile(entry: Mapping[str, Any], version: int) -> Tile:
     known = version == _VERSION
     return Tile(
@@ -134,7 +151,7 @@ def _tile(entry: Mapping[str, Any], version: int) -> Tile:
         num_gaussians=int(entry["num_gaussians"]),
         recipe=dict(entry["recipe"]) if known else {},
         truncated=bool(entry["truncated"]),
-        path=str(entry["path"]),
+        path=_checked_path(entry["path"]),
         sha256=str(entry["sha256"]),
         notes=tuple(str(note) for note in entry["notes"]) if known else (),
     )

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import write_whole
+from gsmap.durable import make_folder, sync_file, sync_folder, write_whole
+from gsmap.export.manifest import FILE_NAME as MANIFEST
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
 from gsmap.types import Gaussians, Tile
@@ -35,6 +36,21 @@ class _Drawn:
 
     def gaussians(self) -> Gaussians:
         return tiles3d.read_content(self.path)
+
+
+def is_stale(out: Path, tiles: Sequence[Tile]) -> bool:
+    """Whether `write_tilesets` has work to do, also where an earlier one was killed."""
+    changed_ns = (out / MANIFEST).stat().st_mtime_ns
+    for folder in {(out / tile.path).parent for tile in tiles if tile.path}:
+        try:
+            if (folder / FILE_NAME).stat().st_mtime_ns <= changed_ns:
+                return True
+        except OSError:
+            return True
+        known = _known_boxes(folder)
+        if any(f"{LEVELS_FOLDER}/{path.name}" not in known for path in (folder / LEVELS_FOLDER).glob("*")):
+            return True
+    return False
 
 
 def write_tilesets(out: Path, tiles: Sequence[Tile], tile_size_m: float) -> list[Path]:
@@ -100,10 +116,12 @@ def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndar
     else:
         finer = Gaussians.concatenate([c.gaussians() for c in children])
         level, voxel_m = tiles3d.coarser(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)))
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
         staged = path.with_name(f".{path.name}.partial")
         boxes = np.stack([tiles3d.write_content(staged, level), *(c.node.box for c in children)])
+        sync_file(staged)
         os.replace(staged, path)
+        sync_folder(path.parent)
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level must never be finer than what replaces it, or viewers would stop at it too early.
         error_m = max(voxel_m, 1.5 * max(c.node.error_m for c in children), 1e-3)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import shutil
 import sqlite3
 import tempfile
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,8 +38,12 @@ class State:
     files: dict[str, str] = field(default_factory=dict)
     exists: bool = False
 
-    def same(self, other: State) -> bool:
-        return self.exists == other.exists and self.alike == other.alike and self.files == other.files
+    def same(self, other: State, *, history: bool = False) -> bool:
+        """Whether two runs came to the same; with ``history``, rows of this one that were replaced by equal ones may be
+        there too.
+        """
+        more = {row for row in self.alike - other.alike if not (history and _standing(row) in other.alike)}
+        return self.exists == other.exists and self.files == other.files and not more and other.alike <= self.alike
 
 
 def state(folder: Path, extra_maps: Iterable[str] = ()) -> State:
@@ -46,13 +52,20 @@ def state(folder: Path, extra_maps: Iterable[str] = ()) -> State:
     files = {}
     for place in (site / "settings.toml", *_files(folder / "out")):
         if place.is_file() and not place.name.startswith("."):
-            files[str(place.relative_to(folder))] = hashlib.sha256(place.read_bytes()).hexdigest()
+            files[str(place.relative_to(folder))] = hashlib.sha256(_content(place)).hexdigest()
     if not (site / "map.sqlite").is_file():
         return State(files=files, exists=False)
     rows: dict[str, str] = {}
     for name in ("", *extra_maps):
         rows |= {name + row: name + like for row, like in _rows(site / name / "map.sqlite").items()}
     return State(frozenset(rows), frozenset(rows.values()), files, True)
+
+
+def _content(path: Path) -> bytes:
+    """Bytes; of JSON the numbers to 9 digits, since poses are read back to the last bit but one."""
+    if path.suffix != ".json":
+        return path.read_bytes()
+    return json.dumps(json.loads(path.read_text(), parse_float=lambda text: f"{float(text):.9g}")).encode()
 
 
 def _files(folder: Path) -> list[Path]:
@@ -89,6 +102,20 @@ def _likeness(table: str, name: str, value: Any) -> Any:
     if name in _PASSING or name.endswith("_at") or (table, name) == ("about", "id"):
         return None if value is None else "*"
     return value
+
+
+def _standing(like: str) -> str:
+    """A row as it was before it was replaced."""
+    table, values = json.loads(like)
+    if values.get("removed_at") is not None:
+        values["removed_at"] = None
+    return json.dumps([table, values], sort_keys=True)
+
+
+def age(folder: Path) -> None:
+    """Let what looks like somebody's passing file look like one that was left an hour ago."""
+    for path in folder.rglob(".*"):
+        os.utime(path, (time.time() - 3600,) * 2, follow_symlinks=False)
 
 
 def tiles_problems(folder: Path) -> list[str]:

@@ -215,9 +215,10 @@ class Server:
         ended = fault_judge.state(self.work)
         if again != 0 and not (verb.done_says and verb.done_says in said and now.same(after)):
             out.repeat.append(f"ended with {again}: {said.strip().splitlines()[-1:]}")
-        elif not ended.same(after):
+        elif not ended.same(after, history=True):
             out.repeat.append(f"ended otherwise than undisturbed: {fault_judge.differences(after, ended)}")
         out.lost += [f"after the repeat: {p}" for p in _problems(site)]
+        fault_judge.age(self.work)
         with Store.open(site) as store:
             store.prune()
         out.left += fault_judge.leftovers(self.work)

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
-from gsmap.export.tileset import FILE_NAME, write_tilesets
+from gsmap.export.tileset import is_stale, write_tilesets
 from gsmap.map.settings import Settings
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_steps
 from gsmap.merge.tile import LazyScene, merge_tile
@@ -141,8 +141,7 @@ def export(store: Store, out: Path, request: Request, settings: Settings, progre
         made=noted,
         progress=progress,
     )
-    is_new = result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))
-    if planned.recipe.is_tileset and is_new:
+    if planned.recipe.is_tileset and is_stale(out, result.tiles):
         write_tilesets(out, result.tiles, request.tile_size_m)
     if not store.catalog.writable:
         _log.warning(
