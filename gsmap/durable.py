@@ -119,7 +119,7 @@ def refuse_links(root: Path, *names: str) -> None:
         at = at / _checked_name(root, name)
         try:
             mode = at.lstat().st_mode
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return
         if stat.S_ISLNK(mode):
             raise _is_a_link(at)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say, text
 
 
 def command(map: MapPath, json: AsJson = False) -> None:
@@ -18,7 +18,7 @@ def command(map: MapPath, json: AsJson = False) -> None:
         print_rows("check", report, json)
     else:
         for problem in report.problems:
-            print(problem)
+            print(text(problem))
     if not report.ok:
         count = len(report.problems)
         say(f"{count} problems in {map}: restore the files named from a backup, or ingest their scenes again")

@@ -70,6 +70,7 @@ OBJECTS: dict[str, Object] = {
     "backup --list": Many("snapshots", rows.SnapshotRow),
     "restore": One(rows.RestoreReport),
     "clone": One(rows.CloneReport),
+    "trust": One(rows.TrustReport),
     "view": One(rows.ViewReport),
     "demo": One(rows.DemoReport),
 }

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
-from gsmap.errors import ConfigError, InputError
+from gsmap.durable import is_file, open_file, write_text_whole
+from gsmap.errors import MALFORMED, ConfigError, InputError
+from gsmap.texts import control_characters
 from gsmap.types import Sim3, Tile
 from gsmap.types.plain import plain
 
@@ -21,6 +22,7 @@ FILE_NAME = "tiles.json"
 _VERSION = 2
 _NAMELESS = 1  # its tiles had a free text instead of a recipe, so that nobody knows what made them
 _SAVE_EVERY_S = 2.0
+_MAX_BYTES = 1 << 30  # a tile's entry has some kilobytes
 _PATH = re.compile(r"component_\d+/[^/\\]+")
 
 
@@ -61,15 +63,15 @@ class Manifest:
                 raise ConfigError(f"{folder} holds files but no {FILE_NAME}: export to an empty or a new folder")
             return cls(map_id)
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            version, owner = content["version"], content["map_id"]
+            content = json.loads(_text(path))
+            version, owner = content["version"], str(content["map_id"])
             if version not in (_NAMELESS, _VERSION):
                 raise ConfigError(
                     f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
             doomed = {_checked_path(p) for p in content.get("doomed", ())}
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
             raise InputError(f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder") from error
@@ -92,9 +94,10 @@ class Manifest:
         """Whether the tile's file lies there with the size it was written with; a tile without Gaussians has none."""
         if not tile.path:
             return True
+        path = folder / tile.path
         try:
-            return (folder / tile.path).stat().st_size == self.num_bytes[tile.path]
-        except OSError:
+            return is_file(path) and path.lstat().st_size == self.num_bytes[tile.path]
+        except (OSError, ValueError):
             return False
 
     def save_sometimes(self, folder: Path) -> None:
@@ -132,9 +135,17 @@ def _entry(name: str, tile: Tile, num_bytes: int) -> dict[str, object]:
     }
 
 
+def _text(path: Path) -> str:
+    with open(open_file(path), "rb") as file:
+        content = file.read(_MAX_BYTES + 1)
+    if len(content) > _MAX_BYTES:
+        raise ValueError(f"it has more than {_MAX_BYTES} bytes")
+    return content.decode()
+
+
 def _checked_path(path: Any) -> str:
     """A tile's path: a file in a component's folder, as every export writes it; empty where the tile holds nothing."""
-    if not isinstance(path, str) or (path and _PATH.fullmatch(path) is None):
+    if not isinstance(path, str) or control_characters(path) or (path and _PATH.fullmatch(path) is None):
         raise ValueError(f"the path {path!r} of a tile is not component_N/NAME")
     if path.rpartition("/")[2] in (".", ".."):
         raise ValueError(f"the path {path!r} of a tile leads out of its folder")

@@ -14,8 +14,8 @@ from threading import Lock
 import numpy as np
 
 from gsmap import formats
-from gsmap.durable import make_folder, remove_empty_folder, remove_file, remove_tree, sync_folder
-from gsmap.errors import CorruptError, GsmapError, StoreError
+from gsmap.durable import make_folder, refuse_links, remove_empty_folder, remove_file, remove_tree, sync_folder
+from gsmap.errors import CorruptError, GsmapError, of_system
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.plan import Params, PlannedTile
 from gsmap.export.recipe import TileRecipe, dirty_reason
@@ -76,10 +76,13 @@ def export_tiles(
 
     Raises:
         ConfigError: the folder belongs to another map or holds other files.
-        StoreError: the folder cannot be written (read-only, full).
+        CorruptError: a link lies in it where a folder of tiles belongs: it would lead elsewhere.
+        DiskFullError, ReadOnlyError, DiskError, StoreError: the folder cannot be written.
     """
     params = params or Params()
     out = Path(out)
+    for component in {tile.component for tile in plan}:
+        refuse_links(out, f"component_{component}")
     manifest = Manifest.load(out, map_id)
     old = manifest.tiles
     todo = [t for t in plan if _must_make(t, old.get((t.component, t.name)), manifest, out, recipe, params)]
@@ -96,7 +99,8 @@ def export_tiles(
         make_folder(out)
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
-        (out / _STAGING).mkdir(exist_ok=True)
+        remove_tree(out, _STAGING)  # it may not be ours, and hold links
+        (out / _STAGING).mkdir()
         with closing(_finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers)) as finished:
             for at, tile, num_bytes in finished:
                 if made is not None:
@@ -115,7 +119,7 @@ def export_tiles(
         with suppress(OSError):
             manifest.save(out)
         if isinstance(error, OSError):
-            raise StoreError(
+            raise of_system(error)(
                 f"cannot write the export to {out}: {error.strerror or error}; finished tiles are kept, "
                 "run the same export again to go on"
             ) from error
@@ -147,6 +151,7 @@ def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, repor
             # A full disk is a matter of the folder, not of what was written.
             raise error.__cause__ if isinstance(error.__cause__, OSError) else error from None
         digest, num_bytes = _synced_digest(staged)
+        refuse_links(out, *path.split("/")[:-1])
         make_folder((out / path).parent)
         os.replace(staged, out / path)
         sync_folder((out / path).parent)

@@ -17,6 +17,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.map import values as as_values
 from gsmap.map.logs import logged
+from gsmap.map.sharing import at_work
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
@@ -206,7 +207,8 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.stages.describe import describe
 
         wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
-        keys = describe(self.store, wanted, self.settings, self._progress)
+        with at_work(self.store, "describe"):
+            keys = describe(self.store, wanted, self.settings, self._progress)
         return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
 
     def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:
@@ -218,7 +220,8 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.stages.register import register
 
-        made = register(self.store, pairs, self.settings, self._progress)
+        with at_work(self.store, "register"):
+            made = register(self.store, pairs, self.settings, self._progress)
         return reports.rows_of_edges(self.store, made)
 
     def add_edge(self, pair: str, S_target_source: Sim3, sigmas: np.ndarray, note: str = "") -> EdgeRow:
@@ -255,7 +258,8 @@ class Map(AbstractContextManager["Map"]):
         """Solve for all scene poses and keep the answer as a new revision."""
         from gsmap.map.stages.optimize import optimize
 
-        number = optimize(self.store, self.settings, self._progress)
+        with at_work(self.store, "optimize"):
+            number = optimize(self.store, self.settings, self._progress)
         return reports.revision_row(self.store, number)
 
     def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
@@ -265,18 +269,19 @@ class Map(AbstractContextManager["Map"]):
             captured_at: as in `ingest`.
         """
         from gsmap.map.stages.describe import describe
-        from gsmap.map.stages.optimize import is_solved, optimize
+        from gsmap.map.stages.optimize import solve
         from gsmap.map.stages.register import register
 
         if captured_at is not None and not captures:
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
-        ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-        describe(self.store, self.scenes(), self.settings, self._progress)
-        while True:
+        with at_work(self.store, "update"):
+            ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
+            describe(self.store, self.scenes(), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
-            if is_solved(self.store, self.settings):
-                return reports.update_report(self.store, ingested)
-            optimize(self.store, self.settings, self._progress)  # scenes that now turn out to be neighbours come next
+            while solve(self.store, self.settings, self._progress):
+                # Scenes that now turn out to be neighbours.
+                register(self.store, "auto", self.settings, self._progress)
+        return reports.update_report(self.store, ingested)
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.

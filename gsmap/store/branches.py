@@ -21,9 +21,10 @@ from sqlalchemy import Connection, delete, func, select, update
 
 from gsmap.durable import sync_file, sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
-from gsmap.store import sqlite
+from gsmap.store import sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
-from gsmap.store.catalog import URL_FILE, Catalog, explained, now, open_engine
+from gsmap.store.catalog import Catalog, now, open_engine
+from gsmap.store.explained import explained
 from gsmap.store.schema import about, exports, files, groups, leases, models, revisions, scenes, tiles
 
 FOLDER = "branches"
@@ -132,7 +133,7 @@ def is_map(folder: Path) -> bool:
 
 def holds_catalog(folder: Path) -> bool:
     """Whether a folder is that of a map or of a branch."""
-    return (folder / sqlite.FILE).is_file() or (folder / URL_FILE).is_file()
+    return (folder / sqlite.FILE).is_file() or (folder / trust.URL_FILE).is_file()
 
 
 class Branches:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
 import threading
 import time
@@ -12,15 +13,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine
+from sqlalchemy import Connection, Engine, RootTransaction, create_engine
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
-from gsmap.errors import BusyError, ConfigError, CorruptError, GsmapError, MissingDependencyError, StoreError
-from gsmap.store import sqlite
+from gsmap.errors import BusyError, ConfigError, MissingDependencyError, StoreError
+from gsmap.store import sqlite, trust
+from gsmap.store.explained import NOT_KEPT, explained
 
-URL_FILE = "catalog.url"
 LOCK_FILE = "lock"
+_log = logging.getLogger("gsmap.store")
 
 
 class Catalog:
@@ -70,14 +72,20 @@ class Catalog:
         if self._writing is not None:
             yield self._writing
             return
-        with self.lock(), explained(self.folder), self.engine.connect() as connection:
-            try:
-                with contextlib.ExitStack() as until_end, connection.execution_options(gsmap_write=True).begin():
-                    self._held.connection, self._held.until_end = connection, until_end
-                    yield connection
-            finally:
-                self._held.connection = None
-            self._checkpoint(at_bytes=sqlite.CHECKPOINT_BYTES)
+        with self.lock():
+            with explained(self.folder, NOT_KEPT), self.engine.connect() as connection:
+                try:
+                    with (
+                        contextlib.ExitStack() as until_end,
+                        connection.execution_options(gsmap_write=True).begin() as transaction,
+                    ):
+                        self._held.connection, self._held.until_end = connection, until_end
+                        yield connection
+                        with explained(self.folder, NOT_KEPT, committing=True):
+                            commit(connection, transaction)
+                finally:
+                    self._held.connection = None
+            self._fold(at_bytes=sqlite.CHECKPOINT_BYTES)
 
     def hold(self, context: contextlib.AbstractContextManager[Any]) -> None:
         """Inside `write`: hold a lock from now until the transaction has been committed or undone."""
@@ -97,9 +105,10 @@ class Catalog:
             yield
             return
         try:
-            handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         except OSError as error:
-            raise StoreError(f"cannot write to {self.folder}: {error.strerror}") from error
+            with explained(self.folder, NOT_KEPT):
+                raise error
         try:
             patience_s = self.patience_s if patience_s is None else patience_s
             deadline = time.monotonic() + patience_s
@@ -122,24 +131,44 @@ class Catalog:
     def close(self) -> None:
         """Leave one file at rest, unless others are still at it."""
         if self.writable and self.is_sqlite:
-            with contextlib.suppress(GsmapError), explained(self.folder), self.lock(patience_s=0.0):
-                self._checkpoint(at_bytes=1)
+            with contextlib.suppress(BusyError), self.lock(patience_s=0.0):
+                self._fold(at_bytes=1)
         self.engine.dispose()
 
-    def _checkpoint(self, at_bytes: int) -> None:
-        if self.is_sqlite:
-            sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
+    def _fold(self, at_bytes: int) -> None:
+        """Fold the log in, under the lock. What was committed is in the log, so that a failure costs nothing."""
+        if not self.is_sqlite:
+            return
+        try:
+            with explained(self.folder):
+                sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
+        except StoreError as error:
+            _log.warning("what was written is kept, but not yet folded into map.sqlite: %s", error)
+
+
+def commit(connection: Connection, transaction: RootTransaction) -> None:
+    """Commit, or leave nothing open: a connection that could not commit is not used again."""
+    try:
+        transaction.commit()
+    except BaseException:
+        connection.invalidate()
+        raise
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:
-    """The engine of a map: its own ``map.sqlite``, or what ``catalog.url`` names."""
+    """The engine of a map: its own ``map.sqlite``, or what ``catalog.url`` names if the user trusts that."""
     if (folder / sqlite.FILE).is_file():
         return sqlite.engine(folder / sqlite.FILE, writable=writable)
-    return url_engine((folder / URL_FILE).read_text().strip())
+    return url_engine(trust.named_url(folder))
 
 
 def url_engine(url: str) -> Engine:
+    """The engine of a catalog on a server that the user named or trusts; nothing is connected to yet."""
     try:
+        if make_url(url).get_backend_name() != "postgresql":
+            raise ConfigError(
+                f"{url_without_password(url)!r} is not a PostgreSQL database URL (postgresql+psycopg://...)"
+            )
         return create_engine(url, pool_pre_ping=True)
     except (ArgumentError, NoSuchModuleError) as error:
         raise ConfigError(f"{url!r} is not a database URL that SQLAlchemy knows: {error}") from error
@@ -149,44 +178,8 @@ def url_engine(url: str) -> Engine:
 
 def url_without_password(url: str) -> str:
     """What may lie in a file: the password comes from the driver's own places (``PGPASSWORD``, ``~/.pgpass``)."""
-    return make_url(url)._replace(password=None).render_as_string(hide_password=False)
-
-
-@contextlib.contextmanager
-def explained(folder: Path) -> Iterator[None]:
-    """Turn what a database says into one line of ours."""
-    try:
-        yield
-    except GsmapError:
-        raise
-    except SQLAlchemyError as error:
-        if isinstance(getattr(error, "orig", None), GsmapError):  # a value that a column type refused
-            raise error.orig from None  # type: ignore[attr-defined]
-        said = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
-        low = said.lower()
-        if "locked" in low or "busy" in low:
-            raise BusyError(f"{folder}: another process holds the catalog; try again later ({said})") from error
-        if "malformed" in low or "not a database" in low or "i/o error" in low:
-            raise CorruptError(
-                f"{folder}: the catalog is damaged ({said}); restore map.sqlite from a backup"
-            ) from error
-        if "readonly" in low or "read-only" in low:
-            raise StoreError(f"{folder} is on a read-only disk: nothing was changed") from error
-        if "is full" in low or "no space" in low:
-            raise StoreError(f"{folder}: the disk is full; nothing was changed") from error
-        if "unable to open" in low:
-            raise StoreError(
-                f"{folder}: the catalog cannot be opened ({said}); check the folder's permissions"
-            ) from error
-        if "password" in low:
-            raise StoreError(
-                f"{folder}: the catalog's server wants another password ({said}): give it in PGPASSWORD or ~/.pgpass"
-            ) from error
-        if isinstance(error, DBAPIError):
-            raise StoreError(f"{folder}: the catalog refused: {said}") from error
-        raise
-    except OSError as error:
-        raise StoreError(f"{folder}: {error.strerror or error}; nothing was changed") from error
+    known = make_url(url).difference_update_query(["password"])._replace(password=None)
+    return known.render_as_string(hide_password=False)
 
 
 def now() -> str:

@@ -16,7 +16,7 @@ from sqlalchemy import Text
 from sqlalchemy.types import TypeDecorator, TypeEngine
 
 from gsmap.errors import CorruptError, InputError
-from gsmap.types.texts import control_characters
+from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
 KINDS = ("scenes", "graphs")

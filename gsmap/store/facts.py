@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, insert, select
 from gsmap.errors import InputError
 from gsmap.store.catalog import now
 from gsmap.store.schema import scene_facts
-from gsmap.types.texts import control_characters
+from gsmap.texts import control_characters
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,11 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 
 from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, GsmapError, StoreError
-from gsmap.store import sqlite
+from gsmap.store import sqlite, staging
 from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
@@ -157,12 +158,15 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
             named_still = (known - set(doomed) if dry_run else known) | others.groups()
             bodies = [group for group in arrays.groups() if group not in named_still]
             num_bytes = sum(arrays.size_bytes(*group) for group in bodies)
-            num_bytes += sum(path.stat().st_size for path in forgotten)
+            abandoned = staging.abandoned_files(catalog.folder)
+            num_bytes += sum(path.stat().st_size for path in forgotten) + sum(abandoned.values())
             if not dry_run:
                 for group in bodies:
                     arrays.drop(*group)
                 for path in forgotten:
                     remove_file(arrays.root.parent, FOLDER, path.name)
+                for name in abandoned:
+                    remove_file(catalog.folder, name)
                 bury_leftovers(arrays.root.parent)
             num_bytes += arrays.drop_leftovers(dry_run=dry_run)
     return Pruned(

@@ -16,8 +16,9 @@ from sqlalchemy import Row, insert, select, update
 from gsmap.durable import open_file, refuse_links, write_whole
 from gsmap.errors import CorruptError, NotFoundError
 from gsmap.store.arrays import Arrays
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import is_relative
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import checked_text
 from gsmap.store.schema import models
 from gsmap.types.plain import plain
@@ -158,7 +159,7 @@ def _copy(source: Path, target: Path) -> None:
     """Copy a file durably; it appears whole or not at all."""
     refuse_links(target.parent.parent, FOLDER)
     target.parent.mkdir(exist_ok=True)
-    with explained(target.parent):
+    with explained(target.parent, NOT_KEPT):
         write_whole(target, partial(_fill, source))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sqlite3
@@ -11,11 +10,14 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, PoolProxiedConnection, create_engine, event
 
-from gsmap.errors import StoreError
+from gsmap.durable import open_file
+from gsmap.errors import CorruptError, StoreError
+from gsmap.store import held
 
 FILE = "map.sqlite"
 DIGEST_FILE = "map.sqlite.sha256"
 CHECKPOINT_BYTES = 4 << 20
+_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")  # ends a journal that names a super-journal
 
 
 def engine(file: Path, *, writable: bool) -> Engine:
@@ -55,6 +57,22 @@ def create_file(file: Path) -> None:
     connection.close()
 
 
+def refuse_super_journal(file: Path) -> None:
+    """Refuse a rollback journal that names a super-journal: SQLite would delete the file that it names.
+
+    gsmap's databases are in WAL mode and never attached to one another, so it is not of its making.
+    """
+    journal = file.with_name(f"{file.name}-journal")
+    try:
+        with open(open_file(journal), "rb") as opened:
+            opened.seek(-min(len(_JOURNAL_MAGIC), journal.stat().st_size), os.SEEK_END)
+            ends = opened.read()
+    except FileNotFoundError:
+        return
+    if ends == _JOURNAL_MAGIC:
+        raise CorruptError(f"{journal} names another file for SQLite to delete: gsmap writes no such thing; remove it")
+
+
 def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
     """Fold a log of at least this size into the database, and note the digest of the result.
 
@@ -73,6 +91,22 @@ def integrity_problems(engine: Engine) -> list[str]:
     return out + [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in _raw(engine, "PRAGMA foreign_key_check")]
 
 
+def damage(file: Path) -> list[str]:
+    """What SQLite finds wrong with a file when it looks at all of its structure; empty also where it cannot look."""
+    if not file.is_file():
+        return [f"{file} is missing"]
+    try:
+        connection = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
+        try:
+            rows = [str(row[0]) for row in connection.execute("PRAGMA quick_check(10)")]
+        finally:
+            connection.close()
+    except sqlite3.Error as error:
+        corrupt = getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+        return [str(error)] if corrupt else []
+    return [] if rows == ["ok"] else rows
+
+
 def digest_problems(file: Path) -> list[str]:
     """Whether the file still has the bytes of the last `checkpoint`; nothing is known of one touched since then.
 
@@ -83,8 +117,7 @@ def digest_problems(file: Path) -> list[str]:
         noted = json.loads(file.with_name(DIGEST_FILE).read_text())
         if not _same_stamp(file, noted):
             return []
-        with open(file, "rb") as opened:
-            found = hashlib.file_digest(opened, "sha256").hexdigest()
+        found = held.sha256(file)
         return (
             []
             if found == noted["sha256"] or not _same_stamp(file, noted)
@@ -122,9 +155,7 @@ def _driver(connection: PoolProxiedConnection) -> Any:
 
 def _note_digest(file: Path) -> None:
     before = file.stat()
-    with open(file, "rb") as opened:
-        sha256 = hashlib.file_digest(opened, "sha256").hexdigest()
-    note = {"sha256": sha256, "size_bytes": before.st_size, "mtime_ns": before.st_mtime_ns}
+    note = {"sha256": held.sha256(file), "size_bytes": before.st_size, "mtime_ns": before.st_mtime_ns}
     staged = file.with_name(f".{DIGEST_FILE}")
     staged.write_text(json.dumps(note))
     os.replace(staged, file.with_name(DIGEST_FILE))

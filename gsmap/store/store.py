@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import uuid
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,17 +12,19 @@ from pathlib import Path
 from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
-from gsmap.errors import ConfigError, NotFoundError, StoreError
-from gsmap.store import branches, integrity, migrate, schema
+from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
+from gsmap.store import branches, integrity, migrate, schema, sqlite, staging, trust
 from gsmap.store import catalog as _catalog
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import empty_catalog
+from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
+from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.priors import Priors
 from gsmap.store.recipes import Recipes
@@ -38,9 +39,9 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models``, ``exports``, ``branches`` and ``backups``. Every method that changes something is one transaction,
-    durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may
-    share a store; processes open their own.
+    ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that changes something is one
+    transaction, durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole.
+    Threads may share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -72,6 +73,7 @@ class Store:
         self.exports = Exports(catalog)
         self.branches = Branches(place, catalog, self.arrays)
         self.backups = Backups(catalog)
+        self.leases = Leases(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
@@ -81,7 +83,7 @@ class Store:
             path: a folder that does not exist or is empty.
             catalog_url: an SQLAlchemy URL (an empty PostgreSQL database, for many writers) to use instead of
                 ``map.sqlite``. It is remembered in ``catalog.url`` without its password, which the driver then takes
-                from its usual places (``PGPASSWORD``, ``~/.pgpass``).
+                from its usual places (``PGPASSWORD``, ``~/.pgpass``), and this user trusts it from now on.
 
         Raises:
             StoreError: the folder is not empty, or cannot be written.
@@ -95,17 +97,14 @@ class Store:
             raise StoreError(f"{path} is a file: a map is a folder; choose another name")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist")
-        staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
-        try:
-            with _catalog.explained(folder):
-                staged.mkdir()
-                (staged / "arrays").mkdir()
-                _make_catalog(staged, catalog_url)
-                sync_folder(staged)
-                os.rename(staged, folder)
-                sync_folder(folder.parent)
-        finally:
-            shutil.rmtree(staged, ignore_errors=True)
+        with explained(folder, "no map was made"), staging.beside(folder) as staged:
+            (staged / "arrays").mkdir()
+            _make_catalog(staged, catalog_url)
+            sync_folder(staged)
+            os.rename(staged, folder)
+            sync_folder(folder.parent)
+        if catalog_url is not None:
+            trust.remember(folder)
         return cls.open(path, "w", catalog_url=catalog_url)
 
     @classmethod
@@ -114,16 +113,20 @@ class Store:
 
         Args:
             mode: ``r`` to read only (works on a read-only disk), ``w`` to change it too.
-            catalog_url: in place of the remembered one.
+            catalog_url: in place of the remembered one, which is used only where the user trusts it
+                (`gsmap.store.trust`).
 
         Raises:
             NotFoundError: no such folder.
-            StoreError: not a map, or not writable.
+            StoreError: not a map, not writable, or its catalog lies on a server that the user has not trusted.
+            CorruptError: it holds links or other things that gsmap never puts there, or another map's catalog.
             SchemaVersionError: written by a newer gsmap, or an older one (``gsmap migrate``).
         """
         store = cls._connect(path, mode, catalog_url)
         try:
             migrate.require_current(store.catalog.engine, store.folder)
+            if not store.catalog.is_sqlite:
+                store._check_id()
         except BaseException:
             store.close()
             raise
@@ -167,12 +170,14 @@ class Store:
         if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
+        _refuse_strange_entries(place.home)
+        _refuse_strange_entries(folder)
         refusal = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
         if mode == "w" and place.is_tag and not even_tags:
             raise StoreError(refusal)
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
-        with _catalog.explained(folder):
+        with explained(folder):
             if catalog_url is not None:
                 engine = _catalog.url_engine(catalog_url)
             else:
@@ -190,6 +195,15 @@ class Store:
         """The map's own random id."""
         with self.catalog.read() as connection:
             return str(connection.execute(select(schema.about.c.id)).scalar_one())
+
+    def _check_id(self) -> None:
+        """Refuse a database that holds another map than the folder says."""
+        known = trust.remembered(self.folder).map_id if (self.folder / trust.URL_FILE).exists() else None
+        if known is not None and known != self.id:
+            raise CorruptError(
+                f"{self.folder} belongs to map {known[:12]}, but the database named for it holds map {self.id[:12]}: "
+                f"name the right one in {trust.ENVIRONMENT}"
+            )
 
     def check(self, progress: Progress | None = None) -> Check:
         """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`.
@@ -218,6 +232,7 @@ class Store:
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def close(self) -> None:
+        self.leases.close()
         self.catalog.close()
 
     def __enter__(self) -> Store:
@@ -230,9 +245,25 @@ class Store:
         return f"Store({self.location!r}, mode={'w' if self.catalog.writable else 'r'!r})"
 
 
+def _refuse_strange_entries(folder: Path) -> None:
+    """Refuse a map with a link in it, which could make gsmap read or write elsewhere, or with a pipe or a device.
+
+    The folder itself may be a link. What lies deeper is looked at where it is used.
+    """
+    with explained(folder), os.scandir(folder) as entries:
+        for entry in entries:
+            if not (entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)):
+                what = "a link" if entry.is_symlink() else "a pipe or a device"
+                raise CorruptError(
+                    f"{entry.path} is {what}: gsmap makes none in a map; put what belongs there in its place"
+                )
+    sqlite.refuse_super_journal(folder / sqlite.FILE)
+
+
 def _make_catalog(folder: Path, url: str | None) -> None:
-    made = empty_catalog(folder, url)
+    map_id = uuid.uuid4().hex
+    made = empty_catalog(folder, url, map_id)
     with made.write() as connection:
-        row = {"id": uuid.uuid4().hex, "created_at": _catalog.now(), "gsmap_version": __version__}
+        row = {"id": map_id, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)
     made.close()

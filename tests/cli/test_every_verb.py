@@ -17,6 +17,7 @@ import gsmap_synthetic
 from gsmap import formats
 from gsmap.cli.app import build
 from gsmap.cli.objects import OBJECTS, Many, Maybe
+from gsmap.store import trust
 
 Run = Callable[..., Any]
 
@@ -67,6 +68,7 @@ RUNS = {
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
     "migrate": "migrate MAP",
+    "trust": "trust TMP/remote.gsmap --yes",
     "view": "view MAP --no-browser",
     "demo": "demo TMP/demo",
 }
@@ -81,6 +83,8 @@ def gsmap_run(
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
     (tmp_path / "encoder.onnx").write_bytes(_image_encoder())
+    (tmp_path / "remote.gsmap" / "arrays").mkdir(parents=True)
+    trust.write(tmp_path / "remote.gsmap", "postgresql+psycopg://me@example.org/site", "0" * 32)
     monkeypatch.setattr("gsmap.view.ViewServer.serve_forever", lambda self: None)
     # The demo's own captures take a minute: what it does with them is what is tried here.
     monkeypatch.setattr(gsmap_synthetic, "make_captures", lambda seed, progress: [])

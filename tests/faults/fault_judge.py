@@ -16,7 +16,19 @@ from pathlib import Path
 from typing import Any
 
 # What two runs of the same verb may differ in, beside everything that ends in _at.
-_PASSING = {"number", "adopts", "registration", "revision", "export", "s0", "s1", "seconds", "token", "since", "snapshot"}
+_PASSING = {
+    "number",
+    "adopts",
+    "registration",
+    "revision",
+    "export",
+    "s0",
+    "s1",
+    "seconds",
+    "token",
+    "since",
+    "snapshot",
+}
 _LEFT_OUT = {"leases", "sqlite_sequence", "backups"}
 ALARM = re.compile(r"damaged|restore\b|corrupt|malformed", re.IGNORECASE)
 UNCHANGED = re.compile(r"nothing (was|has been) (changed|written|stored)", re.IGNORECASE)
@@ -215,7 +227,9 @@ def differences(wanted: State, found: State) -> str:
         return "there is no map" if wanted.exists else "there is a map"
     parts = [f"lacks {row[:160]}" for row in sorted(wanted.alike - found.alike)[:2]]
     parts += [f"has {row[:160]}" for row in sorted(found.alike - wanted.alike)[:2]]
-    parts += [f"{p} differs" for p in sorted({*wanted.files, *found.files}) if wanted.files.get(p) != found.files.get(p)]
+    parts += [
+        f"{p} differs" for p in sorted({*wanted.files, *found.files}) if wanted.files.get(p) != found.files.get(p)
+    ]
     return "; ".join(parts[:4])
 
 

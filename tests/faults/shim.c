@@ -254,6 +254,11 @@ int truncate(const char *p, off_t n) {
     REAL(truncate);
     CHANGING(full(AT_FDCWD, p, path), 't', path, "", n, real(p, n));
 }
+int truncate64(const char *p, off64_t n) {
+    char path[PATH_MAX];
+    REAL(truncate64);
+    CHANGING(full(AT_FDCWD, p, path), 't', path, "", n, real(p, n));
+}
 int unlink(const char *p) { REAL(unlink); NAMED('u', AT_FDCWD, p, real(p)); }
 int unlinkat(int d, const char *p, int flags) {
     REAL(unlinkat);

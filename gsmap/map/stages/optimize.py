@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from gsmap import optimize as solver
 from gsmap.map.settings import Settings
+from gsmap.map.sharing import POLL_S
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
@@ -83,6 +85,28 @@ def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
     number = store.revisions.save(answer, given.key)
     progress("optimize", 1.0, f"revision {number}")
     return number
+
+
+def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
+    """Optimize unless the newest revision is what that would make; returns whether there is a new one.
+
+    One process does it at a time: others wait, and then need not.
+    """
+    told = False
+    while not is_solved(store, settings):
+        if store.leases.try_hold("poses", "optimize"):
+            try:
+                if not is_solved(store, settings):
+                    optimize(store, settings, progress)
+            finally:
+                store.leases.release(["poses"])
+            return True
+        holder = next((lease for lease in store.leases.list() if lease.what == "poses"), None)
+        if holder is not None and not told:
+            progress("optimize", 0.0, f"waiting for {holder.who}")
+            told = True
+        time.sleep(POLL_S)
+    return told
 
 
 def is_solved(store: Store, settings: Settings) -> bool:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map.jobs import register_scenes
 from gsmap.map.settings import Settings
+from gsmap.map.sharing import SharedJobs, noting
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
@@ -40,14 +42,23 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     wanted = _wanted(store, pairs, graphs, settings)
     if pairs in ("auto", "all"):
         wanted = _lacking(store, wanted, graphs, recipe)
-    jobs = [(store.location, (a, graphs[a].digest), (b, graphs[b].digest), settings.register) for a, b in wanted]
+    edges = {_key(recipe, graphs, a, b).digest: (a, b) for a, b in wanted}
+    jobs = {
+        key: (store.location, (a, graphs[a].digest), (b, graphs[b].digest), settings.register)
+        for key, (a, b) in edges.items()
+    }
+    newest = store.registrations.newest()  # what is named is registered again: only what comes later counts
+    after = 0 if pairs in ("auto", "all") else newest
+    shared = SharedJobs(store, "register", "edge", jobs, partial(store.registrations.kept, after=after), progress)
+    results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine))
     names = {scene.id: scene.name for scene in scenes}
-    found: dict[int, Registration] = {}
-    for i, edge in run_jobs(register_scenes, jobs, settings.engine):
-        store.registrations.save(edge, _key(recipe, graphs, *wanted[i]))
-        found[i] = edge
-        progress("register", len(found) / len(jobs), f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
-    return [found[i] for i in sorted(found)]
+    kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
+    with kept, closing(results):
+        for key, edge in results:
+            store.registrations.save(edge, _key(recipe, graphs, *edges[key]))
+            shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
+    found = [store.registrations.find(key) for key in edges]
+    return [stored.registration for stored in found if stored is not None]
 
 
 def _key(recipe: RecipeKey, graphs: Mapping[str, RecipeKey], target: str, source: str) -> RecipeKey:
@@ -55,9 +66,7 @@ def _key(recipe: RecipeKey, graphs: Mapping[str, RecipeKey], target: str, source
     return recipe.of(graphs[target].digest, graphs[source].digest)
 
 
-def _lacking(
-    store: Store, pairs: Sequence[Pair], graphs: Mapping[str, RecipeKey], recipe: RecipeKey
-) -> list[Pair]:
+def _lacking(store: Store, pairs: Sequence[Pair], graphs: Mapping[str, RecipeKey], recipe: RecipeKey) -> list[Pair]:
     """Those of the pairs that this recipe has not registered, in either direction: older maps hold both."""
     current = {frozenset((r.registration.target, r.registration.source)): r for r in store.registrations.current()}
     lacking = []

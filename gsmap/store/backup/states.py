@@ -21,6 +21,7 @@ from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import CHUNK_BYTES
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
+from gsmap.store.explained import explained
 from gsmap.store.models import FOLDER as MODELS
 
 if TYPE_CHECKING:
@@ -209,7 +210,7 @@ def _chunks(path: Path) -> Iterator[bytes]:
 def _capture_catalog(source: Catalog, folder: Path) -> State:
     file = folder / sqlite.FILE
     if source.is_sqlite:
-        with _catalog.explained(source.folder):
+        with explained(source.folder):
             for problem in sqlite.digest_problems(source.folder / sqlite.FILE):
                 raise CorruptError(f"{problem}: run gsmap check; nothing was backed up")
             sqlite.backup(source.engine, file)
@@ -221,7 +222,7 @@ def _capture_catalog(source: Catalog, folder: Path) -> State:
             copy_catalog(source, made, leave_out=("leases",))
         finally:
             made.close()
-    with _catalog.explained(source.folder), contextlib.suppress(FileNotFoundError):
+    with explained(source.folder), contextlib.suppress(FileNotFoundError):
         (folder / SETTINGS).write_bytes((source.folder / SETTINGS).read_bytes())
     return read_state(file)
 

@@ -39,6 +39,7 @@ from gsmap.types.rows.scenes import (
     SceneReport,
     SceneRow,
 )
+from gsmap.types.rows.trust import TrustReport
 from gsmap.types.rows.truth import (
     BandRow,
     ComponentErrorRow,
@@ -94,6 +95,7 @@ __all__ = [
     "SnapshotRow",
     "TileRow",
     "TodoRow",
+    "TrustReport",
     "UpdateReport",
     "ViewReport",
 ]
