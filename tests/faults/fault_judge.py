@@ -186,7 +186,7 @@ def judge_rows(before: State, after: State, now: State) -> list[str]:
     if before.exists and not now.exists:
         out.append("lost: the whole catalog")
     out += [f"invented: {row[:300]}" for row in sorted(now.alike - before.alike - after.alike)]
-    for path, digest in before.files.items():
+    for path in before.files:
         if path not in now.files and path in after.files:
             out.append(f"lost: {path}")
     for path, digest in now.files.items():

@@ -1,10 +1,11 @@
 """A process that has imported everything once, and runs verbs in forked children that it kills or fails.
 
-Started with the shim in ``LD_PRELOAD``; takes one JSON object a line and answers with one. `fault_client.py` speaks to it.
+Started with the shim in ``LD_PRELOAD``; takes one JSON object a line and answers with one; see `fault_client`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -191,10 +192,8 @@ class Server:
         for name in noted.read_text().split():
             if name not in sys.modules and name not in self._known and not name.startswith(("onnxruntime", "tests")):
                 self._known.add(name)
-                try:
+                with contextlib.suppress(BaseException):
                     importlib.import_module(name)
-                except BaseException:
-                    pass
 
     def _judge(
         self, verb: Verb, before: State, after: State, code: int | None, stderr: str, fired: bool, *, end: bool = False

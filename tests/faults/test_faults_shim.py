@@ -44,6 +44,7 @@ finally:
 """
 ALL = ["mkdir d", "create d/a", "write d/a", "fsync d/a", "rename d/a -> d/b", "create c", "write c", "truncate c"]
 ALL += ["link c -> e", "unlink d/b", "rmdir d"]
+NUMBERS = {text: n + (n > 7) for n, text in enumerate(ALL, 1)}  # the copy asks once more, and nothing comes of it
 
 
 def work(folder: Path, mode: str = "pass", n: int = 0) -> tuple[subprocess.CompletedProcess, list[Change]]:
@@ -66,27 +67,28 @@ def text(folder: Path, change: Change) -> str:
 def test_every_change_is_counted_and_written_down(tmp_path):
     done, seen = work(tmp_path)
     assert done.returncode == 0, done.stderr
-    assert [text(tmp_path, change) for change in seen] == ALL
-    assert int(done.stdout) == len(ALL)
+    assert [text(tmp_path, change) for change in seen if change.kind != "?"] == ALL
+    assert int(done.stdout) == len(seen)
     assert [c.data for c in seen if c.kind == "w"] == [b"12345678", b"12345678"]
     assert [c.offset for c in seen if c.kind == "t"] == [3]
 
 
 @needs_shim
-@pytest.mark.parametrize("n", range(1, len(ALL) + 1))
-def test_it_kills_before_and_after(n, tmp_path):
-    for mode, count in (("kill-before", n - 1), ("kill-after", n)):
+@pytest.mark.parametrize("change", ALL)
+def test_it_kills_before_and_after(change, tmp_path):
+    n, at = NUMBERS[change], ALL.index(change)
+    for mode, count in (("kill-before", at), ("kill-after", at + 1)):
         folder = tmp_path / mode
         folder.mkdir()
         done, seen = work(folder, mode, n)
         assert done.returncode == -signal.SIGKILL
-        assert [text(folder, c) for c in seen if c.kind != "!"] == ALL[:count]
+        assert [text(folder, c) for c in seen if c.kind not in "!?"] == ALL[:count]
         assert len([c for c in seen if c.kind == "!"]) == 1
 
 
 @needs_shim
 def test_it_writes_half_before_it_kills(tmp_path):
-    _, seen = work(tmp_path, "kill-after", 1 + ALL.index("write d/a"))
+    _, seen = work(tmp_path, "kill-after", NUMBERS["write d/a"])
     assert (tmp_path / "in" / "d" / "a").read_bytes() == b"1234"
     assert seen[-1].data == b"1234"
 
@@ -96,14 +98,14 @@ def test_it_refuses_once_or_from_then_on(tmp_path):
     for mode, code, at in (("eio-once", errno.EIO, "fsync d/a"), ("enospc-ever", errno.ENOSPC, "create c")):
         folder = tmp_path / mode
         folder.mkdir()
-        done, seen = work(folder, mode, 1 + ALL.index(at))
+        done, seen = work(folder, mode, NUMBERS[at])
         assert os.strerror(code) in done.stderr
-        assert [text(folder, c) for c in seen if c.kind != "!"] == ALL[: ALL.index(at)]
+        assert [text(folder, c) for c in seen if c.kind not in "!?"] == ALL[: ALL.index(at)]
 
 
 @needs_shim
 def test_a_full_disk_lets_go(tmp_path):
-    done, seen = work(tmp_path, "enospc-ever", 1 + ALL.index("unlink d/b"))
+    done, seen = work(tmp_path, "enospc-ever", NUMBERS["unlink d/b"])
     assert done.returncode == 0, done.stderr
     assert not [c for c in seen if c.kind == "!"]
 
