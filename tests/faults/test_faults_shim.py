@@ -162,18 +162,18 @@ def test_the_judge_finds_what_is_wrong():
     def state(*rows: object, files: dict | None = None) -> fault_judge.State:
         exact = {json.dumps(row, sort_keys=True) for row in rows}
         likes = set()
-        for table, values in rows:
+        for place, table, values in rows:
             values = {n: fault_judge._likeness(table, n, v) for n, v in values.items()}
-            likes.add(json.dumps([table, values], sort_keys=True))
+            likes.add(json.dumps([place, table, values], sort_keys=True))
         return fault_judge.State(frozenset(exact), frozenset(likes), files or {}, True)
 
-    one, two, three = (["scenes", {"id": i, "removed_at": None}] for i in "123")
+    one, two, three = (["a", "scenes", {"id": i, "removed_at": None}] for i in "123")
     before, after = state(one, two), state(one, two, three)
     assert fault_judge.judge_rows(before, after, before) == []
     assert fault_judge.judge_rows(before, after, after) == []
     assert "lost" in fault_judge.judge_rows(before, after, state(one))[0]
-    assert "invented" in fault_judge.judge_rows(before, after, state(one, two, ["scenes", {"id": "4"}]))[0]
-    gone = ["scenes", {"id": "2", "removed_at": "2026"}]
+    assert "invented" in fault_judge.judge_rows(before, after, state(one, two, ["a", "scenes", {"id": "4"}]))[0]
+    gone = ["a", "scenes", {"id": "2", "removed_at": "2026"}]
     assert fault_judge.judge_rows(before, state(one, gone), state(one, gone)) == []
     files = state(one, two, files={"out/a": "1"})
     assert "cut off" in fault_judge.judge_rows(files, files, state(one, two, files={"out/a": "2"}))[0]
