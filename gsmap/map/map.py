@@ -111,6 +111,17 @@ def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
     return backing.snapshots(target)
 
 
+def accept_catalog(path: str | os.PathLike[str]) -> list[str]:
+    """Take the catalog of a map that differs from what gsmap wrote as it is; returns what differed, in words.
+
+    For salvage, or after a change by another program: from then on these bytes count as written, right or wrong.
+
+    Raises:
+        CorruptError: SQLite finds it broken: only a backup helps.
+    """
+    return Store.accept_catalog(path)
+
+
 class Map(AbstractContextManager["Map"]):
     """An open map. Every method is a verb of the command line, and returns types or typed rows (`gsmap.types.rows`)."""
 

@@ -31,12 +31,14 @@ class Check:
         problems: one line each; empty for a sound map.
         orphans: folders that no row names (a crash left them; `prune` removes them); no harm.
         num_groups, num_bytes: what was read.
+        unverified: what cannot be compared with what was written, and why.
     """
 
     problems: tuple[str, ...]
     orphans: tuple[str, ...]
     num_groups: int
     num_bytes: int
+    unverified: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -83,12 +85,13 @@ def check(
         manifests = {group: manifest(connection, group) for group in named}
         unread = {group: kind for group, kind in named.items() if (group, manifests[group]) not in read}
         problems = _row_problems(connection, home)
+        if catalog.is_sqlite:
+            problems += sqlite.integrity_problems(connection)
     problems += [f"{arrays.root / name} does not belong there: remove it" for name in arrays.strangers()]
     problems += _odd_models(home)
     if catalog.is_sqlite:
-        with explained(catalog.folder):
-            problems += sqlite.integrity_problems(catalog.engine)
-            problems += sqlite.digest_problems(catalog.folder / sqlite.FILE)
+        problems += catalog.page_problems()
+    unverified = tuple(catalog.unverified())
     for i, (group, kind) in enumerate(unread.items()):
         if progress:
             progress(i / len(unread), f"{kind}/{group[:12]}")
@@ -106,7 +109,7 @@ def check(
     num_bytes = sum(f.size_bytes for group in unread for f in manifests[group])
     if progress:
         progress(1.0, "checked")
-    return Check(tuple(problems), orphans, len(unread), num_bytes)
+    return Check(tuple(problems), orphans, len(unread), num_bytes, unverified)
 
 
 def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:

@@ -158,8 +158,27 @@ class Store:
         return versions
 
     @classmethod
+    def accept_catalog(cls, path: str | os.PathLike[str]) -> list[str]:
+        """Take a catalog that differs from what was written as it is, and note new digests: what differed, in words.
+
+        For salvage: SQLite must find it sound, but nobody knows whether its values are those that were written.
+
+        Raises:
+            CorruptError: SQLite cannot make sense of it.
+            ConfigError: the catalog is no file of the map.
+        """
+        with cls._connect(path, "w", None, verify=False, even_tags=True) as store:
+            return store.catalog.accept()
+
+    @classmethod
     def _connect(
-        cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None, *, even_tags: bool = False
+        cls,
+        path: str | os.PathLike[str],
+        mode: str,
+        catalog_url: str | None,
+        *,
+        even_tags: bool = False,
+        verify: bool = True,
     ) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
@@ -182,7 +201,14 @@ class Store:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        return cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
+        store = cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
+        try:
+            if verify:
+                store.catalog.verify()
+        except BaseException:
+            store.catalog.close(fold=False)
+            raise
+        return store
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:

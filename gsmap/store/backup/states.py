@@ -211,10 +211,10 @@ def _capture_catalog(source: Catalog, folder: Path) -> State:
     file = folder / sqlite.FILE
     if source.is_sqlite:
         with explained(source.folder):
-            for problem in sqlite.digest_problems(source.folder / sqlite.FILE):
+            for problem in source.page_problems():
                 raise CorruptError(f"{problem}: run gsmap check; nothing was backed up")
             sqlite.backup(source.engine, file)
-            for problem in sqlite.file_problems(file):
+            for problem in sqlite.structure_damage(file):
                 raise CorruptError(f"{source.folder / sqlite.FILE} is damaged ({problem}); nothing was backed up")
     else:
         made = empty_catalog(folder)
