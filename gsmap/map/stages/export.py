@@ -15,7 +15,7 @@ import numpy as np
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
-from gsmap.export.tileset import FILE_NAME, write_tilesets
+from gsmap.export.tileset import is_stale, write_tilesets
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_steps
@@ -172,8 +172,7 @@ def _export(
             made=noted,
             progress=progress,
         )
-    is_new = result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))
-    if planned.recipe.is_tileset and is_new:
+    if planned.recipe.is_tileset and is_stale(out, result.tiles):
         write_tilesets(out, result.tiles, request.tile_size_m)
     if not store.catalog.writable:
         _log.warning(
