@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import logging
 import os
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
@@ -14,11 +15,11 @@ from pathlib import Path
 
 from sqlalchemy import Connection, Engine, RootTransaction, create_engine
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
 from gsmap.store import digests, sqlite
-from gsmap.store.explained import NOT_KEPT, explained, summary
+from gsmap.store.explained import NOT_KEPT, explained, is_full, summary
 from gsmap.store.wal import log_of, read_log
 
 URL_FILE = "catalog.url"
@@ -59,7 +60,23 @@ class Catalog:
         if self._writing is not None:
             yield self._writing
             return
-        with explained(self.folder), self.engine.connect() as connection, connection.begin():
+        with explained(self.folder), self._reading() as connection, connection.begin():
+            yield connection
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        """A connection; on a full disk one that needs no room there, for which writers wait meanwhile."""
+        try:
+            connection = self.engine.connect()
+        except (SQLAlchemyError, sqlite3.Error) as error:
+            if not self.is_sqlite or not sqlite.needs_room(error) or not is_full(self.folder):
+                raise
+            with self.still():
+                engine = sqlite.still_engine(self.folder / sqlite.FILE)
+                with engine.connect() as still:
+                    yield still
+            return
+        with connection:
             yield connection
 
     @contextlib.contextmanager

@@ -220,13 +220,13 @@ def _may_lack(noted: Digests, number: int, covered: Collection[int]) -> bool:
 
 def _of_file(handle: Handle, noted: Digests | None = None) -> Digests:
     """The digests of a file as it is."""
-    page_size = noted.page_size if noted is not None else _page_size(handle)
-    many = max(1, _BLOCK_BYTES // page_size) * page_size
+    size = noted.page_size if noted is not None else page_size(handle)
+    many = max(1, _BLOCK_BYTES // size) * size
     digests: list[bytes] = []
-    while content := os.pread(handle.number, many, len(digests) * page_size):
+    while content := os.pread(handle.number, many, len(digests) * size):
         block = memoryview(content)
-        digests += [_digest(block[i : i + page_size]) for i in range(0, len(content), page_size)]
-    return Digests(page_size, b"".join(digests))
+        digests += [_digest(block[i : i + size]) for i in range(0, len(content), size)]
+    return Digests(size, b"".join(digests))
 
 
 def _after(handle: Handle, before: Digests, log: Log, changed: dict[int, bytes]) -> Digests:
@@ -242,7 +242,8 @@ def _after(handle: Handle, before: Digests, log: Log, changed: dict[int, bytes])
     return Digests(before.page_size, b"".join(digests))
 
 
-def _page_size(handle: Handle) -> int:
+def page_size(handle: Handle) -> int:
+    """Of a database, from its header."""
     size = int.from_bytes(os.pread(handle.number, 2, 16), "big")
     return 65536 if size == 1 else size or 4096
 

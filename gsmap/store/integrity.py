@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, delete, not_, select, text, update
 
-from gsmap.errors import ConfigError
+from gsmap.errors import ConfigError, DiskFullError
 from gsmap.store import sqlite
 from gsmap.store.arrays import CHUNK_ROWS, Arrays
 from gsmap.store.catalog import Catalog, now
@@ -18,6 +18,8 @@ from gsmap.store.groups import manifest
 from gsmap.store.models import FOLDER
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress
+
+_AGAIN = "what was to be reclaimed and is still there goes with the next prune"
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) ->
     with catalog.read() as connection:
         named = {row.id: row.kind for row in connection.execute(select(groups).order_by(groups.c.id))}
         manifests = {group: manifest(connection, group) for group in named}
+        spare = {group for _, group in _waste(connection, arrays, None).doomed}
         problems = _row_problems(connection, catalog.folder)
         if catalog.is_sqlite:
             problems += sqlite.integrity_problems(connection)
@@ -77,6 +80,8 @@ def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) ->
     for i, (group, kind) in enumerate(named.items()):
         if progress:
             progress(i / len(named), f"{kind}/{group[:12]}")
+        if group in spare and not (arrays.root / kind / group).exists():
+            continue  # a prune on a full disk was interrupted: nothing claims it
         found = arrays.problems(kind, group, manifests[group])
         if found:  # unless it was pruned or mended meanwhile
             with catalog.read() as connection:
@@ -101,51 +106,91 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
     if keep_revisions is not None and keep_revisions < 0:
         raise ConfigError(f"the number of revisions to keep must not be negative, got {keep_revisions}")
     with contextlib.nullcontext() if dry_run else catalog.lock():
-        with contextlib.ExitStack() as stack:
-            connection = stack.enter_context(catalog.read() if dry_run else catalog.write())
-            kept, dropped = _revisions_to_keep(connection, keep_revisions)
-            named = select(poses.c.scene).where(poses.c.revision.in_(kept))
-            gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
-            of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
-            dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None))).all()
-            keys = list(connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars())
-            claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
-            claimed |= set(
-                connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars()
-            )
-            doomed = [(g.kind, g.id) for g in connection.execute(select(groups)) if g.id not in claimed]
-            known = {(g.kind, g.id) for g in connection.execute(select(groups))}
-            orphans = [group for group in arrays.groups() if group not in known]
-            num_bytes = sum(arrays.size_bytes(*group) for group in [*doomed, *orphans])
-            if not dry_run:
-                ids = [group for _, group in doomed]
-                connection.execute(update(revisions).where(revisions.c.number.in_(dropped)).values(dropped_at=now()))
-                connection.execute(delete(graphs).where(graphs.c.key.in_(keys)))
-                connection.execute(update(scenes).where(scenes.c.group_id.in_(ids)).values(group_id=None))
-                for row in dead:
-                    boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
-                    connection.execute(boxes, {"s": row.number})
-                connection.execute(delete(files).where(files.c.group_id.in_(ids)))
-                connection.execute(delete(groups).where(groups.c.id.in_(ids)))
-        # The rows are gone for good: a crash from here on leaves orphans for the next prune.
-        with explained(catalog.folder):
-            forgotten = _forgotten_models(catalog)
-            num_bytes += sum(path.stat().st_size for path in forgotten)
-            if not dry_run:
-                for group in [*doomed, *orphans]:
+        with catalog.read() as connection:
+            waste = _waste(connection, arrays, keep_revisions)
+            spare = _waste(connection, arrays, None).doomed
+        forgotten = _forgotten_models(catalog)
+        num_bytes = sum(arrays.size_bytes(*group) for group in [*waste.doomed, *waste.orphans])
+        num_bytes += sum(path.stat().st_size for path in forgotten)
+        with explained(catalog.folder, _AGAIN):
+            if not dry_run:  # what no row names goes first: on a full disk that makes the room that rows need
+                for group in waste.orphans:
                     arrays.drop(*group)
                 for path in forgotten:
                     path.unlink()
             num_bytes += arrays.drop_leftovers(dry_run=dry_run)
+        if not dry_run:
+            try:
+                _drop_rows(catalog, waste)
+            except DiskFullError:  # then what nothing claims whatever is kept, which `check` does not miss
+                with explained(catalog.folder, _AGAIN):
+                    for group in spare:
+                        arrays.drop(*group)
+                _drop_rows(catalog, waste)
+            # The rows are gone for good: a crash from here on leaves orphans for the next prune.
+            with explained(catalog.folder, _AGAIN):
+                for group in waste.doomed:
+                    arrays.drop(*group)
     return Pruned(
-        scenes=tuple(row.name for row in dead),
-        revisions=tuple(dropped),
-        num_graphs=len(keys),
-        num_orphans=len(orphans),
+        scenes=tuple(name for name, _ in waste.scenes),
+        revisions=tuple(waste.revisions),
+        num_graphs=len(waste.graphs),
+        num_orphans=len(waste.orphans),
         num_models=len(forgotten),
         num_bytes=num_bytes,
         dry_run=dry_run,
     )
+
+
+@dataclass(frozen=True)
+class _Waste:
+    """What may go.
+
+    Args:
+        revisions: numbers of those that are not kept.
+        scenes: names and numbers of removed scenes that no kept revision names.
+        graphs: keys of their graphs.
+        doomed: kinds and names of the groups that nothing claims then.
+        orphans: of those that no row names.
+    """
+
+    revisions: list[int]
+    scenes: list[tuple[str, int]]
+    graphs: list[str]
+    doomed: list[tuple[str, str]]
+    orphans: list[tuple[str, str]]
+
+
+def _waste(connection: Connection, arrays: Arrays, keep_revisions: int | None) -> _Waste:
+    kept, dropped = _revisions_to_keep(connection, keep_revisions)
+    named = select(poses.c.scene).where(poses.c.revision.in_(kept))
+    gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
+    of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
+    dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None)))
+    keys = connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars()
+    claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
+    claimed |= set(connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars())
+    known = {(g.kind, g.id) for g in connection.execute(select(groups))}
+    return _Waste(
+        dropped,
+        [(row.name, row.number) for row in dead],
+        list(keys),
+        sorted(group for group in known if group[1] not in claimed),
+        [group for group in arrays.groups() if group not in known],
+    )
+
+
+def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
+    ids = [group for _, group in waste.doomed]
+    with catalog.write() as connection:
+        connection.execute(update(revisions).where(revisions.c.number.in_(waste.revisions)).values(dropped_at=now()))
+        connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
+        connection.execute(update(scenes).where(scenes.c.group_id.in_(ids)).values(group_id=None))
+        for _, number in waste.scenes:
+            boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
+            connection.execute(boxes, {"s": number})
+        connection.execute(delete(files).where(files.c.group_id.in_(ids)))
+        connection.execute(delete(groups).where(groups.c.id.in_(ids)))
 
 
 def _row_problems(connection: Connection, folder: Path) -> list[str]:
@@ -180,4 +225,5 @@ def _forgotten_models(catalog: Catalog) -> list[Path]:
     """Copies of models that no row names any more."""
     with catalog.read() as connection:
         standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
-    return [path for path in sorted((catalog.folder / FOLDER).glob("*")) if f"{FOLDER}/{path.name}" not in standing]
+    copies = [path for path in sorted((catalog.folder / FOLDER).glob("*")) if path.is_symlink() or not path.is_dir()]
+    return [path for path in copies if f"{FOLDER}/{path.name}" not in standing]

@@ -20,19 +20,25 @@ if TYPE_CHECKING:
 def version(engine: Engine, folder: Path) -> str | None:
     """The migration a database is at; None where it has never seen one."""
     with explained(folder), engine.connect() as connection:
-        if not inspect(connection).has_table("alembic_version"):
-            return None
-        return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+        return _version(connection)
 
 
-def require_current(engine: Engine, folder: Path) -> None:
+def _version(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+
+
+def require_current(catalog: Catalog) -> None:
     """Refuse a database of another schema.
 
     Raises:
         SchemaVersionError: newer (get a newer gsmap) or older (``gsmap migrate``).
         CorruptError: no schema at all.
     """
-    found = version(engine, folder)
+    folder = catalog.folder
+    with catalog.read() as connection:
+        found = _version(connection)
     if found is None:
         raise CorruptError(f"{folder}: its catalog holds no gsmap tables; restore it from a backup")
     if found > schema.HEAD:
@@ -56,7 +62,7 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
     """
     before = version(catalog.engine, catalog.folder)
     if before is not None and before > schema.HEAD:
-        require_current(catalog.engine, catalog.folder)
+        require_current(catalog)
     if before == schema.HEAD and revision == "head":
         return before, before
     with catalog.lock():

@@ -108,7 +108,7 @@ class Store:
         """
         store = cls._connect(path, mode, catalog_url)
         try:
-            migrate.require_current(store.catalog.engine, store.folder)
+            migrate.require_current(store.catalog)
         except BaseException:
             store.close()
             raise

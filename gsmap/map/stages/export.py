@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
+from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.tileset import FILE_NAME, write_tilesets
 from gsmap.map.settings import Settings
@@ -118,18 +118,23 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
 def export(store: Store, out: Path, request: Request, settings: Settings, progress: Progress) -> ExportResult:
     """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what.
 
-    A map that was opened for reading is exported too; then only the folder's own manifest says what was made.
+    A map that was opened for reading, or whose disk is full, is exported too; then only the folder's own manifest says
+    what was made.
     """
     planned = plan(store, request, settings)
     asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
+    refused = [] if store.catalog.writable else [f"{store.folder} is read-only"]
 
     def noted(tile: Tile) -> None:
-        if not tile.path or not store.catalog.writable:  # nothing lies there, or nothing can be noted
+        if not tile.path or refused:  # nothing lies there, or nothing can be noted
             return
-        if not number:
-            number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
-        store.exports.add_tile(number[0], tile)
+        try:
+            if not number:
+                number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
+            store.exports.add_tile(number[0], tile)
+        except (DiskFullError, ReadOnlyError) as error:
+            refused.append(str(error))
 
     result = export_tiles(
         planned.tiles,
@@ -144,15 +149,14 @@ def export(store: Store, out: Path, request: Request, settings: Settings, progre
     is_new = result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))
     if planned.recipe.is_tileset and is_new:
         write_tilesets(out, result.tiles, request.tile_size_m)
-    if not store.catalog.writable:
-        _log.warning(
-            "%s is read-only: it does not know of this export, so gsmap status cannot watch %s", store.folder, out
-        )
-        return result
     kept = {tile.path for tile in result.tiles}
-    gone = [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]
-    if gone:
-        store.exports.forget(out, gone)
+    if not refused and (gone := [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]):
+        try:
+            store.exports.forget(out, gone)
+        except (DiskFullError, ReadOnlyError) as error:
+            refused.append(str(error))
+    if refused:
+        _log.warning("%s: the map does not know all of this export, so gsmap status cannot watch %s", refused[0], out)
     return result
 
 
