@@ -24,7 +24,6 @@ from gsmap.store.wal import log_of, read_log
 
 URL_FILE = "catalog.url"
 LOCK_FILE = "lock"
-VERIFIED_BYTES = 256 << 20  # a longer catalog is not read through whenever it is opened: that would take seconds
 _LOOKS = 3  # at pages that others are writing, before they are asked to wait
 _log = logging.getLogger("gsmap.store")
 
@@ -164,7 +163,7 @@ class Catalog:
         """
         if self.is_sqlite:
             file = self.folder / sqlite.FILE
-            found = self.page_problems(at_most_bytes=VERIFIED_BYTES)
+            found = self.page_problems(at_most_bytes=digests.WHOLE_BYTES)
             if found:
                 backup = digests.is_backup(file, sqlite.handle(self.engine))
                 if backup is None or read_log(log_of(file)).frames:

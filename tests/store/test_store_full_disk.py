@@ -3,11 +3,11 @@
 import os
 import shutil
 import subprocess
-import sys
 
 import pytest
 from store_samples import key, make_cameras, make_gaussians
 
+from gsmap.cli import app
 from gsmap.errors import DiskFullError
 from gsmap.store import Store, sqlite
 from gsmap.types import NodeLayer, PoseGraph, SceneGraph, ScenePose, Sim3
@@ -54,14 +54,19 @@ def full(disk):
     return disk / "m.gsmap"
 
 
-def run(*arguments: object) -> tuple[int, str]:
-    command = [sys.executable, "-c", "from gsmap.cli import main; main()", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    said = done.stdout + done.stderr
-    assert "Traceback" not in said
-    assert "damaged" not in said
-    assert "restore" not in said
-    return done.returncode, said
+@pytest.fixture
+def run(capfd):
+    def one(*arguments: object) -> tuple[int, str]:
+        try:
+            app.run(list(map(str, arguments)))
+        except SystemExit as ended:
+            code = ended.code or 0
+        said = "".join(capfd.readouterr())
+        assert "damaged" not in said
+        assert "restore" not in said
+        return code, said
+
+    return one
 
 
 @pytest.mark.parametrize("mode", ["r", "w"])
@@ -106,7 +111,7 @@ def test_writing_to_a_full_map_says_so_and_keeps_what_was(full):
             lambda: store.scenes.remove("kept"),
             lambda: store.exports.begin("/out", revision=1),
         ):
-            with pytest.raises(DiskFullError, match="the disk is full.*not kept.*prune"):
+            with pytest.raises(DiskFullError, match=r"the disk is full.*not kept.*prune"):
                 change()
         assert [s.name for s in store.scenes.list()] == ["kept"]
         assert store.check().problems == ()
@@ -172,7 +177,7 @@ def test_a_prune_that_was_killed_on_a_full_disk(full, monkeypatch):
         assert store.check().ok
 
 
-def test_the_verbs_on_a_full_disk(full, tmp_path):
+def test_the_verbs_on_a_full_disk(full, tmp_path, run):
     code, said = run("list", full, "scenes")
     assert (code, "kept" in said) == (0, True)
     assert run("show", full, "kept")[0] == 0
