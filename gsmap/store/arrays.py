@@ -10,6 +10,7 @@ This class is the seam for arrays elsewhere than in a local folder: nothing else
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -24,10 +25,12 @@ import numpy as np
 
 from gsmap.durable import sync_folder
 from gsmap.errors import CorruptError
+from gsmap.store.explained import explained
 
 CHUNK_ROWS = 16_384
 SHARD_ROWS = 16 * CHUNK_ROWS
 _ZSTD_LEVEL = 1
+_NOT_ITS_BYTES = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,9 @@ class Arrays:
             group = zarr.open_group(str(place), mode="r", zarr_format=3)
             return {key: _rows(group[key], rows) for key in (group.array_keys() if only is None else only)}
         except Exception as error:  # zarr and its codecs raise whatever they stumbled over
+            if isinstance(error, OSError) and error.errno in _NOT_ITS_BYTES:
+                with explained(place):
+                    raise
             raise CorruptError(
                 f"{place} cannot be read ({type(error).__name__}: {error}): run gsmap check, and ingest the scene again"
             ) from error
@@ -126,8 +132,8 @@ class Arrays:
                 out.append(f"{path} is missing")
             elif path.stat().st_size != file.size_bytes:
                 out.append(f"{path} has {path.stat().st_size} bytes, {file.size_bytes} were written")
-            elif _sha256(path) != file.sha256:
-                out.append(f"{path} differs from what was written")
+            elif (problem := _content_problem(path, file.sha256)) is not None:
+                out.append(problem)
         return out + [f"{place / extra} does not belong there" for extra in sorted(present - {f.path for f in files})]
 
     def size_bytes(self, kind: str, name: str) -> int:
@@ -233,6 +239,10 @@ def _synchronise(folder: Path) -> tuple[StoredFile, ...]:
     return tuple(out)
 
 
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _content_problem(path: Path, sha256: str) -> str | None:
+    try:
+        with open(path, "rb") as file:
+            same = hashlib.file_digest(file, "sha256").hexdigest() == sha256
+    except OSError as error:  # a disk that fails is what `check` is there to find
+        return f"{path} cannot be read: {error.strerror or error}"
+    return None if same else f"{path} differs from what was written"
