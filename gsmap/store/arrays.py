@@ -10,6 +10,7 @@ This class is the seam for arrays elsewhere than in a local folder: nothing else
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -29,9 +30,11 @@ from gsmap.durable import files_below, is_folder, open_file, refuse_links, remov
 from gsmap.errors import BusyError, CorruptError
 from gsmap.store import layout
 from gsmap.store.columns import KINDS, is_digest
+from gsmap.store.explained import explained
 from gsmap.store.layout import CHUNK_ROWS, SHARD_ROWS
 
 _ZSTD_LEVEL = 1
+_NOT_ITS_BYTES = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 @dataclass(frozen=True)
@@ -183,6 +186,9 @@ class Arrays:
             group = zarr.open_group(str(place), mode="r", zarr_format=3, use_consolidated=False)
             return {name: _rows(group[name], rows) for name in names}
         except Exception as error:  # zarr and its codecs raise whatever they stumbled over
+            if isinstance(error, OSError) and error.errno in _NOT_ITS_BYTES:
+                with explained(place):
+                    raise
             raise CorruptError(
                 f"{place} cannot be read ({type(error).__name__}: {error}): run gsmap check, and ingest the scene again"
             ) from error
@@ -200,8 +206,8 @@ class Arrays:
                 out.append(f"{path} is no plain file (a link, pipe or device)")
             elif found.st_size != file.size_bytes:
                 out.append(f"{path} has {found.st_size} bytes, {file.size_bytes} were written")
-            elif _sha256(path) != file.sha256:
-                out.append(f"{path} differs from what was written")
+            elif (problem := _content_problem(path, file.sha256)) is not None:
+                out.append(problem)
         if not out:
             try:
                 layout.check(place, {file.path: file.size_bytes for file in files}, _arrays_in(files))
@@ -385,3 +391,11 @@ def _names(folder: Path) -> list[str]:
 def _sha256(path: Path) -> str:
     with open(open_file(path), "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _content_problem(path: Path, sha256: str) -> str | None:
+    try:
+        same = _sha256(path) == sha256
+    except OSError as error:  # a disk that fails is what `check` is there to find
+        return f"{path} cannot be read: {error.strerror or error}"
+    return None if same else f"{path} differs from what was written"

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import logging
 import os
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
@@ -15,15 +16,14 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, RootTransaction, create_engine
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
 from gsmap.store import digests, sqlite, trust
-from gsmap.store.explained import NOT_KEPT, explained, summary
+from gsmap.store.explained import NOT_KEPT, explained, is_full, summary
 from gsmap.store.wal import log_of, read_log
 
 LOCK_FILE = "lock"
-VERIFIED_BYTES = 256 << 20  # a longer catalog is not read through whenever it is opened: that would take seconds
 _LOOKS = 3  # at pages that others are writing, before they are asked to wait
 _log = logging.getLogger("gsmap.store")
 
@@ -63,7 +63,23 @@ class Catalog:
         if self._writing is not None:
             yield self._writing
             return
-        with explained(self.folder), self.engine.connect() as connection, connection.begin():
+        with explained(self.folder), self._reading() as connection, connection.begin():
+            yield connection
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        """A connection; on a full disk one that needs no room there, for which writers wait meanwhile."""
+        try:
+            connection = self.engine.connect()
+        except (SQLAlchemyError, sqlite3.Error) as error:
+            if not self.is_sqlite or not sqlite.needs_room(error) or not is_full(self.folder):
+                raise
+            with self.still():
+                engine = sqlite.still_engine(self.folder / sqlite.FILE)
+                with engine.connect() as still:
+                    yield still
+            return
+        with connection:
             yield connection
 
     @contextlib.contextmanager
@@ -158,7 +174,7 @@ class Catalog:
         """
         if self.is_sqlite:
             file = self.folder / sqlite.FILE
-            found = self.page_problems(at_most_bytes=VERIFIED_BYTES)
+            found = self.page_problems(at_most_bytes=digests.WHOLE_BYTES)
             if found:
                 backup = digests.is_backup(file, sqlite.handle(self.engine))
                 if backup is None or read_log(log_of(file)).frames:

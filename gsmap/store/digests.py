@@ -24,6 +24,8 @@ from gsmap.store.wal import Log, log_of, read_log
 
 _MAGIC = b"gsmap page digests 1\n"
 _SIZE = 16  # bytes of BLAKE2b: nobody forges them here, a disk that errs is to be found out
+WHOLE_BYTES = 256 << 20
+"""A longer file is read through by ``gsmap check`` alone, not whenever it is opened or written: that takes seconds."""
 _BLOCK_BYTES = 1 << 20
 _HEADER = struct.Struct("<4I")
 _ENTRY = struct.Struct("<I16s")
@@ -164,7 +166,10 @@ def fold(file: Path, handle: Handle, checkpoint: Callable[[], bool], *, accept: 
     """
     log = read_log(log_of(file), handle.index)
     noted = None if accept else load(file)
-    before = _of_file(handle, noted)
+    if noted is None or noted.next_count or os.fstat(handle.number).st_size <= WHOLE_BYTES:
+        before = _of_file(handle, noted)
+    else:  # pages that stay as they are keep their digests, right or wrong
+        before = _renewed(handle, noted, log.frames)
     if not accept:
         found = _found(file, handle, noted, log, before)
         if found:
@@ -220,13 +225,23 @@ def _may_lack(noted: Digests, number: int, covered: Collection[int]) -> bool:
 
 def _of_file(handle: Handle, noted: Digests | None = None) -> Digests:
     """The digests of a file as it is."""
-    page_size = noted.page_size if noted is not None else _page_size(handle)
-    many = max(1, _BLOCK_BYTES // page_size) * page_size
+    size = noted.page_size if noted is not None else page_size(handle)
+    many = max(1, _BLOCK_BYTES // size) * size
     digests: list[bytes] = []
-    while content := os.pread(handle.number, many, len(digests) * page_size):
+    while content := os.pread(handle.number, many, len(digests) * size):
         block = memoryview(content)
-        digests += [_digest(block[i : i + page_size]) for i in range(0, len(content), page_size)]
-    return Digests(page_size, b"".join(digests))
+        digests += [_digest(block[i : i + size]) for i in range(0, len(content), size)]
+    return Digests(size, b"".join(digests))
+
+
+def _renewed(handle: Handle, noted: Digests, numbers: Iterable[int]) -> Digests:
+    """Digests with those of some pages taken anew from the file."""
+    renewed = bytearray(noted.pages)
+    for number in numbers:
+        if number <= noted.count:
+            content = os.pread(handle.number, noted.page_size, (number - 1) * noted.page_size)
+            renewed[(number - 1) * _SIZE : number * _SIZE] = _digest(content)
+    return Digests(noted.page_size, bytes(renewed))
 
 
 def _after(handle: Handle, before: Digests, log: Log, changed: dict[int, bytes]) -> Digests:
@@ -242,7 +257,8 @@ def _after(handle: Handle, before: Digests, log: Log, changed: dict[int, bytes])
     return Digests(before.page_size, b"".join(digests))
 
 
-def _page_size(handle: Handle) -> int:
+def page_size(handle: Handle) -> int:
+    """Of a database, from its header."""
     size = int.from_bytes(os.pread(handle.number, 2, 16), "big")
     return 65536 if size == 1 else size or 4096
 

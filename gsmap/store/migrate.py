@@ -20,19 +20,25 @@ if TYPE_CHECKING:
 def version(engine: Engine, folder: Path) -> str | None:
     """The migration a database is at; None where it has never seen one."""
     with explained(folder), engine.connect() as connection:
-        if not inspect(connection).has_table("alembic_version"):
-            return None
-        return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+        return _version(connection)
 
 
-def require_current(engine: Engine, folder: Path) -> None:
+def _version(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+
+
+def require_current(catalog: Catalog) -> None:
     """Refuse a database of another schema.
 
     Raises:
         SchemaVersionError: newer (get a newer gsmap) or older (``gsmap migrate``).
         CorruptError: no schema at all, or tables that gsmap did not make.
     """
-    found = version(engine, folder)
+    folder = catalog.folder
+    with catalog.read() as connection:
+        found = _version(connection)
     if found is None:
         raise CorruptError(f"{folder}: its catalog holds no gsmap tables; restore it from a backup")
     if found > schema.HEAD:
@@ -44,8 +50,8 @@ def require_current(engine: Engine, folder: Path) -> None:
         raise SchemaVersionError(
             f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}"
         )
-    if engine.dialect.name == "sqlite":  # a server's tables are the user's own
-        with explained(folder), engine.connect() as connection:
+    if catalog.is_sqlite:  # a server's tables are the user's own
+        with explained(folder), catalog.engine.connect() as connection:
             _require_tables(connection, folder)
 
 
@@ -86,7 +92,7 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
     """
     before = version(catalog.engine, catalog.folder)
     if before is not None and before > schema.HEAD:
-        require_current(catalog.engine, catalog.folder)
+        require_current(catalog)
     if before == schema.HEAD and revision == "head":
         return before, before
     with catalog.lock():

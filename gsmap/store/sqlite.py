@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from sqlalchemy import Connection, Engine, PoolProxiedConnection, QueuePool, create_engine, event
+from sqlalchemy import Connection, Engine, NullPool, PoolProxiedConnection, QueuePool, create_engine, event
 
 from gsmap.durable import open_file
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store import digests
 from gsmap.store.handles import Handle
-from gsmap.store.wal import log_of
+from gsmap.store.wal import log_of, read_log
 
 FILE = "map.sqlite"
 CHECKPOINT_BYTES = 4 << 20
@@ -125,6 +125,41 @@ def engine(file: Path, *, writable: bool) -> Engine:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
     return made
+
+
+def still_engine(file: Path) -> Engine:
+    """An engine that reads a database as it lies there, log included, without the index that SQLite makes for the log.
+
+    For a disk without room for that index; only while nobody writes or folds. A log with something in it is folded in
+    within memory.
+    """
+
+    def connect() -> sqlite3.Connection:
+        log = read_log(log_of(file))
+        if not log.frames:
+            made: sqlite3.Connection = _connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1")
+            return made
+        with contextlib.closing(Handle(file)) as handle, open(log_of(file), "rb") as frames:
+            content = bytearray(os.pread(handle.number, os.fstat(handle.number).st_size, 0))
+            size = digests.page_size(handle)
+            content = content[: log.num_pages * size].ljust(log.num_pages * size, b"\0")
+            for number, at in log.frames.items():
+                frames.seek(at)
+                content[(number - 1) * size : number * size] = frames.read(size)
+        content[18:20] = b"\1\1"  # no WAL mode, which needs a file
+        made = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+        made.deserialize(content)
+        made.execute("PRAGMA query_only = ON")
+        return made
+
+    return create_engine("sqlite://", creator=connect, poolclass=NullPool)
+
+
+def needs_room(error: BaseException) -> bool:
+    """Whether SQLite could not connect for something that it wanted to write."""
+    found: object = getattr(error, "orig", None) or error
+    code = getattr(found, "sqlite_errorcode", 0) & 0xFF
+    return code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
 
 
 def handle(engine: Engine) -> Handle:

@@ -124,7 +124,7 @@ class Store:
         """
         store = cls._connect(path, mode, catalog_url)
         try:
-            migrate.require_current(store.catalog.engine, store.folder)
+            migrate.require_current(store.catalog)
             if not store.catalog.is_sqlite:
                 store._check_id()
         except BaseException:
@@ -152,7 +152,7 @@ class Store:
         """Open for writing, a tag as well: what is purged goes from there, too."""
         store = cls._connect(path, "w", None, even_tags=True)
         try:
-            migrate.require_current(store.catalog.engine, store.folder)
+            migrate.require_current(store.catalog)
         except BaseException:
             store.close()
             raise

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
+from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
 from gsmap.export.tileset import is_stale, write_tilesets
@@ -122,7 +122,8 @@ def export(
 ) -> ExportResult:
     """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what.
 
-    A map that was opened for reading is exported too; then only the folder's own manifest says what was made.
+    A map that was opened for reading, or whose disk is full, is exported too; then only the folder's own manifest says
+    what was made.
 
     Args:
         wait: where another export is at work in the folder, until it has ended.
@@ -150,16 +151,20 @@ def _export(
     """The export itself, in a folder that is ours alone."""
     asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
+    refused = [] if store.catalog.writable else [f"{store.location} is read-only"]
     num_made = 0
 
     def noted(tile: Tile) -> None:
         nonlocal num_made
         num_made += 1
-        if not tile.path or not store.catalog.writable:  # nothing lies there, or nothing can be noted
+        if not tile.path or refused:  # nothing lies there, or nothing can be noted
             return
-        if not number:
-            number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
-        store.exports.add_tile(number[0], tile)
+        try:
+            if not number:
+                number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
+            store.exports.add_tile(number[0], tile)
+        except (DiskFullError, ReadOnlyError) as error:
+            refused.append(str(error))
 
     with noting(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
         result = export_tiles(
@@ -174,15 +179,14 @@ def _export(
         )
     if planned.recipe.is_tileset and is_stale(out, result.tiles):
         write_tilesets(out, result.tiles, request.tile_size_m)
-    if not store.catalog.writable:
-        _log.warning(
-            "%s is read-only: it does not know of this export, so gsmap status cannot watch %s", store.location, out
-        )
-        return result
     kept = {tile.path for tile in result.tiles}
-    gone = [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]
-    if gone:
-        store.exports.forget(out, gone)
+    if not refused and (gone := [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]):
+        try:
+            store.exports.forget(out, gone)
+        except (DiskFullError, ReadOnlyError) as error:
+            refused.append(str(error))
+    if refused:
+        _log.warning("%s: the map does not know all of this export, so gsmap status cannot watch %s", refused[0], out)
     return result
 
 
