@@ -128,6 +128,8 @@ def _shape(shape: Object) -> str:
 
 def _usage(verb: str) -> str:
     known = {"show SCENE": "show MAP SCENE", "show A:B": "show MAP A:B", "convert": "convert IN OUT", "demo": "demo"}
+    known |= {"backup": "backup MAP DEST", "backup --list": "backup MAP DEST --list"}
+    known |= {"restore": "restore DEST MAP", "clone": "clone MAP NEW"}
     words = verb.split()
     if verb in known:
         return known[verb]

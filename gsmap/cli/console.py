@@ -23,7 +23,12 @@ if TYPE_CHECKING:
     from gsmap.types.rows import Row
 
 MapPath = Annotated[
-    str, typer.Argument(metavar="MAP", help="The map's directory, such as site.gsmap.", show_default=False)
+    str,
+    typer.Argument(
+        metavar="MAP",
+        help="The map's directory, such as site.gsmap; site.gsmap@NAME for a branch or tag.",
+        show_default=False,
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; docs/json.md has its fields.")]
 Sets = Annotated[

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.durable import is_file, open_file, write_text_whole
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.texts import control_characters
 from gsmap.types import Sim3, Tile
 from gsmap.types.plain import plain
@@ -35,12 +35,14 @@ class Manifest:
         tiles: those that are finished.
         num_bytes: size of each tile's file, by path.
         notes: what a person should know about the folder as it was found.
+        doomed: paths of files that are no longer a tile's and are still to be deleted.
     """
 
     map_id: str
     tiles: dict[tuple[int, str], Tile] = field(default_factory=dict)
     num_bytes: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    doomed: set[str] = field(default_factory=set)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
 
     @classmethod
@@ -62,13 +64,14 @@ class Manifest:
             return cls(map_id)
         try:
             content = json.loads(_text(path))
-            version, owner = content["version"], content["map_id"]
+            version, owner = content["version"], str(content["map_id"])
             if version not in (_NAMELESS, _VERSION):
                 raise ConfigError(
                     f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+            doomed = {_checked_path(p) for p in content.get("doomed", ())}
+        except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
             raise InputError(f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder") from error
@@ -84,6 +87,7 @@ class Manifest:
             {(tile.component, name): tile for name, tile, _ in entries},
             {tile.path: size for _, tile, size in entries},
             notes,
+            doomed,
         )
 
     def has_file(self, folder: Path, tile: Tile) -> bool:
@@ -91,7 +95,10 @@ class Manifest:
         if not tile.path:
             return True
         path = folder / tile.path
-        return is_file(path) and path.lstat().st_size == self.num_bytes[tile.path]
+        try:
+            return is_file(path) and path.lstat().st_size == self.num_bytes[tile.path]
+        except (OSError, ValueError):
+            return False
 
     def save_sometimes(self, folder: Path) -> None:
         """Save, unless that was done a moment ago: an interrupted export loses seconds, a large one does not crawl."""
@@ -103,8 +110,10 @@ class Manifest:
         entries = [
             _entry(name, tile, self.num_bytes.get(tile.path, 0)) for (_, name), tile in sorted(self.tiles.items())
         ]
-        text = json.dumps({"version": _VERSION, "map_id": self.map_id, "tiles": entries}, indent=1)
-        write_text_whole(folder / FILE_NAME, text)
+        content = {"version": _VERSION, "map_id": self.map_id, "tiles": entries}
+        if self.doomed:
+            content["doomed"] = sorted(self.doomed)
+        write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
         self._saved_at = time.monotonic()
 
 

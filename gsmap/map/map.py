@@ -15,28 +15,38 @@ import numpy as np
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
+from gsmap.map import values as as_values
 from gsmap.map.logs import logged
+from gsmap.map.sharing import at_work
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
+    BackupReport,
+    BranchRow,
     CheckReport,
+    CloneReport,
     EdgeRow,
     EvaluationReport,
     ExportReport,
     GraphRow,
     IngestRow,
     MapStatus,
+    MergeReport,
     ModelRow,
     PairReport,
     PoseChangeRow,
     PoseRow,
     PriorRow,
     PruneReport,
+    PurgeReport,
+    RestoreReport,
     RevisionRow,
     SceneReport,
     SceneRow,
     SettingRow,
+    SnapshotRow,
+    SplitReport,
     TileRow,
     UpdateReport,
 )
@@ -59,19 +69,60 @@ def create(
 
 
 def open(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
-    """Open a map; read-only where its folder cannot be written."""
-    mode = "r" if os.path.isdir(path) and not os.access(path, os.W_OK) else "w"
-    return Map(Store.open(path, mode), progress)
+    """Open a map, or a branch or tag of one (``MAP@NAME``); read-only where its folder cannot be written."""
+    return Map(Store.open(path, "w" if Store.can_write(path) else "r"), progress)
 
 
 def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
     """Open a map, making it first where there is none."""
-    return open(path, progress) if os.path.exists(path) else create(path, progress)
+    return open(path, progress) if Store.exists(path) else create(path, progress)
 
 
 def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
     """Bring an older map to this version's schema; returns the schema before and after."""
     return Store.migrate(path)
+
+
+def restore(
+    target: str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    at: str | None = None,
+    progress: StageProgress | None = None,
+    *,
+    catalog_url: str | None = None,
+) -> RestoreReport:
+    """``gsmap restore DEST MAP``: make a map from a backup, whole or not at all; it is the same map, with its id.
+
+    Args:
+        target: the backup: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
+        path: a folder that does not exist.
+        at: the last snapshot at or before this time, or one by the beginning of its name; the newest by default.
+        catalog_url: SQLAlchemy URL of an empty PostgreSQL database to keep the catalog in.
+    """
+    from gsmap.map import backing
+
+    told = logged(progress)
+    return backing.restore(
+        target, path, at=at, catalog_url=catalog_url, progress=lambda f, text: told("restore", f, text)
+    )
+
+
+def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
+    """``gsmap backup MAP DEST --list``: the states in a backup, oldest first."""
+    from gsmap.map import backing
+
+    return backing.snapshots(target)
+
+
+def accept_catalog(path: str | os.PathLike[str]) -> list[str]:
+    """Take the catalog of a map that differs from what gsmap wrote as it is; returns what differed, in words.
+
+    For salvage, or after a change by another program: from then on these bytes count as written, right or wrong.
+
+    Raises:
+        CorruptError: SQLite finds it broken: only a backup helps.
+    """
+    return Store.accept_catalog(path)
 
 
 class Map(AbstractContextManager["Map"]):
@@ -122,7 +173,8 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap settings MAP --set``: change the map's own settings; nothing is written if any makes no sense."""
         from gsmap.map.settings import write_settings
 
-        write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
+        with self.store.catalog.lock():
+            write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
         self.__dict__.pop("settings", None)
 
     def setting_rows(self) -> list[SettingRow]:
@@ -169,7 +221,8 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.stages.describe import describe
 
         wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
-        keys = describe(self.store, wanted, self.settings, self._progress)
+        with at_work(self.store, "describe"):
+            keys = describe(self.store, wanted, self.settings, self._progress)
         return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
 
     def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:
@@ -181,7 +234,8 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.stages.register import register
 
-        made = register(self.store, pairs, self.settings, self._progress)
+        with at_work(self.store, "register"):
+            made = register(self.store, pairs, self.settings, self._progress)
         return reports.rows_of_edges(self.store, made)
 
     def add_edge(self, pair: str, S_target_source: Sim3, sigmas: np.ndarray, note: str = "") -> EdgeRow:
@@ -218,7 +272,8 @@ class Map(AbstractContextManager["Map"]):
         """Solve for all scene poses and keep the answer as a new revision."""
         from gsmap.map.stages.optimize import optimize
 
-        number = optimize(self.store, self.settings, self._progress)
+        with at_work(self.store, "optimize"):
+            number = optimize(self.store, self.settings, self._progress)
         return reports.revision_row(self.store, number)
 
     def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
@@ -228,18 +283,19 @@ class Map(AbstractContextManager["Map"]):
             captured_at: as in `ingest`.
         """
         from gsmap.map.stages.describe import describe
-        from gsmap.map.stages.optimize import is_solved, optimize
+        from gsmap.map.stages.optimize import solve
         from gsmap.map.stages.register import register
 
         if captured_at is not None and not captures:
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
-        ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-        describe(self.store, self.scenes(), self.settings, self._progress)
-        while True:
+        with at_work(self.store, "update"):
+            ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
+            describe(self.store, self.scenes(), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
-            if is_solved(self.store, self.settings):
-                return reports.update_report(self.store, ingested)
-            optimize(self.store, self.settings, self._progress)  # scenes that now turn out to be neighbours come next
+            while solve(self.store, self.settings, self._progress):
+                # Scenes that now turn out to be neighbours.
+                register(self.store, "auto", self.settings, self._progress)
+        return reports.update_report(self.store, ingested)
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
@@ -272,6 +328,7 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        wait: bool = False,
     ) -> ExportReport:
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
 
@@ -286,8 +343,10 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            wait: where another export is at work in the folder, until it has ended.
 
         Raises:
+            BusyError: another export is at work in the folder; it is named.
             ConfigError, InputError, StoreError: see `gsmap.export`; no half-written tile is left.
         """
         from gsmap.map.stages.export import Request, export
@@ -303,7 +362,11 @@ class Map(AbstractContextManager["Map"]):
             budget_s=budget_s,
             provenance=provenance,
         )
-        made = export(self.store, Path(out), request, self.settings, lambda f, text: self._progress("export", f, text))
+
+        def progress(fraction: float, text: str) -> None:
+            self._progress("export", fraction, text)
+
+        made = export(self.store, Path(out), request, self.settings, progress, wait=wait)
         return reports.export_report(self.store, Path(out), made)
 
     # --- look --------------------------------------------------------------------------------------------------------
@@ -443,7 +506,12 @@ class Map(AbstractContextManager["Map"]):
         if images is None:
             return report
         rows = evaluating.images(
-            self.store, images, lambda f, text: self._progress("evaluate", f, text), tiles=tiles, lpips=lpips
+            self.store,
+            images,
+            lambda f, text: self._progress("evaluate", f, text),
+            tiles=tiles,
+            lpips=lpips,
+            limits=self.settings.describe.object.limits,
         )
         return replace(report, images=rows)
 
@@ -513,6 +581,66 @@ class Map(AbstractContextManager["Map"]):
         self.store.scenes.remove(ref)
         return row
 
+    def branch(self, name: str) -> BranchRow:
+        """``gsmap branch MAP NAME``: another catalog over the same arrays; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name))
+
+    def tag(self, name: str) -> BranchRow:
+        """``gsmap tag MAP NAME``: the map as it is now, which cannot change; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name, tag=True))
+
+    def branches(self, kind: str | None = None) -> list[BranchRow]:
+        """The map's branches and tags, or those of one kind (``branch``, ``tag``)."""
+        rows = [as_values.branch_row(branch) for branch in self.store.branches.list()]
+        return [row for row in rows if kind in (None, row.kind)]
+
+    def delete_branch(self, name: str, kind: str | None = None) -> BranchRow:
+        """``gsmap branch MAP NAME --delete``: forget a branch or tag; what only it named is reclaimed by `prune`.
+
+        Raises:
+            NotFoundError: none of that kind is called so.
+        """
+        row = as_values.branch_row(self.store.branches.get(name))
+        if kind not in (None, row.kind):
+            raise NotFoundError(f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete")
+        self.store.branches.delete(name)
+        return row
+
+    def merge(self, source: str | os.PathLike[str]) -> MergeReport:
+        """``gsmap merge MAP SOURCE``: take all that another map, branch or tag knows; nothing is computed."""
+        return as_values.merge(self.store, source)
+
+    def split(
+        self,
+        out: str | os.PathLike[str],
+        *,
+        island: int | None = None,
+        box: Sequence[float] | None = None,
+        scenes: Sequence[str] | None = None,
+    ) -> SplitReport:
+        """``gsmap split MAP OUT``: a new map of some scenes, with all that is known of and among them.
+
+        Args:
+            island: those of this component.
+            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of the island, else of component 0.
+            scenes: those of these names.
+        """
+        return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))
+
+    def purge(self, ref: str, *, branches: bool = False) -> PurgeReport:
+        """``gsmap remove MAP SCENE --purge``: forget a scene for good: rows, arrays, tiles that were made with it.
+
+        Args:
+            branches: in the map's other branches and tags, too; else they are told of.
+        """
+        from gsmap.map.stages.purge import purge
+
+        return as_values.purge_report(purge(self.store, ref, branches=branches))
+
+    def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
+        """``gsmap restore-scene MAP SCENE``: bring back a removed scene, or (``source``) take one of another map."""
+        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source))
+
     def check(self) -> CheckReport:
         """Read every byte of the map and compare it with what was written."""
         return reports.check_report(self.store.check(lambda f, text: self._progress("check", f, text)))
@@ -521,8 +649,29 @@ class Map(AbstractContextManager["Map"]):
         """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
         return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
 
+    def backup(self, target: str | os.PathLike[str], *, verify: bool = False, keep: int | None = None) -> BackupReport:
+        """``gsmap backup MAP DEST``: save the map as it is now, while others go on; only what is new is sent.
+
+        Args:
+            target: a folder, ``file:///folder`` or ``s3://bucket/prefix``; of this map alone.
+            verify: read again what is there, and send again what is damaged.
+            keep: delete all but this many of the newest snapshots, and what only they needed.
+        """
+        from gsmap.map import backing
+
+        told = self._progress
+        return backing.save(
+            self.store, target, verify=verify, keep=keep, progress=lambda f, text: told("backup", f, text)
+        )
+
+    def clone(self, path: str | os.PathLike[str]) -> CloneReport:
+        """``gsmap clone MAP NEW``: another map, of its own id, that begins with what this one holds now."""
+        from gsmap.map import backing
+
+        return backing.clone(self.store, path, lambda f, text: self._progress("clone", f, text))
+
     def add_model(self, kind: str, path: str | os.PathLike[str], *, preset: str = "clip", copy: bool = True) -> None:
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""
         from gsmap.map import models
 
-        models.add(self.store, kind, path, preset, copy)
+        models.add(self.store, kind, path, preset, copy, self.settings.describe.object.limits)

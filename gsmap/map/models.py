@@ -8,12 +8,14 @@ from typing import Any
 from gsmap.describe.onnx.check import check_model
 from gsmap.errors import CorruptError
 from gsmap.store import Store
-from gsmap.types.model import ModelSpec, Tensor
+from gsmap.types.model import ModelLimits, ModelSpec, Tensor
 
 
-def add(store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool) -> ModelSpec:
+def add(
+    store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool, limits: ModelLimits
+) -> ModelSpec:
     """Check a model and keep it under its kind, in place of the one there was; see `check_model` for the errors."""
-    spec = check_model(kind, path, preset)
+    spec = check_model(kind, path, preset, limits)
     store.models.add(kind, path, kind=kind, options=spec.to_json(), copy=copy)
     return spec
 

@@ -13,7 +13,10 @@ import contextlib
 import fcntl
 import hashlib
 import os
+import shutil
 import stat
+import threading
+import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_folder
-from gsmap.errors import CorruptError
+from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_file, sync_folder
+from gsmap.errors import BusyError, CorruptError
 from gsmap.store import layout
 from gsmap.store.columns import KINDS, is_digest
 from gsmap.store.layout import CHUNK_ROWS, SHARD_ROWS
@@ -60,6 +63,7 @@ class Arrays:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.staging = root / "staging"
+        self._held = threading.local()
 
     @contextlib.contextmanager
     def stage(self, arrays: Mapping[str, np.ndarray]) -> Iterator[Staged]:
@@ -73,8 +77,66 @@ class Arrays:
                 with contextlib.suppress(OSError):  # there is nothing where it was published
                     self._remove_staged(folder.name)
 
+    @contextlib.contextmanager
+    def stage_copies(
+        self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
+    ) -> Iterator[dict[tuple[str, str], Staged]]:
+        """Bring groups of another map beside their places; dropped at the end unless `publish` took them.
+
+        Files are linked where the disk allows, since no map ever writes to one again, and else copied.
+
+        Args:
+            groups: manifest by (kind, name).
+
+        Raises:
+            CorruptError: a file is missing, or differs from what was written.
+        """
+        with self._lock_staging(fcntl.LOCK_SH):
+            folder = self.staging / uuid.uuid4().hex
+            try:
+                folder.mkdir()
+                yield {
+                    group: Staged(_take(source._place(*group), folder / "-".join(group), files), tuple(files))
+                    for group, files in groups.items()
+                }
+            finally:
+                with contextlib.suppress(OSError):
+                    self._remove_staged(folder.name)
+
+    @contextlib.contextmanager
+    def lock(self, patience_s: float = 120.0) -> Iterator[None]:
+        """Held by the one who puts groups into their places, until a committed row names them, or who reclaims them.
+
+        Several catalogs may name these arrays (`gsmap.store.branches`), so that the writer lock of one does not do. Who
+        holds it takes no writer lock of a catalog that others know. Again in the same thread: nothing.
+
+        Raises:
+            BusyError: another process kept it for ``patience_s``.
+        """
+        if getattr(self._held, "depth", 0):
+            yield
+            return
+        handle = os.open(self.root, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            deadline = time.monotonic() + patience_s
+            while True:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() > deadline:
+                        raise BusyError(
+                            f"{self.root}: others have been writing arrays for {patience_s:g} s; try again later"
+                        ) from None
+                    time.sleep(0.01)
+            self._held.depth = 1
+            yield
+        finally:
+            self._held.depth = 0
+            os.close(handle)
+
     def publish(self, staged: Staged, kind: str, name: str) -> None:
-        """Move a staged group into its place; only under the writer lock, and only where no row names that place."""
+        """Move a staged group into its place; only under `lock`, and only where no row names that place."""
         place = self._place(kind, name)
         fresh = not place.parent.exists()
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -259,6 +321,34 @@ def _write(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
         )
         if array.size:
             made[...] = array
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Another name for a file that is never written again, or a copy where the disk has no such thing."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+        sync_file(target)
+
+
+def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
+    """Another map's group as one of our own, every byte compared; returns ``target``."""
+    target.mkdir()
+    present = files_below(place)
+    for file in files:
+        path, mine, found = place / file.path, target / file.path, present.get(file.path)
+        if found is None or not stat.S_ISREG(found.st_mode) or found.st_size != file.size_bytes:
+            raise CorruptError(f"{path} is missing or cut off: run gsmap check on that map, and repair it first")
+        mine.parent.mkdir(parents=True, exist_ok=True)
+        link_or_copy(path, mine)
+        if _sha256(mine) != file.sha256:
+            raise CorruptError(
+                f"{path} differs from what was written: run gsmap check on that map, and repair it first"
+            )
+    for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
+        sync_folder(path)
+    return target
 
 
 def _arrays_in(files: Sequence[StoredFile]) -> list[str]:

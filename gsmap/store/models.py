@@ -15,8 +15,10 @@ from sqlalchemy import Row, insert, select, update
 
 from gsmap.durable import open_file, refuse_links, write_whole
 from gsmap.errors import CorruptError, NotFoundError
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.arrays import Arrays
+from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import is_relative
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import checked_text
 from gsmap.store.schema import models
 from gsmap.types.plain import plain
@@ -48,10 +50,16 @@ class Model:
 
 
 class Models:
-    """The models of a map."""
+    """The models of a map.
 
-    def __init__(self, catalog: Catalog) -> None:
+    Args:
+        arrays: of the same map; the copies lie beside them, for all its branches.
+    """
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
+        self._arrays = arrays
+        self._home = arrays.root.parent
 
     def add(
         self,
@@ -81,7 +89,8 @@ class Models:
         row |= {"sha256": sha256, "size_bytes": source.stat().st_size, "options": plain(dict(options or {}))}
         with self._catalog.write() as connection:
             if copy:
-                _copy(source, self._catalog.folder / relative)
+                self._catalog.hold(self._arrays.lock())
+                _copy(source, self._home / relative)
             standing = (models.c.name == name) & models.c.removed_at.is_(None)
             connection.execute(update(models).where(standing).values(removed_at=now()))
             connection.execute(insert(models), row | {"created_at": now()})
@@ -112,7 +121,7 @@ class Models:
             connection.execute(update(models).where(standing).values(removed_at=now()))
 
     def _model(self, row: Row[Any]) -> Model:
-        path = model_path(self._catalog.folder, row)
+        path = model_path(self._home, row)
         return Model(
             row.name, row.kind, path, bool(row.copied), row.sha256, row.size_bytes, row.created_at, row.options
         )
@@ -150,7 +159,7 @@ def _copy(source: Path, target: Path) -> None:
     """Copy a file durably; it appears whole or not at all."""
     refuse_links(target.parent.parent, FOLDER)
     target.parent.mkdir(exist_ok=True)
-    with explained(target.parent):
+    with explained(target.parent, NOT_KEPT):
         write_whole(target, partial(_fill, source))
 
 

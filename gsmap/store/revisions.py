@@ -29,6 +29,7 @@ class Revision:
         dropped_at: when `prune` was allowed to reclaim what only it names; None while it is kept.
         key: `RecipeKey.digest` of what it was solved from; one of its own kind in revisions that schema 0001 wrote.
         recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in those.
+        origin: ``map`` (its id) and ``number`` of the revision that another map solved; None where this one did.
     """
 
     number: int
@@ -44,6 +45,7 @@ class Revision:
     dropped_at: str | None = None
     key: str = ""
     recipe: str | None = None
+    origin: dict[str, Any] | None = None
 
 
 class Revisions:
@@ -145,6 +147,12 @@ class Revisions:
             return [_revision(row, counts.get(row.number)) for row in connection.execute(query)]
 
 
+def newest_poses(connection: Connection) -> PoseGraph | None:
+    """The newest revision's answer, as a transaction sees it; None before the first."""
+    row = connection.execute(select(revisions).order_by(revisions.c.number.desc()).limit(1)).first()
+    return None if row is None else _pose_graph(connection, row)
+
+
 def _is(condition: Any) -> Any:
     return func.sum(case((condition, 1), else_=0))
 
@@ -177,6 +185,7 @@ def _revision(row: Row[Any], count: Row[Any] | None) -> Revision:
         dropped_at=row.dropped_at,
         key=row.key,
         recipe=row.recipe,
+        origin=row.origin,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -13,7 +14,8 @@ from gsmap.geometry.morton import morton_order
 from gsmap.store import facts
 from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
 from gsmap.store.groups import has_group, manifest, publish
 from gsmap.store.layout import CHUNK_ROWS, Shape
@@ -112,7 +114,7 @@ class Scenes:
         if progress:
             progress(0.4, f"writing {name}")
         staging = self._arrays.stage(_to_arrays(ordered, cameras))
-        with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             row = _by_id(connection, new_id)
             if row is not None and row.removed_at is None:
                 scene = self._dated(new_id, captured_at, dated_by)
@@ -121,9 +123,9 @@ class Scenes:
                 # else its bytes are damaged
             else:
                 scene = self._enter(connection, new_id, fields, rename, dated_by)
-            publish(connection, self._arrays, staged, KIND, new_id)
+            publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
-            _put_boxes(connection, number, boxes)
+            put_boxes(connection, number, boxes)
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))
         return scene, True
 
@@ -183,7 +185,7 @@ class Scenes:
             same = {("name", row.name), ("captured_at", row.captured_at or ""), *(("tag", tag) for tag in tags)}
             new = [fact for fact in dict.fromkeys(new) if fact not in same]
             for kind, value in new:
-                if kind == "name" and _name_taken(connection, value):
+                if kind == "name" and name_taken(connection, value):
                     raise InputError(f"another scene is called {value!r}: choose another name, or rename that one")
                 if kind == "untag" and value not in tags:
                     raise NotFoundError(f"scene {row.name!r} has no tag {value!r}: it has {sorted(tags) or 'none'}")
@@ -263,6 +265,48 @@ class Scenes:
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
             return _with_tags(connection, row)
 
+    def restore(self, ref: str) -> Scene:
+        """Let a removed scene live again, with all that is known of it; where its name is taken now it is ``name-2``.
+
+        Args:
+            ref: its id, the beginning of it, or its last name.
+
+        Raises:
+            NotFoundError: no removed scene is called so, several are, or its arrays were pruned.
+            InputError: it was not removed.
+            CorruptError: its arrays are damaged.
+        """
+        with self._catalog.write() as connection:
+            row = _find_removed(connection, ref)
+            files = manifest(connection, row.group_id or "")
+            if not files:
+                raise NotFoundError(
+                    f"the arrays of scene {row.name} ({row.id}) were pruned: bring them from another map, a branch or "
+                    "a restored backup with --from, or ingest its capture again"
+                )
+            problems = self._arrays.problems(KIND, row.group_id, files)
+            if problems:
+                raise CorruptError(f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}")
+            name, number = row.name, 2
+            while name_taken(connection, name):
+                name, number = f"{row.name}-{number}", number + 1
+            back = {"removed_at": None, "ingested_at": now(), "name": name}
+            connection.execute(update(scenes).where(scenes.c.id == row.id).values(**back))
+            if name != row.name:
+                facts.say(connection, row.id, [("name", name)])
+            return _with_tags(connection, _find(connection, row.id))
+
+    def find_any(self, ref: str) -> Scene:
+        """A scene by name, id or the beginning of its id, living or else removed.
+
+        Raises:
+            NotFoundError: none, or several are called so.
+        """
+        with self._catalog.read() as connection:
+            with contextlib.suppress(NotFoundError):
+                return _with_tags(connection, _find(connection, ref))
+            return _with_tags(connection, _find_removed(connection, ref))
+
     def _dated(self, known_id: str, captured_at: str | None, dated_by: str) -> Scene:
         """A living scene that was ingested again, with the date that came this time.
 
@@ -275,7 +319,7 @@ class Scenes:
     def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str) -> Scene:
         """The row of a new or returning scene, under a name that is free."""
         name, number = fields["name"], 2
-        while _name_taken(connection, fields["name"]):
+        while name_taken(connection, fields["name"]):
             if not rename:
                 raise InputError(f"another scene is called {name!r}: choose another name, or remove that one first")
             fields = fields | {"name": f"{name}-{number}"}
@@ -292,6 +336,22 @@ class Scenes:
         return _with_tags(connection, _find(connection, new_id))
 
 
+def _find_removed(connection: Connection, ref: str) -> Row[Any]:
+    """A removed scene by its id, the beginning of it, or its last name."""
+    gone = scenes.c.removed_at.is_not(None)
+    named = connection.execute(select(scenes).where(gone, (scenes.c.id == ref) | (scenes.c.name == ref))).all()
+    if not named and ref and all(c in "0123456789abcdef" for c in ref):
+        named = connection.execute(select(scenes).where(gone, scenes.c.id.startswith(ref))).all()
+    if len(named) == 1:
+        return named[0]
+    if named:
+        several = ", ".join(f"{row.name} {row.id[:12]}" for row in named)
+        raise NotFoundError(f"several removed scenes are called {ref!r} ({several}): give more of an id")
+    with contextlib.suppress(NotFoundError):
+        raise InputError(f"scene {_find(connection, ref).name} was not removed: there is nothing to bring back")
+    raise NotFoundError(f"no removed scene is called {ref!r}, and no id begins so")
+
+
 def living_ids(connection: Connection) -> set[str]:
     return set(connection.execute(select(scenes.c.id).where(scenes.c.removed_at.is_(None))).scalars())
 
@@ -306,7 +366,8 @@ def scene_name(connection: Connection, ref: str) -> str:
     return str(_find(connection, ref).name)
 
 
-def _name_taken(connection: Connection, name: str) -> bool:
+def name_taken(connection: Connection, name: str) -> bool:
+    """Whether a living scene is called so."""
     same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
     return connection.execute(same).first() is not None
 
@@ -395,7 +456,8 @@ def _to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:
     }
 
 
-def _put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
+def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
+    """Keep the boxes (C, 2, 3) of a scene's chunks, in place of those that there are."""
     if number >= 1 << 24:
         raise StoreError("a map holds at most 16 million scenes")  # the R*Tree's floats count no further
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
@@ -411,6 +473,13 @@ def _put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
         ),
         rows,
     )
+
+
+def get_boxes(connection: Connection, number: int) -> np.ndarray:
+    """The boxes (C, 2, 3) of a scene's chunks."""
+    query = text(f"SELECT x0, y0, z0, x1, y1, z1 FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s ORDER BY chunk")
+    rows = [list(row) for row in connection.execute(query, {"s": number})]
+    return np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
 
 
 def _touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import stat
 import uuid
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
+from gsmap.store import branches, integrity, migrate, schema, sqlite, staging, trust
 from gsmap.store import catalog as _catalog
-from gsmap.store import integrity, migrate, schema, sqlite, staging, trust
-from gsmap.store.arrays import Arrays
+from gsmap.store.arrays import Arrays, StoredFile
+from gsmap.store.backups import Backups
+from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
+from gsmap.store.copying import empty_catalog
+from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
 from gsmap.store.integrity import Check, Pruned
+from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.priors import Priors
 from gsmap.store.recipes import Recipes
@@ -30,16 +35,21 @@ from gsmap.store.scenes import Scenes
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
 
-_log = logging.getLogger("gsmap.store")
-
 
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models`` and ``exports``. Every method that changes something is one transaction, durable when it returns;
-    `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes
-    open their own.
+    ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that changes something is one
+    transaction, durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole.
+    Threads may share a store; processes open their own.
+
+    A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
+
+    Args:
+        place: ``home`` is the map's folder, with arrays and models; ``folder`` is where this catalog, its
+            ``settings.toml`` and its writer lock lie: the same, or that of a branch; ``location`` opens it again.
+        catalog: open on the database.
 
     Example::
 
@@ -47,9 +57,12 @@ class Store:
             scene, is_new = store.scenes.add(gaussians, cameras, name="monday")
     """
 
-    def __init__(self, folder: Path, catalog: Catalog) -> None:
-        self.folder = folder
-        self.arrays = Arrays(folder / "arrays")
+    def __init__(self, place: Place, catalog: Catalog) -> None:
+        self.home = place.home
+        self.folder = place.folder
+        self.branch = place.branch
+        self.location = place.location
+        self.arrays = Arrays(place.home / "arrays")
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
         self.recipes = Recipes(catalog)
@@ -57,8 +70,11 @@ class Store:
         self.registrations = Registrations(catalog)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
-        self.models = Models(catalog)
+        self.models = Models(catalog, self.arrays)
         self.exports = Exports(catalog)
+        self.branches = Branches(place, catalog, self.arrays)
+        self.backups = Backups(catalog)
+        self.leases = Leases(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:
@@ -74,26 +90,22 @@ class Store:
             StoreError: the folder is not empty, or cannot be written.
             NotFoundError: the folder it should lie in does not exist.
         """
-        folder = Path(path).absolute()
+        folder = branches.find(Path(path).absolute()).folder
         if folder.is_dir() and any(folder.iterdir()):
-            is_map = "is a map already" if _is_map(folder) else "is not empty"
+            is_map = "is a map already" if branches.holds_catalog(folder) else "is not empty"
             raise StoreError(f"{path} {is_map}: open it, or choose another name")
         if folder.exists() and not folder.is_dir():
             raise StoreError(f"{path} is a file: a map is a folder; choose another name")
         if not folder.parent.is_dir():
             raise NotFoundError(f"cannot make {path}: {folder.parent} does not exist")
-        remembered: trust.Remembered | None = None
-        with _catalog.explained(folder), staging.beside(folder) as staged:
+        with explained(folder, "no map was made"), staging.beside(folder) as staged:
             (staged / "arrays").mkdir()
-            remembered = _make_catalog(staged, catalog_url)
+            _make_catalog(staged, catalog_url)
             sync_folder(staged)
             os.rename(staged, folder)
             sync_folder(folder.parent)
-        if remembered is not None and remembered.map_id is not None:
-            try:
-                trust.trust(remembered.map_id, remembered.url)
-            except StoreError as error:  # the map is made; it is opened by naming its catalog again
-                _log.warning("%s", error)
+        if catalog_url is not None:
+            trust.remember(folder)
         return cls.open(path, "w", catalog_url=catalog_url)
 
     @classmethod
@@ -121,12 +133,59 @@ class Store:
             raise
         return store
 
+    @staticmethod
+    def exists(path: str | os.PathLike[str]) -> bool:
+        """Whether anything lies there, or the branch does that a path names.
+
+        Raises:
+            NotFoundError: the path names a branch that its map lacks.
+        """
+        return branches.find(path).folder.exists()
+
+    @staticmethod
+    def can_write(path: str | os.PathLike[str]) -> bool:
+        """Whether `open` with mode ``w`` makes sense there: not of a read-only folder, and not of a tag."""
+        place = branches.find(path)
+        return not place.is_tag and (not place.folder.is_dir() or os.access(place.folder, os.W_OK))
+
+    @classmethod
+    def open_even_tag(cls, path: str | os.PathLike[str]) -> Store:
+        """Open for writing, a tag as well: what is purged goes from there, too."""
+        store = cls._connect(path, "w", None, even_tags=True)
+        try:
+            migrate.require_current(store.catalog.engine, store.folder)
+        except BaseException:
+            store.close()
+            raise
+        return store
+
+    def others(self) -> list[Place]:
+        """Where the other catalogs over the same arrays lie: the map, its branches, its tags."""
+        every = (Place(self.home, self.home), *branches.places(self.home))
+        return [place for place in every if place.folder != self.folder]
+
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
-        """Bring an older map to this gsmap's schema; returns the version before and after."""
-        store = cls._connect(path, "w", None)
-        with store:
-            return migrate.upgrade(store.catalog)
+        """Bring an older map (and its branches and tags) to this gsmap's schema; the version before and after."""
+        with cls._connect(path, "w", None, even_tags=True) as store:
+            versions = migrate.upgrade(store.catalog)
+        for place in branches.places(store.home) if not store.branch else ():
+            with cls._connect(place.location, "w", None, even_tags=True) as branch:
+                migrate.upgrade(branch.catalog)
+        return versions
+
+    @classmethod
+    def accept_catalog(cls, path: str | os.PathLike[str]) -> list[str]:
+        """Take a catalog that differs from what was written as it is, and note new digests: what differed, in words.
+
+        For salvage: SQLite must find it sound, but nobody knows whether its values are those that were written.
+
+        Raises:
+            CorruptError: SQLite cannot make sense of it.
+            ConfigError: the catalog is no file of the map.
+        """
+        with cls._connect(path, "w", None, verify=False, even_tags=True) as store:
+            return store.catalog.accept()
 
     @classmethod
     def id_at(cls, path: str | os.PathLike[str], catalog_url: str) -> str:
@@ -135,24 +194,44 @@ class Store:
             return store.id
 
     @classmethod
-    def _connect(cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None) -> Store:
+    def _connect(
+        cls,
+        path: str | os.PathLike[str],
+        mode: str,
+        catalog_url: str | None,
+        *,
+        even_tags: bool = False,
+        verify: bool = True,
+    ) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
-        folder = Path(path)
+        place = branches.find(path)
+        folder = place.folder
         if not folder.exists():
             raise NotFoundError(f"no map at {path}: make one with gsmap init {path}")
-        if not _is_map(folder):
+        if not branches.is_map(place.home):
             what = "lacks map.sqlite and arrays" if folder.is_dir() else "is a file"
             raise StoreError(f"{path} is not a gsmap map (it {what}): make one with gsmap init")
+        _refuse_strange_entries(place.home)
         _refuse_strange_entries(folder)
+        refusal = f"{path} is a tag, which does not change: make a branch of it (gsmap branch {path} NAME)"
+        if mode == "w" and place.is_tag and not even_tags:
+            raise StoreError(refusal)
         if mode == "w" and not os.access(folder, os.W_OK):
             raise StoreError(f"{path} cannot be written (read-only disk or missing permission): open it for reading")
-        with _catalog.explained(folder):
+        with explained(folder):
             if catalog_url is not None:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        return cls(folder, Catalog(folder, engine, writable=mode == "w"))
+        store = cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
+        try:
+            if verify:
+                store.catalog.verify()
+        except BaseException:
+            store.catalog.close(fold=False)
+            raise
+        return store
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -176,14 +255,33 @@ class Store:
             )
 
     def check(self, progress: Progress | None = None) -> Check:
-        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`."""
-        return integrity.check(self.catalog, self.arrays, progress)
+        """Read every byte of the map and compare it with what was written; see `gsmap.store.integrity.Check`.
+
+        With the map itself its branches and tags are checked, too; a branch alone where that is what is open.
+        """
+        read: set[tuple[str, tuple[StoredFile, ...]]] = set()
+        found = integrity.check(self.catalog, self.arrays, progress, read=read)
+        for place in branches.places(self.home) if not self.branch else ():
+            try:
+                with Store.open(place.location, "r") as other:
+                    more = integrity.check(other.catalog, other.arrays, progress, read=read)
+            except StoreError as error:
+                more = Check((str(error),), (), 0, 0)
+            problems = tuple(f"{place.branch}: {problem}" for problem in more.problems)
+            found = replace(
+                found,
+                problems=found.problems + problems,
+                num_groups=found.num_groups + more.num_groups,
+                num_bytes=found.num_bytes + more.num_bytes,
+            )
+        return found
 
     def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
         """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def close(self) -> None:
+        self.leases.close()
         self.catalog.close()
 
     def __enter__(self) -> Store:
@@ -193,12 +291,7 @@ class Store:
         self.close()
 
     def __repr__(self) -> str:
-        return f"Store({str(self.folder)!r}, mode={'w' if self.catalog.writable else 'r'!r})"
-
-
-def _is_map(folder: Path) -> bool:
-    has_catalog = (folder / sqlite.FILE).is_file() or (folder / trust.URL_FILE).is_file()
-    return has_catalog and (folder / "arrays").is_dir()
+        return f"Store({self.location!r}, mode={'w' if self.catalog.writable else 'r'!r})"
 
 
 def _refuse_strange_entries(folder: Path) -> None:
@@ -206,7 +299,7 @@ def _refuse_strange_entries(folder: Path) -> None:
 
     The folder itself may be a link. What lies deeper is looked at where it is used.
     """
-    with _catalog.explained(folder):
+    with explained(folder):
         for name in sorted(os.listdir(folder)):
             try:
                 mode = os.lstat(folder / name).st_mode
@@ -220,22 +313,10 @@ def _refuse_strange_entries(folder: Path) -> None:
     sqlite.refuse_super_journal(folder / sqlite.FILE)
 
 
-def _make_catalog(folder: Path, url: str | None) -> trust.Remembered | None:
+def _make_catalog(folder: Path, url: str | None) -> None:
     map_id = uuid.uuid4().hex
-    remembered: trust.Remembered | None = None
-    if url is None:
-        sqlite.create_file(folder / sqlite.FILE)
-        engine = sqlite.engine(folder / sqlite.FILE, writable=True)
-    else:
-        engine = _catalog.url_engine(url)
-        if migrate.version(engine, folder) is not None:
-            raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
-        remembered = trust.Remembered(_catalog.url_without_password(url), map_id)
-        trust.write(folder, remembered.url, map_id)
-    made = Catalog(folder, engine, writable=True)
-    migrate.upgrade(made)
+    made = empty_catalog(folder, url, map_id)
     with made.write() as connection:
         row = {"id": map_id, "created_at": _catalog.now(), "gsmap_version": __version__}
         connection.execute(insert(schema.about), row)
     made.close()
-    return remembered

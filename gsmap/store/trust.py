@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import logging
 import os
 import re
 from collections.abc import Mapping
@@ -23,6 +24,8 @@ from gsmap.durable import open_file, write_whole
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store.columns import is_digest
 from gsmap.texts import control_characters
+
+_log = logging.getLogger("gsmap.store")
 
 ENVIRONMENT = "GSMAP_CATALOG"
 URL_FILE = "catalog.url"
@@ -143,6 +146,16 @@ def trust(map_id: str, url: str) -> None:
         raise StoreError(
             f"cannot remember in {path} that the catalog is trusted ({error.strerror}): name its URL in {ENVIRONMENT}"
         ) from error
+
+
+def remember(folder: Path) -> None:
+    """Trust the catalog of a map that this user has just made; where that cannot be kept, a warning says so."""
+    found = remembered(folder)
+    try:
+        if found.map_id is not None:
+            trust(found.map_id, found.url)
+    except StoreError as error:  # the map is made; it is opened by naming its catalog again
+        _log.warning("%s", error)
 
 
 def config_file() -> Path:

@@ -34,7 +34,8 @@ def verbs(command: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[str
 
 VERBS = dict(verbs())
 
-# What is run for each verb (or each of its forms, as `gsmap.cli.objects` names them). MAP is a copy of the small map.
+# What is run for each verb (or each of its forms, as `gsmap.cli.objects` names them). MAP is a copy of the small map,
+# SITE that map itself.
 RUNS = {
     "init": "init TMP/new.gsmap",
     "ingest": "ingest MAP CAPTURES/left.ply --scale known",
@@ -62,7 +63,13 @@ RUNS = {
     "models add": "models add MAP clip TMP/encoder.onnx --preset unit",
     "models list": "models list MAP",
     "evaluate": "evaluate MAP --truth CAPTURES/truth",
+    "branch": "branch MAP what-if",
+    "tag": "tag MAP v1",
+    "merge": "merge MAP SITE",
+    "split": "split MAP TMP/part.gsmap --island 0",
     "remove": "remove MAP odd:one",
+    "remove --purge": "remove MAP odd:one --purge",
+    "restore-scene": "restore-scene MAP left --from SITE",
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
     "migrate": "migrate MAP",
@@ -70,13 +77,13 @@ RUNS = {
     "view": "view MAP --no-browser",
     "demo": "demo TMP/demo",
 }
-SILENT = {"init", "prior", "convert", "models add", "remove", "check", "migrate", "view"}
+SILENT = {"init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view"}
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""
 
 
 @pytest.fixture
 def gsmap_run(
-    cli: Run, site: Path, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cli: Run, site: Path, made_site: Path, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str], Any]:
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
@@ -89,7 +96,7 @@ def gsmap_run(
     monkeypatch.setattr(gsmap_synthetic, "write_captures", lambda folder, made: _link_captures(captures, folder))
 
     def call(line: str) -> Any:
-        places = {"MAP": site, "TMP": tmp_path, "CAPTURES": captures}
+        places = {"MAP": site, "SITE": made_site, "TMP": tmp_path, "CAPTURES": captures}
         words = []
         for word in line.split():
             first, slash, rest = word.partition("/")
@@ -231,7 +238,7 @@ def test_lists_are_filtered(site: Path, cli: Run) -> None:
     assert names("--after", "2024-06-01", "--tag", "hall") == ["right"]
     assert names("--after", "2999-01-01") == []
     edges = cli("list", site, "edges", "--json", "--tag", "hall").json["edges"]
-    assert [(row["target_name"], row["source_name"]) for row in edges] == [("left", "right")]
+    assert [{row["target_name"], row["source_name"]} for row in edges] == [{"left", "right"}]
     assert len(cli("list", site, "edges", "--json", "--status", "no_match").json["edges"]) == 2
     assert len(cli("list", site, "revisions", "--json", "--after", "2000-01-01").json["revisions"]) == 2
     assert len(cli("list", site, "tiles", "--json", "--component", 0).json["tiles"]) == 1
@@ -338,7 +345,7 @@ def test_settings_of_one_run_are_not_kept(site: Path, cli: Run) -> None:
 def test_pairs_from_a_file(site: Path, cli: Run, tmp_path: Path) -> None:
     (tmp_path / "pairs.txt").write_text("# checked by hand\nleft right\n\nright odd:one\n")
     rows = cli("register", site, "--pairs", tmp_path / "pairs.txt", "--json").json["edges"]
-    assert [(row["target_name"], row["source_name"]) for row in rows] == [("left", "right"), ("right", "odd:one")]
+    assert [{row["target_name"], row["source_name"]} for row in rows] == [{"left", "right"}, {"right", "odd:one"}]
     assert cli("register", site, "--pairs", tmp_path / "none.txt").code == 1
 
 

@@ -8,8 +8,10 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 ``source`` and ``source_name``. Only `SceneRow`, which is the scene, calls them ``id`` and ``name``.
 """
 
+from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -48,11 +50,16 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
+from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
 
 __all__ = [
     "SCHEMA",
+    "AtWorkRow",
+    "BackupReport",
     "BandRow",
+    "BranchRow",
     "CheckReport",
+    "CloneReport",
     "ComponentErrorRow",
     "ConvertReport",
     "DemoReport",
@@ -67,6 +74,7 @@ __all__ = [
     "InitReport",
     "LayerRow",
     "MapStatus",
+    "MergeReport",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -79,6 +87,8 @@ __all__ = [
     "PoseRow",
     "PriorRow",
     "PruneReport",
+    "PurgeReport",
+    "RestoreReport",
     "RevisionRow",
     "Row",
     "SceneEdgeRow",
@@ -86,6 +96,8 @@ __all__ = [
     "SceneReport",
     "SceneRow",
     "SettingRow",
+    "SnapshotRow",
+    "SplitReport",
     "TileRow",
     "TodoRow",
     "TrustReport",

@@ -1,0 +1,311 @@
+"""Where backups lie: a folder, or a bucket of an object store. Objects appear there whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import shutil
+import stat
+import tempfile
+import urllib.parse
+import uuid
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, Protocol
+
+from gsmap.durable import sync_folder
+from gsmap.errors import ConfigError, GsmapError, MissingDependencyError, NotFoundError, StoreError
+
+CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
+SINGLE_PUT_BYTES = 64 << 20  # up to this size an object is one request; above, its parts appear as one at the end
+_PART_BYTES = 16 << 20  # S3 allows 10,000 parts: objects of up to 160 GB
+_STAGING = "staging"
+_NAME = re.compile(r"[a-z0-9]+(/[0-9a-zA-Z._-]+){0,2}|gsmap-backup\.json")  # what we ourselves call things there
+
+
+@dataclass(frozen=True)
+class Listed:
+    """An object: how long it is, and when it was last written (seconds, by the clock of the place)."""
+
+    size_bytes: int
+    modified_s: float
+
+
+class Place(Protocol):
+    """Named objects under one root; names have slashes, and are checked by who reads them from outside."""
+
+    url: str  # for people and for the catalog; without secrets
+
+    def list(self, prefix: str) -> dict[str, Listed]:
+        """All objects whose name begins with ``prefix`` (a folder with its slash, or nothing), by name."""
+
+    def anything(self) -> str | None:
+        """The name of something that lies there; None where nothing does."""
+
+    def size_bytes(self, name: str) -> int | None:
+        """How long an object is; None where there is none."""
+
+    def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
+        """Write an object, or replace it; durable when it returns, and as before where ``chunks`` raises."""
+
+    def get(self, name: str) -> Iterator[bytes]:
+        """The bytes of an object, in order; NotFoundError where there is none."""
+
+    def delete(self, name: str) -> None:
+        """Delete an object; nothing where there is none."""
+
+    def drop_leftovers(self) -> None:
+        """Delete what writers that died left; only while no other writes."""
+
+
+def place_of(target: str | os.PathLike[str]) -> Place:
+    """The place that a user names: a folder, ``file:///folder`` or ``s3://bucket/prefix``.
+
+    Raises:
+        ConfigError: another scheme, or a URL with a password or options in it.
+        MissingDependencyError: S3 without the package ``obstore``.
+    """
+    text = os.fspath(target)
+    scheme, found, _ = text.partition("://")
+    if not found:
+        return FolderPlace(Path(text))
+    parts = urllib.parse.urlsplit(text)
+    if scheme not in ("file", "s3"):
+        raise ConfigError(f"a backup goes to a folder, file:///FOLDER or s3://BUCKET/PREFIX, not to {scheme}://")
+    if "@" in parts.netloc or parts.query or parts.fragment:
+        raise ConfigError("the address of a backup has no password and no options: give them as AWS_... variables")
+    if scheme == "file":
+        if parts.netloc not in ("", "localhost"):
+            raise ConfigError(f"{text} is on another machine: write file:///FOLDER, with three slashes")
+        return FolderPlace(Path(urllib.parse.unquote(parts.path)))
+    if not parts.netloc:
+        raise ConfigError(f"{text} names no bucket: write s3://BUCKET/PREFIX")
+    return ObjectPlace(parts.netloc, parts.path.strip("/"))
+
+
+class FolderPlace:
+    """A folder. Objects are written below ``staging`` and renamed; links in it are not followed."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.absolute()
+        self.url = str(self.root)
+
+    def list(self, prefix: str) -> dict[str, Listed]:
+        if prefix and not prefix.endswith("/"):
+            raise ValueError(f"a prefix ends with a slash, got {prefix!r}")
+        out: dict[str, Listed] = {}
+        with self._explained():
+            todo = [prefix] if prefix != f"{_STAGING}/" else []
+            while todo:
+                folder = todo.pop()
+                with contextlib.suppress(FileNotFoundError), os.scandir(self.root / folder) as entries:
+                    for entry in entries:
+                        if entry.is_dir(follow_symlinks=False):
+                            todo += [f"{folder}{entry.name}/"] if folder or entry.name != _STAGING else []
+                        elif entry.is_file(follow_symlinks=False):
+                            with contextlib.suppress(FileNotFoundError):  # deleted by another meanwhile
+                                about = entry.stat(follow_symlinks=False)
+                                out[f"{folder}{entry.name}"] = Listed(about.st_size, about.st_mtime)
+        return out
+
+    def anything(self) -> str | None:
+        with self._explained(), contextlib.suppress(FileNotFoundError), os.scandir(self.root) as entries:
+            return next((entry.name for entry in entries if entry.name != _STAGING), None)
+        return None
+
+    def size_bytes(self, name: str) -> int | None:
+        with self._explained(), contextlib.suppress(FileNotFoundError):
+            about = self._path(name).lstat()
+            return about.st_size if stat.S_ISREG(about.st_mode) else None
+        return None
+
+    @contextlib.contextmanager
+    def staging(self) -> Iterator[Path]:
+        """A folder to work in; gone afterwards."""
+        with self._explained():
+            self._make_folder(self.root / _STAGING)
+            folder = Path(tempfile.mkdtemp(dir=self.root / _STAGING))
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
+        place = self._path(name)
+        with self._explained():
+            staged = self.root / _STAGING / uuid.uuid4().hex
+            self._make_folder(staged.parent)
+            try:
+                with open(staged, "xb") as file:
+                    for chunk in chunks:
+                        file.write(chunk)
+                    file.flush()
+                    os.fsync(file.fileno())
+                self._make_folder(place.parent)
+                os.replace(staged, place)
+            finally:
+                staged.unlink(missing_ok=True)
+            sync_folder(place.parent)
+
+    def get(self, name: str) -> Iterator[bytes]:
+        with self._explained():
+            try:
+                handle = os.open(self._path(name), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+            except FileNotFoundError:
+                raise NotFoundError(f"{self.url} has no {name}") from None
+            with open(handle, "rb") as file:
+                if not stat.S_ISREG(os.fstat(handle).st_mode):
+                    raise StoreError(f"{self.url}: {name} is not a file")
+                while chunk := file.read(CHUNK_BYTES):
+                    yield chunk
+
+    def delete(self, name: str) -> None:
+        with self._explained():
+            self._path(name).unlink(missing_ok=True)
+
+    def drop_leftovers(self) -> None:
+        with self._explained(), contextlib.suppress(FileNotFoundError), os.scandir(self.root / _STAGING) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    os.unlink(entry.path)
+
+    def _path(self, name: str) -> Path:
+        if not _NAME.fullmatch(name) or "/." in name:
+            raise ValueError(f"not the name of an object: {name!r}")
+        folder = self.root
+        for part in name.split("/")[:-1]:
+            folder = folder / part
+            if folder.is_symlink():
+                raise StoreError(f"{folder} is a link: a backup has none; it may lead anywhere")
+        return self.root / name
+
+    def _make_folder(self, folder: Path) -> None:
+        made = []
+        while not folder.is_dir():
+            made.append(folder)
+            folder = folder.parent
+        for one in reversed(made):
+            one.mkdir(exist_ok=True)  # another thread may be faster
+            sync_folder(one.parent)
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except GsmapError:
+            raise
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise StoreError(
+                    f"{self.url}: the disk is full; make room and run it again: what is there is kept"
+                ) from (error)
+            if error.errno == errno.ELOOP:
+                raise StoreError(f"{error.filename} is a link: a backup has none; it may lead anywhere") from error
+            raise StoreError(f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})") from error
+
+
+class ObjectPlace:
+    """A prefix of an S3 bucket, through ``obstore``; where it is and who we are says the environment (``AWS_*``)."""
+
+    def __init__(self, bucket: str, prefix: str) -> None:
+        try:
+            import obstore
+            from obstore.store import S3Store
+        except ImportError as error:
+            raise MissingDependencyError("backups on S3 need the package obstore: pip install gsmap[cloud]") from error
+        self.url = f"s3://{bucket}/{prefix}".rstrip("/")
+        endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+        options: dict[str, Any] = {"endpoint": endpoint} if endpoint else {}
+        client: Any = {"timeout": timedelta(minutes=10), "connect_timeout": timedelta(seconds=20)}
+        if endpoint.startswith("http://"):  # the user named it so
+            client["allow_http"] = True
+        self._api = obstore
+        with self._explained("open"):
+            self._store = S3Store(
+                bucket,
+                prefix=prefix or None,
+                client_options=client,
+                retry_config={"max_retries": 6, "retry_timeout": timedelta(minutes=2)},
+                checksum_algorithm="sha256",  # the server refuses bytes that changed on the way
+                **options,
+            )
+
+    def list(self, prefix: str) -> dict[str, Listed]:
+        out: dict[str, Listed] = {}
+        with self._explained("list"):
+            for batch in self._api.list(self._store, prefix=prefix or None, chunk_size=1000):
+                out |= {found["path"]: Listed(found["size"], found["last_modified"].timestamp()) for found in batch}
+        return out
+
+    def anything(self) -> str | None:
+        with self._explained("list"):
+            for batch in self._api.list(self._store, chunk_size=1):
+                return str(batch[0]["path"]) if batch else None
+        return None
+
+    def size_bytes(self, name: str) -> int | None:
+        with self._explained("read"), contextlib.suppress(FileNotFoundError):
+            return int(self._api.head(self._store, name)["size"])
+        return None
+
+    def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
+        try:
+            with self._explained("write"):
+                if size_bytes <= SINGLE_PUT_BYTES:
+                    self._api.put(self._store, name, b"".join(chunks), use_multipart=False)
+                else:
+                    self._api.put(
+                        self._store, name, iter(chunks), use_multipart=True, chunk_size=_PART_BYTES, max_concurrency=4
+                    )
+        except _Refused:
+            # The answer may have been lost and not the object: an object under the name of its digest is what we sent.
+            if name.startswith("objects/") and self.size_bytes(name) == size_bytes:
+                return
+            raise
+
+    def get(self, name: str) -> Iterator[bytes]:
+        with self._explained("read"):
+            try:
+                found = self._api.get(self._store, name)
+            except FileNotFoundError:
+                raise NotFoundError(f"{self.url} has no {name}") from None
+            for chunk in found.stream(min_chunk_size=CHUNK_BYTES):
+                yield bytes(chunk)
+
+    def delete(self, name: str) -> None:
+        with self._explained("delete"), contextlib.suppress(FileNotFoundError):
+            self._api.delete(self._store, name)
+
+    def drop_leftovers(self) -> None:
+        """Parts of objects that were never finished are the bucket's to expire (a lifecycle rule)."""
+
+    @contextlib.contextmanager
+    def _explained(self, what: str) -> Iterator[None]:
+        from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError
+
+        try:
+            yield
+        except (PermissionDeniedError, UnauthenticatedError) as error:
+            raise _Refused(
+                f"{self.url}: not allowed to {what} ({_first_line(error)}): see AWS_ACCESS_KEY_ID"
+            ) from error
+        except (BaseError, OSError) as error:
+            raise _Refused(
+                f"{self.url}: cannot {what} ({_first_line(error)}): see AWS_ENDPOINT_URL, and try again"
+            ) from (error)
+
+
+class _Refused(StoreError):
+    """An object store did not do what it was asked, or its answer was lost."""
+
+
+def _first_line(error: BaseException) -> str:
+    """What an error says, without the XML that servers add to it."""
+    lines = re.split(r"\n|: <\?xml|\bDebug source", str(error).strip())
+    return re.sub(r"\s+", " ", lines[0])[:300]

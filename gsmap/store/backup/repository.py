@@ -1,0 +1,264 @@
+"""What lies in a backup, and reading it: nothing is used before it is held against its digest.
+
+::
+
+    gsmap-backup.json            which map this is a backup of
+    objects/ab/<sha256>          bytes, once for all snapshots that need them
+    snapshots/<time>-<id>.json   a state of the map; written last
+    leases/<task>-<token>.json   who is at work here
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Generator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gsmap.errors import CorruptError, NotFoundError, StoreError
+from gsmap.store.arrays import StoredFile
+from gsmap.store.backup.places import Place, place_of
+from gsmap.store.backup.states import check_path, checked
+from gsmap.version import __version__
+
+FORMAT = 1
+MARKER = "gsmap-backup.json"
+OBJECTS = "objects/"
+SNAPSHOTS = "snapshots/"
+_NAME = re.compile(r"\d{8}T\d{6}\.\d{6}Z-[0-9a-f]{16}")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_LINE = re.compile(r"([0-9a-f]{64}) (\d{1,18}) (.+)")
+_MAX_TEXT_BYTES = 1 << 30  # of a list of files: ten million of them
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One state in a backup.
+
+    Args:
+        name: its time, and the beginning of the digest of the bytes that describe it.
+        map_id, created_at, schema, revision, counts: see `gsmap.store.backup.states.State`.
+        gsmap_version: which gsmap took it.
+        files: digest of the object that lists its files.
+        num_files, num_bytes: of all of them.
+        num_bytes_new: how many of them were sent for it.
+    """
+
+    name: str
+    map_id: str
+    created_at: str
+    schema: str
+    gsmap_version: str
+    files: str
+    files_bytes: int
+    num_files: int
+    num_bytes: int
+    num_bytes_new: int
+    revision: int | None
+    counts: Mapping[str, int]
+
+    @property
+    def time(self) -> str:
+        """``created_at`` as the name has it."""
+        return _compact(self.created_at)
+
+    def packed(self) -> tuple[str, bytes]:
+        """The name that its bytes give it, and the bytes."""
+        fields = {name: value for name, value in asdict(self).items() if name != "name"}
+        text = json.dumps({"format": FORMAT, **fields}, indent=1).encode() + b"\n"
+        return f"{self.time}Z-{hashlib.sha256(text).hexdigest()[:16]}", text
+
+
+class Backup:
+    """A place with snapshots of one map."""
+
+    def __init__(self, place: Place, map_id: str) -> None:
+        self.place = place
+        self.map_id = map_id
+
+    @classmethod
+    def open(cls, target: str | os.PathLike[str]) -> Backup:
+        """The backup at a place.
+
+        Raises:
+            NotFoundError: there is none.
+            StoreError: its format is newer than this gsmap, or it cannot be reached.
+        """
+        return cls.at(place_of(target))
+
+    @classmethod
+    def at(cls, place: Place) -> Backup:
+        """As `open`."""
+        try:
+            text = _read(place, MARKER, 1 << 16)
+        except NotFoundError:
+            raise NotFoundError(f"{place.url} is no backup of a map: it lacks {MARKER}") from None
+        marker = _object(text, f"{place.url}/{MARKER}")
+        return cls(place, _field(marker, "map_id", str, f"{place.url}/{MARKER}"))
+
+    @classmethod
+    def at_or_new(cls, place: Place, map_id: str) -> Backup:
+        """The backup at a place, which is made where there is nothing.
+
+        Raises:
+            StoreError: the place holds something else, or a backup of another map.
+        """
+        try:
+            found = cls.at(place)
+        except NotFoundError:
+            found = cls._begun(place, map_id)
+        if found.map_id != map_id:
+            raise StoreError(
+                f"{place.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place"
+            )
+        return found
+
+    @classmethod
+    def _begun(cls, place: Place, map_id: str) -> Backup:
+        other = place.anything()
+        if other is None:
+            text = json.dumps({"format": FORMAT, "map_id": map_id}, indent=1).encode() + b"\n"
+            place.put(MARKER, [text], len(text))
+        try:
+            return cls.at(place)  # which another may have begun at the same moment
+        except NotFoundError:
+            raise StoreError(f"{place.url} holds other things ({other}): give the backup a place of its own") from None
+
+    def names(self) -> list[str]:
+        """Names of the snapshots, oldest first."""
+        listed = [name[len(SNAPSHOTS) :].removesuffix(".json") for name in self.place.list(SNAPSHOTS)]
+        return sorted(name for name in listed if _NAME.fullmatch(name))
+
+    def snapshot(self, name: str) -> Snapshot:
+        """One snapshot by its whole name.
+
+        Raises:
+            CorruptError: it is not what was written.
+        """
+        where = f"{self.place.url}/{SNAPSHOTS}{name}.json"
+        text = _read(self.place, f"{SNAPSHOTS}{name}.json", 1 << 20)
+        if hashlib.sha256(text).hexdigest()[:16] != name[-16:]:
+            raise CorruptError(f"{where} is damaged: restore an earlier one, and delete it")
+        data = _object(text, where)
+        kinds: dict[str, Any] = {"revision": int | None, "counts": dict}
+        kinds |= dict.fromkeys(("files_bytes", "num_files", "num_bytes", "num_bytes_new"), int)
+        keys = [key for key in Snapshot.__dataclass_fields__ if key != "name"]
+        found = Snapshot(name=name, **{key: _field(data, key, kinds.get(key, str), where) for key in keys})
+        counts = all(key.isidentifier() and isinstance(count, int) for key, count in found.counts.items())
+        if not _DIGEST.fullmatch(found.files) or found.map_id != self.map_id or not counts:
+            raise CorruptError(f"{where} is no snapshot of map {self.map_id}")
+        if found.time != name[: -len("Z-") - 16]:
+            raise CorruptError(f"{where} has another time than its name says")
+        return found
+
+    def snapshots(self) -> list[Snapshot]:
+        """All snapshots, oldest first."""
+        return [self.snapshot(name) for name in self.names()]
+
+    def find(self, name: str | None = None, *, at: str | None = None) -> Snapshot:
+        """A snapshot: the newest one, or the one that is asked for.
+
+        Args:
+            name: its name, or six digits or more of the digest at its end.
+            at: the last one at or before this time, ISO 8601 in UTC.
+
+        Raises:
+            NotFoundError: there is none such.
+        """
+        names = self.names()
+        if not names:
+            raise NotFoundError(f"{self.place.url} has no snapshot yet: a backup was begun there and never finished")
+        if name is not None:
+            found = [one for one in names if name == one or (len(name) >= 6 and one[-16:].startswith(name))]
+            if len(found) != 1:
+                hint = "gsmap backup MAP DEST --list shows what there is"
+                raise NotFoundError(f"{self.place.url} has no snapshot {name!r}, and it is no time either: {hint}")
+            return self.snapshot(found[0])
+        earlier = [one for one in names if at is None or one.split("Z-")[0] <= _compact(at)]
+        if not earlier:
+            raise NotFoundError(f"{self.place.url} has no snapshot at or before {at}: the first one is {names[0]}")
+        return self.snapshot(earlier[-1])
+
+    def files(self, snapshot: Snapshot) -> list[StoredFile]:
+        """The files of a snapshot: relative to the map, inside it, each once.
+
+        Raises:
+            CorruptError: the list is damaged or names what no map has.
+        """
+        where = f"{self.place.url}/{object_name(snapshot.files)}"
+        if snapshot.files_bytes > _MAX_TEXT_BYTES:
+            raise CorruptError(f"{where} is too long for a list of files")
+        listed = StoredFile("", snapshot.files_bytes, snapshot.files)
+        text = b"".join(self.read(listed)).decode("utf-8", errors="replace")
+        out: dict[str, StoredFile] = {}
+        for line in text.splitlines():
+            parts = _LINE.fullmatch(line)
+            if parts is None or parts[3] in out:
+                raise CorruptError(f"{where} is no list of files: {line[:200]!r}")
+            out[check_path(parts[3])] = StoredFile(parts[3], int(parts[2]), parts[1])
+        return list(out.values())
+
+    def read(self, file: StoredFile) -> Generator[bytes, None, None]:
+        """The bytes of an object, compared with its digest while they are read.
+
+        Raises:
+            CorruptError: it is missing or damaged. What was read so far is of no use then.
+        """
+        what = f"{self.place.url}/{object_name(file.sha256)}" + (f" ({file.path})" if file.path else "")
+        try:
+            yield from checked(self.place.get(object_name(file.sha256)), file, what)
+        except NotFoundError:
+            raise CorruptError(f"{what} is missing") from None
+
+
+def listed(files: list[StoredFile]) -> bytes:
+    """The list of files of a snapshot, as an object has it: a line for each, digest, size and path."""
+    return "".join(f"{file.sha256} {file.size_bytes} {file.path}\n" for file in files).encode()
+
+
+def object_name(sha256: str) -> str:
+    """Where bytes lie."""
+    return f"{OBJECTS}{sha256[:2]}/{sha256}"
+
+
+def digest_of(name: str) -> str | None:
+    """The digest whose object has this name; None where that is no object."""
+    sha256 = name.rpartition("/")[2]
+    return sha256 if _DIGEST.fullmatch(sha256) and name == object_name(sha256) else None
+
+
+def _compact(time: str) -> str:
+    """An ISO time of UTC as a file's name can have it: 20261121T194500.123456."""
+    text = re.sub(r"[-:]", "", time.removesuffix("+00:00").removesuffix("Z"))
+    return text if "." in text else f"{text}.000000"
+
+
+def _read(place: Place, name: str, most_bytes: int) -> bytes:
+    out = bytearray()
+    for chunk in place.get(name):
+        out += chunk
+        if len(out) > most_bytes:
+            raise CorruptError(f"{place.url}/{name} is too long")
+    return bytes(out)
+
+
+def _object(text: bytes, where: str) -> dict[str, Any]:
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CorruptError(f"{where} is damaged: it is no JSON") from error
+    if not isinstance(data, dict) or not isinstance(data.get("format"), int):
+        raise CorruptError(f"{where} is damaged: it lacks its format")
+    if data["format"] > FORMAT:
+        raise StoreError(f"{where} was written by a newer gsmap than this ({__version__}): upgrade gsmap")
+    return data
+
+
+def _field(data: Mapping[str, Any], key: str, kind: Any, where: str) -> Any:
+    value = data.get(key)
+    if not isinstance(value, kind) or (isinstance(value, str) and not value.isprintable()):
+        raise CorruptError(f"{where} is damaged: {key} is not what it should be")
+    return value

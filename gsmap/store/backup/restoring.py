@@ -1,0 +1,316 @@
+"""From a state back to a map: staged beside its place, every byte held against its digest, put there by one rename."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import delete, inspect, null, select, text, update
+
+from gsmap.durable import sync_folder
+from gsmap.errors import CorruptError, GsmapError, NotFoundError, StoreError
+from gsmap.store import catalog as _catalog
+from gsmap.store import migrate, schema, sqlite, trust
+from gsmap.store.arrays import StoredFile
+from gsmap.store.backup.places import Place
+from gsmap.store.backup.repository import Backup, Snapshot
+from gsmap.store.backup.saving import TRANSFERS
+from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
+from gsmap.store.catalog import Catalog
+from gsmap.store.copying import copy_catalog, empty_catalog
+from gsmap.store.explained import explained
+from gsmap.store.store import Store
+from gsmap.types.progress import Progress, silent
+from gsmap.version import __version__
+
+_TRIES = 4  # states to begin with where others prune meanwhile
+_log = logging.getLogger("gsmap.store")
+
+
+@dataclass(frozen=True)
+class Restored:
+    """A map that was restored.
+
+    Args:
+        path: where it lies now.
+        snapshot: what it was restored from.
+        schema: of its catalog now; older than this gsmap's where it waits for ``gsmap migrate``.
+    """
+
+    path: Path
+    snapshot: Snapshot
+    schema: str
+
+
+@dataclass(frozen=True)
+class Cloned:
+    """A map that was made from another.
+
+    Args:
+        path: where it lies.
+        map_id: its own.
+        num_linked, num_copied: files that it shares with the other map, and files of its own.
+        num_bytes_copied: of the latter.
+    """
+
+    path: Path
+    map_id: str
+    num_linked: int
+    num_copied: int
+    num_bytes_copied: int
+
+
+def restore(
+    place: Place,
+    path: str | os.PathLike[str],
+    *,
+    snapshot: str | None = None,
+    at: str | None = None,
+    catalog_url: str | None = None,
+    progress: Progress = silent,
+) -> Restored:
+    """Make a map from a backup; it appears whole or not at all, and is the same map, with the same id.
+
+    Args:
+        path: a folder that does not exist.
+        snapshot, at: which one; see `Backup.find`.
+        catalog_url: an empty database to keep the catalog in, as in `Store.create`, instead of ``map.sqlite``.
+
+    Raises:
+        NotFoundError: there is no such backup or snapshot, or no folder to make the map in.
+        CorruptError: something in the backup is not what was written, or names what no map has.
+        StoreError: there is something at ``path``, or it cannot be written.
+    """
+    backup = Backup.at(place)
+    chosen = backup.find(snapshot, at=at)
+    target = _free(path)
+    files = backup.files(chosen)
+    _require_room(target.parent, sum(file.size_bytes for file in files))
+    with _staged(target) as folder, contextlib.ExitStack() as undo:
+        _fetch_all(backup, files, folder, progress)
+        state = _compared(folder, files, chosen)
+        _settle(folder)
+        if catalog_url is not None:
+            state = _move_catalog(folder, catalog_url, undo)
+        _synchronise(folder)
+        _put_in_place(folder, target)
+        undo.pop_all()
+    if catalog_url is not None:
+        trust.remember(target)
+    return Restored(target, chosen, state.schema)
+
+
+def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silent) -> Cloned:
+    """Make another map with what one holds now: new id, its own catalog (SQLite), arrays shared where links can be.
+
+    Arrays are never changed in place, so what one map does the other does not see. Branches, exports, backups and
+    leases stay behind: they are the other map's.
+
+    Raises:
+        StoreError, CorruptError, NotFoundError: as `restore`.
+    """
+    target = _free(path)
+    for _ in range(_TRIES):
+        with _staged(target) as folder, contextlib.suppress(Vanished):
+            state = capture(store, folder, branches=False)
+            made = _link_all(store, state, folder, target, progress)
+            _settle(folder)
+            _rename(folder, made.map_id)
+            _synchronise(folder)
+            _put_in_place(folder, target)
+            return made
+    raise StoreError(f"{store.catalog.folder}: others pruned it faster than it could be copied; run it again")
+
+
+def _free(path: str | os.PathLike[str]) -> Path:
+    target = Path(path).absolute()
+    if os.path.lexists(target) and not (target.is_dir() and not target.is_symlink() and not any(target.iterdir())):
+        raise StoreError(f"{path} is there already: name a folder that does not exist, or move it away first")
+    if not target.parent.is_dir():
+        raise NotFoundError(f"cannot make {path}: {target.parent} does not exist")
+    return target
+
+
+@contextlib.contextmanager
+def _staged(target: Path) -> Iterator[Path]:
+    """An empty folder beside the target, on the same disk; whatever is left of it at the end is deleted."""
+    folder = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        with _writing(target):
+            folder.mkdir()
+            (folder / ARRAYS).mkdir()
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _fetch_all(backup: Backup, files: list[StoredFile], folder: Path, progress: Progress) -> None:
+    for parent in sorted({(folder / file.path).parent for file in files}):
+        parent.mkdir(parents=True, exist_ok=True)
+
+    def fetch(file: StoredFile) -> None:
+        with _writing(folder), contextlib.closing(backup.read(file)) as chunks:
+            _write(folder / file.path, chunks)
+
+    with ThreadPoolExecutor(TRANSFERS) as pool:
+        waiting = [pool.submit(fetch, file) for file in files]
+        try:
+            for done, future in enumerate(waiting, 1):
+                future.result()
+                progress(done / len(files), f"reading, {done} of {len(files)} files")
+        except BaseException:
+            for future in waiting:
+                future.cancel()
+            raise
+
+
+def _link_all(store: Store, state: State, folder: Path, target: Path, progress: Progress) -> Cloned:
+    linked = copied = num_bytes = 0
+    for i, file in enumerate(state.files):
+        place = folder / file.path
+        if place.exists():  # the catalog and the settings, by `capture`
+            continue
+        place.parent.mkdir(parents=True, exist_ok=True)
+        source = store.arrays.root.parent / file.path
+        try:
+            os.link(source, place, follow_symlinks=False)
+            if place.is_symlink() or place.stat().st_size != file.size_bytes:
+                place.unlink()
+                raise FileNotFoundError(errno.ENOENT, "not what was written", str(source))
+            linked += 1
+        except OSError:  # another disk, or one without links; or it is gone, which `read_file` explains
+            with contextlib.closing(read_file(store, file, folder)) as chunks:
+                _write(place, chunks)
+            copied, num_bytes = copied + 1, num_bytes + file.size_bytes
+        progress(i / len(state.files), f"sharing, {i} of {len(state.files)} files")
+    return Cloned(target, uuid.uuid4().hex, linked, copied, num_bytes)
+
+
+def _write(path: Path, chunks: Iterator[bytes]) -> None:
+    with open(path, "xb") as file:
+        for chunk in chunks:
+            file.write(chunk)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> State:
+    """What the catalogs name must be there, and the map be the one that the backup is of."""
+    there = {file.path: (file.size_bytes, file.sha256) for file in files}
+    if sqlite.FILE not in there:
+        raise CorruptError(f"snapshot {snapshot.name} has no {sqlite.FILE}")
+    for problem in sqlite.file_problems(folder / sqlite.FILE):
+        raise CorruptError(f"snapshot {snapshot.name}: its catalog is damaged ({problem})")
+    state = read_state(folder / sqlite.FILE)
+    if (state.map_id, state.schema) != (snapshot.map_id, snapshot.schema):
+        raise CorruptError(f"snapshot {snapshot.name} holds another map, or another schema, than it says")
+    for file in state.files:
+        if there.get(file.path) != (file.size_bytes, file.sha256):
+            raise CorruptError(f"snapshot {snapshot.name} lacks {file.path}, which its catalog names")
+    return state
+
+
+def _settle(folder: Path) -> None:
+    """Nobody is at work on a map that was just made; and its catalog gets the digests that a catalog has."""
+    catalog = _own_catalog(folder)
+    try:
+        with catalog.write() as connection:
+            if inspect(connection).has_table("leases"):
+                connection.execute(delete(schema.leases))
+    finally:
+        catalog.close()
+    for left in (_catalog.LOCK_FILE, f"{sqlite.FILE}-wal", f"{sqlite.FILE}-shm"):
+        (folder / left).unlink(missing_ok=True)
+
+
+def _rename(folder: Path, map_id: str) -> None:
+    """Make a map of its own of a copy: another id; what was exported, backed up and solved was by the other map."""
+    catalog = _own_catalog(folder)
+    try:
+        with catalog.write() as connection:
+            before = connection.execute(select(schema.about.c.id)).scalar_one()
+            row = {"id": map_id, "created_at": _catalog.now(), "gsmap_version": __version__}
+            connection.execute(update(schema.about).values(row))
+            for table in (schema.tiles, schema.exports, schema.backups):
+                connection.execute(delete(table))
+            solved = select(schema.revisions.c.number).where(schema.revisions.c.origin.is_(null()))
+            for number in list(connection.execute(solved).scalars()):
+                mine = schema.revisions.c.number == number
+                connection.execute(
+                    update(schema.revisions).where(mine).values(origin={"map": before, "number": number})
+                )
+    finally:
+        catalog.close()
+    (folder / _catalog.LOCK_FILE).unlink(missing_ok=True)
+
+
+def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> State:
+    """Copy ``map.sqlite`` into another database, with the present schema, and let the map remember it instead."""
+    own = _own_catalog(folder)
+    try:
+        migrate.upgrade(own)
+        with own.read() as connection:
+            map_id = connection.execute(select(schema.about.c.id)).scalar_one()
+        there = empty_catalog(folder, url, map_id)
+        undo.callback(_empty_again, there)
+        with explained(folder):
+            copy_catalog(own, there, leave_out=("leases",))
+    finally:
+        own.close()
+    state = read_state(folder / sqlite.FILE)
+    for left in folder.glob(f"{sqlite.FILE}*"):
+        left.unlink()
+    there.engine.dispose()
+    return state
+
+
+def _empty_again(catalog: Catalog) -> None:
+    """Take the tables back from a database whose map did not come to be."""
+    try:
+        migrate.upgrade(catalog, "base")
+        with explained(catalog.folder), catalog.engine.begin() as connection:
+            connection.execute(text("DROP TABLE alembic_version"))
+    except GsmapError as error:
+        _log.warning("the database %r keeps tables of a map that was not restored: %s", catalog.engine.url, error)
+
+
+def _own_catalog(folder: Path) -> Catalog:
+    return Catalog(folder, sqlite.engine(folder / sqlite.FILE, writable=True), writable=True)
+
+
+def _require_room(folder: Path, num_bytes: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        raise StoreError(f"{folder} has room for {free / 1e6:.0f} MB, the map needs {num_bytes / 1e6:.0f} MB")
+
+
+def _synchronise(folder: Path) -> None:
+    for root, _, names in os.walk(folder):
+        for name in names:
+            if root.startswith(str(folder / ARRAYS)):
+                continue  # synchronised when it was written, or a link to what was
+            with open(Path(root) / name, "rb") as file:
+                os.fsync(file.fileno())
+        sync_folder(Path(root))
+
+
+def _put_in_place(folder: Path, target: Path) -> None:
+    os.rename(folder, target)  # replaces nothing but an empty folder
+    sync_folder(target.parent)
+
+
+@contextlib.contextmanager
+def _writing(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        said = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
+        raise StoreError(f"{target} was not made: {said}") from error

@@ -1,0 +1,281 @@
+"""One committed state of a map: its catalogs as files that lie still, and what they name."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import sqlite3
+import stat
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+from gsmap.errors import CorruptError, StoreError
+from gsmap.settings import FILE_NAME as SETTINGS
+from gsmap.store import catalog as _catalog
+from gsmap.store import sqlite
+from gsmap.store.arrays import StoredFile
+from gsmap.store.backup.places import CHUNK_BYTES
+from gsmap.store.catalog import Catalog
+from gsmap.store.copying import copy_catalog, empty_catalog
+from gsmap.store.explained import explained
+from gsmap.store.models import FOLDER as MODELS
+
+if TYPE_CHECKING:
+    from gsmap.store.store import Store
+
+ARRAYS = "arrays"
+BRANCHES = "branches"
+BRANCH_FILE = "branch.json"
+
+
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+class Vanished(Exception):
+    """A file that a state names is no longer in the map, rightly: it was pruned, or mended, since the state was."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What a map holds at one moment.
+
+    Args:
+        map_id: of the map.
+        created_at: when it was read, UTC; everything that was committed before is in it.
+        schema: of its catalog.
+        files: paths relative to the map, with sizes and digests: arrays, models, settings and the catalogs.
+        revision: the newest one; None before the first.
+        counts: how many ``scenes`` (``removed`` ones apart), ``groups``, ``graphs``, ``registrations``, ``revisions``.
+    """
+
+    map_id: str
+    created_at: str
+    schema: str
+    files: tuple[StoredFile, ...]
+    revision: int | None
+    counts: Mapping[str, int]
+
+    @property
+    def num_bytes(self) -> int:
+        return sum(file.size_bytes for file in self.files)
+
+
+def home_of(store: Store) -> Path:
+    """The map's folder, of a branch too."""
+    return store.arrays.root.parent
+
+
+def capture(store: Store, folder: Path, *, branches: bool = True) -> State:
+    """Copy the catalogs and settings of a map to an empty folder, and say what they name.
+
+    ``map.sqlite`` there is one committed state whatever others write meanwhile: by SQLite's own backup, or row by row
+    in one transaction of another database. So is that of every branch, each at its own moment.
+
+    Raises:
+        CorruptError: the catalog's bytes are not those that were written, or it names what no map holds.
+    """
+    created_at = _catalog.now()
+    home = home_of(store)
+    state = _capture_catalog(store.catalog, folder)
+    files = {file.path: file for file in state.files}
+    for name in _branches(home) if branches else ():
+        (folder / BRANCHES / name).mkdir(parents=True)
+        files |= {file.path: file for file in _capture_branch(home / BRANCHES / name, folder / BRANCHES / name).files}
+    for path in folder.rglob("*"):
+        if path.name in (sqlite.FILE, SETTINGS, BRANCH_FILE):
+            files[path.relative_to(folder).as_posix()] = _stored(path, folder)
+    return State(
+        state.map_id, created_at, state.schema, tuple(files[p] for p in sorted(files)), state.revision, state.counts
+    )
+
+
+def read_state(file: Path, created_at: str = "") -> State:
+    """What a catalog names: a ``map.sqlite`` of any schema that nobody writes to.
+
+    Raises:
+        CorruptError: it cannot be read, or names a path outside the map.
+    """
+    connection = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+    try:
+        connection.execute("PRAGMA trusted_schema = OFF")
+        rows = connection.execute(
+            "SELECT g.kind, g.id, f.path, f.size_bytes, f.sha256 FROM files f JOIN groups g ON g.id = f.group_id"
+        )
+        named = [StoredFile(f"{ARRAYS}/{kind}/{group}/{path}", size, sha) for kind, group, path, size, sha in rows]
+        copied = "SELECT path, size_bytes, sha256 FROM models WHERE copied = 1 AND removed_at IS NULL"
+        named += [StoredFile(*row) for row in connection.execute(copied)]
+        for one in named:
+            check_path(one.path)
+            if not (isinstance(one.sha256, str) and _DIGEST.fullmatch(one.sha256) and isinstance(one.size_bytes, int)):
+                raise CorruptError(f"{file}: the digest of {one.path} is none")
+        counts = {
+            "scenes": "scenes WHERE removed_at IS NULL",
+            "removed": "scenes WHERE removed_at IS NOT NULL",
+            **{name: name for name in ("groups", "graphs", "registrations", "revisions")},
+        }
+        return State(
+            map_id=str(_one(connection, "SELECT id FROM about")),
+            created_at=created_at,
+            schema=str(_one(connection, "SELECT version_num FROM alembic_version")),
+            files=tuple({one.path: one for one in named}.values()),
+            revision=_one(connection, "SELECT max(number) FROM revisions"),
+            counts={name: int(_one(connection, f"SELECT count(*) FROM {rest}")) for name, rest in counts.items()},
+        )
+    except (sqlite3.Error, TypeError) as error:
+        raise CorruptError(f"{file} is no catalog of a map ({error})") from error
+    finally:
+        connection.close()
+
+
+def check_path(path: object) -> str:
+    """A path of a file in a map, relative to it: what every list of files is held against before it is used.
+
+    Raises:
+        CorruptError: it would lie outside the map, or where a map keeps nothing.
+    """
+    if not isinstance(path, str) or not path.isprintable() or "\\" in path:
+        raise CorruptError(f"no path of a file in a map: {path!r}")
+    parts = path.split("/")
+    sound = all(part not in ("", ".", "..") and len(part.encode()) <= 255 for part in parts)
+    top, depth = parts[0], len(parts)
+    if top == BRANCHES:
+        top, depth = parts[-1], depth - 2
+    known = (
+        (top in (sqlite.FILE, SETTINGS) and depth == 1)
+        or (parts[0] == BRANCHES and top == BRANCH_FILE and depth == 1)
+        or (parts[0] == MODELS and depth == 2)
+        or (parts[0] == ARRAYS and parts[1:2] not in (["staging"], []) and depth >= 4)
+    )
+    if not sound or not known or PurePosixPath(path).is_absolute():
+        raise CorruptError(f"no path of a file in a map: {path!r}")
+    return path
+
+
+def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, None, None]:
+    """The bytes of a file that a state names, compared with its digest while they are read.
+
+    Args:
+        folder: where `capture` copied the catalogs to; the other files are in the map.
+
+    Raises:
+        Vanished: the map has it no longer, and its catalog says the same.
+        CorruptError: it is missing or differs from what was written. Then what was read so far is of no use.
+    """
+    immutable = file.path.split("/")[0] in (ARRAYS, MODELS)
+    path = (home_of(store) if immutable else folder) / file.path
+    try:
+        yield from checked(_chunks(path), file, str(path))
+    except (CorruptError, FileNotFoundError, NotADirectoryError) as error:
+        if immutable and not _still_named(store, file):
+            raise Vanished(file.path) from error
+        if isinstance(error, CorruptError):
+            raise CorruptError(f"{error}: run gsmap check, and ingest the scene again") from error
+        raise CorruptError(f"{path} is missing: run gsmap check, and ingest the scene again") from error
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def checked(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[bytes]:
+    """The same bytes, and an error at the end where they are not those of the digest.
+
+    Raises:
+        CorruptError: too many or too few bytes, or others.
+    """
+    seen, digest = 0, hashlib.sha256()
+    for chunk in chunks:
+        seen += len(chunk)
+        if seen > file.size_bytes:
+            break
+        digest.update(chunk)
+        yield chunk
+    if seen != file.size_bytes:
+        raise CorruptError(f"{what} does not have the {file.size_bytes} bytes that were written")
+    if digest.hexdigest() != file.sha256:
+        raise CorruptError(f"{what} differs from what was written")
+
+
+def _chunks(path: Path) -> Iterator[bytes]:
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(handle, "rb") as opened:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise CorruptError(f"{path} is no file")
+        while chunk := opened.read(CHUNK_BYTES):
+            yield chunk
+
+
+def _capture_catalog(source: Catalog, folder: Path) -> State:
+    file = folder / sqlite.FILE
+    if source.is_sqlite:
+        with explained(source.folder):
+            for problem in source.page_problems():
+                raise CorruptError(f"{problem}: run gsmap check; nothing was backed up")
+            sqlite.backup(source.engine, file)
+            for problem in sqlite.file_problems(file):
+                raise CorruptError(f"{source.folder / sqlite.FILE} is damaged ({problem}); nothing was backed up")
+    else:
+        made = empty_catalog(folder)
+        try:
+            copy_catalog(source, made, leave_out=("leases",))
+        finally:
+            made.close()
+    with explained(source.folder), contextlib.suppress(FileNotFoundError):
+        (folder / SETTINGS).write_bytes((source.folder / SETTINGS).read_bytes())
+    return read_state(file)
+
+
+def _capture_branch(source: Path, folder: Path) -> State:
+    engine = _catalog.open_engine(source, writable=False)
+    catalog = Catalog(source, engine, writable=False)
+    try:
+        (folder / BRANCH_FILE).write_bytes((source / BRANCH_FILE).read_bytes())
+        return _capture_catalog(catalog, folder)
+    finally:
+        catalog.close()
+
+
+def _branches(home: Path) -> list[str]:
+    return sorted(marker.parent.name for marker in (home / BRANCHES).glob(f"*/{BRANCH_FILE}"))
+
+
+def _stored(path: Path, folder: Path) -> StoredFile:
+    with open(path, "rb") as opened:
+        sha256 = hashlib.file_digest(opened, "sha256").hexdigest()
+    return StoredFile(path.relative_to(folder).as_posix(), path.stat().st_size, sha256)
+
+
+def _still_named(store: Store, file: StoredFile) -> bool:
+    """Whether any catalog of the map still says that it has this very file."""
+    home = home_of(store)
+    catalogs = [(store.catalog, False)]
+    for name in _branches(home):
+        engine = _catalog.open_engine(home / BRANCHES / name, writable=False)
+        catalogs.append((Catalog(home / BRANCHES / name, engine, writable=False), True))
+    try:
+        return any(_names(catalog, file) for catalog, _ in catalogs)
+    finally:
+        for catalog, opened in catalogs:
+            if opened:
+                catalog.close()
+
+
+def _names(catalog: Catalog, file: StoredFile) -> bool:
+    from sqlalchemy import select
+
+    from gsmap.store.schema import files, models
+
+    top, *rest = file.path.split("/")
+    with catalog.read() as connection:
+        if top == MODELS:
+            standing = (models.c.path == file.path) & models.c.removed_at.is_(None)
+            return connection.execute(select(models.c.number).where(standing)).first() is not None
+        same = (files.c.group_id == rest[1]) & (files.c.path == "/".join(rest[2:])) & (files.c.sha256 == file.sha256)
+        return connection.execute(select(files.c.path).where(same)).first() is not None
+
+
+def _one(connection: sqlite3.Connection, query: str) -> Any:
+    (value,) = connection.execute(query).fetchone()
+    return value

@@ -1,0 +1,132 @@
+"""Copying a catalog from one database to another, whatever the two are: SQLite's file, a PostgreSQL server."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from sqlalchemy import Column, Connection, Double, Integer, MetaData, Table, select, text
+from sqlalchemy.types import TypeDecorator
+
+from gsmap.errors import StoreError
+from gsmap.store import catalog as _catalog
+from gsmap.store import migrate, schema, sqlite, trust
+from gsmap.store.catalog import Catalog
+from gsmap.store.explained import explained
+from gsmap.store.schema import CHUNK_BOXES
+
+BATCH_ROWS = 2000  # rows in memory at a time; poses with covariances are some kilobytes each
+
+# The R*Tree of SQLite and the plain table elsewhere, by the columns that both have.
+_BOXES = Table(
+    CHUNK_BOXES,
+    MetaData(),
+    Column("id", Integer, primary_key=True),
+    *(Column(name, Integer) for name in ("s0", "s1")),
+    *(Column(name, Double) for name in ("x0", "x1", "y0", "y1", "z0", "z1")),
+    Column("chunk", Integer),
+)
+
+
+def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Catalog:
+    """All tables and no row, in a new ``map.sqlite``, or in an empty database; ``catalog.url`` remembers which.
+
+    Args:
+        map_id: the id of the map that a database is for.
+
+    Raises:
+        StoreError: the database holds a map already.
+    """
+    if url is None:
+        sqlite.create_file(folder / sqlite.FILE)
+        engine = sqlite.engine(folder / sqlite.FILE, writable=True)
+    else:
+        engine = _catalog.url_engine(url)
+        if migrate.version(engine, folder) is not None:
+            raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
+        trust.write(folder, _catalog.url_without_password(url), map_id)
+    made = Catalog(folder, engine, writable=True)
+    migrate.upgrade(made)
+    return made
+
+
+def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str] = ()) -> dict[str, int]:
+    """Copy all rows of all tables into a catalog that was just made (`empty_catalog`), in one transaction of each.
+
+    What arrives is one committed state of the source, whatever others write meanwhile; nobody waits for it. Boxes of
+    chunks have 32 bits in SQLite's R*Tree and 64 elsewhere: they widen by a rounding on the way into the tree.
+
+    Args:
+        leave_out: names of tables whose rows stay behind.
+
+    Returns:
+        How many rows of each table were copied.
+
+    Raises:
+        StoreError: the two have different schemas, or the target holds rows already.
+    """
+    versions = [migrate.version(one.engine, one.folder) for one in (source, target)]
+    if versions[0] != versions[1]:
+        raise StoreError(
+            f"{source.folder} has schema {versions[0]}, the catalog to copy it to {versions[1]}: run gsmap migrate"
+        )
+    with one_state(source) as reading, target.write() as writing:
+        return copy_rows(reading, writing, leave_out=leave_out)
+
+
+def copy_rows(source: Connection, target: Connection, *, leave_out: Collection[str] = ()) -> dict[str, int]:
+    """`copy_catalog` inside transactions of the caller's; that of the source must see one state (`one_state`)."""
+    counts = {}
+    for table in tables():
+        if target.execute(select(text("1")).select_from(table).limit(1)).first() is not None:
+            raise StoreError(f"the catalog to copy to holds {table.name} already: give it an empty database")
+        counts[table.name] = 0 if table.name in leave_out else _copy_table(source, target, table)
+    _set_counters(target)
+    return counts
+
+
+@contextlib.contextmanager
+def one_state(catalog: Catalog) -> Iterator[Connection]:
+    """A reading transaction that sees one committed state from its first statement to its last."""
+    options = {} if catalog.is_sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
+    with explained(catalog.folder), catalog.engine.execution_options(**options).begin() as connection:
+        yield connection
+
+
+def tables() -> list[Table]:
+    """Every table but ``alembic_version``, those that others refer to first; texts are as they lie, not decoded."""
+    return [_plain(table) for table in schema.metadata.sorted_tables] + [_BOXES]
+
+
+def _plain(table: Table) -> Table:
+    columns = [(c, c.type.impl_instance if isinstance(c.type, TypeDecorator) else c.type) for c in table.columns]
+    return Table(table.name, MetaData(), *(Column(c.name, kind, primary_key=c.primary_key) for c, kind in columns))
+
+
+def _copy_table(source: Connection, target: Connection, table: Table) -> int:
+    count = 0
+    query = select(table).order_by(*table.primary_key.columns)
+    found = source.execute(query, execution_options={"yield_per": BATCH_ROWS})
+    for batch in found.mappings().partitions():
+        rows = [dict(row) for row in batch]
+        if table is _BOXES:  # the R*Tree gives whole numbers as floats
+            rows = [row | {name: int(row[name]) for name in ("s0", "s1")} for row in rows]
+        target.execute(table.insert(), rows)
+        count += len(rows)
+    return count
+
+
+def _set_counters(connection: Connection) -> None:
+    """Let numbers go on after those that were copied: PostgreSQL keeps a counter beside each table."""
+    if connection.dialect.name != "postgresql":
+        return
+    for table in tables():
+        first, *more = table.primary_key.columns
+        if more or not isinstance(first.type, Integer):
+            continue
+        names = {"t": table.name, "c": first.name}
+        counter = connection.execute(text("SELECT pg_get_serial_sequence(:t, :c)"), names).scalar()
+        if counter is not None:
+            top = f'SELECT setval(:s, (SELECT coalesce(max("{first.name}"), 0) + 1 FROM "{table.name}"), false)'
+            connection.execute(text(top), {"s": counter})
