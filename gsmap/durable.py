@@ -144,13 +144,15 @@ def files_below(folder: Path) -> dict[str, os.stat_result]:
     todo = [""] if is_folder(folder) else []
     while todo:
         below = todo.pop()
-        with os.scandir(folder / below) as entries:
-            for entry in entries:
-                name = f"{below}{entry.name}"
-                if entry.is_dir(follow_symlinks=False):
-                    todo.append(f"{name}/")
-                else:
-                    out[name] = entry.stat(follow_symlinks=False)
+        with contextlib.suppress(FileNotFoundError):  # others may be deleting it
+            for name in os.listdir(folder / below):
+                path = f"{below}{name}"
+                with contextlib.suppress(FileNotFoundError):
+                    found = os.lstat(folder / path)
+                    if stat.S_ISDIR(found.st_mode):
+                        todo.append(f"{path}/")
+                    else:
+                        out[path] = found
     return out
 
 

@@ -51,7 +51,7 @@ def require_current(catalog: Catalog) -> None:
             f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}"
         )
     if catalog.is_sqlite:  # a server's tables are the user's own
-        with explained(folder), catalog.engine.connect() as connection:
+        with catalog.read() as connection:
             _require_tables(connection, folder)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import uuid
 from collections.abc import Iterator
 from dataclasses import replace
@@ -298,12 +299,16 @@ def _refuse_strange_entries(folder: Path) -> None:
 
     The folder itself may be a link. What lies deeper is looked at where it is used.
     """
-    with explained(folder), os.scandir(folder) as entries:
-        for entry in entries:
-            if not (entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)):
-                what = "a link" if entry.is_symlink() else "a pipe or a device"
+    with explained(folder):
+        for name in sorted(os.listdir(folder)):
+            try:
+                mode = os.lstat(folder / name).st_mode
+            except FileNotFoundError:
+                continue  # a file that was just replaced
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                what = "a link" if stat.S_ISLNK(mode) else "a pipe or a device"
                 raise CorruptError(
-                    f"{entry.path} is {what}: gsmap makes none in a map; put what belongs there in its place"
+                    f"{folder / name} is {what}: gsmap makes none in a map; put what belongs there in its place"
                 )
     sqlite.refuse_super_journal(folder / sqlite.FILE)
 
