@@ -23,7 +23,7 @@ from gsmap.formats import tiles3d
 from gsmap.types import MergeResult, Tile
 from gsmap.types.progress import Progress, silent
 
-_STAGING = ".partial"
+STAGING = ".partial"
 Make = Callable[[PlannedTile, Progress], MergeResult]
 _At = tuple[int, str]  # component and name of a tile
 
@@ -99,9 +99,10 @@ def export_tiles(
         make_folder(out)
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
-        remove_tree(out, _STAGING)  # it may not be ours, and hold links
-        (out / _STAGING).mkdir()
-        with closing(_finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers)) as finished:
+        remove_tree(out, STAGING)  # it may not be ours, and hold links
+        (out / STAGING).mkdir()
+        work = _finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers, report.give_up)
+        with closing(work) as finished:
             for at, tile, num_bytes in finished:
                 if made is not None:
                     made(tile)  # first: a tile that the manifest names is not made, and so not told, again
@@ -144,7 +145,7 @@ def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, repor
     path, digest, num_bytes = "", "", 0
     if len(content.gaussians):
         path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
-        staged = out / _STAGING / path.replace("/", "_")
+        staged = out / STAGING / path.replace("/", "_")
         try:
             _write(staged, content, recipe)
         except GsmapError as error:
@@ -200,7 +201,7 @@ def _remove_doomed(out: Path, manifest: Manifest) -> None:
 
 def _remove_leftovers(out: Path) -> None:
     """Delete what an export that was killed had begun to write."""
-    for path in [out / _STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
+    for path in [out / STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
         with suppress(OSError, CorruptError):
             remove_tree(out, *path.relative_to(out).parts)
 
@@ -215,9 +216,12 @@ def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
 
 
 def _finished(
-    todo: Sequence[PlannedTile], make: Callable[[PlannedTile], tuple[_At, Tile, int]], workers: int
+    todo: Sequence[PlannedTile],
+    make: Callable[[PlannedTile], tuple[_At, Tile, int]],
+    workers: int,
+    give_up: Callable[[], None],
 ) -> Generator[tuple[_At, Tile, int], None, None]:
-    """Results of ``make`` as they come; the first error ends it, and what has not begun is never begun."""
+    """Results of ``make`` as they come; the first error ends it: what has not begun never does, the rest gives up."""
     if workers == 1 or len(todo) < 2:
         yield from map(make, todo)
         return
@@ -226,6 +230,7 @@ def _finished(
         for future in as_completed([pool.submit(make, planned) for planned in todo]):
             yield future.result()
     finally:
+        give_up()
         pool.shutdown(cancel_futures=True)
 
 
@@ -235,8 +240,15 @@ class _Report:
     def __init__(self, progress: Progress, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done
         self._lock = Lock()
+        self._given_up = False
+
+    def give_up(self) -> None:
+        """End the making of tiles that are still being made: their result is not wanted any more."""
+        self._given_up = True
 
     def within_tile(self, fraction: float, text: str) -> None:
+        if self._given_up:
+            raise GsmapError("this tile was given up")
         with self._lock:
             at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
             self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")
