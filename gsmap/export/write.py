@@ -106,14 +106,14 @@ def export_tiles(
             for at, tile, num_bytes in finished:
                 if made is not None:
                     made(tile)  # first: a tile that the manifest names is not made, and so not told, again
-                if at in old and old[at].path != tile.path:
+                if at in old and old[at].path not in ("", tile.path):
                     manifest.doomed.add(old[at].path)
                 manifest.tiles[at], manifest.num_bytes[tile.path] = tile, num_bytes
                 news[at] = tile
                 report.tile_done()
                 manifest.save_sometimes(out)
         manifest.tiles = {at: tile for at, tile in manifest.tiles.items() if at in planned}
-        manifest.doomed |= {tile.path for tile in gone}
+        manifest.doomed |= {tile.path for tile in gone if tile.path}
         manifest.save(out)
         _remove_doomed(out, manifest)
     except BaseException as error:
@@ -190,7 +190,7 @@ def _synced_digest(path: Path) -> tuple[str, int]:
 def _remove_doomed(out: Path, manifest: Manifest) -> None:
     """Delete the files of tiles that are no longer named, and their component's folder with the last one."""
     kept = {tile.path for tile in manifest.tiles.values()}
-    doomed = sorted(path for path in manifest.doomed - kept if path)
+    doomed = sorted(manifest.doomed - kept)
     for path in doomed:
         remove_file(out, *path.split("/"))
         remove_empty_folder(out, path.split("/")[0])

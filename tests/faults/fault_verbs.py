@@ -159,7 +159,7 @@ def write_samples(folder: Path) -> None:
     for seed, name in enumerate("abc"):
         formats.write(folder / f"{name}.ply", capture(seed))
         (folder / f"{name}.cameras.json").write_text(json.dumps(_frames(name)))
-    for name, x in (("pose", 1.5), ("pose2", 1.6)):
+    for name, x in (("pose", 5.0), ("pose2", 5.1)):
         pose = np.eye(4)
         pose[0, 3] = x
         np.savetxt(folder / f"{name}.txt", pose)
