@@ -18,6 +18,8 @@ from types import FrameType
 # By two seconds after a signal nothing may be left, workers included; clean-up rarely takes a tenth of one.
 _GRACE_S = 1.2
 
+_AGAIN_S = 0.01  # after a signal struck where nothing can be raised, until it does again
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -44,9 +46,21 @@ def stoppable() -> Iterator[None]:
             stopped.append(signum)
             raise Stopped(signum)
 
+    def raise_again(signum: int, frame: FrameType | None) -> None:
+        raise Stopped(stopped[0])
+
+    def swallowed(found: sys.UnraisableHookArgs) -> None:
+        """It struck in a finalizer or a callback, where nothing can be raised (importing is full of them)."""
+        if isinstance(found.exc_value, Stopped):
+            signal.signal(signal.SIGALRM, raise_again)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        else:
+            sys.__unraisablehook__(found)
+
     # What somebody had ignored (nohup, a job of a shell without job control) stays ignored.
     heard = [s for s in _SIGNALS if signal.getsignal(s) is not signal.SIG_IGN]
     try:
+        sys.unraisablehook = swallowed
         signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)
         for signum in heard:
             signal.signal(signum, raise_once)
@@ -60,6 +74,8 @@ def stoppable() -> Iterator[None]:
         os._exit(128 + stop.signum)  # waiting for no thread
     finally:
         stopped.append(0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        sys.unraisablehook = sys.__unraisablehook__
         signal.set_wakeup_fd(-1)
         for signum in heard:
             signal.signal(signum, signal.SIG_DFL)  # what is left is the interpreter's own end: without a traceback

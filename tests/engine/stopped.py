@@ -30,6 +30,16 @@ def hog(seconds: float) -> float:
     return seconds
 
 
+class Slow:
+    """What is raised in its finalizer is nowhere to be caught."""
+
+    def __del__(self) -> None:
+        print("in it", flush=True)
+        deadline = time.monotonic() + 1
+        while time.monotonic() < deadline:
+            pass
+
+
 def main() -> None:
     from gsmap.engine.executors.local import Params, run_jobs
 
@@ -42,6 +52,10 @@ def main() -> None:
         return
     if word == "hog here":
         hog(seconds)
+    if word == "finalizer":
+        Slow()
+        while True:
+            pass
     if word == "clean-up":  # that never ends
         try:
             time.sleep(seconds)

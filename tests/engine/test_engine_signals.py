@@ -127,9 +127,19 @@ def test_a_second_signal_ends_it_at_once(start: Start) -> None:
     os.kill(process.pid, signal.SIGINT)
     time.sleep(0.2)
     os.kill(process.pid, signal.SIGINT)
-    assert seconds_until_gone(process) < 0.5
+    assert seconds_until_gone(process) < 0.8
     assert process.communicate()[1] == LINE.format("")
     assert process.returncode == 130
+
+
+def test_a_signal_that_strikes_in_a_finalizer_is_not_lost(start: Start) -> None:
+    process = start("finalizer")
+    assert process.stdout is not None
+    assert process.stdout.readline() == "in it\n"
+    os.kill(process.pid, signal.SIGTERM)
+    assert seconds_until_gone(process) < 1  # and not by the watch
+    assert process.communicate()[1] == LINE.format(" by SIGTERM")
+    assert process.returncode == 143
 
 
 def test_who_ignores_a_signal_is_left_alone() -> None:
