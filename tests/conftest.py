@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -20,6 +23,10 @@ def pytest_configure() -> None:
 
     GSMAP_TEST_INSTALLED=1 tests the package as it is installed instead: a wheel, say.
     """
+    # What the person trusts is none of the tests' business, and what they trust is none of the person's.
+    os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="gsmap-test-config-")
+    atexit.register(shutil.rmtree, os.environ["XDG_CONFIG_HOME"], ignore_errors=True)
+    os.environ.pop("GSMAP_CATALOG", None)
     if os.environ.get("GSMAP_TEST_INSTALLED"):
         return
     found = importlib.util.find_spec("gsmap")

@@ -5,6 +5,9 @@ from __future__ import annotations
 
 def main() -> None:
     """Entry point of the ``gsmap`` command."""
-    from gsmap.cli.app import run
+    from gsmap.cli.stopping import stoppable
 
-    run()
+    with stoppable():  # before all else: importing takes a moment, too
+        from gsmap.cli.app import run
+
+        run()

@@ -13,6 +13,7 @@ import typer
 
 from gsmap.cli.console import start_logging
 from gsmap.errors import ConfigError, GsmapError
+from gsmap.texts import escaped
 from gsmap.version import __version__
 
 VERBS = (
@@ -37,6 +38,8 @@ VERBS = (
     "convert",
     "models",
     "evaluate",
+    "branch",
+    "tag",
     "remove",
     "check",
     "prune",
@@ -44,6 +47,7 @@ VERBS = (
     "backup",
     "restore",
     "clone",
+    "trust",
     "view",
     "demo",
 )
@@ -103,5 +107,5 @@ def run(arguments: list[str] | None = None) -> None:
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
         code, message = 1, f"the system refused{where}: {error.strerror or error}"
-    print(f"gsmap: {message}", file=sys.stderr)
+    print(escaped(f"gsmap: {message}"), file=sys.stderr)
     sys.exit(code)

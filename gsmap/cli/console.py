@@ -1,4 +1,7 @@
-"""How verbs speak: data on stdout, progress and remarks on stderr."""
+"""How verbs speak: data on stdout, progress and remarks on stderr.
+
+Names, notes and paths come from files and maps that strangers may have made: everything printed passes `escaped`.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gsmap.texts import escaped
+
 if TYPE_CHECKING:
     from gsmap.map import Map
     from gsmap.types.progress import StageProgress
     from gsmap.types.rows import Row
 
 MapPath = Annotated[
-    str, typer.Argument(metavar="MAP", help="The map's directory, such as site.gsmap.", show_default=False)
+    str,
+    typer.Argument(
+        metavar="MAP",
+        help="The map's directory, such as site.gsmap; site.gsmap@NAME for a branch or tag.",
+        show_default=False,
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; docs/json.md has its fields.")]
 Sets = Annotated[
@@ -39,6 +49,9 @@ _SHORT = 12  # digits of a digest that tell a map's things apart
 class _Stderr(logging.StreamHandler[Any]):
     """Writes to whatever stderr is now: progress bars put themselves in its place while they are drawn."""
 
+    def format(self, record: logging.LogRecord) -> str:
+        return escaped(super().format(record), lines=True)
+
     def emit(self, record: logging.LogRecord) -> None:
         self.stream = sys.stderr
         super().emit(record)
@@ -58,7 +71,7 @@ def start_logging(verbose: int, quiet: bool) -> None:
 def say(text: str) -> None:
     """A remark for the person, on stderr; silent with ``-q``."""
     if logging.getLogger("gsmap").isEnabledFor(logging.WARNING):
-        print(text, file=sys.stderr, flush=True)
+        print(escaped(text), file=sys.stderr, flush=True)
 
 
 # --- data ------------------------------------------------------------------------------------------------------------
@@ -107,7 +120,7 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(title, "table.title"), title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=Text(escaped(title), "table.title"), title_justify="left", box=box.SIMPLE_HEAD)
     values = [[getattr(row, name) for name in columns] for row in rows]
     for i, heading in enumerate(columns.values()):
         numeric = any(isinstance(line[i], (int, float)) and not isinstance(line[i], bool) for line in values)
@@ -123,14 +136,13 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(
-        title=Text(title, "table.title"), title_justify="left", box=None, show_header=False, padding=(0, 2, 0, 0)
-    )
+    shown = Text(escaped(title), "table.title")
+    table = Table(title=shown, title_justify="left", box=None, show_header=False, padding=(0, 2, 0, 0))
     table.add_column(overflow="fold")
     table.add_column(overflow="fold")
     for name, value in facts.items():
         if value is not None and text(value) != "":
-            table.add_row(Text(name), Text(text(value)))
+            table.add_row(Text(escaped(name)), Text(text(value, lines=True)))
     _print(table)
 
 
@@ -140,8 +152,12 @@ def _print(table: Any) -> None:
     Console(width=None if sys.stdout.isatty() else 200, highlight=False).print(table)
 
 
-def text(value: Any) -> str:
-    """A value as people read it in a table."""
+def text(value: Any, *, lines: bool = False) -> str:
+    """A value as people read it in a table; control characters are escaped, whoever wrote them.
+
+    Args:
+        lines: line breaks stay.
+    """
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -149,12 +165,12 @@ def text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {text(item)}" for name, item in value.items())
+        return ", ".join(f"{escaped(str(name))} {text(item, lines=lines)}" for name, item in value.items())
     if hasattr(value, "tolist"):  # numpy arrays
         return " ".join(text(item) for item in value.tolist())
     if isinstance(value, (list, tuple)):
-        return ", ".join(text(item) for item in value)
-    return str(value)
+        return ", ".join(text(item, lines=lines) for item in value)
+    return escaped(str(value), lines=lines)
 
 
 def short(value: Any) -> str:
@@ -220,7 +236,7 @@ def progress_bars() -> Iterator[StageProgress | None]:
         def progress(stage: str, fraction: float, text: str = "") -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task("", total=1.0, stage=stage)
-            bars.update(tasks[stage], completed=fraction, description=text)
+            bars.update(tasks[stage], completed=fraction, description=escaped(text))
 
         yield progress
 
@@ -235,6 +251,6 @@ def _progress_lines() -> StageProgress:
             return
         last[stage] = subject
         if subject:
-            print(f"{stage}: {text}", file=sys.stderr, flush=True)
+            print(escaped(f"{stage}: {text}"), file=sys.stderr, flush=True)
 
     return progress

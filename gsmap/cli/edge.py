@@ -58,7 +58,7 @@ def read_pose(path: Path) -> Sim3:
     """
     import numpy as np
 
-    from gsmap.errors import InputError, NotFoundError
+    from gsmap.errors import MALFORMED, InputError, NotFoundError
     from gsmap.types import Sim3
 
     try:
@@ -71,7 +71,7 @@ def read_pose(path: Path) -> Sim3:
         return Sim3.from_matrix(numbers.reshape(4, 4))
     except FileNotFoundError as error:
         raise NotFoundError(f"no pose at {path}") from error
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, *MALFORMED) as error:
         raise InputError(f"{path} holds no pose, a 4x4 matrix as text or JSON: {error}") from error
 
 

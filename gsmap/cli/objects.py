@@ -60,6 +60,8 @@ OBJECTS: dict[str, Object] = {
     "models add": One(rows.ModelRow),
     "models list": Many("models", rows.ModelRow),
     "evaluate": One(rows.EvaluationReport),
+    "branch": Many("branches", rows.BranchRow),
+    "tag": Many("tags", rows.BranchRow),
     "remove": One(rows.SceneRow),
     "check": One(rows.CheckReport),
     "prune": One(rows.PruneReport),
@@ -68,6 +70,7 @@ OBJECTS: dict[str, Object] = {
     "backup --list": Many("snapshots", rows.SnapshotRow),
     "restore": One(rows.RestoreReport),
     "clone": One(rows.CloneReport),
+    "trust": One(rows.TrustReport),
     "view": One(rows.ViewReport),
     "demo": One(rows.DemoReport),
 }

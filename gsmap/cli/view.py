@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from typing import Annotated
 
 import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows
+from gsmap.cli.stopping import Stopped
 
 
 def command(
@@ -22,7 +24,8 @@ def command(
     """
     from gsmap.types.rows import ViewReport
 
-    with opened(map) as m, m.view(port=port) as server:
+    # A signal is the way to end it, and no interruption.
+    with opened(map) as m, m.view(port=port) as server, suppress(Stopped):
         if json:
             print_rows("view", ViewReport(url=server.url), json)
         else:  # with -q too: without it nobody finds the page

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,9 +28,9 @@ class Params:
 
 
 def run_jobs(
-    job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Params | None = None
+    job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params | None = None
 ) -> Iterator[tuple[int, Any]]:
-    """Yield ``(index, job(*arguments[index]))`` as each is done; see `gsmap.methods.executor`.
+    """Yield ``(index, job(*arguments))`` as each is done; see `gsmap.methods.executor`.
 
     Raises:
         ConfigError: there is no such executor.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import write_text_whole
-from gsmap.errors import ConfigError, InputError
+from gsmap.durable import is_file, open_file, write_text_whole
+from gsmap.errors import MALFORMED, ConfigError, InputError
+from gsmap.texts import control_characters
 from gsmap.types import Sim3, Tile
 from gsmap.types.plain import plain
 
@@ -20,6 +22,8 @@ FILE_NAME = "tiles.json"
 _VERSION = 2
 _NAMELESS = 1  # its tiles had a free text instead of a recipe, so that nobody knows what made them
 _SAVE_EVERY_S = 2.0
+_MAX_BYTES = 1 << 30  # a tile's entry has some kilobytes
+_PATH = re.compile(r"component_\d+/[^/\\]+")
 
 
 @dataclass
@@ -57,14 +61,14 @@ class Manifest:
                 raise ConfigError(f"{folder} holds files but no {FILE_NAME}: export to an empty or a new folder")
             return cls(map_id)
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            version, owner = content["version"], content["map_id"]
+            content = json.loads(_text(path))
+            version, owner = content["version"], str(content["map_id"])
             if version not in (_NAMELESS, _VERSION):
                 raise ConfigError(
                     f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
             raise InputError(f"{path} is not a manifest gsmap wrote ({error!r}): export to another folder") from error
@@ -86,9 +90,10 @@ class Manifest:
         """Whether the tile's file lies there with the size it was written with; a tile without Gaussians has none."""
         if not tile.path:
             return True
+        path = folder / tile.path
         try:
-            return (folder / tile.path).stat().st_size == self.num_bytes[tile.path]
-        except OSError:
+            return is_file(path) and path.lstat().st_size == self.num_bytes[tile.path]
+        except (OSError, ValueError):
             return False
 
     def save_sometimes(self, folder: Path) -> None:
@@ -124,6 +129,23 @@ def _entry(name: str, tile: Tile, num_bytes: int) -> dict[str, object]:
     }
 
 
+def _text(path: Path) -> str:
+    with open(open_file(path), "rb") as file:
+        content = file.read(_MAX_BYTES + 1)
+    if len(content) > _MAX_BYTES:
+        raise ValueError(f"it has more than {_MAX_BYTES} bytes")
+    return content.decode()
+
+
+def _checked_path(path: Any) -> str:
+    """A tile's path: a file in a component's folder, as every export writes it; empty where the tile holds nothing."""
+    if not isinstance(path, str) or control_characters(path) or (path and _PATH.fullmatch(path) is None):
+        raise ValueError(f"the path {path!r} of a tile is not component_N/NAME")
+    if path.rpartition("/")[2] in (".", ".."):
+        raise ValueError(f"the path {path!r} of a tile leads out of its folder")
+    return path
+
+
 def _tile(entry: Mapping[str, Any], version: int) -> Tile:
     known = version == _VERSION
     return Tile(
@@ -134,7 +156,7 @@ def _tile(entry: Mapping[str, Any], version: int) -> Tile:
         num_gaussians=int(entry["num_gaussians"]),
         recipe=dict(entry["recipe"]) if known else {},
         truncated=bool(entry["truncated"]),
-        path=str(entry["path"]),
+        path=_checked_path(entry["path"]),
         sha256=str(entry["sha256"]),
         notes=tuple(str(note) for note in entry["notes"]) if known else (),
     )

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import write_whole
+from gsmap.durable import is_file, open_file, refuse_links, remove_file, write_whole
+from gsmap.errors import MALFORMED, CorruptError
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
 from gsmap.types import Gaussians, Tile
@@ -54,6 +55,7 @@ def write_tilesets(out: Path, tiles: Sequence[Tile], tile_size_m: float) -> list
     written = []
     for members in by_component.values():
         folder = (out / members[0].path).parent
+        refuse_links(out, folder.name, LEVELS_FOLDER)
         known = _known_boxes(folder)
         cells = {_cell(tile, tile_size_m): _leaf(folder, tile) for tile in members}
         while len(cells) > 1:
@@ -95,15 +97,15 @@ def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndar
     digest = hashlib.sha256("\n".join(child.digest for child in children).encode()).hexdigest()
     uri = f"{LEVELS_FOLDER}/{digest[:24]}.glb"
     path = folder / uri
-    if uri in known and path.exists():
+    if uri in known and is_file(path):
         box, error_m = known[uri]
     else:
         finer = Gaussians.concatenate([c.gaussians() for c in children])
         level, voxel_m = tiles3d.coarser(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)))
         path.parent.mkdir(exist_ok=True)
-        staged = path.with_name(f".{path.name}.partial")
-        boxes = np.stack([tiles3d.write_content(staged, level), *(c.node.box for c in children)])
-        os.replace(staged, path)
+        written: list[np.ndarray] = []
+        write_whole(path, lambda staged: written.append(tiles3d.write_content(staged, level)))
+        boxes = np.stack([*written, *(c.node.box for c in children)])
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level must never be finer than what replaces it, or viewers would stop at it too early.
         error_m = max(voxel_m, 1.5 * max(c.node.error_m for c in children), 1e-3)
@@ -125,8 +127,9 @@ def _known_boxes(folder: Path) -> dict[str, tuple[np.ndarray, float]]:
             walk(child)
 
     try:
-        walk(json.loads((folder / FILE_NAME).read_text())["root"])
-    except (OSError, ValueError, KeyError, TypeError):
+        with open(open_file(folder / FILE_NAME), "rb") as file:
+            walk(json.loads(file.read())["root"])
+    except (OSError, *MALFORMED, CorruptError):
         return {}  # none yet, or not ours: everything is read again
     return known
 
@@ -141,4 +144,5 @@ def _remove_unnamed(folder: Path, root: TileNode) -> None:
         todo += node.children
     for path in (folder / LEVELS_FOLDER).glob("*"):
         if f"{LEVELS_FOLDER}/{path.name}" not in named:
-            path.unlink()
+            with suppress(IsADirectoryError):
+                remove_file(folder, LEVELS_FOLDER, path.name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
@@ -15,8 +14,8 @@ from threading import Lock
 import numpy as np
 
 from gsmap import formats
-from gsmap.durable import sync_folder
-from gsmap.errors import GsmapError, StoreError
+from gsmap.durable import refuse_links, remove_empty_folder, remove_file, remove_tree, sync_folder
+from gsmap.errors import GsmapError, of_system
 from gsmap.export.manifest import Manifest
 from gsmap.export.plan import Params, PlannedTile
 from gsmap.export.recipe import TileRecipe, dirty_reason
@@ -76,10 +75,13 @@ def export_tiles(
 
     Raises:
         ConfigError: the folder belongs to another map or holds other files.
-        StoreError: the folder cannot be written (read-only, full).
+        CorruptError: a link lies in it where a folder of tiles belongs: it would lead elsewhere.
+        DiskFullError, ReadOnlyError, DiskError, StoreError: the folder cannot be written.
     """
     params = params or Params()
     out = Path(out)
+    for component in {tile.component for tile in plan}:
+        refuse_links(out, f"component_{component}")
     manifest = Manifest.load(out, map_id)
     old = manifest.tiles
     todo = [t for t in plan if _must_make(t, old.get((t.component, t.name)), manifest, out, recipe, params)]
@@ -92,7 +94,9 @@ def export_tiles(
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     try:
-        (out / _STAGING).mkdir(parents=True, exist_ok=True)
+        if out.exists():
+            remove_tree(out, _STAGING)  # what an interrupted export left; it may not be ours, and hold links
+        (out / _STAGING).mkdir(parents=True)
         with closing(_finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers)) as finished:
             for at, tile, num_bytes in finished:
                 _remove(out, old.get(at), unless=tile.path)
@@ -110,13 +114,14 @@ def export_tiles(
         with suppress(OSError):
             manifest.save(out)
         if isinstance(error, OSError):
-            raise StoreError(
+            raise of_system(error)(
                 f"cannot write the export to {out}: {error.strerror or error}; finished tiles are kept, "
                 "run the same export again to go on"
             ) from error
         raise
     finally:
-        shutil.rmtree(out / _STAGING, ignore_errors=True)
+        with suppress(OSError):
+            remove_tree(out, _STAGING)
     tiles = [manifest.tiles[at] for at in sorted(planned)]
     return ExportResult(tiles, len(todo), reused, len(gone), manifest.notes + _told(news))
 
@@ -142,6 +147,7 @@ def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, repor
             # A full disk is a matter of the folder, not of what was written.
             raise error.__cause__ if isinstance(error.__cause__, OSError) else error from None
         digest, num_bytes = _synced_digest(staged)
+        refuse_links(out, *path.split("/")[:-1])
         (out / path).parent.mkdir(exist_ok=True)
         os.replace(staged, out / path)
         sync_folder((out / path).parent)
@@ -180,9 +186,9 @@ def _remove(out: Path, tile: Tile | None, unless: str = "") -> None:
     """Delete a tile's file, and its component's folder with the last one."""
     if tile is None or not tile.path or tile.path == unless:
         return
-    (out / tile.path).unlink(missing_ok=True)
-    with suppress(OSError):
-        (out / tile.path).parent.rmdir()
+    names = tile.path.split("/")
+    remove_file(out, *names)
+    remove_empty_folder(out, *names[:-1])
 
 
 def _told(news: dict[_At, Tile]) -> tuple[str, ...]:

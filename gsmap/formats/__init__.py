@@ -20,8 +20,6 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import family
 from gsmap.types import Cameras, FileInfo, Gaussians
 
-_MAX_MESSAGE = 300
-
 
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
     """The longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None."""
@@ -127,15 +125,9 @@ def _layout(path: Path, suffix: str) -> str:
 
 @contextlib.contextmanager
 def _explained(path: Path, verb: str) -> Iterator[None]:
-    """Turn what the operating system says into one typed line, and keep what a damaged file says within one."""
+    """Turn what the operating system says into a typed error."""
     try:
         yield
-    except InputError as error:
-        text = " ".join(str(error).split())
-        limit = len(str(path)) + _MAX_MESSAGE
-        if text == str(error) and len(text) <= limit:
-            raise
-        raise InputError(text if len(text) <= limit else f"{text[:limit]}...") from error
     except FileNotFoundError as error:
         what = "no such file" if verb == "read" else f"no such folder: {path.parent}"
         raise NotFoundError(f"cannot {verb} {path}: {what}") from error

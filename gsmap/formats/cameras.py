@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from gsmap.errors import GsmapError, InputError
+from gsmap.errors import MALFORMED, GsmapError, InputError
 from gsmap.formats import cameras_json, colmap, nerfstudio
 from gsmap.formats.camera_files import load_json
 from gsmap.types import Cameras
@@ -34,7 +34,7 @@ def read(path: str | os.PathLike[str]) -> Cameras:
         return cameras_json.parse(content, path) if isinstance(content, list) else nerfstudio.parse(content, path)
     except OSError as error:
         raise InputError(f"cannot read cameras from {path}: {error.strerror or error}") from error
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+    except MALFORMED as error:
         if isinstance(error, GsmapError) and str(path) in str(error):
             raise
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import InputError
+from gsmap.errors import MALFORMED, InputError
 from gsmap.formats.axes import GLTF, PLY, change_axes
 from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
 from gsmap.geometry.sh import rgb_of_sh0
@@ -60,7 +60,7 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
         repeated = sum(int(gltf["accessors"][p["attributes"]["POSITION"]]["count"]) for p, _ in found)
         check_size(path, repeated * _LEAST_BYTES, len(binary))
         parts = [_read_primitive(path, gltf, binary, *item) for item in found]
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
+    except MALFORMED as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} is not valid glTF: {type(error).__name__} {error}") from error

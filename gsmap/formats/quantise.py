@@ -10,14 +10,14 @@ from gsmap.errors import InputError
 from gsmap.types import Gaussians
 
 # Real splats compress 2 to 10 times; what claims far more than that is a bomb.
-_FREE_BYTES = 256 << 20
+_FREE_BYTES = 8 << 20
 _MAX_RATIO = 32
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def check_size(path: str | os.PathLike[str], expanded: int, compressed: int) -> None:
-    """Refuse to expand ``compressed`` bytes to more than 256 MiB and more than 32 times as many.
+    """Refuse to expand ``compressed`` bytes to more than 8 MiB and more than 32 times as many.
 
     Raises:
         InputError: a decompression bomb, or a header that lies.

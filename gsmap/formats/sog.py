@@ -8,22 +8,27 @@ from __future__ import annotations
 
 import io
 import json
+import lzma
 import os
 import zipfile
+import zlib
 from typing import Any
 
 import numpy as np
 
-from gsmap.errors import InputError
-from gsmap.formats.quantise import from_smallest_three, logits_of_bytes
+from gsmap.errors import MALFORMED, InputError
+from gsmap.formats.quantise import check_size, from_smallest_three, logits_of_bytes
 from gsmap.types import Gaussians
 
 VERSION = 1
 
 _MAX_META_BYTES = 4 << 20
 _MAX_PIXELS = 1 << 26  # 64 million Gaussians, 256 MiB an image
+_SPARE_PIXELS = 1 << 16  # of an image beyond those that are used: writers round its sides up
+_LEAST_BYTES = 56  # of a Gaussian in memory, SH degree 0
 _SH_COEFFICIENTS = (0, 3, 8, 15)
 _PALETTE_COLUMNS = 64
+_MAX_PALETTE = 1 << 16  # labels have 16 bits
 _FIRST_TAG = 252  # quaternion tags 252 to 255: which component is largest
 
 
@@ -31,16 +36,16 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a bundled ``.sog`` of version 2.
 
     Raises:
-        InputError: not a ZIP, another version, members missing, images too small for the count or beyond 64
-            megapixels.
+        InputError: not a ZIP, another version, members missing, images too small or far too large for the
+            count.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             meta = _meta(path, archive)
             return _decode(path, archive, meta)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, EOFError) as error:
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError) as error:
         raise InputError(f"{path} is not a readable .sog (a ZIP file): {error}") from error
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
+    except MALFORMED as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: its meta.json does not describe it: {type(error).__name__} {error}") from error
@@ -50,9 +55,10 @@ def _decode(path: str | os.PathLike[str], archive: zipfile.ZipFile, meta: dict[s
     n = int(meta["count"])
     if not 0 < n <= _MAX_PIXELS:
         raise InputError(f"{path}: a count of {n} Gaussians; gsmap reads 1 to {_MAX_PIXELS}")
+    check_size(path, n * _LEAST_BYTES, os.path.getsize(path))
 
     def texels(part: str, file: int = 0) -> np.ndarray:
-        image = _image(path, archive, meta[part]["files"][file]).reshape(-1, 4)
+        image = _image(path, archive, meta[part]["files"][file], 2 * n).reshape(-1, 4)
         if len(image) < n:
             raise InputError(f"{path}: the image of {part} holds {len(image)} texels for {n} Gaussians")
         return image[:n]
@@ -101,15 +107,16 @@ def _member(path: str | os.PathLike[str], archive: zipfile.ZipFile, name: str, l
     return data
 
 
-def _image(path: str | os.PathLike[str], archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """(H, W, 4) uint8 of a lossless WebP."""
+def _image(path: str | os.PathLike[str], archive: zipfile.ZipFile, name: str, most: int) -> np.ndarray:
+    """(H, W, 4) uint8 of a lossless WebP of at most as many pixels, and some to spare."""
     from PIL import Image
 
-    data = _member(path, archive, name, 4 * _MAX_PIXELS)
+    most += _SPARE_PIXELS
+    data = _member(path, archive, name, 4 * most)
     try:
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-            if image.width * image.height > _MAX_PIXELS:
-                raise InputError(f"{path}: {name} has {image.width} x {image.height} pixels, more than 64 million")
+            if image.width * image.height > most:
+                raise InputError(f"{path}: {name} has {image.width} x {image.height} pixels, more than {most:,}")
             return np.asarray(image.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: {name} is not a WebP image: {error}") from error
@@ -131,7 +138,7 @@ def _bands(path: str | os.PathLike[str], meta: dict[str, Any]) -> int:
 
 def _palette_sh(path, archive: zipfile.ZipFile, part: dict[str, Any], labels: np.ndarray, k: int) -> np.ndarray:
     """(N, k, 3): 64 palette entries a row of the image, each of k texels."""
-    image = _image(path, archive, part["files"][0])
+    image = _image(path, archive, part["files"][0], _MAX_PALETTE * k)
     if image.shape[1] != _PALETTE_COLUMNS * k:
         raise InputError(f"{path}: an SH palette {image.shape[1]} wide, expected {_PALETTE_COLUMNS * k}")
     palette = image.reshape(-1, k, 4)[:, :, :3]

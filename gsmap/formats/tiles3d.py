@@ -22,7 +22,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from gsmap.errors import ConfigError, InputError
+from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.formats import glb
 from gsmap.formats.quantise import require_writable
 from gsmap.geometry.voxels import covariances, merge_groups, voxel_labels
@@ -69,7 +69,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     try:
         tileset = json.loads(path.read_bytes())
         contents = list(_finest(path, tileset["root"]))
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
+    except MALFORMED as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} is not a 3D Tiles tileset: {type(error).__name__} {error}") from error
@@ -238,7 +238,10 @@ def _inside(path: Path, uri: str) -> Path:
     """The file of a relative uri within the tileset's folder, links followed."""
     name = PurePosixPath(unquote(str(uri)))
     folder = path.parent.resolve()
-    file = (folder / name).resolve()
+    try:
+        file = (folder / name).resolve()
+    except (ValueError, OSError, RuntimeError) as error:  # a NUL, half a surrogate, a name too long, links in a circle
+        raise InputError(f"{path}: content {uri!r} is no name of a file: {error}") from error
     if name.is_absolute() or ":" in str(name) or "\\" in str(name) or not file.is_relative_to(folder):
         raise InputError(f"{path}: content {uri!r} lies outside the tileset's folder; gsmap will not follow it")
     if file.suffix.lower() != ".glb":

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap import formats
-from gsmap.errors import InputError, NotFoundError
+from gsmap.errors import MALFORMED, InputError, NotFoundError
 from gsmap.evaluate.images import Lpips
 from gsmap.evaluate.judge import JudgedScene, Params, judge
 from gsmap.evaluate.overlap import solid_centres, true_overlaps
@@ -69,7 +69,7 @@ def _read_truth(folder: Path, name: str) -> Sim3 | None:
         return None
     try:
         return Sim3.from_matrix(np.array(json.loads(path.read_text())["T_scene_world"], dtype=float))
-    except (ValueError, KeyError, TypeError) as error:
+    except (OSError, *MALFORMED) as error:
         raise InputError(f"{path} holds no T_scene_world, a 4x4 similarity: {error}") from error
 
 

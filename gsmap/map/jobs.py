@@ -9,7 +9,7 @@ from functools import lru_cache
 from gsmap import describe as describing
 from gsmap import register as registering
 from gsmap.register import SceneView
-from gsmap.store import Store, sqlite
+from gsmap.store import Store, branches, sqlite
 from gsmap.types import Registration, SceneGraph
 from gsmap.types.model import ModelSpec
 
@@ -20,18 +20,18 @@ def _store(path: str) -> Store:
 
 
 @lru_cache(maxsize=1)
-def _opened(folder: str, inode: int) -> Store:
-    return Store.open(folder, "r")
+def _opened(location: str, inode: int) -> Store:
+    return Store.open(location, "r")
 
 
 def _catalog_file(path: str) -> tuple[str, int]:
-    """The absolute folder of a map, and which file its catalog is: where jobs run in a person's own process, another
+    """The absolute location of a map, and which file its catalog is: where jobs run in a person's own process, another
     map may come to lie at the same path. (A file that is held open keeps its inode to itself.)"""
-    folder = os.path.abspath(path)
+    location = os.path.abspath(path)
     try:
-        return folder, os.stat(os.path.join(folder, sqlite.FILE)).st_ino
+        return location, (branches.find(location).folder / sqlite.FILE).stat().st_ino
     except FileNotFoundError:  # its catalog is a database elsewhere
-        return folder, 0
+        return location, 0
 
 
 @lru_cache(maxsize=4)
@@ -46,7 +46,7 @@ def _view(path: str, scene_id: str, graph_key: str) -> SceneView:
 
 
 def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec], params: describing.Params) -> SceneGraph:
-    """The graph of one scene of the map at ``path``."""
+    """The graph of one scene of the map at ``path`` (`Store.location`)."""
     scenes = _store(path).scenes
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)

@@ -15,12 +15,15 @@ import numpy as np
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
+from gsmap.map import values as as_values
 from gsmap.map.logs import logged
+from gsmap.map.sharing import at_work
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
     BackupReport,
+    BranchRow,
     CheckReport,
     CloneReport,
     EdgeRow,
@@ -63,14 +66,13 @@ def create(
 
 
 def open(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
-    """Open a map; read-only where its folder cannot be written."""
-    mode = "r" if os.path.isdir(path) and not os.access(path, os.W_OK) else "w"
-    return Map(Store.open(path, mode), progress)
+    """Open a map, or a branch or tag of one (``MAP@NAME``); read-only where its folder cannot be written."""
+    return Map(Store.open(path, "w" if Store.can_write(path) else "r"), progress)
 
 
 def open_or_create(path: str | os.PathLike[str], progress: StageProgress | None = None) -> Map:
     """Open a map, making it first where there is none."""
-    return open(path, progress) if os.path.exists(path) else create(path, progress)
+    return open(path, progress) if Store.exists(path) else create(path, progress)
 
 
 def migrate(path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
@@ -107,6 +109,17 @@ def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
     from gsmap.map import backing
 
     return backing.snapshots(target)
+
+
+def accept_catalog(path: str | os.PathLike[str]) -> list[str]:
+    """Take the catalog of a map that differs from what gsmap wrote as it is; returns what differed, in words.
+
+    For salvage, or after a change by another program: from then on these bytes count as written, right or wrong.
+
+    Raises:
+        CorruptError: SQLite finds it broken: only a backup helps.
+    """
+    return Store.accept_catalog(path)
 
 
 class Map(AbstractContextManager["Map"]):
@@ -157,7 +170,8 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap settings MAP --set``: change the map's own settings; nothing is written if any makes no sense."""
         from gsmap.map.settings import write_settings
 
-        write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
+        with self.store.catalog.lock():
+            write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
         self.__dict__.pop("settings", None)
 
     def setting_rows(self) -> list[SettingRow]:
@@ -204,7 +218,8 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.stages.describe import describe
 
         wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
-        keys = describe(self.store, wanted, self.settings, self._progress)
+        with at_work(self.store, "describe"):
+            keys = describe(self.store, wanted, self.settings, self._progress)
         return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
 
     def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:
@@ -216,7 +231,8 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.stages.register import register
 
-        made = register(self.store, pairs, self.settings, self._progress)
+        with at_work(self.store, "register"):
+            made = register(self.store, pairs, self.settings, self._progress)
         return reports.rows_of_edges(self.store, made)
 
     def add_edge(self, pair: str, S_target_source: Sim3, sigmas: np.ndarray, note: str = "") -> EdgeRow:
@@ -253,7 +269,8 @@ class Map(AbstractContextManager["Map"]):
         """Solve for all scene poses and keep the answer as a new revision."""
         from gsmap.map.stages.optimize import optimize
 
-        number = optimize(self.store, self.settings, self._progress)
+        with at_work(self.store, "optimize"):
+            number = optimize(self.store, self.settings, self._progress)
         return reports.revision_row(self.store, number)
 
     def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
@@ -263,18 +280,19 @@ class Map(AbstractContextManager["Map"]):
             captured_at: as in `ingest`.
         """
         from gsmap.map.stages.describe import describe
-        from gsmap.map.stages.optimize import is_solved, optimize
+        from gsmap.map.stages.optimize import solve
         from gsmap.map.stages.register import register
 
         if captured_at is not None and not captures:
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
-        ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-        describe(self.store, self.scenes(), self.settings, self._progress)
-        while True:
+        with at_work(self.store, "update"):
+            ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
+            describe(self.store, self.scenes(), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
-            if is_solved(self.store, self.settings):
-                return reports.update_report(self.store, ingested)
-            optimize(self.store, self.settings, self._progress)  # scenes that now turn out to be neighbours come next
+            while solve(self.store, self.settings, self._progress):
+                # Scenes that now turn out to be neighbours.
+                register(self.store, "auto", self.settings, self._progress)
+        return reports.update_report(self.store, ingested)
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
@@ -546,6 +564,31 @@ class Map(AbstractContextManager["Map"]):
         """Take a scene out; older revisions keep it."""
         row = reports.scene_row(self.store, self.store.scenes.get(ref))
         self.store.scenes.remove(ref)
+        return row
+
+    def branch(self, name: str) -> BranchRow:
+        """``gsmap branch MAP NAME``: another catalog over the same arrays; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name))
+
+    def tag(self, name: str) -> BranchRow:
+        """``gsmap tag MAP NAME``: the map as it is now, which cannot change; `open` it as ``MAP@NAME``."""
+        return as_values.branch_row(self.store.branches.make(name, tag=True))
+
+    def branches(self, kind: str | None = None) -> list[BranchRow]:
+        """The map's branches and tags, or those of one kind (``branch``, ``tag``)."""
+        rows = [as_values.branch_row(branch) for branch in self.store.branches.list()]
+        return [row for row in rows if kind in (None, row.kind)]
+
+    def delete_branch(self, name: str, kind: str | None = None) -> BranchRow:
+        """``gsmap branch MAP NAME --delete``: forget a branch or tag; what only it named is reclaimed by `prune`.
+
+        Raises:
+            NotFoundError: none of that kind is called so.
+        """
+        row = as_values.branch_row(self.store.branches.get(name))
+        if kind not in (None, row.kind):
+            raise NotFoundError(f"{name} is a {row.kind}: gsmap {row.kind} {self.store.home} {name} --delete")
+        self.store.branches.delete(name)
         return row
 
     def check(self) -> CheckReport:

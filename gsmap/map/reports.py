@@ -564,6 +564,7 @@ def check_report(found: Check) -> CheckReport:
         orphans=found.orphans,
         num_groups=found.num_groups,
         num_bytes=found.num_bytes,
+        unverified=found.unverified,
     )
 
 

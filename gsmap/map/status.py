@@ -17,7 +17,7 @@ from gsmap.types.rows import MapStatus, TodoRow
 
 def status(store: Store, settings: Settings) -> MapStatus:
     """``gsmap status MAP``, from the catalog alone: no array is read, nothing is computed."""
-    at = shlex.quote(str(store.folder))
+    at = shlex.quote(store.location)
     scenes = store.scenes.list()
     graph = store.revisions.get()
     todo: list[TodoRow] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 
 from gsmap.map import reports
 from gsmap.store import Store
@@ -35,4 +36,4 @@ def view_of(store: Store) -> ViewMap:
         )
         for row in reports.edge_rows(store)
     ]
-    return ViewMap(store.folder.name, scenes, edges)
+    return ViewMap(Path(store.location).name, scenes, edges)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Protocol
 
 
@@ -22,9 +22,13 @@ class Executor(Protocol):
     VERSION: int
 
     def run_jobs(
-        self, job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Any
+        self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Any
     ) -> Iterator[tuple[int, Any]]:
-        """Yield ``(index, job(*arguments[index]))`` as each is done, in any order.
+        """Yield ``(index, job(*arguments))`` as each is done, in any order; the index counts the arguments.
+
+        Arguments are taken as there is room to run them, since taking them says to others that this process does
+        them; an executor that takes all of them at once keeps others from sharing the work. What runs is given up when
+        the iterator is closed.
 
         Raises:
             GsmapError: a worker died; what was yielded before stands.

@@ -35,11 +35,12 @@ def optimize(
     Levenberg-Marquardt solve per component, with one gauge prior each, gives poses and marginal covariances.
 
     Args:
-        scene_ids: all scenes of the map, oldest first (the oldest scene of a component holds its frame).
-        edges: the measurements to consider; leave out what a person rejected.
+        scene_ids: all scenes of the map, oldest first. The oldest scene of a component holds its frame, and of
+            components of one size that of the oldest scene comes first; nothing else depends on their order.
+        edges: the measurements to consider, in any order; leave out what a person rejected.
         priors: outside knowledge. A component whose priors leave a freedom open is held there by its anchor scene.
-        previous: the last answer. Its largest component's frame survives, so that maps do not jump. If only few
-            scenes are new, they are placed in it (``provenance.method == "incremental"``); see `Params`.
+        previous: the last answer. Its largest component's frame survives, so that maps do not jump. In large maps, if
+            only few scenes are new, they are placed in it (``provenance.method == "incremental"``); see `Params`.
         params: see `Params`.
         progress: called with a fraction and a short text.
 
@@ -50,7 +51,10 @@ def optimize(
     from gsmap.optimize.incremental import place_new
 
     params = params or Params()
-    if previous is not None and params.growth > 0:
+    # What is summed, numbered or tried first may decide what is close: by content, not by who came first.
+    edges = sorted(edges, key=lambda edge: (edge.target, edge.source))
+    priors = sorted(priors, key=lambda prior: prior.scene)
+    if previous is not None and params.growth > 0 and len(scene_ids) > params.limits.full_scenes:
         placed = place_new(scene_ids, edges, priors, previous, params)
         if placed is not None:
             return placed

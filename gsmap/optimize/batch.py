@@ -35,9 +35,10 @@ def solve_batch(
     params: Params,
     progress: Progress,
 ) -> PoseGraph:
-    """See `gsmap.optimize.optimize`."""
+    """See `gsmap.optimize.optimize`; edges and priors come sorted by id."""
     check_priors(scene_ids, priors)
-    m = measurements(scene_ids, edges, rigid=all_rigid(edges, priors, previous))
+    # Rows are numbered by id: where the solve starts, and what it does first among equals, is the same in any order.
+    m = measurements(sorted(scene_ids), edges, rigid=all_rigid(edges, priors, previous))
     gate = float(chi2.ppf(params.gate_probability, m.dim))
 
     progress(0.05, "voting on cycles")
@@ -57,9 +58,22 @@ def solve_batch(
     _reconsider(m, state, gate)
     _check_confirmed(m, state, gate, params)
 
-    solved = solve_components(m, state, previous, params, lambda f, text: progress(0.75 + 0.25 * f, text))
+    solved = solve_components(
+        m, state, _ages(m, scene_ids), previous, params, lambda f, text: progress(0.75 + 0.25 * f, text)
+    )
     answer = pose_graph(m, solved.poses, solved.component, solved.covariances, state, votes, params)
-    return replace(answer, provenance=_provenance(m, edges, priors, state, params), notes=solved.notes)
+    return replace(
+        answer,
+        poses={scene: answer.poses[scene] for scene in scene_ids},
+        provenance=_provenance(m, edges, priors, state, params),
+        notes=solved.notes,
+    )
+
+
+def _ages(m: Measurements, scene_ids: Sequence[str]) -> np.ndarray:
+    """(N,) place of each scene in the caller's order, oldest first."""
+    came = {scene: k for k, scene in enumerate(scene_ids)}
+    return np.array([came[scene] for scene in m.scene_ids], dtype=np.int64)
 
 
 def _provenance(

@@ -35,14 +35,18 @@ class Solved:
 
 
 def solve_components(
-    m: Measurements, state: State, previous: PoseGraph | None, params: Params, progress: Progress
+    m: Measurements, state: State, ages: np.ndarray, previous: PoseGraph | None, params: Params, progress: Progress
 ) -> Solved:
-    """Exact poses and covariances of every component from the edges that are taken in."""
+    """Exact poses and covariances of every component from the edges that are taken in.
+
+    Args:
+        ages: (N,) the place of each scene among all, oldest first: the oldest of a component holds its frame.
+    """
     rows = np.flatnonzero(state.accepted)
     labels = component_labels(m, rows)
     sizes = np.bincount(labels, minlength=1)
-    order = sorted(range(labels.max(initial=-1) + 1), key=lambda k: (-sizes[k], k))
-    members = np.split(np.argsort(labels, kind="stable"), np.cumsum(sizes)[:-1]) if m.num_scenes else []
+    members = np.split(np.lexsort((ages, labels)), np.cumsum(sizes)[:-1]) if m.num_scenes else []
+    order = sorted(range(labels.max(initial=-1) + 1), key=lambda k: (-sizes[k], ages[members[k][0]]))
     edge_order = rows[np.argsort(labels[m.targets[rows]], kind="stable")]
     edge_members = np.split(edge_order, np.cumsum(np.bincount(labels[m.targets[rows]], minlength=len(sizes)))[:-1])
     prior_labels = labels[state.terms.scenes]

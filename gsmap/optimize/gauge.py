@@ -19,8 +19,8 @@ from gsmap.types import PoseGraph, Sim3
 def anchor_of(scenes: np.ndarray, scene_ids: tuple[str, ...], previous: PoseGraph | None) -> int:
     """The scene that holds the component's frame: its first one from the largest component it had before.
 
-    Scenes come in the caller's order (oldest first), so a component that swallows another keeps its own frame, and
-    re-optimising moves nothing that need not move.
+    Scenes come oldest first, so a component that swallows another keeps its own frame, and re-optimising moves nothing
+    that need not move.
     """
     if previous is None:
         return int(scenes[0])

@@ -150,6 +150,8 @@ class Limits:
     """Sizes beyond which something cheaper is done.
 
     Args:
+        full_scenes: maps of no more scenes than this are always solved in full, a second at most, so that their poses
+            do not depend on the order in which the scenes came.
         marginal_scenes: components of more scenes get no covariances (noted in the answer): gtsam's cost 1 ms a scene
             at 1,000 scenes, 8 ms at 10,000.
         exact_hops: shortest paths, in scenes times sources, beyond which hops between scenes are estimated from their
@@ -158,12 +160,13 @@ class Limits:
             a volume reach it, those that follow floors and streets stay far below.
     """
 
+    full_scenes: int = 500
     marginal_scenes: int = 3000
     exact_hops: int = 20_000_000
     fill_blocks: int = 500_000
 
     def __post_init__(self) -> None:
-        _at_least(self, 0, "marginal_scenes", "exact_hops", "fill_blocks")
+        _at_least(self, 0, "full_scenes", "marginal_scenes", "exact_hops", "fill_blocks")
 
 
 @dataclass(frozen=True)
@@ -181,8 +184,8 @@ class Params:
         max_rounds: rounds of taking edges in and refining.
         max_failures: an edge that was let go this many times is not taken in again.
         marginals: compute a covariance per scene.
-        growth: with a previous answer of the same recipe, place new scenes one by one until the map has grown by this
-            share since the last full solve; 0 always solves in full.
+        growth: with a previous answer of the same recipe, and more than ``limits.full_scenes`` scenes, place new ones
+            one by one until the map has grown by this share since the last full solve; 0 always solves in full.
         neighbourhood: hops around a new scene's neighbours that give way to it; the outermost scenes stay.
         joining: when components may join.
         aliasing: what is done about places that look alike.

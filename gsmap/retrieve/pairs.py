@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmap.types import NodeLayer, SceneGraph
 
-VERSION = 1
+VERSION = 2
 
 _MIN_NODES = 16  # of each scene, however many scenes share the budget
 _BLOCK = 20_000_000  # entries of one product of similarities: 80 MB
@@ -67,14 +67,16 @@ def candidate_pairs(
     voted for. Placed scenes are also paired with those of their component that their content may touch.
 
     Args:
-        graphs: of all scenes.
+        graphs: of all scenes, in any order.
         new: ids of scenes to find partners for; default all.
         placed: by scene id, what is known of where scenes lie.
 
     Returns:
-        (earlier, later) in the order of ``graphs``, each pair once, most promising first.
+        (lower, higher) by scene id, each pair once, most promising first, equals by id: a scene's id is the digest of
+        its content, so the same scenes make the same pairs in the same direction, whichever came first.
     """
     params = params or Params()
+    graphs = sorted(graphs, key=lambda graph: graph.scene_id)
     order = {graph.scene_id: i for i, graph in enumerate(graphs)}
     asked = [order[s] for s in order if new is None or s in new]
     scores: dict[tuple[int, int], float] = defaultdict(float)

@@ -30,7 +30,7 @@ def load(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is not a text file in UTF-8: mend or remove it") from error
     try:
         return dict(_flat(tomllib.loads(text)))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # not only what tomllib names: an integer of 5000 digits, too
         raise ConfigError(f"{path} is not TOML ({error}): mend or remove it") from error
 
 

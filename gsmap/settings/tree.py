@@ -81,7 +81,7 @@ def parse(text: str) -> tuple[str, Any]:
         raise ConfigError(f"a setting is given as name=value, such as register.verdict.max_log_nfa=-6, got {text!r}")
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return name, None if value.lower() == "none" else value
 
 

@@ -13,7 +13,9 @@ import contextlib
 import fcntl
 import hashlib
 import os
-import shutil
+import stat
+import threading
+import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import sync_folder
-from gsmap.errors import CorruptError
+from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_folder
+from gsmap.errors import BusyError, CorruptError
+from gsmap.store.columns import KINDS, is_digest
 
 CHUNK_ROWS = 16_384
 SHARD_ROWS = 16 * CHUNK_ROWS
@@ -50,6 +53,8 @@ class Staged:
 class Arrays:
     """The groups below one folder.
 
+    Nothing in it is read, written or deleted through a link: it may come from a stranger.
+
     Args:
         root: ``MAP/arrays``.
     """
@@ -57,6 +62,7 @@ class Arrays:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.staging = root / "staging"
+        self._held = threading.local()
 
     @contextlib.contextmanager
     def stage(self, arrays: Mapping[str, np.ndarray]) -> Iterator[Staged]:
@@ -67,12 +73,44 @@ class Arrays:
                 _write(folder, arrays)
                 yield Staged(folder, _synchronise(folder))
             finally:
-                if folder.exists():  # not published
-                    shutil.rmtree(folder, ignore_errors=True)
+                with contextlib.suppress(OSError):  # there is nothing where it was published
+                    self._remove_staged(folder.name)
+
+    @contextlib.contextmanager
+    def lock(self, patience_s: float = 120.0) -> Iterator[None]:
+        """Held by the one who puts groups into their places, until a committed row names them, or who reclaims them.
+
+        Several catalogs may name these arrays (`gsmap.store.branches`), so that the writer lock of one does not do. Who
+        holds it takes no writer lock of a catalog that others know. Again in the same thread: nothing.
+
+        Raises:
+            BusyError: another process kept it for ``patience_s``.
+        """
+        if getattr(self._held, "depth", 0):
+            yield
+            return
+        handle = os.open(self.root, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            deadline = time.monotonic() + patience_s
+            while True:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() > deadline:
+                        raise BusyError(
+                            f"{self.root}: others have been writing arrays for {patience_s:g} s; try again later"
+                        ) from None
+                    time.sleep(0.01)
+            self._held.depth = 1
+            yield
+        finally:
+            self._held.depth = 0
+            os.close(handle)
 
     def publish(self, staged: Staged, kind: str, name: str) -> None:
-        """Move a staged group into its place; only under the writer lock, and only where no row names that place."""
-        place = self.root / kind / name
+        """Move a staged group into its place; only under `lock`, and only where no row names that place."""
+        place = self._place(kind, name)
         fresh = not place.parent.exists()
         place.parent.mkdir(parents=True, exist_ok=True)
         if fresh:
@@ -102,10 +140,13 @@ class Arrays:
         """
         import zarr
 
-        place = self.root / kind / name
+        place = self._place(kind, name)
+        present = files_below(place)
         for file in files:
-            path = place / file.path
-            if not path.is_file() or path.stat().st_size != file.size_bytes:
+            path, found = place / file.path, present.get(file.path)
+            if found is not None and not stat.S_ISREG(found.st_mode):
+                raise CorruptError(f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it")
+            if found is None or found.st_size != file.size_bytes:
                 raise CorruptError(f"{path} is missing or cut off: run gsmap check, and ingest the scene again")
         try:
             group = zarr.open_group(str(place), mode="r", zarr_format=3)
@@ -117,37 +158,69 @@ class Arrays:
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         """What differs from the manifest, after reading every byte."""
-        place = self.root / kind / name
+        place = self._place(kind, name)
         out = []
-        present = {str(p.relative_to(place)) for p in place.rglob("*") if p.is_file()} if place.is_dir() else set()
+        present = files_below(place)
         for file in files:
-            path = place / file.path
-            if file.path not in present:
+            path, found = place / file.path, present.get(file.path)
+            if found is None:
                 out.append(f"{path} is missing")
-            elif path.stat().st_size != file.size_bytes:
-                out.append(f"{path} has {path.stat().st_size} bytes, {file.size_bytes} were written")
+            elif not stat.S_ISREG(found.st_mode):
+                out.append(f"{path} is no plain file (a link, pipe or device)")
+            elif found.st_size != file.size_bytes:
+                out.append(f"{path} has {found.st_size} bytes, {file.size_bytes} were written")
             elif _sha256(path) != file.sha256:
                 out.append(f"{path} differs from what was written")
-        return out + [f"{place / extra} does not belong there" for extra in sorted(present - {f.path for f in files})]
+        extra = sorted(set(present) - {file.path for file in files})
+        return out + [f"{place / name} does not belong there" for name in extra]
 
     def size_bytes(self, kind: str, name: str) -> int:
-        return sum(p.stat().st_size for p in (self.root / kind / name).rglob("*") if p.is_file())
+        return sum(found.st_size for found in files_below(self._place(kind, name)).values())
 
     def drop(self, kind: str, name: str) -> None:
         """Delete a group, in one rename as far as readers can see."""
-        place = self.root / kind / name
-        if place.exists():
-            self.staging.mkdir(parents=True, exist_ok=True)
+        place = self._place(kind, name)
+        if os.path.lexists(place):
+            self._make_staging()
             grave = self.staging / uuid.uuid4().hex
             os.rename(place, grave)
-            shutil.rmtree(grave, ignore_errors=True)
+            with contextlib.suppress(OSError):
+                self._remove_staged(grave.name)
 
     def groups(self) -> list[tuple[str, str]]:
         """(kind, name) of every group on disk, named by a row or not."""
-        if not self.root.is_dir():
-            return []
-        kinds = [k for k in sorted(self.root.iterdir()) if k.is_dir() and k != self.staging]
-        return [(kind.name, group.name) for kind in kinds for group in sorted(kind.iterdir())]
+        return [
+            (kind, name)
+            for kind in KINDS
+            for name in _names(self.root / kind)
+            if is_digest(name) and is_folder(self.root / kind / name)
+        ]
+
+    def strangers(self) -> list[str]:
+        """What lies among the groups and is none; gsmap did not make it and does not touch it."""
+        groups = {f"{kind}/{name}" for kind, name in self.groups()}
+        kinds = [kind for kind in _names(self.root) if not (kind in KINDS and is_folder(self.root / kind))]
+        out = [kind for kind in kinds if kind != self.staging.name or not is_folder(self.staging)]
+        return out + [f"{k}/{name}" for k in KINDS for name in _names(self.root / k) if f"{k}/{name}" not in groups]
+
+    def _place(self, kind: str, name: str) -> Path:
+        """Where a group lies; its name has been a row's, and that row a stranger's."""
+        if kind not in KINDS or not is_digest(name):
+            raise CorruptError(f"{kind}/{name} is not the name of a group of arrays: nothing is done with it")
+        self._check_root()
+        refuse_links(self.root, kind, name)
+        return self.root / kind / name
+
+    def _check_root(self) -> None:
+        refuse_links(self.root.parent, self.root.name)
+
+    def _make_staging(self) -> None:
+        self._check_root()
+        refuse_links(self.root, self.staging.name)
+        self.staging.mkdir(parents=True, exist_ok=True)
+
+    def _remove_staged(self, name: str) -> None:
+        remove_tree(self.root.parent, self.root.name, self.staging.name, name)
 
     def drop_leftovers(self, *, dry_run: bool = False) -> int:
         """Delete what dead writers left while staging; returns the bytes freed. Nothing while another is staging.
@@ -156,14 +229,15 @@ class Arrays:
             dry_run: only count.
         """
         freed = 0
-        if not self.staging.is_dir():
+        if not is_folder(self.staging):
             return freed
         try:
             with self._lock_staging(fcntl.LOCK_EX | fcntl.LOCK_NB):
-                for path in self.staging.iterdir():
-                    freed += sum(p.stat().st_size for p in path.rglob("*") if p.is_file())
+                for name in _names(self.staging):
+                    freed += sum(found.st_size for found in files_below(self.staging / name).values())
                     if not dry_run:
-                        shutil.rmtree(path, ignore_errors=True)
+                        with contextlib.suppress(OSError):
+                            self._remove_staged(name)
         except BlockingIOError:
             pass
         return freed
@@ -171,8 +245,8 @@ class Arrays:
     @contextlib.contextmanager
     def _lock_staging(self, how: int) -> Iterator[None]:
         """Shared by those who stage, exclusive to clean up; the kernel frees it with the process."""
-        self.staging.mkdir(parents=True, exist_ok=True)
-        handle = os.open(self.staging, os.O_RDONLY | os.O_CLOEXEC)
+        self._make_staging()
+        handle = os.open(self.staging, os.O_RDONLY | os.O_CLOEXEC | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
             fcntl.flock(handle, how)
             yield
@@ -233,6 +307,11 @@ def _synchronise(folder: Path) -> tuple[StoredFile, ...]:
     return tuple(out)
 
 
+def _names(folder: Path) -> list[str]:
+    """What lies in a folder; nothing where it is missing or a link."""
+    return sorted(os.listdir(folder)) if is_folder(folder) else []
+
+
 def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
+    with open(open_file(path), "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

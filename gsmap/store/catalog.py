@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
 import threading
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine
+from sqlalchemy import Connection, Engine, RootTransaction, create_engine
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
-from gsmap.errors import BusyError, ConfigError, CorruptError, GsmapError, MissingDependencyError, StoreError
-from gsmap.store import sqlite
+from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
+from gsmap.store import digests, sqlite, trust
+from gsmap.store.explained import NOT_KEPT, explained, summary
+from gsmap.store.wal import log_of, read_log
 
-URL_FILE = "catalog.url"
 LOCK_FILE = "lock"
+VERIFIED_BYTES = 256 << 20  # a longer catalog is not read through whenever it is opened: that would take seconds
+_LOOKS = 3  # at pages that others are writing, before they are asked to wait
+_log = logging.getLogger("gsmap.store")
 
 
 class Catalog:
@@ -30,10 +36,14 @@ class Catalog:
         engine: on its database.
         writable: whether `write` may be called.
         patience_s: how long a writer waits for the others before `BusyError`.
+        refusal: what to tell who would write where that may not be; by default, that it was opened for reading.
     """
 
-    def __init__(self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0) -> None:
+    def __init__(
+        self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0, refusal: str = ""
+    ) -> None:
         self.folder = folder
+        self._refusal = refusal or f"{folder} was opened for reading: open it with mode 'w' to change it"
         self.engine = engine
         self.writable = writable
         self.patience_s = patience_s
@@ -65,14 +75,24 @@ class Catalog:
         if self._writing is not None:
             yield self._writing
             return
-        with self.lock(), explained(self.folder), self.engine.connect() as connection:
-            try:
-                with connection.execution_options(gsmap_write=True).begin():
-                    self._held.connection = connection
-                    yield connection
-            finally:
-                self._held.connection = None
-            self._checkpoint(at_bytes=sqlite.CHECKPOINT_BYTES)
+        with self.lock():
+            with explained(self.folder, NOT_KEPT), self.engine.connect() as connection:
+                try:
+                    with (
+                        contextlib.ExitStack() as until_end,
+                        connection.execution_options(gsmap_write=True).begin() as transaction,
+                    ):
+                        self._held.connection, self._held.until_end = connection, until_end
+                        yield connection
+                        with explained(self.folder, NOT_KEPT, committing=True):
+                            commit(connection, transaction)
+                finally:
+                    self._held.connection = None
+            self._fold(at_bytes=sqlite.CHECKPOINT_BYTES)
+
+    def hold(self, context: contextlib.AbstractContextManager[Any]) -> None:
+        """Inside `write`: hold a lock from now until the transaction has been committed or undone."""
+        self._held.until_end.enter_context(context)
 
     @contextlib.contextmanager
     def lock(self, patience_s: float | None = None) -> Iterator[None]:
@@ -83,54 +103,186 @@ class Catalog:
             BusyError: another process kept it for ``patience_s``.
         """
         if not self.writable:
-            raise StoreError(f"{self.folder} was opened for reading: open it with mode 'w' to change it")
+            raise StoreError(self._refusal)
         if getattr(self._held, "depth", 0):
             yield
             return
         try:
-            handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         except OSError as error:
-            raise StoreError(f"cannot write to {self.folder}: {error.strerror}") from error
+            with explained(self.folder, NOT_KEPT):
+                raise error
         try:
-            patience_s = self.patience_s if patience_s is None else patience_s
-            deadline = time.monotonic() + patience_s
-            while True:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                except BlockingIOError:
-                    if time.monotonic() > deadline:
-                        raise BusyError(
-                            f"{self.folder}: others have been writing for {patience_s:g} s; try again later"
-                        ) from None
-                    time.sleep(0.01)
+            self._wait_for(handle, fcntl.LOCK_EX, self.patience_s if patience_s is None else patience_s)
             self._held.depth = 1
             yield
         finally:
             self._held.depth = 0
             os.close(handle)
 
-    def close(self) -> None:
-        """Leave one file at rest, unless others are still at it."""
-        if self.writable and self.is_sqlite:
-            with contextlib.suppress(GsmapError), explained(self.folder), self.lock(patience_s=0.0):
-                self._checkpoint(at_bytes=1)
-        self.engine.dispose()
+    def _wait_for(self, handle: int, how: int, patience_s: float) -> None:
+        deadline = time.monotonic() + patience_s
+        while True:
+            try:
+                fcntl.flock(handle, how | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise BusyError(
+                        f"{self.folder}: others have been writing for {patience_s:g} s; try again later"
+                    ) from None
+                time.sleep(0.01)
 
-    def _checkpoint(self, at_bytes: int) -> None:
+    @contextlib.contextmanager
+    def still(self) -> Iterator[None]:
+        """Keep everybody from writing for a moment, without the right to write."""
+        if getattr(self._held, "depth", 0):
+            yield
+            return
+        try:
+            handle = os.open(self.folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:  # then nobody has ever written here, or nobody can
+            yield
+            return
+        try:
+            self._wait_for(handle, fcntl.LOCK_SH, self.patience_s)
+            yield
+        finally:
+            os.close(handle)
+
+    def verify(self) -> None:
+        """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.
+
+        Raises:
+            CorruptError: they differ.
+        """
         if self.is_sqlite:
-            sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
+            file = self.folder / sqlite.FILE
+            found = self.page_problems(at_most_bytes=VERIFIED_BYTES)
+            if found:
+                backup = digests.is_backup(file, sqlite.handle(self.engine))
+                if backup is None or read_log(log_of(file)).frames:
+                    raise CorruptError(digests.damaged(file, found))
+                if self.writable:  # somebody put it back
+                    with self.lock():
+                        digests.save(file, backup)
+
+    def page_problems(self, *, at_most_bytes: int | None = None) -> list[str]:
+        """What in the catalog's file and its log differs from what was written.
+
+        Args:
+            at_most_bytes: of a longer file look at the log alone.
+        """
+        file = self.folder / sqlite.FILE
+        with explained(self.folder):
+            for _ in range(_LOOKS):
+                found = self._look(file, at_most_bytes)
+                if not found:
+                    return []
+            with self.still():  # others were writing while we looked, or it is damage
+                return self._look(file, at_most_bytes)
+
+    def _look(self, file: Path, at_most_bytes: int | None) -> list[str]:
+        handle = sqlite.handle(self.engine)
+        try:
+            noted = digests.load(file)
+        except CorruptError as error:
+            return [str(error)]
+        log = read_log(log_of(file), handle.index)
+        if at_most_bytes is not None and (size := os.fstat(handle.number).st_size) > at_most_bytes:
+            _log.info("%s has %.0f MB: only gsmap check compares its pages with their digests", file, size / 1e6)
+            return [f"in its log {log.problem}"] if log.problem else []
+        return digests.problems(file, handle, noted, log)
+
+    def unverified(self) -> list[str]:
+        """Why the catalog's bytes cannot be compared with what was written; empty where they can."""
+        if self.is_sqlite:
+            if digests.digests_of(self.folder / sqlite.FILE).exists():
+                return []
+            return [
+                "the catalog was written by an older gsmap, which kept no digests of its pages: the next write does"
+            ]
+        if self.engine.dialect.name != "postgresql":
+            return ["the catalog lies in a database that gsmap knows nothing of"]
+        with self.read() as connection:
+            checks = connection.exec_driver_sql("SHOW data_checksums").scalar() == "on"
+        says = "on, so that it verifies what it reads" if checks else "off, so that nobody verifies it"
+        return [f"the catalog lies in a PostgreSQL server, whose own page checksums are {says}"]
+
+    def accept(self) -> list[str]:
+        """Take the catalog's pages for what was written, whatever they are; what differed, in words.
+
+        Raises:
+            CorruptError: SQLite cannot make sense of them.
+        """
+        if not self.is_sqlite:
+            raise ConfigError(f"{self.folder}: its catalog is no file of the map, so that there is nothing to accept")
+        with self.lock(), explained(self.folder):
+            found = self.page_problems()
+            with self.read() as connection:
+                wrong = sqlite.integrity_problems(connection)
+            if wrong:
+                raise CorruptError(
+                    f"{self.folder}: the catalog cannot be accepted, SQLite finds {summary(wrong)}: restore "
+                    f"{sqlite.FILE} from a backup"
+                )
+            sqlite.accept(self.engine, self.folder / sqlite.FILE)
+        return found
+
+    def close(self, *, fold: bool = True) -> None:
+        """Leave one file at rest, unless others are still at it.
+
+        Args:
+            fold: whether to touch anything; off where the map turned out to be damaged.
+        """
+        if not self.is_sqlite:
+            self.engine.dispose()
+            return
+        file = self.folder / sqlite.FILE
+        try:
+            if self.writable and fold:
+                with contextlib.suppress(BusyError), self.lock(patience_s=0.0):
+                    self._fold(at_bytes=1)
+                    sqlite.dispose(self.engine, file, tidy=True)
+        finally:
+            sqlite.dispose(self.engine, file, tidy=False)
+
+    def _fold(self, at_bytes: int) -> None:
+        """Fold the log in, under the lock. What was committed is in the log, so that a failure costs nothing."""
+        if not self.is_sqlite:
+            return
+        try:
+            with explained(self.folder):
+                sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
+        except CorruptError:
+            raise
+        except StoreError as error:
+            _log.warning("what was written is kept, but not yet folded into %s: %s", sqlite.FILE, error)
+
+
+def commit(connection: Connection, transaction: RootTransaction) -> None:
+    """Commit, or leave nothing open: a connection that could not commit is not used again."""
+    try:
+        transaction.commit()
+    except BaseException:
+        connection.invalidate()
+        raise
 
 
 def open_engine(folder: Path, *, writable: bool) -> Engine:
-    """The engine of a map: its own ``map.sqlite``, or what ``catalog.url`` names."""
+    """The engine of a map: its own ``map.sqlite``, or what ``catalog.url`` names if the user trusts that."""
     if (folder / sqlite.FILE).is_file():
         return sqlite.engine(folder / sqlite.FILE, writable=writable)
-    return url_engine((folder / URL_FILE).read_text().strip())
+    return url_engine(trust.named_url(folder))
 
 
 def url_engine(url: str) -> Engine:
+    """The engine of a catalog on a server that the user named or trusts; nothing is connected to yet."""
     try:
+        if make_url(url).get_backend_name() != "postgresql":
+            raise ConfigError(
+                f"{url_without_password(url)!r} is not a PostgreSQL database URL (postgresql+psycopg://...)"
+            )
         return create_engine(url, pool_pre_ping=True)
     except (ArgumentError, NoSuchModuleError) as error:
         raise ConfigError(f"{url!r} is not a database URL that SQLAlchemy knows: {error}") from error
@@ -140,42 +292,8 @@ def url_engine(url: str) -> Engine:
 
 def url_without_password(url: str) -> str:
     """What may lie in a file: the password comes from the driver's own places (``PGPASSWORD``, ``~/.pgpass``)."""
-    return make_url(url)._replace(password=None).render_as_string(hide_password=False)
-
-
-@contextlib.contextmanager
-def explained(folder: Path) -> Iterator[None]:
-    """Turn what a database says into one line of ours."""
-    try:
-        yield
-    except GsmapError:
-        raise
-    except SQLAlchemyError as error:
-        said = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
-        low = said.lower()
-        if "locked" in low or "busy" in low:
-            raise BusyError(f"{folder}: another process holds the catalog; try again later ({said})") from error
-        if "malformed" in low or "not a database" in low or "i/o error" in low:
-            raise CorruptError(
-                f"{folder}: the catalog is damaged ({said}); restore map.sqlite from a backup"
-            ) from error
-        if "readonly" in low or "read-only" in low:
-            raise StoreError(f"{folder} is on a read-only disk: nothing was changed") from error
-        if "is full" in low or "no space" in low:
-            raise StoreError(f"{folder}: the disk is full; nothing was changed") from error
-        if "unable to open" in low:
-            raise StoreError(
-                f"{folder}: the catalog cannot be opened ({said}); check the folder's permissions"
-            ) from error
-        if "password" in low:
-            raise StoreError(
-                f"{folder}: the catalog's server wants another password ({said}): give it in PGPASSWORD or ~/.pgpass"
-            ) from error
-        if isinstance(error, DBAPIError):
-            raise StoreError(f"{folder}: the catalog refused: {said}") from error
-        raise
-    except OSError as error:
-        raise StoreError(f"{folder}: {error.strerror or error}; nothing was changed") from error
+    known = make_url(url).difference_update_query(["password"])._replace(password=None)
+    return known.render_as_string(hide_password=False)
 
 
 def now() -> str:

@@ -11,8 +11,9 @@ from sqlalchemy.types import TypeDecorator
 
 from gsmap.errors import StoreError
 from gsmap.store import catalog as _catalog
-from gsmap.store import migrate, schema, sqlite
-from gsmap.store.catalog import Catalog, explained
+from gsmap.store import migrate, schema, sqlite, trust
+from gsmap.store.catalog import Catalog
+from gsmap.store.explained import explained
 from gsmap.store.schema import CHUNK_BOXES
 
 BATCH_ROWS = 2000  # rows in memory at a time; poses with covariances are some kilobytes each
@@ -28,8 +29,11 @@ _BOXES = Table(
 )
 
 
-def empty_catalog(folder: Path, url: str | None = None) -> Catalog:
+def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Catalog:
     """All tables and no row, in a new ``map.sqlite``, or in an empty database; ``catalog.url`` remembers which.
+
+    Args:
+        map_id: the id of the map that a database is for.
 
     Raises:
         StoreError: the database holds a map already.
@@ -41,7 +45,7 @@ def empty_catalog(folder: Path, url: str | None = None) -> Catalog:
         engine = _catalog.url_engine(url)
         if migrate.version(engine, folder) is not None:
             raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
-        (folder / _catalog.URL_FILE).write_text(_catalog.url_without_password(url) + "\n")
+        trust.write(folder, _catalog.url_without_password(url), map_id)
     made = Catalog(folder, engine, writable=True)
     migrate.upgrade(made)
     return made

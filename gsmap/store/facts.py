@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,6 +12,7 @@ from sqlalchemy import Connection, Row, insert, select
 from gsmap.errors import InputError
 from gsmap.store.catalog import now
 from gsmap.store.schema import scene_facts
+from gsmap.texts import control_characters
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def checked_text(what: str, text: str, *, lines: bool = False) -> str:
     """
     if not text.strip():
         raise InputError(f"{what} must not be empty")
-    bad = [c for c in text if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and not (lines and c == "\n")]
+    bad = control_characters(text, lines=lines)
     if bad:
         raise InputError(f"{what} {text!r} has a control character ({bad[0]!r}): leave it out")
     return text

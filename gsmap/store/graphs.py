@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -12,7 +13,8 @@ from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import has_group, manifest, publish
 from gsmap.store.matrices import from_array, to_array
 from gsmap.store.scenes import resolve
@@ -82,13 +84,13 @@ class Graphs:
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
         staging = self._arrays.stage(arrays)
-        with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             old = connection.execute(select(graphs).where(mine)).first()
             if old is not None and old.group_id == group_id:
                 return _stored(old)
             resolve(connection, graph.scene_id)
             if not has_group(connection, group_id):
-                publish(connection, self._arrays, staged, KIND, group_id)
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
             connection.execute(delete(graphs).where(mine))
             made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": now()}
             connection.execute(insert(graphs), row | made)
@@ -122,6 +124,11 @@ class Graphs:
             }
             layers[name] = NodeLayer(**own, **layer["rest"])
         return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
+
+    def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
+        """Those of the keys (as digests) that a graph is kept under."""
+        with self._catalog.read() as connection:
+            return recipes.kept(connection, graphs.c.key, keys)
 
     def list(self) -> list[StoredGraph]:
         """The graphs of all living scenes, oldest first."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from sqlalchemy import Connection, delete, insert, select
 
 from gsmap.store.arrays import Arrays, Staged, StoredFile
-from gsmap.store.catalog import now
+from gsmap.store.branches import Others
+from gsmap.store.catalog import Catalog, now
 from gsmap.store.schema import files, groups
 
 
@@ -13,15 +16,25 @@ def has_group(connection: Connection, group_id: str) -> bool:
     return connection.execute(select(groups.c.id).where(groups.c.id == group_id)).first() is not None
 
 
-def publish(connection: Connection, arrays: Arrays, staged: Staged, kind: str, group_id: str) -> None:
-    """Move a staged group into place and name it, inside a write transaction; it replaces a damaged one."""
-    arrays.publish(staged, kind, group_id)
+def publish(catalog: Catalog, connection: Connection, arrays: Arrays, staged: Staged, kind: str, group_id: str) -> None:
+    """Move a staged group into place and name it, inside a write transaction; it replaces a damaged one.
+
+    Where a branch of the map has the group already and it is whole, it stays as that branch knows it.
+    """
+    catalog.hold(arrays.lock())
+    known = Others(arrays.root.parent, catalog.folder).manifests(group_id)
+    whole = next((manifest for manifest in known if not arrays.problems(kind, group_id, manifest)), None)
+    if whole is None:
+        arrays.publish(staged, kind, group_id)
+    name(connection, kind, group_id, staged.files if whole is None else whole)
+
+
+def name(connection: Connection, kind: str, group_id: str, manifest: Sequence[StoredFile]) -> None:
+    """Write down that a group counts, and the files it must have."""
     if not has_group(connection, group_id):
         connection.execute(insert(groups), {"id": group_id, "kind": kind, "created_at": now()})
     connection.execute(delete(files).where(files.c.group_id == group_id))
-    rows = [
-        {"group_id": group_id, "path": f.path, "size_bytes": f.size_bytes, "sha256": f.sha256} for f in staged.files
-    ]
+    rows = [{"group_id": group_id, "path": f.path, "size_bytes": f.size_bytes, "sha256": f.sha256} for f in manifest]
     connection.execute(insert(files), rows)
 
 

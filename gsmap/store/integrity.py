@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import Connection, delete, not_, select, text, update
 
-from gsmap.errors import ConfigError
-from gsmap.store import sqlite
-from gsmap.store.arrays import CHUNK_ROWS, Arrays
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.durable import is_file, is_folder, remove_file
+from gsmap.errors import ConfigError, GsmapError, StoreError
+from gsmap.store import sqlite, staging
+from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
+from gsmap.store.branches import Others, bury_leftovers
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
-from gsmap.store.models import FOLDER
+from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress
 
@@ -27,12 +31,14 @@ class Check:
         problems: one line each; empty for a sound map.
         orphans: folders that no row names (a crash left them; `prune` removes them); no harm.
         num_groups, num_bytes: what was read.
+        unverified: what cannot be compared with what was written, and why.
     """
 
     problems: tuple[str, ...]
     orphans: tuple[str, ...]
     num_groups: int
     num_bytes: int
+    unverified: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -60,32 +66,56 @@ class Pruned:
     dry_run: bool = False
 
 
-def check(catalog: Catalog, arrays: Arrays, progress: Progress | None = None) -> Check:
-    """Read every byte of the map and compare it with what was written; see `Check`."""
+def check(
+    catalog: Catalog,
+    arrays: Arrays,
+    progress: Progress | None = None,
+    *,
+    read: set[tuple[str, tuple[StoredFile, ...]]] | None = None,
+) -> Check:
+    """Read every byte of the map and compare it with what was written; see `Check`.
+
+    Args:
+        read: groups that are known to be as this manifest says, and need not be read again; those that are, are added.
+    """
+    read = set() if read is None else read
+    home = arrays.root.parent
     with catalog.read() as connection:
         named = {row.id: row.kind for row in connection.execute(select(groups).order_by(groups.c.id))}
         manifests = {group: manifest(connection, group) for group in named}
-        problems = _row_problems(connection, catalog.folder)
+        unread = {group: kind for group, kind in named.items() if (group, manifests[group]) not in read}
+        problems = _row_problems(connection, home)
+        if catalog.is_sqlite:
+            problems += sqlite.integrity_problems(connection)
+    problems += [f"{arrays.root / name} does not belong there: remove it" for name in arrays.strangers()]
+    problems += _odd_models(home)
     if catalog.is_sqlite:
-        with explained(catalog.folder):
-            problems += sqlite.integrity_problems(catalog.engine)
-            problems += sqlite.digest_problems(catalog.folder / sqlite.FILE)
-    for i, (group, kind) in enumerate(named.items()):
+        problems += catalog.page_problems()
+    unverified = tuple(catalog.unverified())
+    for i, (group, kind) in enumerate(unread.items()):
         if progress:
-            progress(i / len(named), f"{kind}/{group[:12]}")
+            progress(i / len(unread), f"{kind}/{group[:12]}")
         found = arrays.problems(kind, group, manifests[group])
+        if not found:
+            read.add((group, manifests[group]))
         if found:  # unless it was pruned or mended meanwhile
             with catalog.read() as connection:
                 problems += found if manifest(connection, group) == manifests[group] else []
-    orphans = tuple(f"{kind}/{name}" for kind, name in arrays.groups() if named.get(name) != kind)
-    num_bytes = sum(f.size_bytes for files in manifests.values() for f in files)
+    try:
+        named_by_any = named.items() | {(group, kind) for kind, group in Others(home, catalog.folder).groups()}
+        orphans = tuple(f"{kind}/{name}" for kind, name in arrays.groups() if (name, kind) not in named_by_any)
+    except StoreError:  # a branch that cannot be read may need any of them; who checks the map is told of it
+        orphans = ()
+    num_bytes = sum(f.size_bytes for group in unread for f in manifests[group])
     if progress:
         progress(1.0, "checked")
-    return Check(tuple(problems), orphans, len(named), num_bytes)
+    return Check(tuple(problems), orphans, len(unread), num_bytes, unverified)
 
 
 def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
     """Reclaim the arrays of removed scenes that no kept revision names, their graphs, and what crashes left.
+
+    What another branch or tag of the map names stays, whichever of them is pruned.
 
     Args:
         keep_revisions: keep only this many of the newest; older ones stay listed but lose their claim. None: all.
@@ -96,6 +126,8 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
     """
     if keep_revisions is not None and keep_revisions < 0:
         raise ConfigError(f"the number of revisions to keep must not be negative, got {keep_revisions}")
+    others = Others(arrays.root.parent, catalog.folder)
+    others.groups()  # asked before anything is changed: a branch that cannot be read may need any of it
     with contextlib.nullcontext() if dry_run else catalog.lock():
         with contextlib.ExitStack() as stack:
             connection = stack.enter_context(catalog.read() if dry_run else catalog.write())
@@ -110,9 +142,6 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
                 connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars()
             )
             doomed = [(g.kind, g.id) for g in connection.execute(select(groups)) if g.id not in claimed]
-            known = {(g.kind, g.id) for g in connection.execute(select(groups))}
-            orphans = [group for group in arrays.groups() if group not in known]
-            num_bytes = sum(arrays.size_bytes(*group) for group in [*doomed, *orphans])
             if not dry_run:
                 ids = [group for _, group in doomed]
                 connection.execute(update(revisions).where(revisions.c.number.in_(dropped)).values(dropped_at=now()))
@@ -123,28 +152,38 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
                     connection.execute(boxes, {"s": row.number})
                 connection.execute(delete(files).where(files.c.group_id.in_(ids)))
                 connection.execute(delete(groups).where(groups.c.id.in_(ids)))
-        # The rows are gone for good: a crash from here on leaves orphans for the next prune.
-        with explained(catalog.folder):
-            forgotten = _forgotten_models(catalog)
-            num_bytes += sum(path.stat().st_size for path in forgotten)
+        # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
+        with explained(catalog.folder), contextlib.nullcontext() if dry_run else arrays.lock():
+            forgotten = _forgotten_models(catalog, others, arrays.root.parent)
+            # Asked again under the lock of the arrays: nobody comes to name any of them from here on.
+            with catalog.read() as connection:
+                known = {(g.kind, g.id) for g in connection.execute(select(groups))}
+            named_still = (known - set(doomed) if dry_run else known) | others.groups()
+            bodies = [group for group in arrays.groups() if group not in named_still]
+            num_bytes = sum(arrays.size_bytes(*group) for group in bodies)
+            abandoned = staging.abandoned_files(catalog.folder)
+            num_bytes += sum(path.stat().st_size for path in forgotten) + sum(abandoned.values())
             if not dry_run:
-                for group in [*doomed, *orphans]:
+                for group in bodies:
                     arrays.drop(*group)
                 for path in forgotten:
-                    path.unlink()
+                    remove_file(arrays.root.parent, FOLDER, path.name)
+                for name in abandoned:
+                    remove_file(catalog.folder, name)
+                bury_leftovers(arrays.root.parent)
             num_bytes += arrays.drop_leftovers(dry_run=dry_run)
     return Pruned(
         scenes=tuple(row.name for row in dead),
         revisions=tuple(dropped),
         num_graphs=len(keys),
-        num_orphans=len(orphans),
+        num_orphans=len(set(bodies) - set(doomed)),
         num_models=len(forgotten),
         num_bytes=num_bytes,
         dry_run=dry_run,
     )
 
 
-def _row_problems(connection: Connection, folder: Path) -> list[str]:
+def _row_problems(connection: Connection, home: Path) -> list[str]:
     out = []
     for row in connection.execute(select(scenes).where(scenes.c.removed_at.is_(None))):
         if row.group_id is None:
@@ -154,11 +193,16 @@ def _row_problems(connection: Connection, folder: Path) -> list[str]:
         if boxes != -(-row.num_gaussians // CHUNK_ROWS):
             out.append(f"scene {row.name} has {boxes} chunk boxes, not one for every {CHUNK_ROWS} Gaussians")
     for row in connection.execute(select(models).where(models.c.removed_at.is_(None))):
-        path = folder / row.path if row.copied else Path(row.path)
-        if not path.is_file():
-            out.append(f"model {row.name} is missing: {path}")
+        try:
+            path = model_path(home, row)
+            opened = open_model(home, row)
+        except FileNotFoundError as error:
+            out.append(f"model {row.name} is missing: {error.filename}")
             continue
-        with open(path, "rb") as file:
+        except (OSError, GsmapError) as error:
+            out.append(f"model {row.name} cannot be read: {error}")
+            continue
+        with open(opened, "rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != row.sha256:
                 out.append(f"model {row.name} differs from what was added: {path}")
     return out
@@ -172,8 +216,21 @@ def _revisions_to_keep(connection: Connection, keep: int | None) -> tuple[list[i
     return numbers[cut:], numbers[:cut]
 
 
-def _forgotten_models(catalog: Catalog) -> list[Path]:
-    """Copies of models that no row names any more."""
+def _forgotten_models(catalog: Catalog, others: Others, home: Path) -> list[Path]:
+    """Copies of models that no row of any catalog names any more. What is no plain file is no copy of ours."""
     with catalog.read() as connection:
         standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
-    return [path for path in sorted((catalog.folder / FOLDER).glob("*")) if f"{FOLDER}/{path.name}" not in standing]
+    standing |= others.models()
+    return [path for path in _in_models(home) if is_file(path) and f"{FOLDER}/{path.name}" not in standing]
+
+
+def _odd_models(home: Path) -> list[str]:
+    place = home / FOLDER
+    if os.path.lexists(place) and not is_folder(place):
+        return [f"{place} is no folder (a link, perhaps): put a folder in its place"]
+    return [f"{path} does not belong there: remove it" for path in _in_models(home) if not is_file(path)]
+
+
+def _in_models(home: Path) -> list[Path]:
+    place = home / FOLDER
+    return sorted(place.iterdir()) if is_folder(place) else []

@@ -9,7 +9,8 @@ from sqlalchemy import Connection, Engine, inspect, text
 
 from gsmap.errors import CorruptError, SchemaVersionError, StoreError
 from gsmap.store import schema, sqlite
-from gsmap.store.catalog import Catalog, explained
+from gsmap.store.catalog import Catalog, commit
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.version import __version__
 
 if TYPE_CHECKING:
@@ -60,18 +61,21 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
         return before, before
     with catalog.lock():
         if before is not None and catalog.is_sqlite:
-            sqlite.backup(catalog.engine, catalog.folder / f"{sqlite.FILE}.{before}.bak")
-        with explained(catalog.folder), catalog.engine.connect() as connection:
+            with explained(catalog.folder, NOT_KEPT):
+                sqlite.backup(catalog.engine, catalog.folder / f"{sqlite.FILE}.{before}.bak")
+        with explained(catalog.folder, NOT_KEPT), catalog.engine.connect() as connection:
             if catalog.is_sqlite:
                 # Batch migrations rebuild tables, which foreign keys would forbid; checked before the commit.
                 _driver(connection).execute("PRAGMA foreign_keys = OFF")
             try:
-                with connection.execution_options(gsmap_write=True).begin():
+                with connection.execution_options(gsmap_write=True).begin() as transaction:
                     _run(connection, revision)
                     if catalog.is_sqlite and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
-                        raise StoreError(f"{catalog.folder}: the migration would break references; nothing was changed")
+                        raise StoreError(f"{catalog.folder}: the migration would break references: it was not kept")
+                    with explained(catalog.folder, NOT_KEPT, committing=True):
+                        commit(connection, transaction)
             finally:
-                if catalog.is_sqlite:
+                if catalog.is_sqlite and not connection.invalidated:
                     _driver(connection).execute("PRAGMA foreign_keys = ON")
     return before, version(catalog.engine, catalog.folder)
 

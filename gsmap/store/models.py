@@ -13,9 +13,13 @@ from typing import Any
 
 from sqlalchemy import Row, insert, select, update
 
-from gsmap.durable import write_whole
-from gsmap.errors import InputError, NotFoundError
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.durable import open_file, refuse_links, write_whole
+from gsmap.errors import CorruptError, NotFoundError
+from gsmap.store.arrays import Arrays
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.columns import is_relative
+from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.store.facts import checked_text
 from gsmap.store.schema import models
 from gsmap.types.plain import plain
 
@@ -46,10 +50,16 @@ class Model:
 
 
 class Models:
-    """The models of a map."""
+    """The models of a map.
 
-    def __init__(self, catalog: Catalog) -> None:
+    Args:
+        arrays: of the same map; the copies lie beside them, for all its branches.
+    """
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
+        self._arrays = arrays
+        self._home = arrays.root.parent
 
     def add(
         self,
@@ -71,8 +81,7 @@ class Models:
         source = Path(path).absolute()
         if not source.is_file():
             raise NotFoundError(f"no model file at {path}")
-        if not name:
-            raise InputError("a model needs a name")
+        checked_text("the name of a model", name)
         with open(source, "rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         relative = f"{FOLDER}/{sha256[:32]}{source.suffix}"
@@ -80,7 +89,8 @@ class Models:
         row |= {"sha256": sha256, "size_bytes": source.stat().st_size, "options": plain(dict(options or {}))}
         with self._catalog.write() as connection:
             if copy:
-                _copy(source, self._catalog.folder / relative)
+                self._catalog.hold(self._arrays.lock())
+                _copy(source, self._home / relative)
             standing = (models.c.name == name) & models.c.removed_at.is_(None)
             connection.execute(update(models).where(standing).values(removed_at=now()))
             connection.execute(insert(models), row | {"created_at": now()})
@@ -111,16 +121,45 @@ class Models:
             connection.execute(update(models).where(standing).values(removed_at=now()))
 
     def _model(self, row: Row[Any]) -> Model:
-        path = self._catalog.folder / row.path if row.copied else Path(row.path)
+        path = model_path(self._home, row)
         return Model(
             row.name, row.kind, path, bool(row.copied), row.sha256, row.size_bytes, row.created_at, row.options
         )
 
 
+def model_path(folder: Path, row: Row[Any]) -> Path:
+    """Where a row's model lies: its copy in the map, else where it was when it was added.
+
+    A file outside the map is only ever read, and only as the model that it was added as (`gsmap.describe.onnx` compares
+    its digest): a map cannot say anything of it but whether it is that.
+
+    Raises:
+        CorruptError: the copy would not lie in the map's own folder of models.
+    """
+    if not row.copied:
+        return Path(row.path)
+    path: str = row.path
+    above, _, name = path.partition("/")
+    if above != FOLDER or "/" in name or not is_relative(path):
+        raise CorruptError(
+            f"the catalog holds {path!r} in models.path, which is not a file of the map's own: gsmap did not write "
+            "that; restore the catalog from a backup, and do not trust a map that was sent to you so"
+        )
+    refuse_links(folder, FOLDER, name)
+    return folder / path
+
+
+def open_model(folder: Path, row: Row[Any]) -> int:
+    """Open a row's model to read it; a person may have put a link where one lies outside the map."""
+    path = model_path(folder, row)
+    return open_file(path if row.copied else path.resolve())
+
+
 def _copy(source: Path, target: Path) -> None:
     """Copy a file durably; it appears whole or not at all."""
+    refuse_links(target.parent.parent, FOLDER)
     target.parent.mkdir(exist_ok=True)
-    with explained(target.parent):
+    with explained(target.parent, NOT_KEPT):
         write_whole(target, partial(_fill, source))
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sqlalchemy import Connection, Row, insert, select
+from sqlalchemy import ColumnElement, Connection, Row, insert, select, true
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.methods import RecipeKey, text_digest
@@ -13,6 +13,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.schema import recipes
 from gsmap.types.plain import canonical, plain
 
+_ASKED_AT_ONCE = 10_000  # values in one query; SQLite takes 32,766
 PARTS = ("stage", "method", "version", "settings", "backend")
 
 
@@ -57,6 +58,21 @@ def keep(connection: Connection, recipe: RecipeKey | Mapping[str, Any] | None) -
 def digest_of(key: RecipeKey | str) -> str:
     """What a result is kept under."""
     return key.digest if isinstance(key, RecipeKey) else key
+
+
+def kept(
+    connection: Connection,
+    column: ColumnElement[str],
+    keys: Iterable[RecipeKey | str],
+    where: ColumnElement[bool] | None = None,
+) -> set[str]:
+    """Those of the keys (as digests) that a column holds, in rows that meet a condition."""
+    wanted, found = sorted({digest_of(key) for key in keys}), set()
+    for start in range(0, len(wanted), _ASKED_AT_ONCE):
+        some = column.in_(wanted[start : start + _ASKED_AT_ONCE])
+        query = select(column).where(some, true() if where is None else where)
+        found |= set(connection.execute(query).scalars())
+    return found
 
 
 def recipe_json(row: Row[Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from sqlalchemy import Connection, Row, insert, select
+from sqlalchemy import Connection, Row, func, insert, select
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
@@ -165,6 +165,16 @@ class Registrations:
                 return None
             choice = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
         return _stored(row, choice.word)
+
+    def kept(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
+        """Those of the keys (as digests) that a registration is kept under, made later than the one of a number."""
+        with self._catalog.read() as connection:
+            return recipes.kept(connection, registrations.c.key, keys, registrations.c.number > after)
+
+    def newest(self) -> int:
+        """Number of the newest registration; 0 where there is none."""
+        with self._catalog.read() as connection:
+            return connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
 
     def history(self, a: str, b: str) -> list[StoredRegistration]:
         """Every registration of a pair, oldest first."""

@@ -29,6 +29,7 @@ class Revision:
         dropped_at: when `prune` was allowed to reclaim what only it names; None while it is kept.
         key: `RecipeKey.digest` of what it was solved from; one of its own kind in revisions that schema 0001 wrote.
         recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in those.
+        origin: ``map`` (its id) and ``number`` of the revision that another map solved; None where this one did.
     """
 
     number: int
@@ -44,6 +45,7 @@ class Revision:
     dropped_at: str | None = None
     key: str = ""
     recipe: str | None = None
+    origin: dict[str, Any] | None = None
 
 
 class Revisions:
@@ -177,6 +179,7 @@ def _revision(row: Row[Any], count: Row[Any] | None) -> Revision:
         dropped_at=row.dropped_at,
         key=row.key,
         recipe=row.recipe,
+        origin=row.origin,
     )
 
 

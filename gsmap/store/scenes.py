@@ -13,7 +13,8 @@ from gsmap.geometry.morton import morton_order
 from gsmap.store import facts
 from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes
-from gsmap.store.catalog import Catalog, explained, now
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
 from gsmap.store.groups import has_group, manifest, publish
 from gsmap.store.schema import CHUNK_BOXES, scenes
@@ -111,7 +112,7 @@ class Scenes:
         if progress:
             progress(0.4, f"writing {name}")
         staging = self._arrays.stage(_to_arrays(ordered, cameras))
-        with explained(self._catalog.folder), staging as staged, self._catalog.write() as connection:
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             row = _by_id(connection, new_id)
             if row is not None and row.removed_at is None:
                 scene = self._dated(new_id, captured_at, dated_by)
@@ -120,7 +121,7 @@ class Scenes:
                 # else its bytes are damaged
             else:
                 scene = self._enter(connection, new_id, fields, rename, dated_by)
-            publish(connection, self._arrays, staged, KIND, new_id)
+            publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
             _put_boxes(connection, number, boxes)
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from sqlalchemy import (
@@ -19,7 +18,27 @@ from sqlalchemy import (
     Text,
     text,
 )
-from sqlalchemy.types import TypeDecorator, TypeEngine
+from sqlalchemy.types import TypeEngine
+
+from gsmap.store.columns import (
+    Digest,
+    Json,
+    Key,
+    Kind,
+    Line,
+    Lines,
+    Pair,
+    RelativePath,
+    a_box,
+    a_direction,
+    a_graph,
+    a_matrix,
+    a_pose,
+    an_object,
+    poses_by_scene,
+    sigmas,
+    texts,
+)
 
 HEAD = "0003"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
@@ -39,35 +58,25 @@ Real: TypeEngine[float] = Double().with_variant(
 )  # STRICT tables know REAL; elsewhere REAL would be single precision
 
 
-class Json(TypeDecorator[Any]):
-    """JSON in a text column: the same on every database, floats to the last bit, infinity allowed."""
-
-    impl = Text
-    cache_ok = True
-
-    def process_bind_param(self, value: Any, dialect: Any) -> str | None:
-        return None if value is None else json.dumps(value, separators=(",", ":"))
-
-    def process_result_value(self, value: str | None, dialect: Any) -> Any:
-        return None if value is None else json.loads(value)
-
-
 def _table(name: str, *parts: Any) -> Table:
+    for part in parts:
+        if isinstance(part, Column) and hasattr(part.type, "at"):
+            part.type = part.type.at(f"{name}.{part.name}")  # so that a message can say where
     return Table(name, metadata, *parts, sqlite_strict=True)
 
 
 def _scene(name: str, **options: Any) -> Column[str]:
-    return Column(name, Text, ForeignKey("scenes.id"), nullable=False, **options)
+    return Column(name, Digest, ForeignKey("scenes.id"), nullable=False, **options)
 
 
 def _recipe() -> Column[str]:
     """Null in rows that schema 0001 wrote."""
-    return Column("recipe", Text, ForeignKey("recipes.digest"))
+    return Column("recipe", Digest, ForeignKey("recipes.digest"))
 
 
 about = _table(
     "about",
-    Column("id", Text, primary_key=True),  # of the map, random
+    Column("id", Digest, primary_key=True),  # of the map, random
     Column("created_at", Text, nullable=False),
     Column("gsmap_version", Text, nullable=False),
 )
@@ -75,35 +84,35 @@ about = _table(
 # An immutable folder of arrays, and the digest of each of its files.
 groups = _table(
     "groups",
-    Column("id", Text, primary_key=True),  # digest of the content
-    Column("kind", Text, nullable=False),  # scenes, graphs
+    Column("id", Digest, primary_key=True),  # digest of the content
+    Column("kind", Kind, nullable=False),  # scenes, graphs
     Column("created_at", Text, nullable=False),
 )
 files = _table(
     "files",
-    Column("group_id", Text, ForeignKey("groups.id"), primary_key=True),
-    Column("path", Text, primary_key=True),  # relative to the group
+    Column("group_id", Digest, ForeignKey("groups.id"), primary_key=True),
+    Column("path", RelativePath, primary_key=True),  # relative to the group
     Column("size_bytes", Bytes, nullable=False),
-    Column("sha256", Text, nullable=False),
+    Column("sha256", Digest, nullable=False),
 )
 
 scenes = _table(
     "scenes",
     Column("number", Integer, primary_key=True),
-    Column("id", Text, nullable=False, unique=True),  # digest of Gaussians and cameras
-    Column("name", Text, nullable=False),
+    Column("id", Digest, nullable=False, unique=True),  # digest of Gaussians and cameras
+    Column("name", Line, nullable=False),
     Column("num_gaussians", Integer, nullable=False),
     Column("sh_degree", Integer, nullable=False),
     Column("num_cameras", Integer, nullable=False),
-    Column("bounds", Json, nullable=False),
+    Column("bounds", Json(a_box), nullable=False),
     Column("scale_policy", Text, nullable=False),
     Column("captured_at", Text),
     Column("ingested_at", Text, nullable=False),
     Column("source", Text, nullable=False),
     Column("cameras_synthesised", Integer, nullable=False),
     Column("antialiased", Integer, nullable=False),
-    Column("notes", Json, nullable=False),
-    Column("group_id", Text, ForeignKey("groups.id")),  # null once pruned
+    Column("notes", Json(texts), nullable=False),
+    Column("group_id", Digest, ForeignKey("groups.id")),  # null once pruned
     Column("removed_at", Text),  # the tombstone
     CheckConstraint("scale_policy in ('auto', 'known', 'unknown')", name="scale_policy"),
 )
@@ -121,8 +130,8 @@ scene_facts = _table(
     Column("number", Integer, primary_key=True),
     _scene("scene", index=True),
     Column("kind", Text, nullable=False),
-    Column("value", Text, nullable=False),  # empty: a date that was taken back
-    Column("author", Text, nullable=False),
+    Column("value", Lines, nullable=False),  # empty: a date that was taken back
+    Column("author", Line, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("kind in ('name', 'captured_at', 'note', 'tag', 'untag')", name="kind"),
 )
@@ -134,23 +143,23 @@ CHUNK_BOXES = "chunk_boxes"
 # How results were made: a `gsmap.methods.RecipeKey` without its inputs, once for all results that share it.
 recipes = _table(
     "recipes",
-    Column("digest", Text, primary_key=True),  # RecipeKey.recipe
+    Column("digest", Digest, primary_key=True),  # RecipeKey.recipe
     Column("stage", Text, nullable=False),
     Column("method", Text, nullable=False),
-    Column("version", Json, nullable=False),
-    Column("settings", Json, nullable=False),
+    Column("version", Json(an_object), nullable=False),
+    Column("settings", Json(an_object), nullable=False),
     Column("backend", Text, nullable=False),
     Column("created_at", Text, nullable=False),
 )
 
 graphs = _table(
     "graphs",
-    Column("key", Text, primary_key=True),  # RecipeKey.digest
+    Column("key", Key, primary_key=True),  # RecipeKey.digest
     _recipe(),
     _scene("scene", index=True),
     Column("num_nodes", Integer, nullable=False),
-    Column("about", Json, nullable=False),  # up, unit_m, notes, layers
-    Column("group_id", Text, ForeignKey("groups.id"), nullable=False),
+    Column("about", Json(a_graph), nullable=False),  # up, unit_m, notes, layers
+    Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 
@@ -159,32 +168,32 @@ registrations = _table(
     Column("number", Integer, primary_key=True),
     _scene("target"),
     _scene("source"),
-    Column("pair", Text, nullable=False, index=True),  # both ids, sorted: the pair in either direction
-    Column("key", Text, nullable=False, index=True),  # RecipeKey.digest; empty: a person's own measurement
+    Column("pair", Pair, nullable=False, index=True),  # both ids, sorted: the pair in either direction
+    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest; empty: a person's own measurement
     _recipe(),
     Column("adopts", Integer, ForeignKey("registrations.number")),  # the earlier row that this one makes current again
     Column("status", Text, nullable=False),
     Column("reason", Text, nullable=False),
-    Column("S_target_source", Json),
-    Column("information", Json),
+    Column("S_target_source", Json(a_pose)),
+    Column("information", Json(a_matrix)),
     Column("num_inliers", Integer, nullable=False),
     Column("num_correspondences", Integer, nullable=False),
     Column("overlap", Real, nullable=False),
     Column("proposer", Text, nullable=False),
     Column("exact", Integer, nullable=False),
-    Column("seconds", Json, nullable=False),
-    Column("evidence", Json, nullable=False),
-    Column("notes", Json, nullable=False, server_default="[]"),
+    Column("seconds", Json(an_object), nullable=False),
+    Column("evidence", Json(an_object), nullable=False),
+    Column("notes", Json(texts), nullable=False, server_default="[]"),
     Column("created_at", Text, nullable=False),
     CheckConstraint("status in ('accepted', 'rejected', 'no_match')", name="status"),
 )
 reviews = _table(
     "reviews",
     Column("number", Integer, primary_key=True),
-    Column("pair", Text, nullable=False, index=True),
+    Column("pair", Pair, nullable=False, index=True),
     Column("review", Text, nullable=False),
     Column("registration", Integer, ForeignKey("registrations.number"), nullable=False),
-    Column("note", Text, nullable=False),
+    Column("note", Lines, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),
 )
@@ -192,24 +201,26 @@ reviews = _table(
 revisions = _table(
     "revisions",
     Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("key", Text, nullable=False, server_default=""),  # RecipeKey.digest
+    Column("key", Key, nullable=False, server_default=""),  # RecipeKey.digest
     _recipe(),
-    Column("settings", Json, nullable=False, server_default="{}"),
-    Column("provenance", Json, nullable=False, server_default="{}"),
-    Column("notes", Json, nullable=False, server_default="[]"),
-    Column("note", Text, nullable=False),
+    Column("settings", Json(an_object), nullable=False, server_default="{}"),
+    Column("provenance", Json(an_object), nullable=False, server_default="{}"),
+    Column("notes", Json(texts), nullable=False, server_default="[]"),
+    Column("note", Lines, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("dropped_at", Text),  # prune may reclaim what only this revision names
-    Column("origin", Json),  # {"map": id, "number": n} of a revision that another map solved; null where this one did
+    Column(
+        "origin", Json(an_object)
+    ),  # {"map": id, "number": n} of a revision that another map solved; null where this one did
 )
 poses = _table(
     "poses",
     Column("revision", Integer, ForeignKey("revisions.number"), primary_key=True),
     _scene("scene", primary_key=True),
-    Column("S_map_scene", Json),
+    Column("S_map_scene", Json(a_pose)),
     Column("component", Integer, nullable=False),
     Column("status", Text, nullable=False),
-    Column("covariance", Json),
+    Column("covariance", Json(a_matrix)),
 )
 edges = _table(
     "edges",
@@ -227,9 +238,9 @@ priors = _table(
     "priors",
     Column("number", Integer, primary_key=True),
     _scene("scene", index=True),
-    Column("S_map_scene", Json, nullable=False),
-    Column("sigmas", Json, nullable=False),
-    Column("up", Json),
+    Column("S_map_scene", Json(a_pose), nullable=False),
+    Column("sigmas", Json(sigmas), nullable=False),
+    Column("up", Json(a_direction)),
     Column("up_sigma_rad", Real, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
@@ -238,13 +249,13 @@ priors = _table(
 models = _table(
     "models",
     Column("number", Integer, primary_key=True),
-    Column("name", Text, nullable=False),
-    Column("kind", Text, nullable=False),
+    Column("name", Line, nullable=False),
+    Column("kind", Line, nullable=False),
     Column("path", Text, nullable=False),  # relative to the map where it was copied
     Column("copied", Integer, nullable=False),
-    Column("sha256", Text, nullable=False),
+    Column("sha256", Digest, nullable=False),
     Column("size_bytes", Bytes, nullable=False),
-    Column("options", Json, nullable=False),
+    Column("options", Json(an_object), nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
 )
@@ -261,24 +272,24 @@ exports = _table(
     Column("number", Integer, primary_key=True),
     Column("target", Text, nullable=False, index=True),  # the folder or file it was written to
     Column("revision", Integer, ForeignKey("revisions.number")),
-    Column("settings", Json, nullable=False),
+    Column("settings", Json(an_object), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 tiles = _table(
     "tiles",
     Column("number", Integer, primary_key=True),
     Column("export", Integer, ForeignKey("exports.number"), nullable=False),
-    Column("key", Text, nullable=False, index=True),  # RecipeKey.digest
+    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest
     _recipe(),
     Column("older_recipe", Text),  # of rows that schema 0001 wrote: merger and parameters as one text
     Column("component", Integer, nullable=False),
-    Column("bounds", Json, nullable=False),
-    Column("poses", Json, nullable=False),  # S_map_scene by scene id
+    Column("bounds", Json(a_box), nullable=False),
+    Column("poses", Json(poses_by_scene), nullable=False),  # S_map_scene by scene id
     Column("num_gaussians", Integer, nullable=False),
     Column("truncated", Integer, nullable=False),
-    Column("notes", Json, nullable=False, server_default="[]"),
-    Column("path", Text, nullable=False),  # relative to the target
-    Column("sha256", Text, nullable=False),
+    Column("notes", Json(texts), nullable=False, server_default="[]"),
+    Column("path", RelativePath, nullable=False),  # relative to the target
+    Column("sha256", Key, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
 )
@@ -299,7 +310,7 @@ backups = _table(
     "backups",
     Column("number", Integer, primary_key=True),
     Column("target", Text, nullable=False),  # where it went; no password
-    Column("snapshot", Text, nullable=False),  # its name there
+    Column("snapshot", Line, nullable=False),  # its name there
     Column("created_at", Text, nullable=False),
     Column("num_bytes", Bytes, nullable=False),  # that it added there
 )
@@ -308,7 +319,7 @@ backups = _table(
 purges = _table(
     "purges",
     Column("number", Integer, primary_key=True),
-    Column("scene", Text, nullable=False),  # its id: a digest
-    Column("receipt", Json, nullable=False),  # what went, and where else it may live
+    Column("scene", Digest, nullable=False),  # its id: a digest
+    Column("receipt", Json(an_object), nullable=False),  # what went, and where else it may live
     Column("created_at", Text, nullable=False),
 )

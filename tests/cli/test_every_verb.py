@@ -18,6 +18,7 @@ import gsmap_synthetic
 from gsmap import formats
 from gsmap.cli.app import build
 from gsmap.cli.objects import OBJECTS, Many, Maybe
+from gsmap.store import trust
 
 Run = Callable[..., Any]
 
@@ -62,6 +63,8 @@ RUNS = {
     "models add": "models add MAP clip TMP/encoder.onnx --preset unit",
     "models list": "models list MAP",
     "evaluate": "evaluate MAP --truth CAPTURES/truth",
+    "branch": "branch MAP what-if",
+    "tag": "tag MAP v1",
     "remove": "remove MAP odd:one",
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
@@ -70,10 +73,12 @@ RUNS = {
     "backup --list": "backup MAP TMP/saved --list",
     "restore": "restore TMP/saved TMP/restored.gsmap",
     "clone": "clone MAP TMP/clone.gsmap",
+    "trust": "trust TMP/remote.gsmap --yes",
     "view": "view MAP --no-browser",
     "demo": "demo TMP/demo",
 }
-SILENT = {"init", "prior", "convert", "models add", "remove", "check", "migrate", "view", "backup", "restore", "clone"}
+SILENT = {"init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view"}
+SILENT |= {"backup", "restore", "clone"}
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""
 
 
@@ -84,6 +89,8 @@ def gsmap_run(
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
     (tmp_path / "encoder.onnx").write_bytes(_image_encoder())
+    (tmp_path / "remote.gsmap" / "arrays").mkdir(parents=True)
+    trust.write(tmp_path / "remote.gsmap", "postgresql+psycopg://me@example.org/site", "0" * 32)
     monkeypatch.setattr("gsmap.view.ViewServer.serve_forever", lambda self: None)
     # The demo's own captures take a minute: what it does with them is what is tried here.
     monkeypatch.setattr(gsmap_synthetic, "make_captures", lambda seed, progress: [])
@@ -235,7 +242,7 @@ def test_lists_are_filtered(site: Path, cli: Run) -> None:
     assert names("--after", "2024-06-01", "--tag", "hall") == ["right"]
     assert names("--after", "2999-01-01") == []
     edges = cli("list", site, "edges", "--json", "--tag", "hall").json["edges"]
-    assert [(row["target_name"], row["source_name"]) for row in edges] == [("left", "right")]
+    assert [{row["target_name"], row["source_name"]} for row in edges] == [{"left", "right"}]
     assert len(cli("list", site, "edges", "--json", "--status", "no_match").json["edges"]) == 2
     assert len(cli("list", site, "revisions", "--json", "--after", "2000-01-01").json["revisions"]) == 2
     assert len(cli("list", site, "tiles", "--json", "--component", 0).json["tiles"]) == 1
@@ -342,7 +349,7 @@ def test_settings_of_one_run_are_not_kept(site: Path, cli: Run) -> None:
 def test_pairs_from_a_file(site: Path, cli: Run, tmp_path: Path) -> None:
     (tmp_path / "pairs.txt").write_text("# checked by hand\nleft right\n\nright odd:one\n")
     rows = cli("register", site, "--pairs", tmp_path / "pairs.txt", "--json").json["edges"]
-    assert [(row["target_name"], row["source_name"]) for row in rows] == [("left", "right"), ("right", "odd:one")]
+    assert [{row["target_name"], row["source_name"]} for row in rows] == [{"left", "right"}, {"right", "odd:one"}]
     assert cli("register", site, "--pairs", tmp_path / "none.txt").code == 1
 
 

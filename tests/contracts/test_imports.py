@@ -18,7 +18,8 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = {"gsmap": ROOT / "gsmap", "gsmap_synthetic": ROOT / "synthetic" / "gsmap_synthetic"}
 
 LAYERS = [
-    {"version", "errors", "durable"},
+    {"version", "errors", "texts"},
+    {"durable"},
     {"types"},
     {"geometry"},
     {"methods"},

@@ -1,3 +1,4 @@
+import contextlib
 import io
 import json
 import zipfile
@@ -155,6 +156,38 @@ def test_bombs_are_refused_before_they_expand(tmp_path):
     save(tmp_path / "b.sog", meta, files | {"quats.webp": bytes(image)})
     with pytest.raises(InputError, match="9000 x 9000 pixels"):
         formats.read(tmp_path / "b.sog")
+
+
+def test_an_image_much_larger_than_its_gaussians_is_not_decoded(tmp_path):
+    """2.6 kB that would take 256 MiB; and a count that no file of this size holds."""
+    meta, files = sog(with_sh=False)
+    out = io.BytesIO()
+    Image.new("RGBA", (8192, 8192)).save(out, "WEBP", lossless=True)
+    save(tmp_path / "a.sog", meta, files | {"scales.webp": out.getvalue()})
+    with pytest.raises(InputError, match=r"8192 x 8192 pixels, more than 65,546"):
+        formats.read(tmp_path / "a.sog")
+    save(tmp_path / "b.sog", meta | {"count": 1 << 20}, files)
+    with pytest.raises(InputError, match="hostile"):
+        formats.read(tmp_path / "b.sog")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_damage_within_a_member_is_an_input_error(tmp_path, method):
+    meta, files = sog(with_sh=False)
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", method) as archive:
+        for name, data in {"meta.json": json.dumps(meta).encode(), **files}.items():
+            archive.writestr(name, data)
+    whole = (tmp_path / "a.sog").read_bytes()
+    for at in range(40, 240, 3):
+        (tmp_path / "a.sog").write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF, 0x55]) + whole[at + 2 :])
+        with contextlib.suppress(InputError):  # some bytes do not matter
+            formats.read(tmp_path / "a.sog")
+    locked = bytearray(whole)
+    locked[6] |= 1
+    locked[whole.index(b"PK\1\2") + 8] |= 1
+    (tmp_path / "a.sog").write_bytes(locked)
+    with pytest.raises(InputError, match="encrypted"):
+        formats.read(tmp_path / "a.sog")
 
 
 def test_truncation_and_other_files(tmp_path):

@@ -237,3 +237,11 @@ def test_published_validators_find_no_fault(tmp_path):
     if done.returncode == 3:
         pytest.skip(done.stderr.strip())
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("uri", ["a\\u0000b.glb", "\\ud800.glb", "%00.glb", "a" * 300 + ".glb", 7, None, ["a.glb"]])
+def test_content_that_is_no_name_of_a_file_is_refused(tmp_path, uri):
+    text = json.dumps({"root": {"content": {"uri": uri}}}).replace("\\\\", "\\")
+    (tmp_path / "tileset.json").write_text(text)
+    with pytest.raises(InputError, match="content"):
+        formats.read(tmp_path / "tileset.json")

@@ -32,12 +32,16 @@ def folder(tmp_path):
 
 def test_python_serves_what_the_store_holds(folder):
     with gsmap.open(folder) as m, m.view().start() as server:
-        said = json.load(urllib.request.urlopen(server.url + "map.json", timeout=10))
+
+        def get(path: str):
+            return urllib.request.urlopen(f"http://127.0.0.1:{server.port}/{path}?token={server.token}", timeout=30)
+
+        said = json.load(get("map.json"))
         assert [s["name"] for s in said["scenes"]] == ["hall"]
         assert said["title"] == "site.gsmap"
-        rows = urllib.request.urlopen(server.url + "scenes/0/splats", timeout=30).read()
+        rows = get("scenes/0/splats").read()
         assert len(rows) == 3000 * 40
-        assert json.load(urllib.request.urlopen(server.url + "scenes/0/extras", timeout=30))["layers"] == {}
+        assert json.load(get("scenes/0/extras"))["layers"] == {}
 
 
 def test_the_command_serves_until_it_is_interrupted(folder):
@@ -46,7 +50,8 @@ def test_the_command_serves_until_it_is_interrupted(folder):
         try:
             line = process.stderr.readline()
             assert line.startswith("http://127.0.0.1:")
-            assert b"<canvas" in urllib.request.urlopen(line.split()[0], timeout=10).read()
+            browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+            assert b"<canvas" in browser.open(line.split()[0], timeout=10).read()
             process.send_signal(signal.SIGINT)
             assert process.wait(20) == 0
         finally:

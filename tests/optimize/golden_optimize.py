@@ -10,7 +10,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from made_worlds import city, twin_wings
+from made_worlds import PLACING, city, twin_wings
 
 from gsmap.optimize import Params, gravity_align, optimize
 from gsmap.optimize.cycles import vote
@@ -41,7 +41,7 @@ def _batch() -> dict[str, np.ndarray]:
 def _incremental() -> dict[str, np.ndarray]:
     world = city(30, 0.0, seed=1)
     old = [e for e in world.edges if world.ids[29] not in (e.target, e.source)]
-    answer = optimize(world.ids, world.edges, previous=optimize(world.ids[:29], old))
+    answer = optimize(world.ids, world.edges, previous=optimize(world.ids[:29], old, params=PLACING), params=PLACING)
     assert answer.provenance.method == "incremental"
     return _arrays(answer)
 

@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
-from made_worlds import ROT_RAD, city, true_edges
+from made_worlds import PLACING, ROT_RAD, city, true_edges
 
 from gsmap.geometry.rotations import angle_between
 from gsmap.optimize import Params, optimize
@@ -14,10 +14,10 @@ def known(world, count):
 
 def test_placing_scenes_one_by_one_agrees_with_solving_at_once():
     world = city(120, 0.2, seed=4)
-    answer = optimize(*known(world, 110))
+    answer = optimize(*known(world, 110), params=PLACING)
     methods = []
     for count in range(111, 121):
-        answer = optimize(*known(world, count), previous=answer)
+        answer = optimize(*known(world, count), previous=answer, params=PLACING)
         methods.append(answer.provenance.method)
     assert methods.count("incremental") >= 8
     full = optimize(*known(world, 120), params=Params(growth=0))
@@ -38,8 +38,8 @@ def test_placing_scenes_one_by_one_agrees_with_solving_at_once():
 
 def test_a_placed_scene_has_an_honest_covariance():
     world = city(100, 0.0, seed=1)
-    before = optimize(*known(world, 99))
-    after = optimize(*known(world, 100), previous=before)
+    before = optimize(*known(world, 99), params=PLACING)
+    after = optimize(*known(world, 100), previous=before, params=PLACING)
     assert after.provenance.method == "incremental"
     full = optimize(*known(world, 100), params=Params(growth=0))
     scene = world.ids[99]
@@ -50,8 +50,8 @@ def test_a_placed_scene_has_an_honest_covariance():
 
 def test_a_scene_without_a_tie_waits_alone():
     world = city(60, 0.0, seed=1)
-    before = optimize(world.ids, world.edges)
-    after = optimize([*world.ids, "new"], world.edges, previous=before)
+    before = optimize(world.ids, world.edges, params=PLACING)
+    after = optimize([*world.ids, "new"], world.edges, previous=before, params=PLACING)
     assert after.provenance.method == "incremental"
     assert after.poses["new"].status == "isolated"
     assert after.poses["new"].component not in {p.component for p in before.poses.values()}
@@ -61,10 +61,10 @@ def test_a_scene_without_a_tie_waits_alone():
 def test_what_changed_underneath_is_solved_in_full():
     world = city(60, 0.0, seed=1)
     ids, edges = known(world, 59)
-    before = optimize(ids, edges)
+    before = optimize(ids, edges, params=PLACING)
 
     def method(edges):
-        return optimize(world.ids, edges, previous=before).provenance.method
+        return optimize(world.ids, edges, previous=before, params=PLACING).provenance.method
 
     assert method(world.edges) == "incremental"
     assert method(world.edges[::-1]) == "incremental"
@@ -76,16 +76,17 @@ def test_what_changed_underneath_is_solved_in_full():
 
 def test_growth_by_a_tenth_and_joined_islands_are_solved_in_full():
     world = city(60, 0.0, seed=1)
-    before = optimize(*known(world, 50))
-    assert optimize(*known(world, 54), previous=before).provenance.method == "incremental"
-    assert optimize(*known(world, 56), previous=before).provenance.method == "batch"
+    before = optimize(*known(world, 50), params=PLACING)
+    assert optimize(*known(world, 54), previous=before, params=PLACING).provenance.method == "incremental"
+    assert optimize(*known(world, 56), previous=before, params=PLACING).provenance.method == "batch"
 
     rng = np.random.default_rng(0)
     inside = [[a, b] for a in range(10) for b in range(a + 1, 10) if a // 5 == b // 5]
-    apart = optimize(world.ids[:10], true_edges(world.truth, inside, rng, world.ids))
+    growing = replace(PLACING, growth=1)
+    apart = optimize(world.ids[:10], true_edges(world.truth, inside, rng, world.ids), params=growing)
     assert len({p.component for p in apart.poses.values()}) == 2
     ties = true_edges(world.truth, [[0, 10], [1, 10], [2, 10], [5, 10], [6, 10], [7, 10]], rng, world.ids)
     edges = true_edges(world.truth, inside, np.random.default_rng(0), world.ids) + ties
-    joined = optimize(world.ids[:11], edges, previous=apart, params=Params(growth=1))
+    joined = optimize(world.ids[:11], edges, previous=apart, params=growing)
     assert joined.provenance.method == "batch"
     assert len({p.component for p in joined.poses.values()}) == 1

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_worlds import STIFF, city, information, poses_at, true_edges
+from made_worlds import PLACING, STIFF, city, information, poses_at, true_edges
 
 from gsmap.errors import ConfigError
 from gsmap.optimize import Params, optimize, recipe_key
@@ -50,24 +50,24 @@ def test_settings_and_keys_load_no_solver():
 def test_an_answer_tells_its_recipe_and_is_built_upon_by_that_recipe_only():
     world = city(60, 0.0, seed=1)
     old = [e for e in world.edges if world.ids[59] not in (e.target, e.source)]
-    before = optimize(world.ids[:59], old)
-    assert before.settings == plain(Params())
-    assert before.provenance.recipe == recipe_key(Params()).recipe
+    before = optimize(world.ids[:59], old, params=PLACING)
+    assert before.settings == plain(PLACING)
+    assert before.provenance.recipe == recipe_key(PLACING).recipe
 
     def method(previous, params):
         return optimize(world.ids, world.edges, previous=previous, params=params).provenance.method
 
-    assert method(before, Params()) == "incremental"
-    assert method(before, Params(gate_probability=0.99)) == "batch"
+    assert method(before, PLACING) == "incremental"
+    assert method(before, replace(PLACING, gate_probability=0.99)) == "batch"
     unknown = replace(before, provenance=replace(before.provenance, recipe=""))
-    assert method(unknown, Params()) == "batch"
+    assert method(unknown, PLACING) == "batch"
 
 
 def test_missing_covariances_are_noted():
     world = city(40, 0.0, seed=1)
     assert optimize(world.ids, world.edges).notes == ()
     assert optimize(world.ids, world.edges, params=Params(marginals=False)).notes == ()
-    few = Params(limits=replace(Params().limits, marginal_scenes=10))
+    few = Params(limits=replace(PLACING.limits, marginal_scenes=10))
     answer = optimize(world.ids, world.edges, params=few)
     large = [p.component for p in answer.poses.values()].count(0)
     assert answer.poses[world.ids[0]].covariance is None

@@ -26,5 +26,5 @@ def walk(num_scenes: int, seed: int = 0, noise: float = 0.15) -> list[SceneGraph
     for i in range(num_scenes):
         seen = slice(i * 40, i * 40 + 60)
         e = features[seen] + rng.normal(size=(60, 24)) * noise
-        graphs.append(SceneGraph(f"s{i}", {"landmarks": layer(rng, 60, embeddings=e, type_ids=kinds[seen])}))
+        graphs.append(SceneGraph(f"s{i:03}", {"landmarks": layer(rng, 60, embeddings=e, type_ids=kinds[seen])}))
     return graphs

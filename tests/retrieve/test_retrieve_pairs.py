@@ -1,5 +1,7 @@
 """Candidate pairs: true partners are found among many scenes, few others are."""
 
+from dataclasses import replace
+
 import numpy as np
 from retrieve_worlds import layer, walk
 
@@ -10,32 +12,44 @@ from gsmap.types import SceneGraph
 def test_small_maps_are_tried_exhaustively():
     pairs = candidate_pairs(walk(5))
     assert len(pairs) == 10
-    assert set(pairs[:4]) == {("s0", "s1"), ("s1", "s2"), ("s2", "s3"), ("s3", "s4")}
+    assert set(pairs[:4]) == {(f"s{i:03}", f"s{i + 1:03}") for i in range(4)}
 
 
 def test_true_partners_are_found_among_many_scenes():
     pairs = candidate_pairs(walk(80), params=Params(top_k=5))
-    wanted = {(f"s{i}", f"s{i + 1}") for i in range(79)}
+    wanted = {(f"s{i:03}", f"s{i + 1:03}") for i in range(79)}
     assert len(wanted & set(pairs)) >= 75
     assert len(pairs) < 80 * 5
     assert len(set(pairs)) == len(pairs)
-    assert all(int(a[1:]) < int(b[1:]) for a, b in pairs)
+    assert all(a < b for a, b in pairs)
+
+
+def test_any_order_of_scenes_gives_the_same_pairs():
+    rng, params = np.random.default_rng(0), Params(top_k=2, num_spatial=1)
+    graphs = walk(30)
+    graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
+    placed = {graph.scene_id: Placed(0, np.zeros(3), 1.0) for graph in graphs[:9]}
+    first = candidate_pairs(graphs, placed=placed, params=params)
+    for _ in range(5):
+        other = [graphs[k] for k in rng.permutation(len(graphs))]
+        assert candidate_pairs(other, placed=placed, params=params) == first
+    assert all(a < b for a, b in first)
 
 
 def test_only_pairs_of_new_scenes_are_asked_for():
     graphs = walk(30)
-    pairs = candidate_pairs(graphs, new={"s7"})
-    assert {("s6", "s7"), ("s7", "s8")} <= set(pairs)
-    assert all("s7" in pair for pair in pairs)
+    pairs = candidate_pairs(graphs, new={"s007"})
+    assert {("s006", "s007"), ("s007", "s008")} <= set(pairs)
+    assert all("s007" in pair for pair in pairs)
 
 
 def test_placed_neighbours_join_the_votes():
     rng = np.random.default_rng(1)
-    graphs = [SceneGraph(f"s{i}", {"landmarks": layer(rng, 30)}) for i in range(40)]
-    placed = {f"s{i}": Placed(0, np.array([3.0 * i, 0, 0]), 2.0) for i in range(39)}
+    graphs = [SceneGraph(f"s{i:02}", {"landmarks": layer(rng, 30)}) for i in range(40)]
+    placed = {f"s{i:02}": Placed(0, np.array([3.0 * i, 0, 0]), 2.0) for i in range(39)}
     placed["s39"] = Placed(1, np.array([0.5, 0, 0]), 2.0)
     pairs = set(candidate_pairs(graphs, placed=placed, params=Params(top_k=0)))
-    assert pairs == {(f"s{i}", f"s{i + 1}") for i in range(38)}
+    assert pairs == {(f"s{i:02}", f"s{i + 1:02}") for i in range(38)}
     uncertain = {s: Placed(p.component, p.centre, p.radius, sigma=1.0) for s, p in placed.items()}
     assert len(candidate_pairs(graphs, placed=uncertain, params=Params(top_k=0))) > 38
 
@@ -55,8 +69,8 @@ def test_an_asked_scene_may_lack_a_type_of_node():
     features = graphs[4].layers["landmarks"].embeddings
     alone = SceneGraph("alone", {"landmarks": layer(rng, 60, embeddings=features, type_ids=np.ones(60, int))})
     pairs = candidate_pairs([*graphs, alone], new={"alone"})
-    assert pairs[0] == ("s4", "alone")
-    assert all(b == "alone" for _, b in pairs)
+    assert pairs[0] == ("alone", "s004")
+    assert all(a == "alone" for a, _ in pairs)
     strange = SceneGraph("strange", {"landmarks": layer(rng, 20, type_ids=np.full(20, 7), dim=24)})
     assert candidate_pairs([*graphs, strange], new={"strange"}) == []
 

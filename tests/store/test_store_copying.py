@@ -71,7 +71,7 @@ def test_to_postgres_and_back(store, tmp_path, postgres_database):
     before = rows_of(store.catalog)
     for name in ("there", "back"):
         (tmp_path / name).mkdir()
-    there = empty_catalog(tmp_path / "there", postgres_database)
+    there = empty_catalog(tmp_path / "there", postgres_database, "0" * 32)
     copy_catalog(store.catalog, there)
     assert rows_of(there) == before
     back = empty_catalog(tmp_path / "back")

@@ -343,7 +343,7 @@ def test_outcomes_come_back(store, two_scenes):
 
 def test_a_revision_of_unknown_scenes_leaves_nothing(store):
     with pytest.raises(StoreError):
-        store.revisions.save(PoseGraph({"x": ScenePose("x", None, 0, "isolated")}))
+        store.revisions.save(PoseGraph({"0" * 32: ScenePose("x", None, 0, "isolated")}))
     assert store.revisions.list() == []
 
 
@@ -496,7 +496,7 @@ def test_a_dry_run_counts_everything_and_changes_nothing(store, two_scenes, tmp_
     (tmp_path / "net.onnx").write_bytes(b"x" * 1000)
     store.models.add("net", tmp_path / "net.onnx", kind="clip")
     store.models.remove("net")
-    for folder in ("scenes/orphan", "staging/leftover"):
+    for folder in (f"scenes/{'0' * 32}", "staging/leftover"):
         (store.folder / "arrays" / folder).mkdir()
         (store.folder / "arrays" / folder / "c").write_bytes(b"x" * 5000)
     store.scenes.remove("scene1")

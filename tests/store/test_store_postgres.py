@@ -1,5 +1,7 @@
 """The same store with its catalog in a real PostgreSQL server."""
 
+import stat
+
 import numpy as np
 import pytest
 import store_children
@@ -7,8 +9,9 @@ from store_children import messages
 from store_samples import key, make_cameras, make_gaussians
 from test_store_nouns import graph_of, layer, registration, tile
 
-from gsmap.errors import ConfigError, StoreError
-from gsmap.store import Store, schema
+import gsmap.map
+from gsmap.errors import ConfigError, CorruptError, StoreError
+from gsmap.store import Store, schema, trust
 from gsmap.store.arrays import CHUNK_ROWS
 from gsmap.types import Prior, SceneGraph, Sim3
 
@@ -76,6 +79,45 @@ def test_the_password_stays_out_of_the_map(tmp_path, guarded_database, monkeypat
     monkeypatch.setenv("PGPASSWORD", "secret")
     with Store.open(tmp_path / "m") as store:
         assert store.id == made
+
+
+def test_a_remembered_server_is_connected_to_only_once_it_is_trusted(tmp_path, postgres_database, monkeypatch):
+    folder = tmp_path / "m"
+    with Store.create(folder, catalog_url=postgres_database) as store:
+        made = store.id
+    assert (folder / "catalog.url").read_text().splitlines()[1] == made
+    assert stat.S_IMODE(trust.config_file().stat().st_mode) == 0o600
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of_another_user"))
+    with pytest.raises(StoreError, match=r"gsmap trust.*GSMAP_CATALOG"):
+        Store.open(folder)
+    monkeypatch.setenv("GSMAP_CATALOG", postgres_database)
+    with Store.open(folder) as store:
+        assert store.id == made
+    monkeypatch.delenv("GSMAP_CATALOG")
+    assert not gsmap.map.catalog_of(folder).trusted
+    assert gsmap.map.trust(folder).trusted
+    with Store.open(folder) as store:
+        assert store.id == made
+    # Another server under the same map's id, and another map under the same URL, are not what was trusted.
+    trust.write(folder, postgres_database.replace("gsmap@", "eve@"), made)
+    with pytest.raises(StoreError, match="'eve'"):
+        Store.open(folder)
+    trust.write(folder, postgres_database, "0" * 32)
+    trust.trust("0" * 32, postgres_database)
+    with pytest.raises(CorruptError, match="belongs to map"):
+        Store.open(folder)
+
+
+def test_a_catalog_url_of_an_older_gsmap_is_trusted_by_asking_its_database(tmp_path, postgres_database):
+    folder = tmp_path / "m"
+    with Store.create(folder, catalog_url=postgres_database) as store:
+        made = store.id
+    (folder / "catalog.url").write_text(postgres_database + "\n")
+    with pytest.raises(StoreError, match="gsmap trust"):
+        Store.open(folder)
+    gsmap.map.trust(folder)
+    assert (folder / "catalog.url").read_text() == f"{postgres_database}\n{made}\n"
+    Store.open(folder).close()
 
 
 def test_a_server_that_is_not_there(tmp_path):

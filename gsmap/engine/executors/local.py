@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
 from typing import Any
 
-from gsmap.errors import ConfigError, GsmapError
+from gsmap.engine.pool import Pool
+from gsmap.errors import ConfigError
 
 VERSION = 1
 
@@ -29,28 +28,18 @@ class Params:
 
 
 def run_jobs(
-    job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Params | None = None
+    job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params | None = None
 ) -> Iterator[tuple[int, Any]]:
     """See `gsmap.methods.executor`; in the order of the arguments where there is one worker or one job."""
-    params = params or Params()
-    workers = min(params.workers or default_workers(), len(arguments))
-    if workers <= 1:
-        for index, args in enumerate(arguments):
-            yield index, job(*args)
+    workers = (params or Params()).workers or default_workers()
+    todo = iter(arguments)
+    first = list(islice(todo, 2)) if workers > 1 else []
+    if len(first) > 1:
+        with Pool(workers) as pool:
+            yield from pool.run(job, chain(first, todo))
         return
-    # "spawn": a forked child inherits threads and locks of torch and OpenMP that no longer run in it.
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures = {pool.submit(job, *args): index for index, args in enumerate(arguments)}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BrokenProcessPool as error:
-            raise GsmapError(
-                "a worker process died, most likely for lack of memory: run again with GSMAP_WORKERS=1"
-            ) from error
-        finally:
-            for future in futures:
-                future.cancel()
+    for index, args in enumerate(chain(first, todo)):
+        yield index, job(*args)
 
 
 def default_workers() -> int:

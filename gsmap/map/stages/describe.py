@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 
 from gsmap.describe import recipe_key
@@ -10,6 +11,7 @@ from gsmap.engine import run_jobs
 from gsmap.map import models
 from gsmap.map.jobs import describe_scene
 from gsmap.map.settings import Settings
+from gsmap.map.sharing import SharedJobs, noting
 from gsmap.methods import RecipeKey
 from gsmap.render import backend
 from gsmap.store import Store
@@ -40,8 +42,14 @@ def describe(
     # A worker elsewhere must not choose another renderer than the one that the key names.
     rendered_by = backend(settings.describe.object.render_backend)
     params = replace(settings.describe, object=replace(settings.describe.object, render_backend=rendered_by))
-    jobs = [(str(store.folder), scene.id, specs, params) for scene in missing]
-    for done, (i, graph) in enumerate(run_jobs(describe_scene, jobs, settings.engine), 1):
-        store.graphs.save(graph, keys[graph.scene_id])
-        progress("describe", done / len(missing), f"{missing[i].name}: {graph.num_nodes} nodes")
+    names = {keys[scene.id].digest: scene.name for scene in missing}
+    jobs = {keys[scene.id].digest: (store.location, scene.id, specs, params) for scene in missing}
+    shared = SharedJobs(store, "describe", "graph", jobs, store.graphs.kept, progress)
+    results = shared.results(lambda arguments: run_jobs(describe_scene, arguments, settings.engine))
+    there = len(scenes) - len(missing)
+    kept = noting(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")
+    with kept, closing(results):
+        for key, graph in results:
+            store.graphs.save(graph, keys[graph.scene_id])
+            shared.saved(key, f"{names[key]}: {graph.num_nodes} nodes")
     return keys

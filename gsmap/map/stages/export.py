@@ -146,7 +146,7 @@ def export(store: Store, out: Path, request: Request, settings: Settings, progre
         write_tilesets(out, result.tiles, request.tile_size_m)
     if not store.catalog.writable:
         _log.warning(
-            "%s is read-only: it does not know of this export, so gsmap status cannot watch %s", store.folder, out
+            "%s is read-only: it does not know of this export, so gsmap status cannot watch %s", store.location, out
         )
         return result
     kept = {tile.path for tile in result.tiles}

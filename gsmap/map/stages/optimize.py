@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from gsmap import optimize as solver
 from gsmap.map.settings import Settings
+from gsmap.map.sharing import POLL_S
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
@@ -41,10 +43,9 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
     living, priors = store.scenes.list(), store.priors.list()
     scenes = [scene.id for scene in living]
     edges, named = [], []
-    row = {scene: number for number, scene in enumerate(scenes)}
-    # In the order of the scenes, not in that in which workers happened to finish: the same poses to the last bit.
+    # By id, not in the order in which workers happened to finish: the same key whenever they were made.
     current = store.registrations.current()
-    for stored in sorted(current, key=lambda r: (row[r.registration.target], row[r.registration.source])):
+    for stored in sorted(current, key=lambda r: (r.registration.target, r.registration.source)):
         registration = stored.registration
         usable = stored.review == "confirm" or (registration.status == "accepted" and stored.review != "reject")
         if not usable or registration.S_target_source is None or registration.information is None:
@@ -84,6 +85,28 @@ def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
     number = store.revisions.save(answer, given.key)
     progress("optimize", 1.0, f"revision {number}")
     return number
+
+
+def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
+    """Optimize unless the newest revision is what that would make; returns whether there is a new one.
+
+    One process does it at a time: others wait, and then need not.
+    """
+    told = False
+    while not is_solved(store, settings):
+        if store.leases.try_hold("poses", "optimize"):
+            try:
+                if not is_solved(store, settings):
+                    optimize(store, settings, progress)
+            finally:
+                store.leases.release(["poses"])
+            return True
+        holder = next((lease for lease in store.leases.list() if lease.what == "poses"), None)
+        if holder is not None and not told:
+            progress("optimize", 0.0, f"waiting for {holder.who}")
+            told = True
+        time.sleep(POLL_S)
+    return told
 
 
 def is_solved(store: Store, settings: Settings) -> bool:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
+from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map.jobs import register_scenes
 from gsmap.map.settings import Settings
+from gsmap.map.sharing import SharedJobs, noting
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
@@ -30,7 +33,8 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     """Register the pairs asked for; those of ``auto`` and ``all`` only where this recipe has not done so yet.
 
     A result that this recipe made before, under settings that were changed meanwhile, becomes the pair's current one
-    again without being computed.
+    again without being computed. The target of a pair is the scene of lower id, however the pair was named: an edge is
+    the same whichever scene came first.
     """
     scenes = store.scenes.list()
     graphs = graph_keys(store, scenes, settings)
@@ -38,14 +42,23 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     wanted = _wanted(store, pairs, graphs, settings)
     if pairs in ("auto", "all"):
         wanted = _lacking(store, wanted, graphs, recipe)
-    jobs = [(str(store.folder), (a, graphs[a].digest), (b, graphs[b].digest), settings.register) for a, b in wanted]
+    edges = {_key(recipe, graphs, a, b).digest: (a, b) for a, b in wanted}
+    jobs = {
+        key: (store.location, (a, graphs[a].digest), (b, graphs[b].digest), settings.register)
+        for key, (a, b) in edges.items()
+    }
+    newest = store.registrations.newest()  # what is named is registered again: only what comes later counts
+    after = 0 if pairs in ("auto", "all") else newest
+    shared = SharedJobs(store, "register", "edge", jobs, partial(store.registrations.kept, after=after), progress)
+    results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine))
     names = {scene.id: scene.name for scene in scenes}
-    found: dict[int, Registration] = {}
-    for i, edge in run_jobs(register_scenes, jobs, settings.engine):
-        store.registrations.save(edge, _key(recipe, graphs, *wanted[i]))
-        found[i] = edge
-        progress("register", len(found) / len(jobs), f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
-    return [found[i] for i in sorted(found)]
+    kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
+    with kept, closing(results):
+        for key, edge in results:
+            store.registrations.save(edge, _key(recipe, graphs, *edges[key]))
+            shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
+    found = [store.registrations.find(key) for key in edges]
+    return [stored.registration for stored in found if stored is not None]
 
 
 def _key(recipe: RecipeKey, graphs: Mapping[str, RecipeKey], target: str, source: str) -> RecipeKey:
@@ -53,20 +66,16 @@ def _key(recipe: RecipeKey, graphs: Mapping[str, RecipeKey], target: str, source
     return recipe.of(graphs[target].digest, graphs[source].digest)
 
 
-def _lacking(
-    store: Store, pairs: Sequence[tuple[str, str]], graphs: Mapping[str, RecipeKey], recipe: RecipeKey
-) -> list[tuple[str, str]]:
-    """Those of the pairs that this recipe has not registered, in the direction in which each was registered last."""
+def _lacking(store: Store, pairs: Sequence[Pair], graphs: Mapping[str, RecipeKey], recipe: RecipeKey) -> list[Pair]:
+    """Those of the pairs that this recipe has not registered, in either direction: older maps hold both."""
     current = {frozenset((r.registration.target, r.registration.source)): r for r in store.registrations.current()}
     lacking = []
     for pair in pairs:
         stands = current.get(frozenset(pair))
-        if stands is not None and not stands.manual:
-            pair = stands.registration.target, stands.registration.source
-        key = _key(recipe, graphs, *pair)
-        if stands is not None and stands.key == key.digest:
+        keys = _key(recipe, graphs, *pair), _key(recipe, graphs, *reversed(pair))
+        if stands is not None and stands.key in {key.digest for key in keys}:
             continue
-        known = store.registrations.find(key)
+        known = store.registrations.find(keys[0]) or store.registrations.find(keys[1])
         if known is None:
             lacking.append(pair)
         elif stands is not None and not stands.manual:
@@ -170,33 +179,37 @@ def _pair_on(store: Store, text: str) -> tuple[Scene, Scene]:
     return pair_of(store, text)
 
 
-def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], settings: Settings) -> list[tuple[str, str]]:
+def _directed(a: str, b: str) -> Pair:
+    """A pair of scene ids as (target, source): by content, so that no order of ingestion gives another edge."""
+    return (a, b) if a < b else (b, a)
+
+
+def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], settings: Settings) -> list[Pair]:
     """The scene pairs that are asked for, each as (target, source), in a fixed order, each once."""
     lacking = set(without_graph(store, graphs))
     described = [scene for scene in graphs if scene not in lacking]
     if pairs == "all":
-        return [(a, b) for i, a in enumerate(described) for b in described[i + 1 :]]
+        return list(combinations(sorted(described), 2))
     if pairs == "auto":
         loaded = [_graph(store, graphs[scene]) for scene in described]
         candidates = candidate_pairs(loaded, placed=placed_scenes(store), params=settings.retrieve)
-        known = {frozenset(pair) for pair in candidates}
-        again = stale(store.registrations.current(), graphs, settings)
-        return candidates + [pair for pair in again if frozenset(pair) not in known and not set(pair) & lacking]
+        again = {_directed(*pair) for pair in stale(store.registrations.current(), graphs, settings)} - set(candidates)
+        return candidates + sorted(pair for pair in again if not set(pair) & lacking)
     if isinstance(pairs, Path):
         named = read_pairs(store, pairs)
     elif isinstance(pairs, str):
         named = [pair_of(store, pairs)]
     else:
         named = [(store.scenes.get(a), store.scenes.get(b)) for a, b in pairs]
-    chosen: dict[frozenset[str], tuple[str, str]] = {}
+    chosen: list[Pair] = []
     for a, b in named:
         for scene in _two(a, b):
             if scene.id not in graphs:
                 raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
             if scene.id in lacking:
                 raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
-        chosen.setdefault(frozenset((a.id, b.id)), (a.id, b.id))
-    return list(chosen.values())
+        chosen.append(_directed(a.id, b.id))
+    return list(dict.fromkeys(chosen))
 
 
 def placed_scenes(store: Store) -> dict[str, Placed]:

@@ -18,14 +18,15 @@ from sqlalchemy import delete, inspect, null, select, text, update
 from gsmap.durable import sync_folder
 from gsmap.errors import CorruptError, GsmapError, NotFoundError, StoreError
 from gsmap.store import catalog as _catalog
-from gsmap.store import migrate, schema, sqlite
+from gsmap.store import migrate, schema, sqlite, trust
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
 from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
-from gsmap.store.catalog import Catalog, explained
+from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
+from gsmap.store.explained import explained
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
@@ -102,6 +103,8 @@ def restore(
         _synchronise(folder)
         _put_in_place(folder, target)
         undo.pop_all()
+    if catalog_url is not None:
+        trust.remember(target)
     return Restored(target, chosen, state.schema)
 
 
@@ -204,7 +207,7 @@ def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> Stat
     there = {file.path: (file.size_bytes, file.sha256) for file in files}
     if sqlite.FILE not in there:
         raise CorruptError(f"snapshot {snapshot.name} has no {sqlite.FILE}")
-    for problem in sqlite.file_problems(folder / sqlite.FILE):
+    for problem in sqlite.structure_damage(folder / sqlite.FILE):
         raise CorruptError(f"snapshot {snapshot.name}: its catalog is damaged ({problem})")
     state = read_state(folder / sqlite.FILE)
     if (state.map_id, state.schema) != (snapshot.map_id, snapshot.schema):
@@ -254,7 +257,9 @@ def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> State:
     own = _own_catalog(folder)
     try:
         migrate.upgrade(own)
-        there = empty_catalog(folder, url)
+        with own.read() as connection:
+            map_id = connection.execute(select(schema.about.c.id)).scalar_one()
+        there = empty_catalog(folder, url, map_id)
         undo.callback(_empty_again, there)
         with explained(folder):
             copy_catalog(own, there, leave_out=("leases",))

@@ -21,6 +21,7 @@ from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import CHUNK_BYTES
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
+from gsmap.store.explained import explained
 from gsmap.store.models import FOLDER as MODELS
 
 if TYPE_CHECKING:
@@ -209,11 +210,11 @@ def _chunks(path: Path) -> Iterator[bytes]:
 def _capture_catalog(source: Catalog, folder: Path) -> State:
     file = folder / sqlite.FILE
     if source.is_sqlite:
-        with _catalog.explained(source.folder):
-            for problem in sqlite.digest_problems(source.folder / sqlite.FILE):
+        with explained(source.folder):
+            for problem in source.page_problems():
                 raise CorruptError(f"{problem}: run gsmap check; nothing was backed up")
             sqlite.backup(source.engine, file)
-            for problem in sqlite.file_problems(file):
+            for problem in sqlite.structure_damage(file):
                 raise CorruptError(f"{source.folder / sqlite.FILE} is damaged ({problem}); nothing was backed up")
     else:
         made = empty_catalog(folder)
@@ -221,7 +222,7 @@ def _capture_catalog(source: Catalog, folder: Path) -> State:
             copy_catalog(source, made, leave_out=("leases",))
         finally:
             made.close()
-    with _catalog.explained(source.folder), contextlib.suppress(FileNotFoundError):
+    with explained(source.folder), contextlib.suppress(FileNotFoundError):
         (folder / SETTINGS).write_bytes((source.folder / SETTINGS).read_bytes())
     return read_state(file)
 

@@ -39,6 +39,7 @@ from gsmap.types.rows.scenes import (
     SceneReport,
     SceneRow,
 )
+from gsmap.types.rows.trust import TrustReport
 from gsmap.types.rows.truth import (
     BandRow,
     ComponentErrorRow,
@@ -48,11 +49,13 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
+from gsmap.types.rows.values import BranchRow
 
 __all__ = [
     "SCHEMA",
     "BackupReport",
     "BandRow",
+    "BranchRow",
     "CheckReport",
     "CloneReport",
     "ComponentErrorRow",
@@ -92,6 +95,7 @@ __all__ = [
     "SnapshotRow",
     "TileRow",
     "TodoRow",
+    "TrustReport",
     "UpdateReport",
     "ViewReport",
 ]

@@ -130,6 +130,7 @@ class CheckReport(Row):
         orphans: folders that an interrupted step left; no harm, `gsmap prune` removes them.
         num_groups: how many groups of arrays were read.
         num_bytes: how many bytes were read.
+        unverified: what could not be compared with what was written, and why.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"num_groups": "groups", "num_bytes": "bytes", "ok": "ok"}
@@ -139,6 +140,7 @@ class CheckReport(Row):
     orphans: tuple[str, ...]
     num_groups: int
     num_bytes: int
+    unverified: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,0 +1,40 @@
+"""gsmap branch: another catalog over the same arrays."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+
+
+def command(
+    map: MapPath,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="What to call it.", show_default=False)] = None,
+    delete: Annotated[bool, typer.Option("--delete", help="Delete the branch NAME.")] = False,
+    list_all: Annotated[bool, typer.Option("--list", help="List the branches of the map.")] = False,
+    json: AsJson = False,
+) -> None:
+    """Make a branch of a map: a catalog of its own over the same arrays, opened as MAP@NAME wherever a map is given.
+
+    What is done to a branch leaves the map as it is; `gsmap merge MAP MAP@NAME` brings it back. Without NAME the
+    branches are listed.
+
+    Example: `gsmap branch site.gsmap what-if`
+    """
+    from gsmap.errors import ConfigError
+
+    if (name is None and delete) or (name is not None and list_all):
+        raise ConfigError("name the branch to make or to delete, or give --list alone")
+    with opened(map) as m:
+        if name is None:
+            rows = m.branches("branch")
+        elif delete:
+            rows = [m.delete_branch(name, "branch")]
+            say(f"deleted branch {name}; gsmap prune {map} reclaims what only it named")
+        else:
+            rows = [m.branch(name)]
+            say(f"made branch {name}: open it as {rows[0].map}")
+    if name is None or json:
+        print_rows("branch", rows, json, "branches")

@@ -1,0 +1,162 @@
+"""Jobs that several processes share: each does those that no other is doing, and all end when all are done."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from gsmap.errors import GsmapError
+from gsmap.store import Store
+from gsmap.types.progress import StageProgress
+
+_log = logging.getLogger("gsmap.map")
+
+_WORTH_S = 1.0
+"""How much work is leased in one transaction: jobs of several seconds one by one, so that none lies idle in one process
+while another has nothing to do; hundreds of quick ones a few at a time, so that leasing them costs little."""
+_AT_MOST = 16
+
+POLL_S = 0.5
+"""How often those who wait look whether the others have finished or dropped something; one small read each time."""
+
+
+class SharedJobs:
+    """Jobs of one stage by what each makes.
+
+    Args:
+        store: of the map.
+        stage: the verb, for others to read, and for the progress.
+        kind: ``graph`` or ``edge``; a job is leased as ``KIND KEY``.
+        jobs: the arguments of each by the key (digest) of its result, the most wanted first.
+        done: tells from the catalog of which keys the results are there, whoever made them.
+        progress: told what is done, and, once for each, whose work is waited for.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        stage: str,
+        kind: str,
+        jobs: Mapping[str, tuple[Any, ...]],
+        done: Callable[[Collection[str]], set[str]],
+        progress: StageProgress,
+    ) -> None:
+        self._leases, self._stage, self._kind, self._progress = store.leases, stage, kind, progress
+        self._done = done
+        self._keys = list(jobs)
+        self._todo = dict(jobs)  # not done as far as is known, and not begun here
+        self._ours: list[str] = []
+        self._saved: list[str] = []  # still leased
+        self._count, self._began = 0, time.monotonic()
+
+    def results(
+        self, run: Callable[[Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
+    ) -> Generator[tuple[str, Any], None, None]:
+        """Yield (key, result) of the jobs that this process does; ends when all are done, by whomever. To be closed.
+
+        Each result must be kept, and `saved` told, before the next is asked for.
+
+        Args:
+            run: does jobs by their arguments, and takes those one by one as it has room (`gsmap.engine.run_jobs`).
+        """
+        while self._todo:
+            begun: list[str] = []
+            running = run(self._begin(begun))
+            try:
+                for index, result in running:
+                    yield begun[index], result
+            finally:
+                if isinstance(running, Generator):
+                    running.close()  # its workers end now, and not when somebody collects what is left of it
+                self._leases.release([self._lease(key) for key in (*self._ours, *self._saved)])
+                self._saved.clear()
+            self._wait()
+
+    def saved(self, key: str, text: str) -> None:
+        """The result of a job is in the catalog."""
+        self._ours.remove(key)
+        self._saved.append(key)
+        self._count += 1
+        self._tell(text)
+
+    def num_kept(self) -> int:
+        """How many of the results are in the catalog."""
+        with suppress(GsmapError):
+            return len(self._done(self._keys))
+        return len(self._keys) - self._left
+
+    @property
+    def _left(self) -> int:
+        return len(self._todo) + len(self._ours)
+
+    def _lease(self, key: str) -> str:
+        return f"{self._kind} {key}"
+
+    def _tell(self, text: str) -> None:
+        self._progress(self._stage, 1 - self._left / len(self._keys), text)
+
+    def _begin(self, begun: list[str]) -> Iterator[tuple[Any, ...]]:
+        """The arguments of jobs that are leased to this process, as long as there are any that nobody does."""
+
+        def done(leases: Collection[str]) -> set[str]:
+            return {self._lease(key) for key in self._done([lease.partition(" ")[2] for lease in leases])}
+
+        while self._todo:
+            worth = int(_WORTH_S * self._count / (time.monotonic() - self._began + 1e-3))
+            taken = self._leases.take(
+                [self._lease(key) for key in self._todo],
+                self._stage,
+                limit=min(max(worth, 1), _AT_MOST),
+                done=done,
+                give_back=[self._lease(key) for key in self._saved],
+            )
+            self._saved.clear()
+            for lease in taken.done:
+                del self._todo[lease.partition(" ")[2]]
+            if not taken.ours:
+                return
+            keys = [lease.partition(" ")[2] for lease in taken.ours]
+            arguments = [self._todo.pop(key) for key in keys]
+            self._ours += keys
+            for key, args in zip(keys, arguments, strict=True):
+                begun.append(key)
+                yield args
+
+    def _wait(self) -> None:
+        """Until all is done, or others have dropped something."""
+        told: set[str] = set()
+        while True:
+            for key in self._done(list(self._todo)):
+                del self._todo[key]
+            holders = {lease.what: lease for lease in self._leases.list()}
+            waited_for = [holders.get(self._lease(key)) for key in self._todo]
+            if not waited_for or None in waited_for:
+                return
+            for holder in waited_for:
+                if holder is not None and holder.token not in told:
+                    told.add(holder.token)
+                    self._tell(f"waiting for {holder.who}: {len(waited_for)} left")
+            time.sleep(POLL_S)
+
+
+@contextmanager
+def at_work(store: Store, task: str) -> Iterator[None]:
+    """Say that this process is at work on the map, and remark (in the logs) who else is."""
+    with store.leases.attend(task) as others:
+        for other in others:
+            _log.warning("another %s is at work: what is left is shared", other.who)
+        yield
+
+
+@contextmanager
+def noting(kept: Callable[[], str]) -> Iterator[None]:
+    """Whatever stops the work within is told what is kept (`BaseException.add_note`); errors speak for themselves."""
+    try:
+        yield
+    except BaseException as stopped:
+        if not isinstance(stopped, (Exception, GeneratorExit)):
+            stopped.add_note(kept())
+        raise

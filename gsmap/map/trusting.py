@@ -1,0 +1,50 @@
+"""Which server a map has gsmap connect to, and whether its user allows that."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.store import Store
+from gsmap.store import trust as trusting
+from gsmap.types.rows import TrustReport
+
+
+def catalog_of(path: str | os.PathLike[str]) -> TrustReport:
+    """Which server a map names, and whether this user trusts that; nothing is connected to.
+
+    Raises:
+        NotFoundError: no such map.
+        ConfigError: its catalog lies in its own folder.
+        CorruptError: it names something else than a PostgreSQL database.
+    """
+    found = _remembered(Path(path))
+    known = found.map_id is not None and trusting.trusted().get(found.map_id) == found.url
+    return TrustReport(map=str(path), server=found.server, database=found.database, user=found.user, trusted=known)
+
+
+def trust(path: str | os.PathLike[str]) -> TrustReport:
+    """``gsmap trust MAP``: connect to the server that a map names, from now on.
+
+    Raises:
+        NotFoundError, ConfigError, CorruptError: as `catalog_of`.
+        StoreError: what the user trusts cannot be written down.
+    """
+    folder = Path(path)
+    found = _remembered(folder)
+    map_id = found.map_id
+    if map_id is None:  # an older gsmap made it: the database knows
+        with Store.open(folder, "r", catalog_url=found.url) as store:
+            map_id = store.id
+        trusting.write(folder, found.url, map_id)
+    trusting.trust(map_id, found.url)
+    return catalog_of(path)
+
+
+def _remembered(folder: Path) -> trusting.Remembered:
+    if not folder.is_dir():
+        raise NotFoundError(f"no map at {folder}")
+    if not (folder / trusting.URL_FILE).exists():
+        raise ConfigError(f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust")
+    return trusting.remembered(folder)

@@ -1,0 +1,244 @@
+"""Column types that check what they hold: a map may come from a stranger, and rows become paths, keys and text.
+
+A value that gsmap cannot have written raises where its row is read, before anything is done with it, and one that it
+must not write raises before it is written. Values that are only compared with are not checked, and neither is what
+passes by the tables: SQL given as text.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from typing import Any
+
+from sqlalchemy import Text
+from sqlalchemy.types import TypeDecorator, TypeEngine
+
+from gsmap.errors import CorruptError, InputError
+from gsmap.texts import control_characters
+
+_DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
+KINDS = ("scenes", "graphs")
+"""Of groups of arrays: the folders below ``arrays``."""
+
+
+def is_digest(text: str) -> bool:
+    """Whether a text is 32 or 64 hex digits."""
+    return _DIGEST.fullmatch(text) is not None
+
+
+def is_relative(path: str) -> bool:
+    """Whether a path leads downwards only: parts with ``/`` between them, none empty, ``.`` or ``..``."""
+    parts = path.split("/")
+    return not control_characters(path) and "\\" not in path and not any(part in ("", ".", "..") for part in parts)
+
+
+class _Checked(TypeDecorator[Any]):
+    """A text column whose values are checked."""
+
+    impl = Text
+    cache_ok = True
+    what = "a text"
+
+    def __init__(self, where: str = "") -> None:
+        super().__init__()
+        self.where = where
+
+    def at(self, where: str) -> _Checked:
+        """The same type, knowing its column (``table.column``)."""
+        made: _Checked = self.copy()
+        made.where = where
+        return made
+
+    def fits(self, value: str) -> bool:
+        raise NotImplementedError
+
+    def process_bind_param(self, value: Any, dialect: Any) -> Any:
+        if value is not None and not (isinstance(value, str) and self.fits(value)):
+            raise InputError(f"{self.where} must be {self.what}, got {_short(value)}")
+        return value
+
+    def process_result_value(self, value: Any, dialect: Any) -> Any:
+        if value is not None and not (isinstance(value, str) and self.fits(value)):
+            raise _corrupt(self.where, value, self.what)
+        return value
+
+    def coerce_compared_value(self, op: Any, value: Any) -> TypeEngine[Any]:
+        return Text()
+
+
+class Digest(_Checked):
+    """32 or 64 hex digits."""
+
+    cache_ok = True
+    what = "32 or 64 hex digits"
+
+    def fits(self, value: str) -> bool:
+        return is_digest(value)
+
+
+class Key(_Checked):
+    """What a result is kept under: compared and shown, never a path. A digest today; schema 0001 had other words."""
+
+    cache_ok = True
+    what = "a text without control characters"
+
+    def fits(self, value: str) -> bool:
+        return not control_characters(value)
+
+
+class Pair(_Checked):
+    """Two scene ids with a colon between them."""
+
+    cache_ok = True
+    what = "two digests with a colon between them"
+
+    def fits(self, value: str) -> bool:
+        return all(map(is_digest, value.split(":"))) and value.count(":") == 1
+
+
+class Kind(_Checked):
+    """The kind of a group of arrays: the name of a folder."""
+
+    cache_ok = True
+    what = " or ".join(KINDS)
+
+    def fits(self, value: str) -> bool:
+        return value in KINDS
+
+
+class RelativePath(_Checked):
+    """A path that leads downwards only; empty where there is no file."""
+
+    cache_ok = True
+    what = "a path that stays inside"
+
+    def fits(self, value: str) -> bool:
+        return not value or is_relative(value)
+
+
+class Line(_Checked):
+    """What a person wrote, on one line. Read as it is: it is escaped where it is printed."""
+
+    cache_ok = True
+    what = "a text without control characters"
+    lines = False
+
+    def fits(self, value: str) -> bool:
+        return not control_characters(value, lines=self.lines)
+
+    def process_result_value(self, value: Any, dialect: Any) -> Any:
+        return value
+
+
+class Lines(Line):
+    """What a person wrote, on any number of lines."""
+
+    cache_ok = True
+    lines = True
+
+
+class Json(TypeDecorator[Any]):
+    """JSON in a text column: the same on every database, floats to the last bit, infinity allowed.
+
+    Args:
+        fits: what a value that is read must be, one of the functions below; anything where None.
+    """
+
+    impl = Text
+    cache_ok = True
+
+    def __init__(self, fits: Callable[[Any], bool] | None = None, where: str = "") -> None:
+        super().__init__()
+        self.fits = fits
+        self.where = where
+
+    def at(self, where: str) -> Json:
+        """The same type, knowing its column (``table.column``)."""
+        made: Json = self.copy()
+        made.where = where
+        return made
+
+    def process_bind_param(self, value: Any, dialect: Any) -> str | None:
+        return None if value is None else json.dumps(value, separators=(",", ":"))
+
+    def process_result_value(self, value: Any, dialect: Any) -> Any:
+        if value is None:
+            return None
+        try:
+            found = json.loads(value)
+        except (ValueError, TypeError, RecursionError) as error:
+            raise _corrupt(self.where, value, "JSON") from error
+        if self.fits is not None and not self.fits(found):
+            raise _corrupt(self.where, value, f"JSON of {self.fits.__name__.strip('_').replace('_', ' ')}")
+        return found
+
+
+def an_object(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+def texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+def a_direction(value: Any) -> bool:
+    return _numbers(value, 3)
+
+
+def sigmas(value: Any) -> bool:
+    return _numbers(value, 7)
+
+
+def a_box(value: Any) -> bool:
+    return _numbers(value, 2, 3)
+
+
+def a_matrix(value: Any) -> bool:
+    return _numbers(value, 7, 7)
+
+
+def a_pose(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and _numbers(value.get("rotation"), 3, 3)
+        and _numbers(value.get("translation"), 3)
+        and _numbers(value.get("scale"))
+    )
+
+
+def poses_by_scene(value: Any) -> bool:
+    return isinstance(value, dict) and all(is_digest(scene) and a_pose(pose) for scene, pose in value.items())
+
+
+def a_graph(value: Any) -> bool:
+    """What a graph is beside its arrays."""
+    if not isinstance(value, dict) or not isinstance(value.get("layers"), dict):
+        return False
+    layers = value["layers"].values()
+    return (
+        (value.get("up") is None or a_direction(value["up"]))
+        and _numbers(value.get("unit_m"))
+        and texts(value.get("notes"))
+        and all(isinstance(x, dict) and isinstance(x.get("count"), int) and an_object(x.get("rest")) for x in layers)
+    )
+
+
+def _numbers(value: Any, *shape: int) -> bool:
+    if not shape:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, list) and len(value) == shape[0] and all(_numbers(item, *shape[1:]) for item in value)
+
+
+def _corrupt(where: str, value: Any, what: str) -> CorruptError:
+    return CorruptError(
+        f"the catalog holds {_short(value)} in {where}, which is not {what}: gsmap did not write that; "
+        "restore the catalog from a backup, and do not trust a map that was sent to you so"
+    )
+
+
+def _short(value: Any) -> str:
+    """A value as a message quotes it."""
+    said = repr(value)
+    return said if len(said) <= 60 else f"{said[:57]}..."

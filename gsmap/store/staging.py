@@ -1,0 +1,82 @@
+"""Folders that are made beside their place, and what is left of those whose makers died."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from gsmap.durable import is_folder, remove_tree
+
+_STAGED = r"\.{name}\.[0-9a-f]{{8}}"
+# Files that are replaced in one step (`gsmap.durable.write_whole`), and how old one must be to be nobody's.
+_STAGED_FILE = re.compile(r"\.(settings\.toml|catalog\.url|map\.sqlite[a-z0-9.]*)\.[0-9a-f]{8}|\.map\.sqlite\.sha256")
+_ABANDONED_S = 60.0
+_PART = re.compile(r"arrays|lock|\.?(map\.sqlite|catalog\.url).*")  # of a map that is being made
+
+
+@contextlib.contextmanager
+def beside(folder: Path) -> Iterator[Path]:
+    """A new folder beside ``folder``, to be renamed to it inside the block; else it is removed.
+
+    It is locked for as long as this process lives, so that another one can tell it from what a dead one left; such
+    leftovers of the same name are removed first.
+    """
+    _remove_leftovers(folder)
+    while True:
+        staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}")
+        staged.mkdir()
+        try:
+            handle = _locked(staged)
+        except FileNotFoundError:
+            continue  # swept away before it was locked
+        if os.fstat(handle).st_nlink:
+            break
+        os.close(handle)
+    try:
+        yield staged
+    finally:
+        with contextlib.suppress(OSError):
+            remove_tree(staged.parent, staged.name)  # nothing, where it has been renamed
+        os.close(handle)
+
+
+def abandoned_files(folder: Path) -> dict[str, int]:
+    """Names and sizes of the files that killed processes left in a map while they replaced others."""
+    out = {}
+    for entry in os.scandir(folder):
+        if _STAGED_FILE.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+            found = entry.stat(follow_symlinks=False)
+            if time.time() - found.st_mtime > _ABANDONED_S:
+                out[entry.name] = found.st_size
+    return out
+
+
+def _remove_leftovers(folder: Path) -> None:
+    staged = re.compile(_STAGED.format(name=re.escape(folder.name)))
+    for name in sorted(os.listdir(folder.parent)):
+        path = folder.parent / name
+        if not (staged.fullmatch(name) and is_folder(path)):
+            continue
+        with contextlib.suppress(OSError):  # somebody holds it, or it is not ours: then it stays
+            handle = _locked(path, fcntl.LOCK_NB)
+            try:
+                if all(_PART.fullmatch(part) for part in os.listdir(handle)):
+                    remove_tree(folder.parent, name)
+            finally:
+                os.close(handle)
+
+
+def _locked(folder: Path, how: int = 0) -> int:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | how)
+    except BaseException:
+        os.close(handle)
+        raise
+    return handle

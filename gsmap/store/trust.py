@@ -1,0 +1,173 @@
+"""Which catalogs on servers this user has named or trusted.
+
+A map may come from a stranger, and its ``catalog.url`` would have gsmap connect to any server with the user's password
+(``PGPASSWORD``, ``~/.pgpass``). So a URL that a map remembers is used only where the user said so: by making the map
+with it, by ``gsmap trust``, or in the environment variable `ENVIRONMENT`. The yes is kept in the user's configuration,
+by the map's id, without password, and holds for that very URL.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError
+
+from gsmap.durable import open_file, write_whole
+from gsmap.errors import CorruptError, StoreError
+from gsmap.store.columns import is_digest
+from gsmap.texts import control_characters
+
+_log = logging.getLogger("gsmap.store")
+
+ENVIRONMENT = "GSMAP_CATALOG"
+URL_FILE = "catalog.url"
+_MAX_BYTES = 4096  # of a catalog.url; longer ones are not read
+_DRIVER = re.compile(r"postgresql(\+[a-z0-9]+)?")
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """What a map says of its catalog.
+
+    Args:
+        url: of the database, without password.
+        map_id: of the map in it; None in maps that an older gsmap made.
+    """
+
+    url: str
+    map_id: str | None
+
+    @property
+    def server(self) -> str:
+        """The machine (and port), or the folder of a socket, that would be connected to."""
+        url = make_url(self.url)
+        hosts = [url.host, *_listed(url.query.get("host")), *_listed(url.query.get("hostaddr"))]
+        named = ", ".join(host for host in hosts if host) or "this machine"
+        port = url.port or ", ".join(_listed(url.query.get("port")))
+        return f"{named}, port {port}" if port else named
+
+    @property
+    def database(self) -> str:
+        return make_url(self.url).database or ""
+
+    @property
+    def user(self) -> str:
+        return make_url(self.url).username or ""
+
+
+def remembered(folder: Path) -> Remembered:
+    """What a map's ``catalog.url`` says; nothing is connected to.
+
+    Raises:
+        CorruptError: it is no plain file, or names anything but a PostgreSQL database.
+    """
+    path = folder / URL_FILE
+    with open(open_file(path), "rb") as file:
+        content = file.read(_MAX_BYTES + 1)
+    try:
+        lines = content.decode().splitlines()
+        url = make_url(lines[0])
+        fits = len(content) <= _MAX_BYTES and len(lines) <= 2 and not control_characters(lines[0])
+        fits = fits and _DRIVER.fullmatch(url.drivername) is not None and (len(lines) < 2 or is_digest(lines[1]))
+    except (ArgumentError, ValueError, IndexError):
+        fits = False
+    if not fits:
+        raise CorruptError(
+            f"{path} does not name a PostgreSQL database (postgresql+psycopg://...), and gsmap writes nothing else "
+            f"there: name the catalog in {ENVIRONMENT}, and do not trust a map that was sent to you so"
+        )
+    return Remembered(lines[0], lines[1] if len(lines) > 1 else None)
+
+
+def write(folder: Path, url: str, map_id: str) -> None:
+    """Write a map's ``catalog.url``: the URL (without password), and the map's id, a line each."""
+    text = f"{url}\n{map_id}\n"
+    write_whole(folder / URL_FILE, lambda staged: staged.write_text(text, encoding="utf-8"))
+
+
+def named_url(folder: Path) -> str:
+    """The URL to open a map's catalog with: what the environment names, else what the map remembers if that is trusted.
+
+    Raises:
+        StoreError: the user has neither named nor trusted it.
+        CorruptError: see `remembered`.
+    """
+    if named := os.environ.get(ENVIRONMENT):
+        return named
+    found = remembered(folder)
+    if found.map_id is not None and trusted().get(found.map_id) == found.url:
+        return found.url
+    raise StoreError(
+        f"{folder} would connect to {found.server} (database {found.database!r}, user {found.user!r}), which you have "
+        f"not trusted yet: run gsmap trust {folder} if that is right, or name the catalog's URL in {ENVIRONMENT}"
+    )
+
+
+def trusted() -> dict[str, str]:
+    """The URLs (without password) that this user trusts, by map id.
+
+    Raises:
+        StoreError: the user's file of them cannot be read.
+    """
+    path = config_file()
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["catalogs"]
+        if not all(isinstance(key, str) and isinstance(url, str) for key, url in found.items()):
+            raise TypeError("it maps ids to URLs")
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StoreError(f"{path} cannot be read ({error}): mend it, or remove it and trust your maps again") from error
+    return dict(found)
+
+
+def trust(map_id: str, url: str) -> None:
+    """Remember that this user trusts a URL (without password) as the catalog of a map."""
+    path = config_file()
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)  # two at once would forget what one of them says
+            known: Mapping[str, str] = {**trusted(), map_id: url}
+            text = json.dumps({"catalogs": dict(known)}, indent=1) + "\n"
+            write_whole(path, lambda staged: _write_private(staged, text))
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise StoreError(
+            f"cannot remember in {path} that the catalog is trusted ({error.strerror}): name its URL in {ENVIRONMENT}"
+        ) from error
+
+
+def remember(folder: Path) -> None:
+    """Trust the catalog of a map that this user has just made; where that cannot be kept, a warning says so."""
+    found = remembered(folder)
+    try:
+        if found.map_id is not None:
+            trust(found.map_id, found.url)
+    except StoreError as error:  # the map is made; it is opened by naming its catalog again
+        _log.warning("%s", error)
+
+
+def config_file() -> Path:
+    """Where this user's trusted catalogs are listed."""
+    base = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
+    return Path(base).expanduser() / "gsmap" / "catalogs.json"
+
+
+def _write_private(path: Path, text: str) -> None:
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "wb") as file:
+        file.write(text.encode())
+
+
+def _listed(value: str | tuple[str, ...] | None) -> tuple[str, ...]:
+    return () if value is None else (value,) if isinstance(value, str) else tuple(value)

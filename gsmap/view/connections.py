@@ -1,0 +1,128 @@
+"""Connections to this machine's own address: from this user only where that can be told, a bounded number, none idle
+for long."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import socket
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+# A browser opens six; a second window and a reload beside it fit. Each holds a thread.
+MAX_CONNECTIONS = 16
+# To send a whole request, or the next one: what is slower is no browser on this machine.
+REQUEST_S = 10.0
+_ESTABLISHED = "01"
+
+
+@dataclass(eq=False)
+class Connection:
+    """One client.
+
+    Args:
+        socket: to it.
+        waiting_since: `time.monotonic` when its next request was first waited for; None while it is answered.
+    """
+
+    socket: socket.socket
+    waiting_since: float | None = field(default_factory=time.monotonic)
+
+    def drop(self) -> None:
+        """End it, whoever waits for it."""
+        with contextlib.suppress(OSError):  # it has ended already
+            self.socket.shutdown(socket.SHUT_RDWR)
+
+
+class LocalServer(HTTPServer):
+    """Answers at most `MAX_CONNECTIONS` at once, with as many threads. When one more comes, the one that has kept a
+    thread waiting for longest is dropped, so that half requests cannot keep the page out."""
+
+    request_queue_size = 64
+
+    def __init__(self, port: int, handler: type[BaseHTTPRequestHandler]) -> None:
+        self.open: dict[socket.socket, Connection] = {}
+        self._lock = threading.Lock()
+        self._accepted: queue.SimpleQueue[tuple[socket.socket, object] | None] = queue.SimpleQueue()
+        super().__init__(("127.0.0.1", port), handler)
+        for _ in range(MAX_CONNECTIONS):
+            threading.Thread(target=self._work, daemon=True).start()
+
+    def verify_request(self, request: object, client_address: object) -> bool:
+        """Whether the client may be another user's; asked before anything is read."""
+        return not is_of_another_user(client_address, self.server_address)
+
+    def process_request(self, request: object, client_address: object) -> None:
+        assert isinstance(request, socket.socket)
+        with self._lock:
+            if len(self.open) >= MAX_CONNECTIONS:
+                waiting = [c for c in self.open.values() if c.waiting_since is not None]
+                if not waiting:
+                    self.shutdown_request(request)
+                    return
+                self._forget(min(waiting, key=lambda c: c.waiting_since or 0.0))
+            self.open[request] = Connection(request)
+        self._accepted.put((request, client_address))
+
+    def service_actions(self) -> None:
+        """Called twice a second by `serve_forever`: ends what has waited for too long."""
+        with self._lock:
+            late = time.monotonic() - REQUEST_S
+            for one in [c for c in self.open.values() if c.waiting_since is not None and c.waiting_since < late]:
+                self._forget(one)
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A client that goes away is no error, and nothing below the command line prints."""
+
+    def server_close(self) -> None:
+        super().server_close()
+        with self._lock:
+            for one in list(self.open.values()):
+                self._forget(one)
+        for _ in range(MAX_CONNECTIONS):
+            self._accepted.put(None)
+
+    def _forget(self, one: Connection) -> None:
+        del self.open[one.socket]
+        one.drop()
+
+    def _work(self) -> None:
+        while (accepted := self._accepted.get()) is not None:
+            request, client_address = accepted
+            try:
+                self.finish_request(request, client_address)
+            except Exception:
+                self.handle_error(request, client_address)
+            finally:
+                with self._lock:
+                    self.open.pop(request, None)
+                self.shutdown_request(request)
+
+
+def is_of_another_user(client: object, server: object) -> bool:
+    """Whether the socket at the other end of a connection on this machine is known to be of another user than this
+    one and root. Linux tells; elsewhere, and of a socket that is closing, nothing is known."""
+    if not sys.platform.startswith("linux"):
+        return False
+    (client_host, client_port), (server_host, server_port) = client, server  # type: ignore[misc, attr-defined]
+    here, there = _hexadecimal(client_host, client_port), _hexadecimal(server_host, server_port)
+    for name, prefix in (("tcp", ""), ("tcp6", "0000000000000000FFFF0000")):  # an IPv6 socket may speak IPv4
+        try:
+            rows = Path("/proc/net", name).read_text(encoding="ascii").splitlines()[1:]
+        except OSError:
+            continue
+        for row in rows:
+            _, local, remote, state, _, _, _, user, *_ = row.split()
+            if (local, remote, state) == (prefix + here, prefix + there, _ESTABLISHED):
+                return int(user) not in (0, os.getuid(), os.geteuid())
+    return False
+
+
+def _hexadecimal(host: str, port: int) -> str:
+    """An IPv4 address as the kernel lists it: the address in the machine's byte order."""
+    return f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"

@@ -1,0 +1,88 @@
+"""Every reader of JSON, TOML or text from outside: damage that the fuzzer found (tools/fuzz_parsers.py) is refused with
+one of gsmap's errors, in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsmap.cli.edge import read_pose
+from gsmap.errors import ConfigError, GsmapError, InputError
+from gsmap.export import tileset
+from gsmap.export.manifest import Manifest
+from gsmap.formats import g2o
+from gsmap.map.evaluating import _read_truth
+from gsmap.map.settings import map_settings
+from gsmap.settings import parse
+
+EYE = np.eye(4).tolist()
+HUGE, DEEP = 10**400, "[" * 100_000
+TILE = {"name": "a", "component": 0, "path": "a.ply", "bounds_m": [[0, 0, 0], [1, 1, 1]], "num_gaussians": 1, "key": ""}
+TILE |= {"num_bytes": 1, "sha256": "", "recipe": {}, "truncated": False, "notes": [], "S_map_scene": {"s": EYE}}
+MANIFEST = {"version": 2, "map_id": "m", "tiles": [TILE]}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        DEEP,
+        json.dumps({**MANIFEST, "map_id": 7}),
+        json.dumps({**MANIFEST, "tiles": [{**TILE, "S_map_scene": True}]}),
+        json.dumps({**MANIFEST, "tiles": [{**TILE, "bounds_m": [[HUGE] * 3] * 2}]}),
+    ],
+)
+def test_manifest(tmp_path: Path, text: str) -> None:
+    (tmp_path / "tiles.json").write_text(text)
+    with pytest.raises((InputError, ConfigError), match="export to another folder"):
+        Manifest.load(tmp_path, "m")
+
+
+def test_a_tile_whose_path_is_no_name(tmp_path: Path) -> None:
+    (tmp_path / "tiles.json").write_text(json.dumps({**MANIFEST, "tiles": [{**TILE, "path": "a\0b"}]}))
+    with pytest.raises(InputError, match="not a manifest gsmap wrote"):
+        Manifest.load(tmp_path, "m")
+
+
+@pytest.mark.parametrize("text", [DEEP, '{"root": {"boundingVolume": {"box": [%d, 0, 0]}}}' % HUGE, '{"root": 7}'])
+def test_levels_of_a_tileset_that_is_not_ours_are_made_again(tmp_path: Path, text: str) -> None:
+    (tmp_path / "tileset.json").write_text(text)
+    assert tileset._known_boxes(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    "text", [DEEP, json.dumps({"T_scene_world": [[HUGE] * 4] * 4}), "7", '{"T_scene_world": null}']
+)
+def test_truth(tmp_path: Path, text: str) -> None:
+    (tmp_path / "hall.json").write_text(text)
+    with pytest.raises(InputError, match="T_scene_world"):
+        _read_truth(tmp_path, "hall")
+
+
+@pytest.mark.parametrize("text", [DEEP, json.dumps([[HUGE] * 4] * 4), '{"a": 1}', "[true, {}]"])
+def test_pose(tmp_path: Path, text: str) -> None:
+    (tmp_path / "pose.json").write_text(text)
+    with pytest.raises(InputError):
+        read_pose(tmp_path / "pose.json")
+
+
+@pytest.mark.parametrize("text", ["a = " + "9" * 5000, "a = " + DEEP, "a = nan", "[describe]\nobjects = 2099-99-99"])
+def test_settings(tmp_path: Path, text: str) -> None:
+    (tmp_path / "settings.toml").write_text(text)
+    with pytest.raises(ConfigError, match=r"settings\.toml"):
+        map_settings(tmp_path, None, {})
+    name, _, value = text.partition(" = ")
+    assert parse(f"{name}={value}")[0] == name
+
+
+def test_a_message_is_one_printable_line_whatever_it_quotes(tmp_path: Path) -> None:
+    (tmp_path / "a.g2o").write_text("VERTEX_SE3:QUAT\x1b]0;owned\x07 " + "word" * 5000 + " 1 2 3 4 5 6 7\n")
+    with pytest.raises(GsmapError) as caught:
+        g2o.read_graph(tmp_path / "a.g2o")
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) <= 1000
+    said = str(InputError("x" * 5000 + " at line 3: " + "mend it"))
+    assert said.endswith("at line 3: mend it")
+    assert str(InputError(said)) == said

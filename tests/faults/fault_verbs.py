@@ -1,0 +1,192 @@
+"""What the harness runs: small captures, the maps that verbs begin from, and the verbs, as tables to add lines to."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsmap import formats
+from gsmap.types import Gaussians
+
+OLDER = Path(__file__).resolve().parents[1] / "store" / "schema_0001.tar.xz"
+EXPORT = "export MAP OUT --merge union --tile-size 3"
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A command whose every change of the disk is met once.
+
+    Args:
+        name: how it is called in tables and on the command line of the sweep.
+        base: the map it begins with, of `BASES`.
+        line: its arguments. MAP, OUT and IN stand for the map, the folder of an export and that of the samples.
+        done_says: what the repeated verb may say where the first run had come to its end.
+        also: lines that are run first, undisturbed and unwatched.
+        needs: a package without which there is no such verb.
+    """
+
+    name: str
+    base: str
+    line: str
+    done_says: str = ""
+    also: tuple[str, ...] = ()
+    needs: str = ""
+
+    @property
+    def possible(self) -> bool:
+        return not self.needs or importlib.util.find_spec(self.needs) is not None
+
+
+BASES = {
+    "nothing": ("", ()),
+    "empty": ("nothing", ("init MAP",)),
+    "ingested": ("empty", ("ingest MAP IN/a.ply IN/b.ply",)),
+    "described": ("ingested", ("describe MAP",)),
+    "registered": ("described", ("register MAP", "edge MAP a:b --pose IN/pose.txt --sigma 1,0.1")),
+    "placed": ("registered", ("optimize MAP",)),
+    "exported": ("placed", (EXPORT,)),
+    # Poses, a scene and with it tiles that are no longer planned.
+    "moved": (
+        "exported",
+        ("ingest MAP IN/c.ply", "edge MAP a:b --pose IN/pose2.txt --sigma 0.1,0.01", "optimize MAP"),
+    ),
+    "shrunk": ("exported", ("remove MAP b", "optimize MAP")),
+    "modelled": ("placed", ("models add MAP clip IN/encoder.onnx --preset unit",)),
+    # Everything that prune takes: a removed scene with its graph, revisions, an orphan, what a dead writer left.
+    "littered": ("placed", ("remove MAP b", "optimize MAP", "*litter")),
+    "older": ("nothing", ("*older",)),
+}
+"""Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
+
+VERBS = {
+    verb.name: verb
+    for verb in (
+        Verb("init", "nothing", "init MAP", done_says="is a map already"),
+        Verb("ingest", "placed", "ingest MAP IN/c.ply"),
+        Verb("ingest-two", "empty", "ingest MAP IN/a.ply IN/b.ply"),
+        Verb("describe", "ingested", "describe MAP a"),
+        Verb("register", "described", "register MAP"),
+        Verb("optimize", "registered", "optimize MAP"),
+        Verb("update", "nothing", "update MAP IN/a.ply IN/b.ply"),
+        Verb("update-one", "placed", "update MAP IN/c.ply"),
+        Verb("export", "placed", EXPORT),
+        Verb("export-moved", "moved", EXPORT),
+        Verb("export-shrunk", "shrunk", EXPORT),
+        Verb("export-3dtiles", "placed", "export MAP OUT --merge union --tile-size 3 --format 3dtiles"),
+        Verb("prune", "littered", "prune MAP --keep-revisions 1"),
+        Verb("remove", "placed", "remove MAP b", done_says="no scene is called"),
+        Verb("models-add", "placed", "models add MAP clip IN/encoder.onnx --preset unit", needs="onnx"),
+        Verb("models-again", "modelled", "models add MAP clip IN/encoder2.onnx --preset unit", needs="onnx"),
+        Verb("migrate", "older", "migrate MAP"),
+        Verb("confirm", "placed", "confirm MAP a:b"),
+        Verb("reject", "placed", "reject MAP a:b"),
+        Verb("edge", "placed", "edge MAP a:b --pose IN/pose2.txt --sigma 1,0.1"),
+        Verb("prior", "placed", "prior MAP a --anchor"),
+        Verb("edit", "placed", "edit MAP a --captured-at 2024-05-31 --note wet --tag hall"),
+        Verb("settings", "placed", "settings MAP --set export.moved_m=0.01"),
+    )
+}
+"""Verbs by name. A verb that is new is one line here."""
+
+
+def words(line: str, folder: Path, samples: Path) -> list[str]:
+    """The arguments of a line, in a folder that holds the map and the export."""
+    places = {"MAP": str(folder / "site.gsmap"), "OUT": str(folder / "out"), "IN": str(samples), "HERE": str(folder)}
+    out = []
+    for word in line.split():
+        first, slash, rest = word.partition("/")
+        out.append(places.get(first, first) + slash + rest)
+    return out
+
+
+# --- what bases need that no verb makes ----------------------------------------------------------------------------
+
+
+def litter(site: Path) -> None:
+    """What crashes leave."""
+    for folder in (site / "arrays" / "scenes" / ("0" * 32), site / "arrays" / "staging" / ("1" * 32) / "means"):
+        folder.mkdir(parents=True)
+        (folder / "zarr.json").write_text("{}")
+
+
+def older(site: Path) -> None:
+    """A map of schema 0001."""
+    with tarfile.open(OLDER) as archive:
+        archive.extractall(site.parent, filter="data")
+    os.rename(site.parent / "old.gsmap", site)
+
+
+# --- captures --------------------------------------------------------------------------------------------------------
+
+
+def write_samples(folder: Path) -> None:
+    """Three captures of a few hundred Gaussians, poses for ``gsmap edge``, and models where onnx is installed."""
+    folder.mkdir(parents=True)
+    for seed, name in enumerate("abc"):
+        formats.write(folder / f"{name}.ply", _capture(seed))
+        (folder / f"{name}.cameras.json").write_text(json.dumps(_frames(name)))
+    for name, x in (("pose", 1.5), ("pose2", 1.6)):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        np.savetxt(folder / f"{name}.txt", pose)
+    if importlib.util.find_spec("onnx") is not None:
+        for name, window in (("encoder", 16), ("encoder2", 8)):
+            (folder / f"{name}.onnx").write_bytes(_encoder(window))
+
+
+def _capture(seed: int, count: int = 400) -> Gaussians:
+    """Gaussians on the sides of a box of 4 x 3 x 2 m, of one texture."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(size=(count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = rng.integers(0, 2, count)
+    points *= [4.0, 3.0, 2.0]
+    colours = np.sin(points * [3.0, 4.0, 5.0])[:, None]
+    flat = np.full((count, 3), np.log(0.05))
+    return Gaussians(points, np.tile([1.0, 0, 0, 0], (count, 1)), flat, np.full(count, 3.0), colours)
+
+
+def _frames(name: str) -> list[dict[str, object]]:
+    return [
+        {"id": i, "img_name": f"{name}_{i}", "width": 32, "height": 24, "position": [2.0, 1.5, 1.0]}
+        | {"rotation": [[0, 0, way], [-way, 0, 0], [0, -1, 0]], "fx": 20.0, "fy": 20.0}
+        for i, way in enumerate((1, -1))
+    ]
+
+
+def _encoder(window: int) -> bytes:
+    from onnx import TensorProto, helper
+
+    across = 32 // window
+    pool = helper.make_node(
+        "AveragePool", ["image"], ["pooled"], kernel_shape=[window, window], strides=[window, window]
+    )
+    flat = helper.make_node("Flatten", ["pooled"], ["features"])
+    graph = helper.make_graph(
+        [pool, flat],
+        "encoder",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
+        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 3 * across * across])],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
+
+
+FUNCTIONS = {"*litter": litter, "*older": older}
+
+
+def copy_map(source: Path, target: Path) -> None:
+    """A copy to break: files of arrays are linked, since what is in its place is never written again."""
+
+    def copy(there: str, here: str) -> None:
+        if "/arrays/" in there:
+            os.link(there, here)
+        else:
+            shutil.copy2(there, here)
+
+    shutil.copytree(source, target, copy_function=copy, symlinks=True, dirs_exist_ok=True)
