@@ -35,6 +35,15 @@ def sync_file(path: Path) -> None:
         os.close(handle)
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, and what it lies in, so that it survives a power cut; nothing where it is there."""
+    if path.is_dir():
+        return
+    make_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync_folder(path.parent)
+
+
 def write_text_whole(path: Path, text: str) -> None:
     """Replace a text file (UTF-8) in one step; see `write_whole`."""
     write_whole(path, lambda staged: staged.write_bytes(text.encode("utf-8")))

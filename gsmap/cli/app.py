@@ -40,7 +40,10 @@ VERBS = (
     "evaluate",
     "branch",
     "tag",
+    "merge",
+    "split",
     "remove",
+    "restore-scene",
     "check",
     "prune",
     "migrate",
@@ -84,7 +87,7 @@ def build() -> typer.Typer:
     )
     app.callback()(_root)
     for verb in VERBS:
-        module = importlib.import_module(f"gsmap.cli.{verb}")
+        module = importlib.import_module(f"gsmap.cli.{verb.replace('-', '_')}")
         if hasattr(module, "app"):
             app.add_typer(module.app, name=verb)
         else:

@@ -32,18 +32,21 @@ from gsmap.types.rows import (
     GraphRow,
     IngestRow,
     MapStatus,
+    MergeReport,
     ModelRow,
     PairReport,
     PoseChangeRow,
     PoseRow,
     PriorRow,
     PruneReport,
+    PurgeReport,
     RestoreReport,
     RevisionRow,
     SceneReport,
     SceneRow,
     SettingRow,
     SnapshotRow,
+    SplitReport,
     TileRow,
     UpdateReport,
 )
@@ -325,6 +328,7 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        wait: bool = False,
     ) -> ExportReport:
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
 
@@ -339,8 +343,10 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            wait: where another export is at work in the folder, until it has ended.
 
         Raises:
+            BusyError: another export is at work in the folder; it is named.
             ConfigError, InputError, StoreError: see `gsmap.export`; no half-written tile is left.
         """
         from gsmap.map.stages.export import Request, export
@@ -356,7 +362,11 @@ class Map(AbstractContextManager["Map"]):
             budget_s=budget_s,
             provenance=provenance,
         )
-        made = export(self.store, Path(out), request, self.settings, lambda f, text: self._progress("export", f, text))
+
+        def progress(fraction: float, text: str) -> None:
+            self._progress("export", fraction, text)
+
+        made = export(self.store, Path(out), request, self.settings, progress, wait=wait)
         return reports.export_report(self.store, Path(out), made)
 
     # --- look --------------------------------------------------------------------------------------------------------
@@ -496,7 +506,12 @@ class Map(AbstractContextManager["Map"]):
         if images is None:
             return report
         rows = evaluating.images(
-            self.store, images, lambda f, text: self._progress("evaluate", f, text), tiles=tiles, lpips=lpips
+            self.store,
+            images,
+            lambda f, text: self._progress("evaluate", f, text),
+            tiles=tiles,
+            lpips=lpips,
+            limits=self.settings.describe.object.limits,
         )
         return replace(report, images=rows)
 
@@ -591,6 +606,41 @@ class Map(AbstractContextManager["Map"]):
         self.store.branches.delete(name)
         return row
 
+    def merge(self, source: str | os.PathLike[str]) -> MergeReport:
+        """``gsmap merge MAP SOURCE``: take all that another map, branch or tag knows; nothing is computed."""
+        return as_values.merge(self.store, source)
+
+    def split(
+        self,
+        out: str | os.PathLike[str],
+        *,
+        island: int | None = None,
+        box: Sequence[float] | None = None,
+        scenes: Sequence[str] | None = None,
+    ) -> SplitReport:
+        """``gsmap split MAP OUT``: a new map of some scenes, with all that is known of and among them.
+
+        Args:
+            island: those of this component.
+            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of the island, else of component 0.
+            scenes: those of these names.
+        """
+        return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))
+
+    def purge(self, ref: str, *, branches: bool = False) -> PurgeReport:
+        """``gsmap remove MAP SCENE --purge``: forget a scene for good: rows, arrays, tiles that were made with it.
+
+        Args:
+            branches: in the map's other branches and tags, too; else they are told of.
+        """
+        from gsmap.map.stages.purge import purge
+
+        return as_values.purge_report(purge(self.store, ref, branches=branches))
+
+    def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
+        """``gsmap restore-scene MAP SCENE``: bring back a removed scene, or (``source``) take one of another map."""
+        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source))
+
     def check(self) -> CheckReport:
         """Read every byte of the map and compare it with what was written."""
         return reports.check_report(self.store.check(lambda f, text: self._progress("check", f, text)))
@@ -624,4 +674,4 @@ class Map(AbstractContextManager["Map"]):
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""
         from gsmap.map import models
 
-        models.add(self.store, kind, path, preset, copy)
+        models.add(self.store, kind, path, preset, copy, self.settings.describe.object.limits)

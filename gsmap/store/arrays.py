@@ -13,6 +13,7 @@ import contextlib
 import fcntl
 import hashlib
 import os
+import shutil
 import stat
 import threading
 import time
@@ -24,12 +25,12 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_folder
+from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_file, sync_folder
 from gsmap.errors import BusyError, CorruptError
+from gsmap.store import layout
 from gsmap.store.columns import KINDS, is_digest
+from gsmap.store.layout import CHUNK_ROWS, SHARD_ROWS
 
-CHUNK_ROWS = 16_384
-SHARD_ROWS = 16 * CHUNK_ROWS
 _ZSTD_LEVEL = 1
 
 
@@ -74,6 +75,32 @@ class Arrays:
                 yield Staged(folder, _synchronise(folder))
             finally:
                 with contextlib.suppress(OSError):  # there is nothing where it was published
+                    self._remove_staged(folder.name)
+
+    @contextlib.contextmanager
+    def stage_copies(
+        self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
+    ) -> Iterator[dict[tuple[str, str], Staged]]:
+        """Bring groups of another map beside their places; dropped at the end unless `publish` took them.
+
+        Files are linked where the disk allows, since no map ever writes to one again, and else copied.
+
+        Args:
+            groups: manifest by (kind, name).
+
+        Raises:
+            CorruptError: a file is missing, or differs from what was written.
+        """
+        with self._lock_staging(fcntl.LOCK_SH):
+            folder = self.staging / uuid.uuid4().hex
+            try:
+                folder.mkdir()
+                yield {
+                    group: Staged(_take(source._place(*group), folder / "-".join(group), files), tuple(files))
+                    for group, files in groups.items()
+                }
+            finally:
+                with contextlib.suppress(OSError):
                     self._remove_staged(folder.name)
 
     @contextlib.contextmanager
@@ -127,6 +154,7 @@ class Arrays:
         *,
         only: Sequence[str] | None = None,
         rows: Sequence[tuple[int, int]] | None = None,
+        shapes: Mapping[str, layout.Shape] | None = None,
     ) -> dict[str, np.ndarray]:
         """Read arrays of a group.
 
@@ -134,9 +162,10 @@ class Arrays:
             files: its manifest; a missing or short file is found before zarr turns it into zeros.
             only: names of the arrays to read.
             rows: ranges ``[start, stop)`` of rows, in order; all where None.
+            shapes: what the catalog says of the arrays; None for a length that it does not know.
 
         Raises:
-            CorruptError: a file is missing, short, or fails its checksum.
+            CorruptError: a file is missing, short, or fails its checksum, or gsmap does not write arrays so.
         """
         import zarr
 
@@ -148,9 +177,11 @@ class Arrays:
                 raise CorruptError(f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it")
             if found is None or found.st_size != file.size_bytes:
                 raise CorruptError(f"{path} is missing or cut off: run gsmap check, and ingest the scene again")
+        names = _arrays_in(files) if only is None else only
+        layout.check(place, {file.path: file.size_bytes for file in files}, names, shapes)
         try:
-            group = zarr.open_group(str(place), mode="r", zarr_format=3)
-            return {key: _rows(group[key], rows) for key in (group.array_keys() if only is None else only)}
+            group = zarr.open_group(str(place), mode="r", zarr_format=3, use_consolidated=False)
+            return {name: _rows(group[name], rows) for name in names}
         except Exception as error:  # zarr and its codecs raise whatever they stumbled over
             raise CorruptError(
                 f"{place} cannot be read ({type(error).__name__}: {error}): run gsmap check, and ingest the scene again"
@@ -171,6 +202,11 @@ class Arrays:
                 out.append(f"{path} has {found.st_size} bytes, {file.size_bytes} were written")
             elif _sha256(path) != file.sha256:
                 out.append(f"{path} differs from what was written")
+        if not out:
+            try:
+                layout.check(place, {file.path: file.size_bytes for file in files}, _arrays_in(files))
+            except CorruptError as error:
+                out.append(str(error))
         extra = sorted(set(present) - {file.path for file in files})
         return out + [f"{place / name} does not belong there" for name in extra]
 
@@ -285,6 +321,40 @@ def _write(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
         )
         if array.size:
             made[...] = array
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Another name for a file that is never written again, or a copy where the disk has no such thing."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+        sync_file(target)
+
+
+def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
+    """Another map's group as one of our own, every byte compared; returns ``target``."""
+    target.mkdir()
+    present = files_below(place)
+    for file in files:
+        path, mine, found = place / file.path, target / file.path, present.get(file.path)
+        if found is None or not stat.S_ISREG(found.st_mode) or found.st_size != file.size_bytes:
+            raise CorruptError(f"{path} is missing or cut off: run gsmap check on that map, and repair it first")
+        mine.parent.mkdir(parents=True, exist_ok=True)
+        link_or_copy(path, mine)
+        if _sha256(mine) != file.sha256:
+            raise CorruptError(
+                f"{path} differs from what was written: run gsmap check on that map, and repair it first"
+            )
+    for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
+        sync_folder(path)
+    return target
+
+
+def _arrays_in(files: Sequence[StoredFile]) -> list[str]:
+    """The names of a group's arrays, by its manifest."""
+    found = (file.path.rpartition("/") for file in files)
+    return sorted(above for above, _, name in found if name == "zarr.json" and above)
 
 
 def _rows(array: Any, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +14,12 @@ from sqlalchemy import Connection, delete, not_, select, text, update
 from gsmap.durable import is_file, is_folder, remove_file
 from gsmap.errors import ConfigError, GsmapError, StoreError
 from gsmap.store import sqlite, staging
-from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
+from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
+from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress
@@ -126,8 +128,9 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
     """
     if keep_revisions is not None and keep_revisions < 0:
         raise ConfigError(f"the number of revisions to keep must not be negative, got {keep_revisions}")
-    others = Others(arrays.root.parent, catalog.folder)
-    others.groups()  # asked before anything is changed: a branch that cannot be read may need any of it
+    Others(
+        arrays.root.parent, catalog.folder
+    ).groups()  # asked before anything is changed: a branch that cannot be read may need any of it
     with contextlib.nullcontext() if dry_run else catalog.lock():
         with contextlib.ExitStack() as stack:
             connection = stack.enter_context(catalog.read() if dry_run else catalog.write())
@@ -153,34 +156,57 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
                 connection.execute(delete(files).where(files.c.group_id.in_(ids)))
                 connection.execute(delete(groups).where(groups.c.id.in_(ids)))
         # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
-        with explained(catalog.folder), contextlib.nullcontext() if dry_run else arrays.lock():
-            forgotten = _forgotten_models(catalog, others, arrays.root.parent)
-            # Asked again under the lock of the arrays: nobody comes to name any of them from here on.
-            with catalog.read() as connection:
-                known = {(g.kind, g.id) for g in connection.execute(select(groups))}
-            named_still = (known - set(doomed) if dry_run else known) | others.groups()
-            bodies = [group for group in arrays.groups() if group not in named_still]
-            num_bytes = sum(arrays.size_bytes(*group) for group in bodies)
-            abandoned = staging.abandoned_files(catalog.folder)
-            num_bytes += sum(path.stat().st_size for path in forgotten) + sum(abandoned.values())
-            if not dry_run:
-                for group in bodies:
-                    arrays.drop(*group)
-                for path in forgotten:
-                    remove_file(arrays.root.parent, FOLDER, path.name)
-                for name in abandoned:
-                    remove_file(catalog.folder, name)
-                bury_leftovers(arrays.root.parent)
-            num_bytes += arrays.drop_leftovers(dry_run=dry_run)
+        reclaimed = reclaim(catalog, arrays, dry_run=dry_run, besides=doomed if dry_run else ())
     return Pruned(
         scenes=tuple(row.name for row in dead),
         revisions=tuple(dropped),
         num_graphs=len(keys),
-        num_orphans=len(set(bodies) - set(doomed)),
-        num_models=len(forgotten),
-        num_bytes=num_bytes,
+        num_orphans=len(set(reclaimed.groups) - set(doomed)),
+        num_models=reclaimed.num_models,
+        num_bytes=reclaimed.num_bytes,
         dry_run=dry_run,
     )
+
+
+@dataclass(frozen=True)
+class Reclaimed:
+    """What no row of any catalog named: (kind, id) of groups, copies of models, and the bytes of all of it."""
+
+    groups: tuple[tuple[str, str], ...]
+    num_models: int
+    num_bytes: int
+
+
+def reclaim(
+    catalog: Catalog, arrays: Arrays, *, dry_run: bool = False, besides: Collection[tuple[str, str]] = ()
+) -> Reclaimed:
+    """Delete the arrays and models that no row of the map or of any of its branches names, and what crashes left.
+
+    Args:
+        dry_run: only say what would go.
+        besides: groups that rows name and that go all the same.
+    """
+    home, others = arrays.root.parent, Others(arrays.root.parent, catalog.folder)
+    with explained(catalog.folder), contextlib.nullcontext() if dry_run else arrays.lock():
+        forgotten = _forgotten_models(catalog, others, home)
+        # Asked under the lock of the arrays: nobody comes to name any of them from here on.
+        with catalog.read() as connection:
+            known = {(g.kind, g.id) for g in connection.execute(select(groups))}
+        named = known - set(besides) | others.groups()
+        bodies = [group for group in arrays.groups() if group not in named]
+        num_bytes = sum(arrays.size_bytes(*group) for group in bodies)
+        abandoned = staging.abandoned_files(catalog.folder)
+        num_bytes += sum(path.stat().st_size for path in forgotten) + sum(abandoned.values())
+        if not dry_run:
+            for group in bodies:
+                arrays.drop(*group)
+            for path in forgotten:
+                remove_file(home, FOLDER, path.name)
+            for name in abandoned:
+                remove_file(catalog.folder, name)
+            bury_leftovers(home)
+        num_bytes += arrays.drop_leftovers(dry_run=dry_run)
+    return Reclaimed(tuple(bodies), len(forgotten), num_bytes)
 
 
 def _row_problems(connection: Connection, home: Path) -> list[str]:

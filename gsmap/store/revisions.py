@@ -147,6 +147,12 @@ class Revisions:
             return [_revision(row, counts.get(row.number)) for row in connection.execute(query)]
 
 
+def newest_poses(connection: Connection) -> PoseGraph | None:
+    """The newest revision's answer, as a transaction sees it; None before the first."""
+    row = connection.execute(select(revisions).order_by(revisions.c.number.desc()).limit(1)).first()
+    return None if row is None else _pose_graph(connection, row)
+
+
 def _is(condition: Any) -> Any:
     return func.sum(case((condition, 1), else_=0))
 

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, Row, insert, select, text, update
 
-from gsmap.errors import InputError, NotFoundError, StoreError
+from gsmap.errors import CorruptError, InputError, NotFoundError, StoreError
 from gsmap.geometry.morton import morton_order
 from gsmap.store import facts
-from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile, digest
+from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
 from gsmap.store.groups import has_group, manifest, publish
+from gsmap.store.layout import CHUNK_ROWS, Shape
 from gsmap.store.schema import CHUNK_BOXES, scenes
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import Progress
@@ -123,7 +125,7 @@ class Scenes:
                 scene = self._enter(connection, new_id, fields, rename, dated_by)
             publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
-            _put_boxes(connection, number, boxes)
+            put_boxes(connection, number, boxes)
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))
         return scene, True
 
@@ -183,7 +185,7 @@ class Scenes:
             same = {("name", row.name), ("captured_at", row.captured_at or ""), *(("tag", tag) for tag in tags)}
             new = [fact for fact in dict.fromkeys(new) if fact not in same]
             for kind, value in new:
-                if kind == "name" and _name_taken(connection, value):
+                if kind == "name" and name_taken(connection, value):
                     raise InputError(f"another scene is called {value!r}: choose another name, or rename that one")
                 if kind == "untag" and value not in tags:
                     raise NotFoundError(f"scene {row.name!r} has no tag {value!r}: it has {sorted(tags) or 'none'}")
@@ -230,7 +232,7 @@ class Scenes:
             files = _manifest(connection, row)
             chunks = None if bounds is None else _touching(connection, row.number, np.asarray(bounds, np.float64))
         rows = None if chunks is None else _ranges(chunks, row.num_gaussians)
-        out = Gaussians(**self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows))
+        out = Gaussians(**self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows, shapes=_shapes(row)))
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)
@@ -247,8 +249,13 @@ class Scenes:
             row = _find(connection, ref)
             files = _manifest(connection, row)
         names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
-        pose, intrinsics, sizes, text_bytes = self._arrays.read(KIND, row.group_id, files, only=names).values()
-        image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
+        pose, intrinsics, sizes, text_bytes = self._arrays.read(
+            KIND, row.group_id, files, only=names, shapes=_shapes(row)
+        ).values()
+        try:
+            image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
+        except UnicodeDecodeError as error:
+            raise CorruptError(f"scene {row.name}: the names of its cameras are no text: ingest it again") from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
 
     def remove(self, ref: str) -> Scene:
@@ -257,6 +264,48 @@ class Scenes:
             row = _alive(connection, ref)
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
             return _with_tags(connection, row)
+
+    def restore(self, ref: str) -> Scene:
+        """Let a removed scene live again, with all that is known of it; where its name is taken now it is ``name-2``.
+
+        Args:
+            ref: its id, the beginning of it, or its last name.
+
+        Raises:
+            NotFoundError: no removed scene is called so, several are, or its arrays were pruned.
+            InputError: it was not removed.
+            CorruptError: its arrays are damaged.
+        """
+        with self._catalog.write() as connection:
+            row = _find_removed(connection, ref)
+            files = manifest(connection, row.group_id or "")
+            if not files:
+                raise NotFoundError(
+                    f"the arrays of scene {row.name} ({row.id}) were pruned: bring them from another map, a branch or "
+                    "a restored backup with --from, or ingest its capture again"
+                )
+            problems = self._arrays.problems(KIND, row.group_id, files)
+            if problems:
+                raise CorruptError(f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}")
+            name, number = row.name, 2
+            while name_taken(connection, name):
+                name, number = f"{row.name}-{number}", number + 1
+            back = {"removed_at": None, "ingested_at": now(), "name": name}
+            connection.execute(update(scenes).where(scenes.c.id == row.id).values(**back))
+            if name != row.name:
+                facts.say(connection, row.id, [("name", name)])
+            return _with_tags(connection, _find(connection, row.id))
+
+    def find_any(self, ref: str) -> Scene:
+        """A scene by name, id or the beginning of its id, living or else removed.
+
+        Raises:
+            NotFoundError: none, or several are called so.
+        """
+        with self._catalog.read() as connection:
+            with contextlib.suppress(NotFoundError):
+                return _with_tags(connection, _find(connection, ref))
+            return _with_tags(connection, _find_removed(connection, ref))
 
     def _dated(self, known_id: str, captured_at: str | None, dated_by: str) -> Scene:
         """A living scene that was ingested again, with the date that came this time.
@@ -270,7 +319,7 @@ class Scenes:
     def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str) -> Scene:
         """The row of a new or returning scene, under a name that is free."""
         name, number = fields["name"], 2
-        while _name_taken(connection, fields["name"]):
+        while name_taken(connection, fields["name"]):
             if not rename:
                 raise InputError(f"another scene is called {name!r}: choose another name, or remove that one first")
             fields = fields | {"name": f"{name}-{number}"}
@@ -287,6 +336,22 @@ class Scenes:
         return _with_tags(connection, _find(connection, new_id))
 
 
+def _find_removed(connection: Connection, ref: str) -> Row[Any]:
+    """A removed scene by its id, the beginning of it, or its last name."""
+    gone = scenes.c.removed_at.is_not(None)
+    named = connection.execute(select(scenes).where(gone, (scenes.c.id == ref) | (scenes.c.name == ref))).all()
+    if not named and ref and all(c in "0123456789abcdef" for c in ref):
+        named = connection.execute(select(scenes).where(gone, scenes.c.id.startswith(ref))).all()
+    if len(named) == 1:
+        return named[0]
+    if named:
+        several = ", ".join(f"{row.name} {row.id[:12]}" for row in named)
+        raise NotFoundError(f"several removed scenes are called {ref!r} ({several}): give more of an id")
+    with contextlib.suppress(NotFoundError):
+        raise InputError(f"scene {_find(connection, ref).name} was not removed: there is nothing to bring back")
+    raise NotFoundError(f"no removed scene is called {ref!r}, and no id begins so")
+
+
 def living_ids(connection: Connection) -> set[str]:
     return set(connection.execute(select(scenes.c.id).where(scenes.c.removed_at.is_(None))).scalars())
 
@@ -301,7 +366,8 @@ def scene_name(connection: Connection, ref: str) -> str:
     return str(_find(connection, ref).name)
 
 
-def _name_taken(connection: Connection, name: str) -> bool:
+def name_taken(connection: Connection, name: str) -> bool:
+    """Whether a living scene is called so."""
     same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
     return connection.execute(same).first() is not None
 
@@ -361,6 +427,23 @@ def _scene(row: Row[Any], tags: tuple[str, ...]) -> Scene:
     )
 
 
+def _shapes(row: Row[Any]) -> dict[str, Shape]:
+    """What a scene's row says of its arrays."""
+    n, c = row.num_gaussians, row.num_cameras
+    shapes: dict[str, Shape] = {
+        "means": (n, 3),
+        "quats": (n, 4),
+        "log_scales": (n, 3),
+        "logit_opacities": (n,),
+        "sh": (n, (row.sh_degree + 1) ** 2, 3),
+        "cameras.T_frame_camera": (c, 4, 4),
+        "cameras.intrinsics_px": (c, 4),
+        "cameras.sizes_px": (c, 2),
+        "cameras.names": (None,),
+    }
+    return shapes
+
+
 def _to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:
     for name in cameras.names:
         if "\n" in name:
@@ -373,7 +456,8 @@ def _to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:
     }
 
 
-def _put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
+def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
+    """Keep the boxes (C, 2, 3) of a scene's chunks, in place of those that there are."""
     if number >= 1 << 24:
         raise StoreError("a map holds at most 16 million scenes")  # the R*Tree's floats count no further
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
@@ -389,6 +473,13 @@ def _put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
         ),
         rows,
     )
+
+
+def get_boxes(connection: Connection, number: int) -> np.ndarray:
+    """The boxes (C, 2, 3) of a scene's chunks."""
+    query = text(f"SELECT x0, y0, z0, x1, y1, z1 FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s ORDER BY chunk")
+    rows = [list(row) for row in connection.execute(query, {"s": number})]
+    return np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
 
 
 def _touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:

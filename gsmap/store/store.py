@@ -148,6 +148,22 @@ class Store:
         return not place.is_tag and (not place.folder.is_dir() or os.access(place.folder, os.W_OK))
 
     @classmethod
+    def open_even_tag(cls, path: str | os.PathLike[str]) -> Store:
+        """Open for writing, a tag as well: what is purged goes from there, too."""
+        store = cls._connect(path, "w", None, even_tags=True)
+        try:
+            migrate.require_current(store.catalog.engine, store.folder)
+        except BaseException:
+            store.close()
+            raise
+        return store
+
+    def others(self) -> list[Place]:
+        """Where the other catalogs over the same arrays lie: the map, its branches, its tags."""
+        every = (Place(self.home, self.home), *branches.places(self.home))
+        return [place for place in every if place.folder != self.folder]
+
+    @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
         """Bring an older map (and its branches and tags) to this gsmap's schema; the version before and after."""
         with cls._connect(path, "w", None, even_tags=True) as store:
@@ -169,6 +185,12 @@ class Store:
         """
         with cls._connect(path, "w", None, verify=False, even_tags=True) as store:
             return store.catalog.accept()
+
+    @classmethod
+    def id_at(cls, path: str | os.PathLike[str], catalog_url: str) -> str:
+        """The id of the map whose catalog is at a URL, whatever its schema; see `open` for the errors."""
+        with cls._connect(path, "r", catalog_url) as store:
+            return store.id
 
     @classmethod
     def _connect(

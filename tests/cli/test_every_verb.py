@@ -35,7 +35,8 @@ def verbs(command: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[str
 
 VERBS = dict(verbs())
 
-# What is run for each verb (or each of its forms, as `gsmap.cli.objects` names them). MAP is a copy of the small map.
+# What is run for each verb (or each of its forms, as `gsmap.cli.objects` names them). MAP is a copy of the small map,
+# SITE that map itself.
 RUNS = {
     "init": "init TMP/new.gsmap",
     "ingest": "ingest MAP CAPTURES/left.ply --scale known",
@@ -65,7 +66,11 @@ RUNS = {
     "evaluate": "evaluate MAP --truth CAPTURES/truth",
     "branch": "branch MAP what-if",
     "tag": "tag MAP v1",
+    "merge": "merge MAP SITE",
+    "split": "split MAP TMP/part.gsmap --island 0",
     "remove": "remove MAP odd:one",
+    "remove --purge": "remove MAP odd:one --purge",
+    "restore-scene": "restore-scene MAP left --from SITE",
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
     "migrate": "migrate MAP",
@@ -84,7 +89,7 @@ SILENT |= {"backup", "restore", "clone"}
 
 @pytest.fixture
 def gsmap_run(
-    cli: Run, site: Path, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cli: Run, site: Path, made_site: Path, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str], Any]:
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
@@ -100,7 +105,7 @@ def gsmap_run(
         if "TMP/saved" in line:
             with gsmap.map.open(site) as m:
                 m.backup(tmp_path / "saved")
-        places = {"MAP": site, "TMP": tmp_path, "CAPTURES": captures}
+        places = {"MAP": site, "SITE": made_site, "TMP": tmp_path, "CAPTURES": captures}
         words = []
         for word in line.split():
             first, slash, rest = word.partition("/")

@@ -46,7 +46,7 @@ def test_a_tile_whose_path_is_no_name(tmp_path: Path) -> None:
         Manifest.load(tmp_path, "m")
 
 
-@pytest.mark.parametrize("text", [DEEP, '{"root": {"boundingVolume": {"box": [%d, 0, 0]}}}' % HUGE, '{"root": 7}'])
+@pytest.mark.parametrize("text", [DEEP, f'{{"root": {{"boundingVolume": {{"box": [{HUGE}, 0]}}}}}}', '{"root": 7}'])
 def test_levels_of_a_tileset_that_is_not_ours_are_made_again(tmp_path: Path, text: str) -> None:
     (tmp_path / "tileset.json").write_text(text)
     assert tileset._known_boxes(tmp_path) == {}
@@ -68,7 +68,10 @@ def test_pose(tmp_path: Path, text: str) -> None:
         read_pose(tmp_path / "pose.json")
 
 
-@pytest.mark.parametrize("text", ["a = " + "9" * 5000, "a = " + DEEP, "a = nan", "[describe]\nobjects = 2099-99-99"])
+@pytest.mark.parametrize(
+    "text",
+    ["a = " + "9" * 5000, "a = " + DEEP, "a = nan", f"[merge]\nnear_m = {HUGE}", "[describe]\nobjects = 2099-99-99"],
+)
 def test_settings(tmp_path: Path, text: str) -> None:
     (tmp_path / "settings.toml").write_text(text)
     with pytest.raises(ConfigError, match=r"settings\.toml"):

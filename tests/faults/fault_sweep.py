@@ -109,7 +109,9 @@ class Tally:
         lines.append(["all", *(f"{value:.0f}" for value in self.total.values())])
         widths = [max(len(line[i]) for line in [list(heads), *lines]) for i in range(len(heads))]
         text = [[h.ljust(w) for h, w in zip(heads, widths, strict=True)]]
-        text += [[c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(x, widths, strict=True))] for x in lines]
+        text += [
+            [c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(x, widths, strict=True))] for x in lines
+        ]
         return "\n".join("  ".join(line).rstrip() for line in text)
 
     def report(self) -> str:

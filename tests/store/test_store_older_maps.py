@@ -3,6 +3,7 @@ import shutil
 import pytest
 import store_older
 
+import gsmap.map
 from gsmap.errors import SchemaVersionError
 from gsmap.store import Store, migrate, schema, sqlite
 
@@ -40,7 +41,7 @@ def test_down_and_up_again_loses_nothing_that_schema_0001_knew(tmp_path):
         store_older.use(store)
 
 
-def test_a_map_of_schema_0001_on_postgres(tmp_path, postgres_database, monkeypatch):
+def test_a_map_of_schema_0001_on_postgres(tmp_path, postgres_database):
     path = store_older.unpack(tmp_path)
     older = sqlite.engine(path / sqlite.FILE, writable=True)
     with Store._connect(path, "w", postgres_database) as store:
@@ -50,7 +51,7 @@ def test_a_map_of_schema_0001_on_postgres(tmp_path, postgres_database, monkeypat
     older.dispose()
     (path / sqlite.FILE).unlink()
     (path / "catalog.url").write_text(postgres_database + "\n")
-    monkeypatch.setenv("GSMAP_CATALOG", postgres_database)  # the map's own word is not enough
+    gsmap.map.trust(path)  # the map's own word is not enough
     with pytest.raises(SchemaVersionError, match="gsmap migrate"):
         Store.open(path)
     assert Store.migrate(path) == ("0001", schema.HEAD)

@@ -207,7 +207,7 @@ def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> Stat
     there = {file.path: (file.size_bytes, file.sha256) for file in files}
     if sqlite.FILE not in there:
         raise CorruptError(f"snapshot {snapshot.name} has no {sqlite.FILE}")
-    for problem in sqlite.structure_damage(folder / sqlite.FILE):
+    for problem in sqlite.file_problems(folder / sqlite.FILE):
         raise CorruptError(f"snapshot {snapshot.name}: its catalog is damaged ({problem})")
     state = read_state(folder / sqlite.FILE)
     if (state.map_id, state.schema) != (snapshot.map_id, snapshot.schema):

@@ -214,7 +214,7 @@ def _capture_catalog(source: Catalog, folder: Path) -> State:
             for problem in source.page_problems():
                 raise CorruptError(f"{problem}: run gsmap check; nothing was backed up")
             sqlite.backup(source.engine, file)
-            for problem in sqlite.structure_damage(file):
+            for problem in sqlite.file_problems(file):
                 raise CorruptError(f"{source.folder / sqlite.FILE} is damaged ({problem}); nothing was backed up")
     else:
         made = empty_catalog(folder)

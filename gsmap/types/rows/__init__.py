@@ -11,6 +11,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -49,10 +50,11 @@ from gsmap.types.rows.truth import (
     NeesRow,
     PoseErrorRow,
 )
-from gsmap.types.rows.values import BranchRow
+from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
 
 __all__ = [
     "SCHEMA",
+    "AtWorkRow",
     "BackupReport",
     "BandRow",
     "BranchRow",
@@ -72,6 +74,7 @@ __all__ = [
     "InitReport",
     "LayerRow",
     "MapStatus",
+    "MergeReport",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -84,6 +87,7 @@ __all__ = [
     "PoseRow",
     "PriorRow",
     "PruneReport",
+    "PurgeReport",
     "RestoreReport",
     "RevisionRow",
     "Row",
@@ -93,6 +97,7 @@ __all__ = [
     "SceneRow",
     "SettingRow",
     "SnapshotRow",
+    "SplitReport",
     "TileRow",
     "TodoRow",
     "TrustReport",

@@ -1,0 +1,101 @@
+"""Purge: a scene forgotten for good, in the map, in its branches if asked, and in the folders it was exported to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gsmap.durable import remove_file, remove_tree
+from gsmap.errors import GsmapError, NotFoundError
+from gsmap.export.manifest import FILE_NAME, Manifest
+from gsmap.export.write import STAGING
+from gsmap.store import Store, purging
+from gsmap.store.purging import Purge
+
+
+@dataclass
+class _Tiles:
+    """What became of the folders that a map was exported to."""
+
+    tile_files: int = 0
+    cleaned: list[str] = field(default_factory=list)
+    unreachable: list[str] = field(default_factory=list)
+
+
+def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, Purge]]:
+    """Forget a scene; whatever an interrupted purge left undone is done first.
+
+    Args:
+        ref: name, id, or the beginning of an id, of a living or a removed scene; of one that was purged its id.
+        branches: in the other branches and tags of the map, too.
+
+    Returns:
+        The location of each catalog that it was taken out of, the map that is open first, and the receipt. Those of
+        interrupted purges that this one finished, where no scene is called so any more.
+
+    Raises:
+        NotFoundError: no scene is called so, and none of that id was purged.
+        StoreError: a branch cannot be read, or somebody reads an older state; the same call again goes on.
+    """
+    with ExitStack() as stack:
+        catalogs = [store]
+        if branches:
+            catalogs += [stack.enter_context(Store.open_even_tag(place.location)) for place in store.others()]
+        done = [(one.location, _finish(one, p)) for one in catalogs for p in purging.listed(one) if not p.is_done]
+        scene = _scene(catalogs, ref)
+        if scene is None:
+            earlier = [(one.location, p) for one in catalogs for p in purging.listed(one) if p.scene == ref]
+            if not done and not earlier:
+                raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes")
+            return done or earlier
+        holding = [one for one in catalogs if _holds(one, scene)]
+        begun = [(one, purging.begin(one, scene)) for one in holding]
+        return [(one.location, _finish(one, one_purge)) for one, one_purge in begun]
+
+
+def _scene(catalogs: Sequence[Store], ref: str) -> str | None:
+    for one in catalogs:
+        try:
+            return one.scenes.find_any(ref).id
+        except NotFoundError:
+            continue
+    return None
+
+
+def _holds(store: Store, scene: str) -> bool:
+    try:
+        return store.scenes.find_any(scene).id == scene
+    except NotFoundError:
+        return False
+
+
+def _finish(store: Store, begun: Purge) -> Purge:
+    tiles = _Tiles()
+    for target in begun.receipt["pending"]["targets"]:
+        try:
+            _clean(store, Path(target), begun.scene, tiles)
+        except (OSError, GsmapError) as error:
+            tiles.unreachable.append(f"{target}: {error}")
+    gone = {"tile_files": tiles.tile_files, "cleaned": tiles.cleaned, "unreachable": tiles.unreachable}
+    return purging.finish(store, begun, gone)
+
+
+def _clean(store: Store, out: Path, scene: str, found: _Tiles) -> None:
+    """Delete the tiles of one folder that were made with a scene; only in a folder that holds this map's export."""
+    if not os.path.lexists(out / FILE_NAME):
+        found.unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME}")
+        return
+    manifest = Manifest.load(out, store.id)
+    made_with_it = {at: tile for at, tile in manifest.tiles.items() if scene in tile.poses}
+    remove_tree(out, STAGING)  # what an interrupted export left may be such a tile; a running one is to begin anew
+    for tile in made_with_it.values():
+        if tile.path:
+            remove_file(out, *tile.path.split("/"))
+            found.tile_files += 1
+    if made_with_it:
+        manifest.tiles = {at: tile for at, tile in manifest.tiles.items() if at not in made_with_it}
+        manifest.save(out)
+        found.cleaned.append(str(out))

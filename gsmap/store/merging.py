@@ -1,0 +1,203 @@
+"""Maps as values: one merged into another, part of one as a map of its own, a scene brought back."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Row, func, insert, select
+
+from gsmap.errors import NotFoundError
+from gsmap.settings import FILE_NAME, load
+from gsmap.store.joint import joined, restricted
+from gsmap.store.revisions import newest_poses
+from gsmap.store.schema import about, edges, poses, revisions, scenes
+from gsmap.store.store import Store
+from gsmap.store.transfer import Transfer, between
+
+Identity = tuple[str, int, str | None]
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What a merge brought.
+
+    Args:
+        scenes, removed, known: scenes that are new here and live, that are new or now removed, and that both maps had.
+        graphs, registrations, reviews, facts, priors, models, recipes, revisions: rows that are new here.
+        renamed: (old, new) names of scenes whose name was taken.
+        revision: number of the joint revision; None where none was needed.
+        num_bytes: of the arrays that are new here, linked or copied.
+        notes: what a person should know.
+    """
+
+    scenes: int = 0
+    removed: int = 0
+    known: int = 0
+    graphs: int = 0
+    registrations: int = 0
+    reviews: int = 0
+    facts: int = 0
+    priors: int = 0
+    models: int = 0
+    recipes: int = 0
+    revisions: int = 0
+    renamed: tuple[tuple[str, str], ...] = ()
+    revision: int | None = None
+    num_bytes: int = 0
+    notes: tuple[str, ...] = field(default=())
+
+
+def merge(into: Store, source: Store) -> Merged:
+    """Take all that another map knows; that map stays as it is, and nothing is computed. Again it adds nothing.
+
+    Scenes are the same where their content is. Revisions travel as history (`revisions.origin` says which map solved
+    them), followed by one revision of the newest poses of both, as `gsmap.store.joint` puts them together; where this
+    map's newest poses are part of the other's history, the other's newest count as they are.
+
+    Raises:
+        ConfigError: a map into itself.
+        CorruptError: arrays of the other map are missing or damaged; nothing was changed.
+    """
+    with between(into, source) as transfer:
+        transfer.scenes()
+        transfer.graphs()
+        transfer.pairs()
+        transfer.priors()
+        transfer.models()
+        number = _revisions(transfer)
+        transfer.notes += _other_settings(into, source)
+        return _merged(transfer, number)
+
+
+def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
+    """Bring some scenes of a map, with all that is known of and among them, into a map that is new and empty.
+
+    Of the history the newest poses come along, restricted to these scenes, as revision 1.
+
+    Raises:
+        CorruptError: arrays of the map are missing or damaged; nothing was changed.
+    """
+    with between(out, source, only=chosen) as transfer:
+        transfer.scenes()
+        transfer.graphs()
+        transfer.pairs()
+        transfer.priors()
+        transfer.models()
+        number = None
+        newest = newest_poses(transfer.theirs)
+        if newest is not None and set(newest.poses) & set(chosen):
+            number = out.revisions.save(restricted(newest, chosen), note=f"part of {source.location}")
+            row = transfer.theirs.execute(select(revisions).order_by(revisions.c.number.desc()).limit(1)).one()
+            map_id, its_number, part = _identity(row, _id(transfer.theirs))
+            origin = {"map": map_id, "number": its_number, "part": part or _id(transfer.ours)}
+            transfer.ours.execute(revisions.update().where(revisions.c.number == number).values(origin=origin))
+        return _merged(transfer, number)
+
+
+def bring_scene(into: Store, source: Store, scene: str) -> Merged:
+    """Bring one scene of another map (by id), its graphs, and its edges to scenes that are here.
+
+    Raises:
+        NotFoundError: it was forgotten here on demand.
+        CorruptError: its arrays are missing or damaged there; nothing was changed.
+    """
+    with between(into, source, only={scene}) as transfer:
+        if scene not in transfer.wanted:
+            raise NotFoundError(
+                f"scene {scene} was forgotten in {into.location} on demand: ingest its capture if it is to come back"
+            )
+        transfer.scenes()
+        if into.scenes.removed_at(scene) is not None:  # whatever was said before: it is asked for now
+            into.scenes.restore(scene)
+        transfer.graphs()
+        transfer.pairs()
+        transfer.priors()
+        return replace(_merged(transfer, None), notes=())
+
+
+def _merged(transfer: Transfer, revision: int | None) -> Merged:
+    nouns = ("scenes", "removed", "known", "graphs", "registrations", "reviews", "facts", "priors", "models", "recipes")
+    counts = {noun: transfer.counts[noun] for noun in (*nouns, "revisions")}
+    return Merged(
+        **counts,
+        renamed=tuple(transfer.renamed),
+        revision=revision,
+        num_bytes=transfer.counts["bytes"],
+        notes=tuple(dict.fromkeys(transfer.notes)),
+    )
+
+
+# --- revisions -------------------------------------------------------------------------------------------------------
+
+
+def _revisions(transfer: Transfer) -> int | None:
+    """Their revisions as history, and then one of the newest poses of both; its number, None where none is needed."""
+    ours, theirs = transfer.ours, transfer.theirs
+    my_id, their_id = _id(ours), _id(theirs)
+    mine, newest = newest_poses(ours), newest_poses(theirs)
+    rows = ours.execute(select(revisions).order_by(revisions.c.number)).all()
+    known = {_identity(row, my_id) for row in rows}
+    their_rows = theirs.execute(select(revisions).order_by(revisions.c.number)).all()
+    lacking = [row for row in their_rows if not _is_known(_identity(row, their_id), known)]
+    for row in lacking:
+        transfer.recipe(row.recipe)
+        _append(transfer, row, _identity(row, their_id))
+    transfer.counts["revisions"] = len(lacking)
+    if not lacking or mine is None or newest is None:
+        return None
+    history = {_identity(row, their_id) for row in their_rows}
+    if their_rows[-1].number == lacking[-1].number and _is_known(_identity(rows[-1], my_id), history):
+        return None  # ours is part of their history: theirs is what comes after it
+    living = {row.id: np.array(row.bounds) for row in ours.execute(select(scenes).where(scenes.c.removed_at.is_(None)))}
+    joint = joined(mine, newest, living, living)
+    transfer.notes += joint.notes
+    return transfer.into.revisions.save(joint, note=f"joined with {transfer.source.location}")
+
+
+def _append(transfer: Transfer, row: Row[Any], identity: Identity) -> None:
+    number = 1 + (transfer.ours.execute(select(func.max(revisions.c.number))).scalar() or 0)
+    map_id, its_number, part = identity
+    origin = {"map": map_id, "number": its_number, **({"part": part} if part else {})}
+    transfer.ours.execute(insert(revisions), dict(row._mapping) | {"number": number, "origin": origin})
+    here = set(transfer.ours.execute(select(scenes.c.id)).scalars())  # all but those that were forgotten
+    for table, ends in ((poses, ("scene",)), (edges, ("target", "source"))):
+        lines = transfer.theirs.execute(select(table).where(table.c.revision == row.number)).mappings()
+        taken = [{**line, "revision": number} for line in lines if {line[end] for end in ends} <= here]
+        if taken:
+            transfer.ours.execute(insert(table), taken)
+
+
+def _identity(row: Row[Any], map_id: str) -> Identity:
+    """What a revision is called in whichever map it lies: the map that solved it, its number there, and which part."""
+    if row.origin is None:
+        return map_id, row.number, None
+    return str(row.origin["map"]), int(row.origin["number"]), row.origin.get("part")
+
+
+def _is_known(identity: Identity, known: Collection[Identity]) -> bool:
+    """Whether a revision, or the whole of which it is a part, is among those that are known."""
+    return identity in known or (*identity[:2], None) in known
+
+
+def _id(connection: Connection) -> str:
+    return str(connection.execute(select(about.c.id)).scalar_one())
+
+
+# --- settings --------------------------------------------------------------------------------------------------------
+
+
+def _other_settings(into: Store, source: Store) -> list[str]:
+    """A note on each setting that differs; those of the map that is merged into hold."""
+    mine, theirs = load(into.folder / FILE_NAME), load(source.folder / FILE_NAME)
+    return [
+        f"setting {name} stays {_shown(mine, name)} (there: {_shown(theirs, name)}): what that made is out of date here"
+        for name in sorted({*mine, *theirs})
+        if mine.get(name) != theirs.get(name)
+    ]
+
+
+def _shown(values: Mapping[str, Any], name: str) -> str:
+    return str(values[name]) if name in values else "its default"

@@ -1,0 +1,303 @@
+"""Forgetting a scene for good: its rows, its arrays, and every byte of the catalog that told of it.
+
+In three steps, so that a crash leaves a purge that the next one finishes: `begin` takes the rows out in one transaction
+and writes down what is still to be done; who knows the exports deletes tiles there; `finish` reclaims arrays, older
+copies of the catalog and what deleted rows left in its file, and completes the receipt.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Row, Table, delete, insert, select, text, update
+
+from gsmap.durable import files_below, is_file, remove_file
+from gsmap.errors import BusyError
+from gsmap.store import integrity, sqlite
+from gsmap.store.branches import Others, Place
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import explained
+from gsmap.store.schema import (
+    CHUNK_BOXES,
+    backups,
+    edges,
+    exports,
+    files,
+    graphs,
+    groups,
+    leases,
+    poses,
+    priors,
+    purges,
+    registrations,
+    reviews,
+    revisions,
+    scene_facts,
+    scenes,
+    tiles,
+)
+from gsmap.store.store import Store
+from gsmap.types.plain import plain
+
+_GONE = "a scene that was purged"
+# Texts that gsmap wrote itself: where one names the scene it says instead that it was purged. What people wrote of
+# other scenes is theirs, and is only told of.
+_REMARKS: tuple[tuple[Table, tuple[str, ...]], ...] = (
+    (scenes, ("notes",)),
+    (registrations, ("reason", "notes")),
+    (revisions, ("notes", "provenance")),
+    (edges, ("reason",)),
+    (tiles, ("notes",)),
+)
+_WORDS: tuple[tuple[Table, str, str], ...] = (
+    (scene_facts, "value", "scene"),
+    (reviews, "note", "pair"),
+    (revisions, "note", "number"),
+)
+
+
+@dataclass(frozen=True)
+class Purge:
+    """A purge of a scene and how far it is.
+
+    Args:
+        number: of its row.
+        scene: id.
+        receipt: counts of what went, what is still to be done (``pending``), and where else the scene may live.
+        created_at: when its rows went.
+    """
+
+    number: int
+    scene: str
+    receipt: dict[str, Any]
+    created_at: str
+
+    @property
+    def is_done(self) -> bool:
+        return "pending" not in self.receipt
+
+
+def begin(store: Store, scene: str) -> Purge:
+    """Take everything out of the catalog that tells of a scene, in one transaction; `finish` does the rest.
+
+    Args:
+        scene: id of a scene that the catalog has, living or removed.
+    """
+    Others(store.home, store.folder).groups()  # asked first: what of its arrays another branch names must be known
+    with store.catalog.write() as connection:
+        row = connection.execute(select(scenes).where(scenes.c.id == scene)).one()
+        names = _names(connection, row)
+        linked = _linked_files(store, connection, scene)
+        targets = sorted(connection.execute(select(exports.c.target).distinct()).scalars())
+        elsewhere = _backups(connection, row.ingested_at)
+        counts = _delete_rows(connection, row)
+        _scrub(connection, scene, names)
+        mentions = _mentions(connection, scene, names)
+        receipt: dict[str, Any] = {
+            "rows": dict(counts),
+            "pending": {"targets": targets},
+            "backups": elsewhere,
+            "linked_files": linked,
+            "mentions": mentions,
+        }
+        when = now()
+        created = {"scene": scene, "receipt": receipt, "created_at": when}
+        number = connection.execute(insert(purges).returning(purges.c.number), created).scalar_one()
+    return Purge(number, scene, receipt, when)
+
+
+def listed(store: Store) -> list[Purge]:
+    """All purges, oldest first."""
+    with store.catalog.read() as connection:
+        rows = connection.execute(select(purges).order_by(purges.c.number)).all()
+    return [Purge(row.number, row.scene, dict(row.receipt), row.created_at) for row in rows]
+
+
+def finish(store: Store, purge: Purge, tiles_gone: Mapping[str, Any]) -> Purge:
+    """Reclaim arrays, older copies and what deleted rows left in the catalog's file; the receipt is complete then.
+
+    Args:
+        tiles_gone: what became of the folders that were exported to, for the receipt.
+
+    Raises:
+        BusyError: somebody reads a state from before the purge, so that it cannot be taken out of the file yet.
+    """
+    reclaimed = integrity.reclaim(store.catalog, store.arrays)
+    copies = _drop_copies(store)
+    receipt = {key: value for key, value in purge.receipt.items() if key != "pending"} | {
+        "num_groups": len(reclaimed.groups),
+        "num_bytes": reclaimed.num_bytes,
+        "catalog_copies": copies,
+        "branches": [place.location for place in holders(store, purge.scene)],
+        **plain(dict(tiles_gone)),
+    }
+    overwrite(store.catalog)
+    with store.catalog.write() as connection:
+        connection.execute(update(purges).where(purges.c.number == purge.number).values(receipt=receipt))
+    return Purge(purge.number, purge.scene, receipt, purge.created_at)
+
+
+def holders(store: Store, scene: str) -> list[Place]:
+    """The other catalogs of the map (itself, branches, tags) that know a scene."""
+    found = []
+    for place in store.others():
+        with Store.open(place.location, "r") as other, other.catalog.read() as connection:
+            if connection.execute(select(scenes.c.id).where(scenes.c.id == scene)).first() is not None:
+                found.append(place)
+    return found
+
+
+def overwrite(catalog: Catalog) -> None:
+    """Write the catalog anew, so that nothing of deleted rows is left in its files.
+
+    Raises:
+        BusyError: a reader holds an older state.
+    """
+    with catalog.lock(), explained(catalog.folder):
+        if not catalog.is_sqlite:
+            with catalog.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+                connection.execute(text("VACUUM FULL"))
+            return
+        file = catalog.folder / sqlite.FILE
+        raw = catalog.engine.raw_connection()
+        try:
+            driver: Any = raw.driver_connection
+            driver.execute("PRAGMA secure_delete = ON")
+            driver.execute("VACUUM")
+        finally:
+            raw.close()
+        sqlite.checkpoint(catalog.engine, file, at_bytes=1)
+        log = file.with_name(file.name + "-wal")
+        if log.exists() and log.stat().st_size:
+            raise BusyError(
+                f"{catalog.folder}: another process reads the state from before the purge; its rows are gone, but not "
+                "yet from the file: run the same command again when that process is done"
+            )
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+def _delete_rows(connection: Connection, row: Row[Any]) -> Counter[str]:
+    scene = row.id
+    counts: Counter[str] = Counter()
+
+    def drop(noun: str, table: Table, condition: Any) -> None:
+        counts[noun] += int(connection.execute(delete(table).where(condition)).rowcount)
+
+    pairs = (registrations.c.target == scene) | (registrations.c.source == scene)
+    affected = set(connection.execute(select(poses.c.revision).where(poses.c.scene == scene)).scalars())
+    drop("reviews", reviews, reviews.c.pair.contains(scene))
+    drop("registrations", registrations, pairs)
+    drop("edges", edges, (edges.c.target == scene) | (edges.c.source == scene))
+    drop("poses", poses, poses.c.scene == scene)
+    drop("priors", priors, priors.c.scene == scene)
+    drop("facts", scene_facts, scene_facts.c.scene == scene)
+    drop("leases", leases, leases.c.what.contains(scene))
+    with_it = [tile.number for tile in connection.execute(select(tiles.c.number, tiles.c.poses)) if scene in tile.poses]
+    drop("tiles", tiles, tiles.c.number.in_(with_it))
+    drop("graphs", graphs, graphs.c.scene == scene)
+    connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
+    drop("scenes", scenes, scenes.c.id == scene)
+    claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(graphs.c.group_id)).scalars())
+    unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
+    connection.execute(delete(files).where(files.c.group_id.in_(unclaimed)))
+    connection.execute(delete(groups).where(groups.c.id.in_(unclaimed)))
+    for number in sorted(affected):
+        mine = revisions.c.number == number
+        notes = connection.execute(select(revisions.c.notes).where(mine)).scalar_one()
+        said = f"the pose of {_GONE} is no longer part of this revision"
+        connection.execute(update(revisions).where(mine).values(notes=[*notes, said]))
+    counts["revisions"] = len(affected)
+    return counts
+
+
+def _names(connection: Connection, row: Row[Any]) -> set[str]:
+    """What the scene was ever called."""
+    said = select(scene_facts.c.value).where(scene_facts.c.scene == row.id, scene_facts.c.kind == "name")
+    return {row.name, *connection.execute(said).scalars()}
+
+
+def _pattern(scene: str, names: Iterable[str]) -> re.Pattern[str]:
+    """The scene's id, its short form, and its names as words of their own."""
+    words = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
+    return re.compile(rf"{scene}|\b{scene[:12]}\b|(?<!\w)(?:{words})(?!\w)")
+
+
+def _scrub(connection: Connection, scene: str, names: set[str]) -> None:
+    """Take the scene out of the remarks that gsmap itself wrote of other things."""
+    pattern = _pattern(scene, names)
+    for table, columns in _REMARKS:
+        for line in connection.execute(select(table)).mappings().all():
+            changed = {column: _without(line[column], pattern) for column in columns}
+            changed = {column: value for column, value in changed.items() if value != line[column]}
+            if changed:
+                keys = [column == line[column.name] for column in table.primary_key.columns]
+                connection.execute(update(table).where(*keys).values(**changed))
+    for row in connection.execute(select(graphs.c.key, graphs.c.about)).all():
+        notes = _without(row.about["notes"], pattern)
+        if notes != row.about["notes"]:
+            about = {**row.about, "notes": notes}
+            connection.execute(update(graphs).where(graphs.c.key == row.key).values(about=about))
+
+
+def _without(value: Any, pattern: re.Pattern[str]) -> Any:
+    if isinstance(value, str):
+        return pattern.sub(_GONE, value)
+    if isinstance(value, list):
+        return [_without(item, pattern) for item in value]
+    if isinstance(value, dict):  # of a provenance: lists of scenes lose it
+        return {
+            key: [_without(item, pattern) for item in part if not pattern.fullmatch(str(item))]
+            if isinstance(part, list)
+            else _without(part, pattern)
+            for key, part in value.items()
+        }
+    return value
+
+
+def _mentions(connection: Connection, scene: str, names: set[str]) -> list[str]:
+    """Where people wrote of the scene elsewhere, without its name."""
+    pattern = _pattern(scene, names)
+    found = []
+    for table, column, of in _WORDS:
+        for line in connection.execute(select(table)).mappings():
+            if pattern.search(line[column]):
+                found.append(f"a {line.get('kind', 'note')} of {of} {line[of]}")
+    return found
+
+
+# --- what lies elsewhere ---------------------------------------------------------------------------------------------
+
+
+def _backups(connection: Connection, since: str) -> list[str]:
+    """Snapshots that were taken since the scene came."""
+    rows = connection.execute(select(backups).order_by(backups.c.number))
+    return [f"{row.target} {row.snapshot}" for row in rows if row.created_at >= since]
+
+
+def _linked_files(store: Store, connection: Connection, scene: str) -> int:
+    """How many of its files have other names on this disk: another map that it was merged or split into, a clone."""
+    ids = [
+        ("scenes", scene),
+        *(
+            ("graphs", g)
+            for g in connection.execute(select(graphs.c.group_id).where(graphs.c.scene == scene)).scalars()
+        ),
+    ]
+    found = (files_below(store.arrays.root / kind / name) for kind, name in ids)
+    return sum(entry.st_nlink > 1 for group in found for entry in group.values())
+
+
+def _drop_copies(store: Store) -> list[str]:
+    """Delete the copies of the catalog that migrations left: they hold what is to be forgotten. Their names."""
+    pattern = re.compile(re.escape(sqlite.FILE) + r"\.[0-9A-Za-z]+\.bak[a-z0-9.-]*")
+    names = sorted(p.name for p in store.folder.iterdir() if pattern.fullmatch(p.name) and is_file(p))
+    for name in names:
+        remove_file(store.folder, name)
+    return names

@@ -1,0 +1,299 @@
+"""Forgetting a scene: no byte of the map tells of it afterwards, whatever happened on the way."""
+
+import json
+import os
+import shutil
+import sqlite3
+import sys
+
+import numpy as np
+import pytest
+from store_children import changes_disk
+from store_samples import key, make_cameras, make_gaussians
+
+import gsmap
+from gsmap.errors import BusyError, NotFoundError
+from gsmap.store import Store
+from gsmap.store.merging import merge
+from gsmap.types import EdgeOutcome, PoseGraph, Prior, Provenance, Registration, SceneGraph, ScenePose, Sim3
+
+NAME, NOTE, SOURCE = "secret-garden", "the key is under the mat", "/home/ann/private/garden.ply"
+
+
+def make(path):
+    """A map of three scenes; the second is to be forgotten. Returns its id."""
+    with Store.create(path) as store:
+        ids = [
+            store.scenes.add(
+                make_gaussians(80, seed=i), make_cameras(), name=name, source=source, captured_at="2024-05-31"
+            )[0].id
+            for i, (name, source) in enumerate((("hall", "/a.ply"), (NAME, SOURCE), ("attic", "/c.ply")))
+        ]
+        secret = ids[1]
+        for scene in ids:
+            store.graphs.save(SceneGraph(scene), key("describe", scene))
+        pose = Sim3(np.eye(3), np.array([1.0, 0, 0]))
+        for a, b in ((0, 1), (1, 2), (0, 2)):
+            done = Registration(ids[a], ids[b], "accepted", S_target_source=pose, information=np.eye(7), proposer="g")
+            store.registrations.save(done, key("register", ids[a], ids[b]))
+        store.registrations.review(ids[0], secret, "confirm", f"{NOTE} indeed")
+        store.scenes.edit(secret, note=NOTE, tags_add=["mine-only"], author="ann")
+        store.scenes.edit(secret, name=f"{NAME}-2")
+        store.scenes.edit(secret, name=NAME)
+        store.priors.set(Prior(secret, Sim3.identity(), np.full(7, 0.1)))
+        outcomes = {
+            (ids[0], secret): EdgeOutcome("used", 1.0),
+            (ids[0], ids[2]): EdgeOutcome("unused", 9.0, f"{secret} contradicts"),
+        }
+        placed = {s: ScenePose(s, Sim3.identity(), 0, "placed") for s in ids}
+        told = Provenance(contradicted_priors=(secret, ids[0]))
+        graph = PoseGraph(placed, outcomes, provenance=told, notes=(f"{NAME} lies far out", "all is well"))
+        store.revisions.save(graph)
+        store.revisions.save(graph)
+    return secret
+
+
+def finds(folder, *texts):
+    """Files below a folder that have one of the texts in their bytes or in their names."""
+    return sorted(
+        f"{text}: {p}"
+        for text in texts
+        for p in folder.rglob("*")
+        if text in p.name or (p.is_file() and text.encode() in p.read_bytes())
+    )
+
+
+def kept_rows(folder):
+    """Rows of the catalog with the id in them: the receipt alone."""
+    connection = sqlite3.connect(folder / "map.sqlite")
+    tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+    found = {t: list(connection.execute(f"SELECT * FROM {t}")) for t in tables}
+    connection.close()
+    return found
+
+
+@pytest.fixture
+def place(tmp_path):
+    return tmp_path / "site.gsmap"
+
+
+def test_nothing_of_it_is_left(place):
+    secret = make(place)
+    shutil.copy(place / "map.sqlite", place / "map.sqlite.0002.bak")  # what a migration left
+    assert finds(place, NAME, NOTE, SOURCE, secret)
+    with gsmap.map.open(place) as m:
+        report = m.purge(NAME)
+        assert [s.name for s in m.scenes()] == ["hall", "attic"]
+        assert m.check().ok
+    assert finds(place, NAME, NOTE, SOURCE, "mine-only") == []
+    assert not (place / "map.sqlite.0002.bak").exists()
+    assert {f.split("/")[-1] for f in finds(place, secret)} <= {"map.sqlite"}
+    rows = kept_rows(place)
+    assert [t for t, lines in rows.items() if any(secret in str(v) for line in lines for v in line)] == ["purges"]
+    (receipt,) = rows["purges"]
+    assert NAME not in str(receipt)
+    assert report.scene == secret
+    assert report.num_rows == {
+        **{"scenes": 1, "graphs": 1, "registrations": 2, "reviews": 1, "poses": 2, "edges": 2, "priors": 1},
+        **{"facts": 6, "leases": 0, "tiles": 0, "revisions": 2},
+    }
+    assert report.num_groups == 2
+    assert report.num_bytes > 1000
+    assert report.catalog_copies == ("map.sqlite.0002.bak",)
+    with Store.open(place, "r") as store:
+        assert len(store.registrations.current()) == 1
+        graph = store.revisions.get(1)
+        assert len(graph.poses) == 2
+        assert graph.notes == (
+            "a scene that was purged lies far out",
+            "all is well",
+            "the pose of a scene that was purged is no longer part of this revision",
+        )
+        assert len(graph.provenance.contradicted_priors) == 1
+        assert next(iter(graph.outcomes.values())).reason == "a scene that was purged contradicts"
+
+
+def test_a_removed_scene_can_be_forgotten_and_comes_back_only_by_ingest(place, tmp_path):
+    secret = make(place)
+    shutil.copytree(place, tmp_path / "copy.gsmap")
+    with gsmap.map.open(place) as m:
+        m.remove(NAME)
+        m.purge(NAME)
+        assert finds(place, NAME, NOTE) == []
+        with Store.open(tmp_path / "copy.gsmap", "r") as copy:
+            merged = merge(m.store, copy)
+            assert merged.scenes == 0
+            assert any("forgotten here on demand" in note for note in merged.notes)
+            with pytest.raises(NotFoundError, match="forgotten"):
+                m.restore_scene(secret, tmp_path / "copy.gsmap")
+        assert finds(place, NAME, NOTE) == []
+        assert m.check().ok
+        again = m.store.scenes.add(make_gaussians(80, seed=1), make_cameras(), name="anew")[0]
+        assert again.id == secret
+        assert m.check().ok
+        with pytest.raises(NotFoundError):
+            m.purge("nobody")
+
+
+def test_twice_shows_the_receipt(place):
+    secret = make(place)
+    with gsmap.map.open(place) as m:
+        first = m.purge(NAME)
+        assert m.purge(secret) == first
+        with pytest.raises(NotFoundError):
+            m.purge(NAME)  # nobody knows that name any more
+
+
+def test_branches_are_told_of_and_purged_on_demand(place):
+    secret = make(place)
+    with gsmap.map.open(place) as m:
+        m.branch("b")
+        m.tag("v1")
+        report = m.purge(NAME)
+        assert report.branches == (f"{place}@b", f"{place}@v1")
+        assert report.num_groups == 0  # the arrays are theirs now
+        assert (place / "arrays" / "scenes" / secret).is_dir()
+        report = m.purge(secret, branches=True)
+        assert set(report.maps) == {f"{place}@b", f"{place}@v1"}
+        assert report.num_groups == 2
+        assert m.check().ok
+    assert finds(place, NAME, NOTE, SOURCE) == []
+    assert not (place / "arrays" / "scenes" / secret).exists()
+    with gsmap.map.open(f"{place}@v1") as tag:
+        assert [s.name for s in tag.scenes()] == ["hall", "attic"]
+
+
+def test_all_at_once(place):
+    make(place)
+    with gsmap.map.open(place) as m:
+        m.branch("b")
+        report = m.purge(NAME, branches=True)
+        assert report.maps == (str(place), f"{place}@b")
+        assert report.branches == ()
+    assert finds(place, NAME, NOTE, SOURCE) == []
+
+
+def test_what_people_wrote_of_others_is_told_of(place):
+    make(place)
+    with gsmap.map.open(place) as m:
+        m.edit("hall", note=f"west of {NAME}")
+        m.store.backups.add("s3://bucket/site", "20240531", 10)
+        shutil.copytree(place, place.with_name("linked"), copy_function=os.link)
+        report = m.purge(NAME)
+        assert [text.split()[:4] for text in report.mentions] == [["a", "note", "of", "scene"]]
+        assert report.backups == ("s3://bucket/site 20240531",)
+        assert report.linked_files > 5
+        assert m.show_scene("hall").name == "hall"
+
+
+def test_tiles_made_with_it_go(place, tmp_path):
+    make(place)
+    out, gone, foreign = (tmp_path / n for n in ("out", "gone", "foreign"))
+    with gsmap.map.open(place) as m:
+        for target in (out, gone):
+            m.export(target, tile_size_m=0, merge="union")
+        m.export(foreign, tile_size_m=0, merge="union")
+        shutil.rmtree(gone)
+        text = json.loads((foreign / "tiles.json").read_text())
+        (foreign / "tiles.json").write_text(json.dumps({**text, "map_id": "0" * 32}))
+        kept = sorted(foreign.rglob("*"))
+        before = list(out.rglob("*.ply"))
+        assert before
+        (out / ".partial").mkdir()
+        (out / ".partial" / "x.ply").write_bytes(b"half a tile")
+        report = m.purge(NAME)
+        assert report.num_tiles == len(before)
+        assert report.exports == (str(out),)
+        assert {text.split(":")[0] for text in report.unreachable} >= {str(gone), str(foreign)}
+        assert list(out.rglob("*.ply")) == []
+        assert not (out / ".partial").exists()
+        assert json.loads((out / "tiles.json").read_text())["tiles"] == []
+        assert sorted(foreign.rglob("*")) == kept
+        assert finds(out, NAME, report.scene) == []
+        m.export(out, tile_size_m=0, merge="union")
+        assert len(list(out.rglob("*.ply"))) == 1
+
+
+def test_a_tile_outside_the_folder_stays(place, tmp_path):
+    """A ``tiles.json`` that names a file beside its folder."""
+    make(place)
+    (tmp_path / "component_0").mkdir()
+    victim = tmp_path / "component_0" / "precious.ply"
+    victim.write_bytes(b"precious")
+    with gsmap.map.open(place) as m:
+        m.export(tmp_path / "out", tile_size_m=0, merge="union")
+        file = tmp_path / "out" / "tiles.json"
+        for odd in ("../component_0/precious.ply", str(victim)):
+            text = json.loads(file.read_text())
+            text["tiles"][0]["path"] = odd
+            file.write_text(json.dumps(text))
+            shutil.copytree(place, tmp_path / "again")
+            with gsmap.map.open(tmp_path / "again") as copy:
+                assert any(str(tmp_path / "out") in text for text in copy.purge(NAME).unreachable)
+            shutil.rmtree(tmp_path / "again")
+        shutil.rmtree(tmp_path / "out" / "component_0")
+        os.symlink(tmp_path / "component_0", tmp_path / "out" / "component_0")
+        text["tiles"][0]["path"] = "component_0/precious.ply"
+        file.write_text(json.dumps(text))
+        m.purge(NAME)
+    assert victim.read_bytes() == b"precious"
+
+
+def test_a_reader_of_the_state_before_is_waited_for(place):
+    make(place)
+    with gsmap.map.open(place) as m:
+        reader = sqlite3.connect(place / "map.sqlite", isolation_level=None)
+        reader.execute("BEGIN")
+        reader.execute("SELECT count(*) FROM scenes").fetchone()
+        with pytest.raises(BusyError, match="run the same command again"):
+            m.purge(NAME)
+        reader.close()
+        report = m.purge(NAME)  # its name is gone already: what is left undone is done
+        assert report.num_rows["scenes"] == 1
+    assert finds(place, NAME, NOTE, SOURCE) == []
+
+
+def _die_at(path, step, pipe):
+    """Purge, and die at the given change of the disk; tells where, or that it came through."""
+    left = [step]
+
+    def hook(event, arguments):
+        if changes_disk(event, arguments):
+            left[0] -= 1
+            if left[0] == 0:
+                pipe.send(f"died at {event}")
+                os._exit(9)
+
+    with gsmap.map.open(path) as m:
+        sys.addaudithook(hook)
+        m.purge(NAME)
+        left[0] = -1
+    pipe.send("through")
+
+
+@pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.slow), 6])
+def test_killed_anywhere_the_same_command_finishes(tmp_path, start, stride):
+    secret = make(tmp_path / "first.gsmap")
+    with gsmap.map.open(tmp_path / "first.gsmap") as m:
+        m.export(tmp_path / "tiles", tile_size_m=0, merge="union")
+    deaths = 0
+    for step in range(1, 1000, stride):
+        path = tmp_path / "site.gsmap"
+        shutil.rmtree(path, ignore_errors=True)
+        shutil.copytree(tmp_path / "first.gsmap", path)
+        process, pipe = start(_die_at, str(path), step)
+        process.join()
+        through = pipe.poll(0) and pipe.recv() == "through"
+        with gsmap.map.open(path) as m:
+            try:
+                m.purge(NAME)
+            except NotFoundError:
+                assert m.purge(secret).num_rows["scenes"] == 1
+            assert m.check().ok
+            assert m.store.scenes.list()[0].name == "hall"
+        assert finds(path, NAME, NOTE, SOURCE) == []
+        assert not (path / "arrays" / "scenes" / secret).exists()
+        if through:
+            break
+        deaths += 1
+    assert deaths >= 3
