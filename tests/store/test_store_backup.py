@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 
@@ -99,15 +100,16 @@ def test_a_damaged_map_is_not_backed_up(filled, place):
 
 
 def test_a_damaged_catalog_is_not_backed_up(tmp_path, place):
+    """A text in it changes on the disk while the map is open, which SQLite itself would not notice."""
     with Store.create(tmp_path / "m") as store:
         fill(store, tmp_path)
-    catalog = tmp_path / "m" / "map.sqlite"
-    data = bytearray(catalog.read_bytes())
-    data[data.rindex(b"settings") + 3] ^= 1  # in a text, which SQLite itself does not notice
+    harm = "import sys; f = open(sys.argv[1], 'r+b'); d = f.read(); f.seek(d.rindex(b'settings') + 3); f.write(b'x')"
     with Store.open(tmp_path / "m", "r") as store:
-        catalog.write_bytes(data)
+        # by another process: to close the file in this one would drop the locks that SQLite has on it
+        subprocess.run([sys.executable, "-c", harm, tmp_path / "m" / "map.sqlite"], check=True)
         with pytest.raises(CorruptError, match=r"map\.sqlite"):
             save(store, place)
+    assert Backup.at(place).names() == []
 
 
 class Meddling(FolderPlace):
