@@ -30,7 +30,7 @@ def test_a_branch_is_a_map_wherever_one_is_given(site: Path, cli: Run, tmp_path:
     assert names(cli, branch) == ["right", "west"]
     assert names(cli, site) == names(cli, f"{site}@v1") == ["left", "odd:one", "right"]
     assert not (site / "settings.toml").exists()
-    assert f"gsmap update {branch}" in str(cli("status", branch, "--json").json["todo"])
+    assert f"gsmap optimize {branch}" in str(cli("status", branch, "--json").json["todo"])
     # A folder that was exported to keeps to one map or branch.
     assert cli("export", branch, tmp_path / "out", "--tile-size", 0, "--merge", "union").code == 0
     refused = cli("export", site, tmp_path / "out", "--tile-size", 0, "--merge", "union")
@@ -89,12 +89,11 @@ def test_merged_parts_are_registered_across_only(
             return run(work, given, *more)
 
         monkeypatch.setattr(module, "run_jobs", spied)
-    updated = cli("update", west, "--json").json
+    assert cli("update", west).code == 0
     assert jobs["describe"] == []
     left = {row["name"]: row["id"] for row in cli("list", west, "scenes", "--json").json["scenes"]}["left"]
     assert {target[0] for _, target, *_ in jobs["register"]} | {job[2][0] for job in jobs["register"]} > {left}
     assert all(left in (job[1][0], job[2][0]) for job in jobs["register"])
-    assert updated["components"] == 2
     poses = {row["scene_name"]: row["component"] for row in cli("poses", west, "--json").json["poses"]}
     assert poses == {"left": 0, "right": 0, "odd:one": 1}
 
