@@ -11,6 +11,8 @@ from gsmap.types import Cameras, Gaussians
 # A Gaussian this many times wider than the scene is not a background; it is a broken file.
 MAX_SCALE_OVER_EXTENT = 1e4
 _SAMPLE = 20_000
+# What a JPEG can be; a file that says more is damaged, and nothing could be rendered for such a camera.
+MAX_SIDE_PX = 65_535
 
 
 def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str = "the capture") -> tuple[str, ...]:
@@ -20,8 +22,8 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
         where: what to call it in messages (its file).
 
     Raises:
-        InputError: no Gaussians; NaN, infinity, an absurd scale or a zero quaternion, with its row; cameras of which
-            none sees a Gaussian.
+        InputError: no Gaussians; NaN, infinity, an absurd scale or a zero quaternion, with its row; cameras with
+            images beyond 65,535 pixels a side, or of which none sees a Gaussian.
     """
     if not len(gaussians):
         raise InputError(f"{where} has no Gaussians")
@@ -41,6 +43,13 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
         return ()
     if not len(cameras):
         raise InputError(f"{where} has an empty list of cameras: leave them out, and gsmap makes some")
+    if (cameras.sizes_px > MAX_SIDE_PX).any():
+        i = int((cameras.sizes_px > MAX_SIDE_PX).any(1).argmax())
+        width, height = cameras.sizes_px[i].tolist()
+        raise InputError(
+            f"{where}: camera {i} has an image of {width} x {height} pixels, more than {MAX_SIDE_PX} a side: correct "
+            "it, or leave the cameras out"
+        )
     seen = sees(cameras, _sampled(gaussians).means)
     if not seen.any() and not sees(cameras, gaussians.means).any():
         raise InputError(f"{where}: none of its {len(cameras)} cameras sees a Gaussian: they belong to another scene")
