@@ -70,7 +70,13 @@ def test_pose(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["a = " + "9" * 5000, "a = " + DEEP, "a = nan", f"[merge]\nnear_m = {HUGE}", "[describe]\nobjects = 2099-99-99"],
+    [
+        "a = " + "9" * 5000,
+        "a = " + DEEP,
+        "a = nan",
+        f"[merge.mergers.voxel]\nvoxel_m = {HUGE}",
+        "[describe]\nobjects = 2099-99-99",
+    ],
 )
 def test_settings(tmp_path: Path, text: str) -> None:
     (tmp_path / "settings.toml").write_text(text)

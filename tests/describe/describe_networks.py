@@ -145,7 +145,7 @@ def endless(path: Path, *, grows: bool = False) -> Path:
     return _save(path, [mean, loop], *shapes, constants)
 
 
-def enormous(path: Path) -> Path:
+def enormous(path: Path, numbers: int = 40_000_000_000) -> Path:
     """An image encoder whose weights are 160 GB of zeros in a few bytes."""
     nodes = [
         helper.make_node("ConstantOfShape", ["shape"], ["zeros"]),
@@ -153,5 +153,5 @@ def enormous(path: Path) -> Path:
         helper.make_node("ReduceMean", ["pixels"], ["mean"], axes=[2, 3], keepdims=0),
         helper.make_node("Add", ["mean", "zero"], ["features"]),
     ]
-    shape = {"shape": np.array([40_000_000_000], np.int64)}
+    shape = {"shape": np.array([numbers], np.int64)}
     return _save(path, nodes, [_value("pixels", ["n", 3, 8, 8])], [_value("features", ["n", 3])], shape)

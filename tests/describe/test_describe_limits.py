@@ -87,6 +87,10 @@ def test_memory_is_held_to_the_limit_and_what_fits_runs(tmp_path):
     assert large.run(None, {"pixels": pictures})[0].shape == (60, 3)
     with pytest.raises(InputError, match=r"more than 100 MB with --set describe\.object\.model_memory_mb"):
         small.run(None, {"pixels": pictures})
+    inside = str(networks.enormous(tmp_path / "e.onnx", 100_000_000))  # 400 MB that nobody sends
+    np.testing.assert_allclose(ModelProcess(inside, ModelLimits(60, 2000)).run(None, PICTURE)[0], 1)
+    with pytest.raises(InputError, match="more than 100 MB"):
+        ModelProcess(inside, ModelLimits(60, 100)).run(None, PICTURE)
 
 
 def test_numbers_are_those_of_the_model_whatever_their_size_and_kind(tmp_path):
