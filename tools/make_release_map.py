@@ -68,14 +68,14 @@ def write(path: Path) -> None:
         m.reject("stairwell:attic", "another door")
         m.reject("hall:attic", "in doubt")
         m.reject("hall:attic", withdraw=True)
-        m.add_edge("hall:shed", Sim3(np.eye(3), [4.0, 0, 0]), np.full(7, 0.05), "tape measure")
+        m.add_edge("hall:shed", Sim3(np.eye(3), np.array([4.0, 0, 0])), np.full(7, 0.05), "tape measure")
         m.optimize()
         m.remove("shed")
         m.optimize()
         m.prune(keep_revisions=3)
-        if hasattr(m, "tag"):
-            m.tag("handed-over")
-            m.branch("what-if")
+        for verb, name in (("tag", "handed-over"), ("branch", "what-if")):
+            if hasattr(m, verb):  # younger than this script
+                getattr(m, verb)(name)
 
 
 def room(seed: int, n: int = 250) -> tuple[Gaussians, Cameras]:
