@@ -251,6 +251,18 @@ def file_problems(file: Path) -> list[str]:
     return ([] if rows == ["ok"] else rows) + [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in odd]
 
 
+def damage(file: Path) -> list[str]:
+    """What is wrong with a file, by the digests of its pages or else by SQLite's own look; empty for a sound one."""
+    with contextlib.suppress(OSError), contextlib.closing(Handle(file)) as opened:
+        try:
+            found = digests.problems(file, opened, digests.load(file), read_log(log_of(file)))
+        except CorruptError as error:
+            found = [str(error)]
+        if found:
+            return found
+    return structure_damage(file)
+
+
 def structure_damage(file: Path) -> list[str]:
     """What SQLite finds wrong with a file when it looks at all of its structure; empty also where it cannot look."""
     if not file.is_file():
