@@ -16,7 +16,7 @@ from gsmap import formats
 from gsmap.cli import app
 from gsmap.types import Gaussians
 
-OLDER = Path(__file__).resolve().parents[1] / "store" / "schema_0001.tar.xz"
+OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
 
 
