@@ -111,7 +111,7 @@ VERBS = {
         Verb("branch-delete", "branched", "branch MAP what-if --delete", done_says="no branch"),
         Verb("tag", "placed", "tag MAP handover", done_says="exists already"),
         Verb("merge", "two", "merge MAP HERE/other.gsmap"),
-        Verb("split", "placed", "split MAP HERE/part.gsmap --scenes a", done_says="already"),
+        Verb("split", "placed", "split MAP HERE/part.gsmap --scenes a", done_says="exists already"),
     )
 }
 """Verbs by name. A verb that is new is one line here."""
