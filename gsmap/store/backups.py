@@ -12,11 +12,11 @@ from gsmap.store.schema import backups
 
 @dataclass(frozen=True)
 class StoredBackup:
-    """A snapshot that was taken.
+    """A snapshot that was taken, or a clone that was made.
 
     Args:
         target: the folder or URL it went to, without secrets.
-        snapshot: its name there.
+        snapshot: its name there; of a clone the word and its map id.
         created_at: when it was done.
         num_bytes: how many were sent.
     """

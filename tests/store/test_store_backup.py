@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 from store_backups import fill, holdings
@@ -166,7 +167,7 @@ def test_scenes_that_are_pruned_all_the_time(filled, tmp_path, monkeypatch):
 
         thread = threading.Thread(target=change)
         thread.start()
-        thread.join()
+        thread.join(2.0)  # the last one waits for the backup
         return state
 
     filled.scenes.add(make_gaussians(50, seed=10), make_cameras(), name="n0")
@@ -352,17 +353,28 @@ def test_a_map_that_cannot_be_written_is_backed_up(filled, place, tmp_path):
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
 
 
-def test_branches_go_with_their_map(filled, place, tmp_path):
-    filled.close()
+def test_branches_and_tags_go_with_their_map(filled, place, tmp_path):
+    filled.branches.make("what-if")
+    filled.branches.make("v1", tag=True)
     home = filled.catalog.folder
-    (home / "branches" / "what-if").mkdir(parents=True)
-    shutil.copy(home / "map.sqlite", home / "branches" / "what-if" / "map.sqlite")
-    (home / "branches" / "what-if" / "branch.json").write_text("{}")
-    with Store.open(home) as store:
-        save(store, place)
+    filled.scenes.remove("b")
+    with Store.open(f"{home}@what-if") as branch:
+        branch.scenes.add(make_gaussians(60, seed=8), make_cameras(), name="only-there")
+        with pytest.raises(ConfigError, match="with their map"):
+            save(branch, place)
+    (home / "branches" / ".staged.1234").mkdir()
+    (home / "branches" / ".staged.1234" / "branch.json").write_text("half written")
+    save(filled, place)
     restore(place, tmp_path / "r")
-    kept = sorted(p.name for p in (tmp_path / "r" / "branches" / "what-if").iterdir())
-    assert kept[:2] == ["branch.json", "map.sqlite"]
+    assert sorted(p.name for p in (tmp_path / "r" / "branches").iterdir()) == ["v1", "what-if"]
+    for name, scenes in (("", ["a"]), ("@what-if", ["a", "b", "only-there"]), ("@v1", ["a", "b"])):
+        assert holdings(tmp_path / f"r{name}") == holdings(Path(f"{home}{name}"))
+        with Store.open(tmp_path / f"r{name}", "r") as store:
+            assert sorted(scene.name for scene in store.scenes.list()) == scenes
+            check = store.check()
+            assert (check.ok, check.unverified) == (True, ())
+    with pytest.raises(StoreError, match="is a tag"):
+        Store.open(tmp_path / "r@v1")
 
 
 def test_a_full_disk(filled, tmp_path):

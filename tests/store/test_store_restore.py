@@ -293,6 +293,9 @@ def test_a_clone_is_another_map(site, tmp_path):
         before = holdings(site)
         made = clone(store, tmp_path / "c.gsmap")
         assert made.map_id != store.id
+        assert [(b.target, b.snapshot) for b in store.backups.list()] == [
+            (str(tmp_path / "c.gsmap"), f"clone {made.map_id}")
+        ]
     after = holdings(tmp_path / "c.gsmap")
     left_behind = {"about", "exports", "tiles", "revisions", *PASSING}
     assert {k: v for k, v in after.items() if k not in left_behind} == {

@@ -23,7 +23,7 @@ from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
-from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
+from gsmap.store.backup.states import ARRAYS, BRANCHES, State, Vanished, capture, read_file, read_state
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.explained import explained
@@ -126,8 +126,18 @@ def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silen
             _rename(folder, made.map_id)
             _synchronise(folder)
             _put_in_place(folder, target)
+            _note(store, made)
             return made
     raise StoreError(f"{store.catalog.folder}: others pruned it faster than it could be copied; run it again")
+
+
+def _note(store: Store, made: Cloned) -> None:
+    """Let a map remember its clones, as it does its backups: what it forgets on demand may live on there."""
+    if store.catalog.writable:
+        try:
+            store.backups.add(str(made.path), f"clone {made.map_id}", made.num_bytes_copied)
+        except GsmapError as error:
+            _log.warning("the clone is complete, but the map could not note it: %s", error)
 
 
 def _free(path: str | os.PathLike[str]) -> Path:
@@ -210,25 +220,35 @@ def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> Stat
     for problem in sqlite.file_problems(folder / sqlite.FILE):
         raise CorruptError(f"snapshot {snapshot.name}: its catalog is damaged ({problem})")
     state = read_state(folder / sqlite.FILE)
+    named = [*state.files]
+    for branch in _branches(folder):
+        for problem in sqlite.structure_damage(branch / sqlite.FILE):
+            raise CorruptError(f"snapshot {snapshot.name}: the catalog of branch {branch.name} is damaged ({problem})")
+        named += read_state(branch / sqlite.FILE).files
     if (state.map_id, state.schema) != (snapshot.map_id, snapshot.schema):
         raise CorruptError(f"snapshot {snapshot.name} holds another map, or another schema, than it says")
-    for file in state.files:
+    for file in named:
         if there.get(file.path) != (file.size_bytes, file.sha256):
             raise CorruptError(f"snapshot {snapshot.name} lacks {file.path}, which its catalog names")
     return state
 
 
 def _settle(folder: Path) -> None:
-    """Nobody is at work on a map that was just made; and its catalog gets the digests that a catalog has."""
-    catalog = _own_catalog(folder)
-    try:
-        with catalog.write() as connection:
-            if inspect(connection).has_table("leases"):
-                connection.execute(delete(schema.leases))
-    finally:
-        catalog.close()
-    for left in (_catalog.LOCK_FILE, f"{sqlite.FILE}-wal", f"{sqlite.FILE}-shm"):
-        (folder / left).unlink(missing_ok=True)
+    """Nobody is at work on a map that was just made; and its catalogs get the digests that catalogs have."""
+    for one in (folder, *_branches(folder)):
+        catalog = _own_catalog(one)
+        try:
+            with catalog.write() as connection:
+                if inspect(connection).has_table("leases"):
+                    connection.execute(delete(schema.leases))
+        finally:
+            catalog.close()
+        for left in (_catalog.LOCK_FILE, f"{sqlite.FILE}-wal", f"{sqlite.FILE}-shm"):
+            (one / left).unlink(missing_ok=True)
+
+
+def _branches(folder: Path) -> list[Path]:
+    return sorted(file.parent for file in (folder / BRANCHES).glob(f"*/{sqlite.FILE}"))
 
 
 def _rename(folder: Path, map_id: str) -> None:

@@ -154,8 +154,8 @@ class _Run:
     def save(self) -> Snapshot:
         """States are begun with until all of one is there."""
         for trial in range(_TRIES + 1):
-            last = trial == _TRIES and self.store.catalog.writable
-            with self.store.catalog.lock() if last else contextlib.nullcontext(), self._folder() as folder:
+            reclaiming = self.store.arrays.lock() if trial == _TRIES else contextlib.nullcontext()
+            with reclaiming, self._folder() as folder:
                 state = capture(self.store, folder)
                 with contextlib.suppress(Vanished):
                     self._send(state, folder)

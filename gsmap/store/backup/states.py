@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import os
 import re
+import shutil
 import sqlite3
 import stat
 from collections.abc import Generator, Iterator, Mapping
@@ -13,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from gsmap.durable import is_file, is_folder
 from gsmap.errors import CorruptError, StoreError
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import catalog as _catalog
 from gsmap.store import sqlite
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import CHUNK_BYTES
+from gsmap.store.branches import places
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.explained import explained
@@ -83,9 +84,15 @@ def capture(store: Store, folder: Path, *, branches: bool = True) -> State:
     home = home_of(store)
     state = _capture_catalog(store.catalog, folder)
     files = {file.path: file for file in state.files}
-    for name in _branches(home) if branches else ():
-        (folder / BRANCHES / name).mkdir(parents=True)
-        files |= {file.path: file for file in _capture_branch(home / BRANCHES / name, folder / BRANCHES / name).files}
+    for place in places(home) if branches else ():
+        own = folder / BRANCHES / place.branch
+        own.mkdir(parents=True)
+        try:
+            files |= {file.path: file for file in _capture_branch(place.folder, own).files}
+        except (StoreError, FileNotFoundError):
+            if place.folder.exists():
+                raise
+            shutil.rmtree(own)  # deleted meanwhile
     for path in folder.rglob("*"):
         if path.name in (sqlite.FILE, SETTINGS, BRANCH_FILE):
             files[path.relative_to(folder).as_posix()] = _stored(path, folder)
@@ -175,7 +182,8 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
             raise Vanished(file.path) from error
         if isinstance(error, CorruptError):
             raise CorruptError(f"{error}: run gsmap check, and ingest the scene again") from error
-        raise CorruptError(f"{path} is missing: run gsmap check, and ingest the scene again") from error
+        helps = "run gsmap check and ingest the scene again, or gsmap prune if one was interrupted"
+        raise CorruptError(f"{path} is missing: {helps}") from error
     except OSError as error:
         raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
 
@@ -238,13 +246,6 @@ def _capture_branch(source: Path, folder: Path) -> State:
         catalog.close()
 
 
-def _branches(home: Path) -> list[str]:
-    """Names of the folders of branches; what leads elsewhere is none."""
-    root = home / BRANCHES
-    names = sorted(os.listdir(root)) if is_folder(root) else []
-    return [name for name in names if is_folder(root / name) and is_file(root / name / BRANCH_FILE)]
-
-
 def _stored(path: Path, folder: Path) -> StoredFile:
     with open(path, "rb") as opened:
         sha256 = hashlib.file_digest(opened, "sha256").hexdigest()
@@ -253,17 +254,16 @@ def _stored(path: Path, folder: Path) -> StoredFile:
 
 def _still_named(store: Store, file: StoredFile) -> bool:
     """Whether any catalog of the map still says that it has this very file."""
-    home = home_of(store)
-    catalogs = [(store.catalog, False)]
-    for name in _branches(home):
-        engine = _catalog.open_engine(home / BRANCHES / name, writable=False)
-        catalogs.append((Catalog(home / BRANCHES / name, engine, writable=False), True))
-    try:
-        return any(_names(catalog, file) for catalog, _ in catalogs)
-    finally:
-        for catalog, opened in catalogs:
-            if opened:
-                catalog.close()
+    if _names(store.catalog, file):
+        return True
+    for place in places(home_of(store)):
+        catalog = Catalog(place.folder, _catalog.open_engine(place.folder, writable=False), writable=False)
+        try:
+            if _names(catalog, file):
+                return True
+        finally:
+            catalog.close()
+    return False
 
 
 def _names(catalog: Catalog, file: StoredFile) -> bool:
