@@ -35,6 +35,15 @@ def sync_file(path: Path) -> None:
         os.close(handle)
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, and what it lies in, so that it survives a power cut; nothing where it is there."""
+    if path.is_dir():
+        return
+    make_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync_folder(path.parent)
+
+
 def write_text_whole(path: Path, text: str) -> None:
     """Replace a text file (UTF-8) in one step; see `write_whole`."""
     write_whole(path, lambda staged: staged.write_bytes(text.encode("utf-8")))
@@ -135,13 +144,15 @@ def files_below(folder: Path) -> dict[str, os.stat_result]:
     todo = [""] if is_folder(folder) else []
     while todo:
         below = todo.pop()
-        with os.scandir(folder / below) as entries:
-            for entry in entries:
-                name = f"{below}{entry.name}"
-                if entry.is_dir(follow_symlinks=False):
-                    todo.append(f"{name}/")
-                else:
-                    out[name] = entry.stat(follow_symlinks=False)
+        with contextlib.suppress(FileNotFoundError):  # others may be deleting it
+            for name in os.listdir(folder / below):
+                path = f"{below}{name}"
+                with contextlib.suppress(FileNotFoundError):
+                    found = os.lstat(folder / path)
+                    if stat.S_ISDIR(found.st_mode):
+                        todo.append(f"{path}/")
+                    else:
+                        out[path] = found
     return out
 
 

@@ -78,7 +78,7 @@ def json_value(data: bytes, rng: random.Random, guided: Guided) -> bytes | None:
         for _ in range(rng.choice([1, 1, 1, 2, 3])):
             _wound(tree, rng.choice(places), rng)
         return json.dumps(tree).encode("utf-8", "surrogatepass")
-    except (ValueError, RecursionError, IndexError, KeyError, TypeError):
+    except (ValueError, RecursionError, LookupError, TypeError, ArithmeticError):
         return None
 
 
@@ -93,8 +93,10 @@ def _places(tree: Any, depth: int = 0) -> Any:
 
 def _wound(tree: Any, place: tuple[Any, Any], rng: random.Random) -> None:
     holder, key = place
-    kind = rng.randrange(6)
-    if kind <= 2:
+    kind = rng.randrange(8)
+    if kind >= 6 and isinstance(holder[key], (int, float)):  # as good a number as it was
+        holder[key] = type(holder[key])(holder[key] * rng.choice([-1, 0.5, 2, 1.0001, 1000]) + rng.choice([0, 0, 1]))
+    elif kind <= 2 or kind >= 6:
         holder[key] = rng.choice(VALUES)
     elif kind == 3:
         del holder[key]

@@ -152,7 +152,7 @@ def child(name: str, inputs: int, seed: int, keep: Path) -> int:
         keep.mkdir(exist_ok=True)
         options = [f"-runs={inputs}", f"-seed={seed}", f"-max_len={MAX_INPUT_BYTES}", "-len_control=0", "-timeout=60"]
         options += ["-rss_limit_mb=0", f"-artifact_prefix={keep}/{name}.ended.", "-print_final_stats=0", "-verbosity=1"]
-        options += ["-handle_int=0", "-handle_term=0", "-reload=0"]
+        options += ["-handle_int=0", "-handle_term=0", "-reload=0", "-mutate_depth=1"]
         atheris.Setup([sys.argv[0], *options, str(seeds)], trial, custom_mutator=mutate)
         trial.limit = inputs
         atheris.Fuzz()

@@ -20,7 +20,6 @@ import numpy as np
 
 from gsmap import formats
 from gsmap.cli.edge import read_pose
-from gsmap.describe.onnx.file import refuse_external_data
 from gsmap.errors import NotFoundError
 from gsmap.export.manifest import Manifest
 from gsmap.export.tileset import _known_boxes
@@ -32,6 +31,7 @@ from gsmap.ingest.validate import validate
 from gsmap.map.evaluating import _read_truth
 from gsmap.map.settings import map_settings, write_settings
 from gsmap.map.stages.register import read_pairs
+from gsmap.networks.file import refuse_external_data
 from gsmap.settings import parse
 from gsmap.types import Cameras, Edge, Gaussians, Sim3, Tile
 

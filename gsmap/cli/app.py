@@ -1,6 +1,6 @@
 """The ``gsmap`` program: collects the verbs and turns errors into one line and an exit code.
 
-Exit codes: 0 ok, 1 failed, 2 wrong usage.
+Exit codes: 0 ok, 1 failed, 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP (`gsmap.cli.stopping`).
 """
 
 from __future__ import annotations

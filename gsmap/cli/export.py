@@ -34,6 +34,9 @@ def command(
         bool,
         typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
     ] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="If another export is at work in OUT, wait for it; refused else.")
+    ] = False,
     sets: Sets = None,
     preset: Preset = None,
     json: AsJson = False,
@@ -54,6 +57,7 @@ def command(
             steps=steps,
             budget_s=budget,
             provenance=provenance,
+            wait=wait,
         )
     about: dict[str, list[str]] = {}
     for tile in report.tiles:

@@ -62,7 +62,7 @@ def _report(m: Map, thing: str) -> SceneReport | PairReport:
 def _print_scene(scene: SceneReport, nodes: bool) -> None:
     size, prior, sigmas = scene.bounds[1] - scene.bounds[0], scene.prior, None
     if scene.rotation_sigma_deg is not None:
-        sigmas = f"{text(scene.rotation_sigma_deg)} deg, {text(scene.translation_sigma_m)} m"
+        sigmas = f"{text(scene.rotation_sigma_deg)} deg, {text(scene.translation_sigma_m)} map units"
     facts = {
         "id": scene.id,
         "status": scene.status,

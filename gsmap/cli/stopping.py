@@ -2,23 +2,23 @@
 
 The first signal is an exception in the main thread, so that every ``finally`` on the way out runs: staged files go,
 workers are killed, leases are given back. Then one line says what is kept. Native code does not see a signal before it
-returns, and clean-up may hang on a dead disk; so a thread, which the interpreter's own signal handler wakes through a
-pipe whatever the main thread does, ends the process when it has not ended itself in time, or at a second signal.
+returns, and clean-up may hang on a dead disk; so a native thread, which the interpreter's signal handler wakes through
+a pipe whatever runs, ends the process when it has not ended itself in time, or at a second signal.
 """
 
 from __future__ import annotations
 
 import os
-import select
 import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 
 # By two seconds after a signal nothing may be left, workers included; clean-up rarely takes a tenth of one.
 _GRACE_S = 1.2
+
+_AGAIN_S = 0.01  # after a signal struck where nothing can be raised, until it does again
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -34,9 +34,11 @@ class Stopped(BaseException):
 @contextmanager
 def stoppable() -> Iterator[None]:
     """Inside, a signal that asks to stop ends this process with one line and the exit code that shells give it."""
+    from gsmap._native import StopWatch
+
     ears, mouth = os.pipe()
     os.set_blocking(mouth, False)  # the interpreter insists on it
-    said = threading.Lock()  # taken by whoever ends the process: the line is printed once
+    watch = StopWatch(ears, _GRACE_S, {int(signum): _line(signum, ()) for signum in _SIGNALS})
     stopped: list[int] = []
 
     def raise_once(signum: int, frame: FrameType | None) -> None:
@@ -44,41 +46,40 @@ def stoppable() -> Iterator[None]:
             stopped.append(signum)
             raise Stopped(signum)
 
-    def watch() -> None:
-        heard = iter(lambda: os.read(ears, 1), b"")
-        asked = next((signum for (signum,) in heard if signum in _SIGNALS), None)
-        if asked is None:
-            os.close(ears)
-            return
-        again, _, _ = select.select([ears], [], [], _GRACE_S)
-        if again and not os.read(ears, 1):  # it was taken for an answer, as by `gsmap view`
-            os.close(ears)
-            return
-        if said.acquire(blocking=False) and select.select([], [2], [], 0)[1]:
-            os.write(2, _line(asked, ()).encode())  # the main thread may hold the lock of sys.stderr
-        os._exit(128 + asked)
+    def raise_again(signum: int, frame: FrameType | None) -> None:
+        raise Stopped(stopped[0])
 
-    threading.Thread(target=watch, name="gsmap-stop", daemon=True).start()
+    def swallowed(found: sys.UnraisableHookArgs) -> None:
+        """It struck in a finalizer or a callback, where nothing can be raised (importing is full of them)."""
+        if isinstance(found.exc_value, Stopped):
+            signal.signal(signal.SIGALRM, raise_again)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        else:
+            sys.__unraisablehook__(found)
+
     # What somebody had ignored (nohup, a job of a shell without job control) stays ignored.
     heard = [s for s in _SIGNALS if signal.getsignal(s) is not signal.SIG_IGN]
     try:
+        sys.unraisablehook = swallowed
         signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)
         for signum in heard:
             signal.signal(signum, raise_once)
         yield
     except Stopped as stop:
-        said.acquire()  # never given back: there is no way on from here
-        with suppress(OSError, ValueError):
-            sys.stdout.flush()
-            sys.stderr.write(_line(stop.signum, getattr(stop, "__notes__", ())))
-            sys.stderr.flush()
+        if watch.claim():
+            with suppress(OSError, ValueError):
+                sys.stdout.flush()
+                sys.stderr.write(_line(stop.signum, getattr(stop, "__notes__", ())))
+                sys.stderr.flush()
         os._exit(128 + stop.signum)  # waiting for no thread
     finally:
         stopped.append(0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        sys.unraisablehook = sys.__unraisablehook__
         signal.set_wakeup_fd(-1)
         for signum in heard:
             signal.signal(signum, signal.SIG_DFL)  # what is left is the interpreter's own end: without a traceback
-        os.close(mouth)  # which ends the thread
+        os.close(mouth)  # which ends the watch
 
 
 def _line(signum: int, notes: Sequence[str]) -> str:

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.errors import InputError, MissingDependencyError, NotFoundError
+from gsmap.networks import ModelProcess, refuse_external_data
+from gsmap.types.model import ModelLimits
 
 _SSIM_SIGMA_PX = 1.5
 _SSIM_RADIUS_PX = 5
@@ -51,36 +53,34 @@ class Lpips:
 
     Args:
         path: an ONNX file with two image inputs (1, 3, H, W), RGB in [-1, 1], whose first output is the distance.
+        limits: what it may take.
 
     Raises:
-        MissingDependencyError: no file was given (its weights are not ours to ship), or onnxruntime is missing.
+        MissingDependencyError: no file was given: its weights are not ours to ship.
         NotFoundError: there is no such file.
-        InputError: the file is no such network.
+        InputError: the file is no such network, or goes beyond the limits.
     """
 
-    def __init__(self, path: str | Path | None) -> None:
+    def __init__(self, path: str | Path | None, limits: ModelLimits | None = None) -> None:
         if path is None:
             raise MissingDependencyError(
                 "LPIPS needs network weights that gsmap does not ship: pass lpips.LPIPS exported to ONNX"
             )
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise MissingDependencyError("LPIPS needs onnxruntime: pip install onnxruntime") from error
         if not Path(path).is_file():
             raise NotFoundError(f"no LPIPS network at {path}")
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        except Exception as error:
-            raise InputError(f"{path} is not an ONNX network: {str(error).splitlines()[0]}") from error
-        self._inputs = [i.name for i in self._session.get_inputs()]
+        refuse_external_data(Path(path))
+        self._model = ModelProcess(str(path), limits or ModelLimits())
+        self._inputs = [tensor.name for tensor in self._model.inputs]
         if len(self._inputs) != 2:
             raise InputError(f"{path} takes {len(self._inputs)} inputs, an LPIPS network takes two images")
 
     def __call__(self, image: np.ndarray, reference: np.ndarray) -> float:
         """Distance of images (H, W, 3) with values in [0, 1]."""
         pair = [np.ascontiguousarray(v.transpose(2, 0, 1)[None] * 2 - 1, np.float32) for v in _pair(image, reference)]
-        return float(np.mean(self._session.run(None, dict(zip(self._inputs, pair, strict=True)))[0]))
+        try:
+            return float(np.mean(self._model.run(None, dict(zip(self._inputs, pair, strict=True)))[0]))
+        except RuntimeError as error:
+            raise InputError(f"the LPIPS network {self._model.path} does not run on {image.shape}: {error}") from error
 
 
 def _pair(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -48,7 +48,7 @@ def find_images(cameras: Cameras, folder: str | os.PathLike[str]) -> dict[int, P
         raise NotFoundError(f"no folder of images at {folder}")
     index = {_stem(name): i for i, name in enumerate(cameras.names)}
     found: dict[int, Path] = {}
-    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES):
+    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file()):
         at = index.get(_stem(path.relative_to(folder)), index.get(path.stem))
         if at is None:
             continue

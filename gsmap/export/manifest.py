@@ -35,12 +35,14 @@ class Manifest:
         tiles: those that are finished.
         num_bytes: size of each tile's file, by path.
         notes: what a person should know about the folder as it was found.
+        doomed: paths of files that are no longer a tile's and are still to be deleted.
     """
 
     map_id: str
     tiles: dict[tuple[int, str], Tile] = field(default_factory=dict)
     num_bytes: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    doomed: set[str] = field(default_factory=set)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
 
     @classmethod
@@ -68,6 +70,7 @@ class Manifest:
                     f"{path} has version {version}, this gsmap writes {_VERSION}: export to another folder"
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
+            doomed = {_checked_path(p) for p in content.get("doomed", ())}
         except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
@@ -84,6 +87,7 @@ class Manifest:
             {(tile.component, name): tile for name, tile, _ in entries},
             {tile.path: size for _, tile, size in entries},
             notes,
+            doomed,
         )
 
     def has_file(self, folder: Path, tile: Tile) -> bool:
@@ -106,8 +110,10 @@ class Manifest:
         entries = [
             _entry(name, tile, self.num_bytes.get(tile.path, 0)) for (_, name), tile in sorted(self.tiles.items())
         ]
-        text = json.dumps({"version": _VERSION, "map_id": self.map_id, "tiles": entries}, indent=1)
-        write_text_whole(folder / FILE_NAME, text)
+        content = {"version": _VERSION, "map_id": self.map_id, "tiles": entries}
+        if self.doomed:
+            content["doomed"] = sorted(self.doomed)
+        write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
         self._saved_at = time.monotonic()
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.durable import is_file, open_file, refuse_links, remove_file, write_whole
+from gsmap.durable import is_file, make_folder, open_file, refuse_links, remove_file, write_whole
 from gsmap.errors import MALFORMED, CorruptError
+from gsmap.export.manifest import FILE_NAME as MANIFEST
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
 from gsmap.types import Gaussians, Tile
@@ -36,6 +37,21 @@ class _Drawn:
 
     def gaussians(self) -> Gaussians:
         return tiles3d.read_content(self.path)
+
+
+def is_stale(out: Path, tiles: Sequence[Tile]) -> bool:
+    """Whether `write_tilesets` has work to do, also where an earlier one was killed."""
+    changed_ns = (out / MANIFEST).stat().st_mtime_ns
+    for folder in {(out / tile.path).parent for tile in tiles if tile.path}:
+        try:
+            if (folder / FILE_NAME).stat().st_mtime_ns <= changed_ns:
+                return True
+        except OSError:
+            return True
+        known = _known_boxes(folder)
+        if any(f"{LEVELS_FOLDER}/{path.name}" not in known for path in (folder / LEVELS_FOLDER).glob("*")):
+            return True
+    return False
 
 
 def write_tilesets(out: Path, tiles: Sequence[Tile], tile_size_m: float) -> list[Path]:
@@ -102,7 +118,7 @@ def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndar
     else:
         finer = Gaussians.concatenate([c.gaussians() for c in children])
         level, voxel_m = tiles3d.coarser(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)))
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
         written: list[np.ndarray] = []
         write_whole(path, lambda staged: written.append(tiles3d.write_content(staged, level)))
         boxes = np.stack([*written, *(c.node.box for c in children)])

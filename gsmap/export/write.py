@@ -14,9 +14,9 @@ from threading import Lock
 import numpy as np
 
 from gsmap import formats
-from gsmap.durable import refuse_links, remove_empty_folder, remove_file, remove_tree, sync_folder
-from gsmap.errors import GsmapError, of_system
-from gsmap.export.manifest import Manifest
+from gsmap.durable import make_folder, refuse_links, remove_empty_folder, remove_file, remove_tree, sync_folder
+from gsmap.errors import CorruptError, GsmapError, of_system
+from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.plan import Params, PlannedTile
 from gsmap.export.recipe import TileRecipe, dirty_reason
 from gsmap.formats import tiles3d
@@ -60,8 +60,9 @@ def export_tiles(
 ) -> ExportResult:
     """Bring a folder to hold exactly the planned tiles, making only those that an earlier export did not.
 
-    Every tile is written under a temporary name, fsynced and renamed; the manifest follows. Interrupted anywhere, the
-    folder holds whole tiles only, and the same call goes on from there.
+    The manifest is there before the first tile. Every tile is written under a temporary name, fsynced and renamed; the
+    manifest follows, and what it no longer names is deleted last. Interrupted anywhere, the folder holds whole tiles
+    only, and the same call goes on from there.
 
     Args:
         plan: from `plan_tiles`.
@@ -88,28 +89,33 @@ def export_tiles(
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
-    if not todo and not gone and out.exists():
+    _remove_leftovers(out)
+    if not todo and not gone and not manifest.doomed and out.exists():
         return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
 
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     try:
-        if out.exists():
-            remove_tree(out, STAGING)  # what an interrupted export left; it may not be ours, and hold links
-        (out / STAGING).mkdir(parents=True)
-        with closing(_finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers)) as finished:
+        make_folder(out)
+        if not (out / FILE_NAME).exists():
+            manifest.save(out)  # whose folder it is, before anything lies in it
+        remove_tree(out, STAGING)  # it may not be ours, and hold links
+        (out / STAGING).mkdir()
+        work = _finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers, report.give_up)
+        with closing(work) as finished:
             for at, tile, num_bytes in finished:
-                _remove(out, old.get(at), unless=tile.path)
+                if made is not None:
+                    made(tile)  # first: a tile that the manifest names is not made, and so not told, again
+                if at in old and old[at].path not in ("", tile.path):
+                    manifest.doomed.add(old[at].path)
                 manifest.tiles[at], manifest.num_bytes[tile.path] = tile, num_bytes
                 news[at] = tile
-                if made is not None:
-                    made(tile)
                 report.tile_done()
                 manifest.save_sometimes(out)
         manifest.tiles = {at: tile for at, tile in manifest.tiles.items() if at in planned}
+        manifest.doomed |= {tile.path for tile in gone if tile.path}
         manifest.save(out)
-        for tile in gone:
-            _remove(out, tile)
+        _remove_doomed(out, manifest)
     except BaseException as error:
         with suppress(OSError):
             manifest.save(out)
@@ -120,8 +126,7 @@ def export_tiles(
             ) from error
         raise
     finally:
-        with suppress(OSError):
-            remove_tree(out, STAGING)
+        _remove_leftovers(out)
     tiles = [manifest.tiles[at] for at in sorted(planned)]
     return ExportResult(tiles, len(todo), reused, len(gone), manifest.notes + _told(news))
 
@@ -148,7 +153,7 @@ def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, repor
             raise error.__cause__ if isinstance(error.__cause__, OSError) else error from None
         digest, num_bytes = _synced_digest(staged)
         refuse_links(out, *path.split("/")[:-1])
-        (out / path).parent.mkdir(exist_ok=True)
+        make_folder((out / path).parent)
         os.replace(staged, out / path)
         sync_folder((out / path).parent)
     tile = Tile(
@@ -182,13 +187,23 @@ def _synced_digest(path: Path) -> tuple[str, int]:
         return digest, file.tell()
 
 
-def _remove(out: Path, tile: Tile | None, unless: str = "") -> None:
-    """Delete a tile's file, and its component's folder with the last one."""
-    if tile is None or not tile.path or tile.path == unless:
-        return
-    names = tile.path.split("/")
-    remove_file(out, *names)
-    remove_empty_folder(out, *names[:-1])
+def _remove_doomed(out: Path, manifest: Manifest) -> None:
+    """Delete the files of tiles that are no longer named, and their component's folder with the last one."""
+    kept = {tile.path for tile in manifest.tiles.values()}
+    doomed = sorted(manifest.doomed - kept)
+    for path in doomed:
+        remove_file(out, *path.split("/"))
+        remove_empty_folder(out, path.split("/")[0])
+    if manifest.doomed:
+        manifest.doomed = set()
+        manifest.save(out)
+
+
+def _remove_leftovers(out: Path) -> None:
+    """Delete what an export that was killed had begun to write."""
+    for path in [out / STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
+        with suppress(OSError, CorruptError):
+            remove_tree(out, *path.relative_to(out).parts)
 
 
 def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
@@ -201,9 +216,12 @@ def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
 
 
 def _finished(
-    todo: Sequence[PlannedTile], make: Callable[[PlannedTile], tuple[_At, Tile, int]], workers: int
+    todo: Sequence[PlannedTile],
+    make: Callable[[PlannedTile], tuple[_At, Tile, int]],
+    workers: int,
+    give_up: Callable[[], None],
 ) -> Generator[tuple[_At, Tile, int], None, None]:
-    """Results of ``make`` as they come; the first error ends it, and what has not begun is never begun."""
+    """Results of ``make`` as they come; the first error ends it: what has not begun never does, the rest gives up."""
     if workers == 1 or len(todo) < 2:
         yield from map(make, todo)
         return
@@ -212,6 +230,7 @@ def _finished(
         for future in as_completed([pool.submit(make, planned) for planned in todo]):
             yield future.result()
     finally:
+        give_up()
         pool.shutdown(cancel_futures=True)
 
 
@@ -221,8 +240,15 @@ class _Report:
     def __init__(self, progress: Progress, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done
         self._lock = Lock()
+        self._given_up = False
+
+    def give_up(self) -> None:
+        """End the making of tiles that are still being made: their result is not wanted any more."""
+        self._given_up = True
 
     def within_tile(self, fraction: float, text: str) -> None:
+        if self._given_up:
+            raise GsmapError("this tile was given up")
         with self._lock:
             at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
             self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import uuid
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -62,7 +63,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object)
     """
     path = Path(path)
     module = _load(_suffix(path, "write"))
-    staged = path.with_name(f".{os.getpid()}.{path.name}")
+    staged = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # a name that nobody can have put a link at
     try:
         with _explained(path, "write"):
             module.write(staged, gaussians, **options)
@@ -126,6 +127,8 @@ def _layout(path: Path, suffix: str) -> str:
 @contextlib.contextmanager
 def _explained(path: Path, verb: str) -> Iterator[None]:
     """Turn what the operating system says into a typed error."""
+    if verb == "read" and path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"cannot read {path}: it is a pipe or a device, not a file")
     try:
         yield
     except FileNotFoundError as error:

@@ -56,16 +56,22 @@ def find_captures(paths: Iterable[str | os.PathLike[str]]) -> list[Found]:
         if not path.exists():
             raise NotFoundError(f"no such file or folder: {path}")
         if not path.is_dir():
+            if not path.is_file():
+                raise InputError(f"{path} is a pipe or a device, not a file: save what comes from it first")
             out.append(_file(path, alone=len(_splats(path.parent)) <= 1))
             continue
-        found = _folder(path.resolve() if path.name in ("", "..") else path, MAX_DEPTH)
+        found = _folder(path.resolve() if path.name in ("", "..") else path, MAX_DEPTH, set())
         if not found:
             raise InputError(f"{path} holds no captures: {_why_none(path)}")
         out.extend(found)
     return out
 
 
-def _folder(folder: Path, depth: int) -> list[Found]:
+def _folder(folder: Path, depth: int, seen: set[Path]) -> list[Found]:
+    """The captures of a folder and of those in it, each of which is looked at once, however many links lead to it."""
+    if folder.resolve() in seen:
+        return []
+    seen.add(folder.resolve())
     whole = _last(folder.glob("point_cloud/iteration_*/point_cloud.*")) or _last(folder.glob("ply/point_cloud_*.*"))
     if whole is None and (folder / "tileset.json").is_file():  # its tiles are parts of one scene
         whole = folder / "tileset.json"
@@ -75,7 +81,7 @@ def _folder(folder: Path, depth: int) -> list[Found]:
     out = [_file(path, alone=len(files) == 1) for path in files]
     if depth > 0:
         for child in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
-            out.extend(_folder(child, depth - 1))
+            out.extend(_folder(child, depth - 1, seen))
     return out
 
 

@@ -10,6 +10,8 @@ from gsmap.types import Cameras, Gaussians
 
 # A Gaussian this many times wider than the scene is not a background; it is a broken file.
 MAX_SCALE_OVER_EXTENT = 1e4
+# No camera takes larger pictures, and a JPEG holds none; views are rendered at the size of a camera's picture.
+MAX_SIDE_PX = 65_535
 _SAMPLE = 20_000
 
 
@@ -21,7 +23,7 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
 
     Raises:
         InputError: no Gaussians; NaN, infinity, an absurd scale or a zero quaternion, with its row; cameras of which
-            none sees a Gaussian.
+            none sees a Gaussian, or with pictures larger than any.
     """
     if not len(gaussians):
         raise InputError(f"{where} has no Gaussians")
@@ -41,6 +43,14 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
         return ()
     if not len(cameras):
         raise InputError(f"{where} has an empty list of cameras: leave them out, and gsmap makes some")
+    large = cameras.sizes_px.max(1) > MAX_SIDE_PX
+    if large.any():
+        i = int(np.argmax(large))
+        width, height = cameras.sizes_px[i]
+        raise InputError(
+            f"{where}: camera {cameras.names[i]!r} has {width} x {height} pixels, more than {MAX_SIDE_PX} on a side: "
+            "correct its size"
+        )
     seen = sees(cameras, _sampled(gaussians).means)
     if not seen.any() and not sees(cameras, gaussians.means).any():
         raise InputError(f"{where}: none of its {len(cameras)} cameras sees a Gaussian: they belong to another scene")

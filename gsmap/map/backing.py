@@ -20,7 +20,7 @@ def save(
     """``gsmap backup MAP DEST``; see `gsmap.store.backup.save`."""
     made = _backup.save(store, place_of(target), verify=verify, keep=keep, progress=progress)
     return BackupReport(
-        target=made.target,
+        dest=made.target,
         snapshot=snapshot_row(made.snapshot),
         num_files_new=made.num_files_new,
         deleted=made.deleted,
@@ -53,7 +53,7 @@ def restore(
     return RestoreReport(
         path=str(path),
         snapshot=snapshot_row(made.snapshot),
-        schema=made.schema,
+        catalog_schema=made.schema,
         needs_migration=made.schema < schema.HEAD,
     )
 
@@ -81,7 +81,7 @@ def snapshot_row(one: _backup.Snapshot) -> SnapshotRow:
         num_files=one.num_files,
         num_bytes=one.num_bytes,
         num_bytes_new=one.num_bytes_new,
-        schema=one.schema,
+        catalog_schema=one.schema,
         gsmap_version=one.gsmap_version,
     )
 

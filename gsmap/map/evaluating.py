@@ -24,6 +24,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, Scene, ScenePose, Sim3, Tile
+from gsmap.types.model import ModelLimits
 from gsmap.types.progress import Progress
 from gsmap.types.rows import EvaluationReport, ImageErrorRow
 
@@ -80,6 +81,7 @@ def images(
     *,
     tiles: str | os.PathLike[str] | None = None,
     lpips: str | os.PathLike[str] | None = None,
+    limits: ModelLimits | None = None,
 ) -> tuple[ImageErrorRow, ...]:
     """How well each scene alone, the union of it and its neighbours, and exported tiles reproduce its own photographs.
 
@@ -91,12 +93,13 @@ def images(
             cameras share names.
         tiles: folder that this map was exported to.
         lpips: an LPIPS network (`gsmap.evaluate.images.Lpips`) to compare with, too.
+        limits: what that may take.
 
     Raises:
         NotFoundError: no photograph is named like a camera, or no export lies in ``tiles``.
         ConfigError, InputError: the export of another map, or one that lacks a file.
     """
-    network = None if lpips is None else Lpips(Path(lpips))
+    network = None if lpips is None else Lpips(Path(lpips), limits)
     exported = None if tiles is None else _Export(store, Path(tiles))
     scenes = store.scenes.list()
     union = _union_of(store, scenes)

@@ -114,6 +114,17 @@ def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
     return backing.snapshots(target)
 
 
+def accept_catalog(path: str | os.PathLike[str]) -> list[str]:
+    """Take the catalog of a map that differs from what gsmap wrote as it is; returns what differed, in words.
+
+    For salvage, or after a change by another program: from then on these bytes count as written, right or wrong.
+
+    Raises:
+        CorruptError: SQLite finds it broken: only a backup helps.
+    """
+    return Store.accept_catalog(path)
+
+
 class Map(AbstractContextManager["Map"]):
     """An open map. Every method is a verb of the command line, and returns types or typed rows (`gsmap.types.rows`)."""
 
@@ -317,6 +328,7 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        wait: bool = False,
     ) -> ExportReport:
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
 
@@ -331,8 +343,10 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            wait: where another export is at work in the folder, until it has ended.
 
         Raises:
+            BusyError: another export is at work in the folder; it is named.
             ConfigError, InputError, StoreError: see `gsmap.export`; no half-written tile is left.
         """
         from gsmap.map.stages.export import Request, export
@@ -348,7 +362,11 @@ class Map(AbstractContextManager["Map"]):
             budget_s=budget_s,
             provenance=provenance,
         )
-        made = export(self.store, Path(out), request, self.settings, lambda f, text: self._progress("export", f, text))
+
+        def progress(fraction: float, text: str) -> None:
+            self._progress("export", fraction, text)
+
+        made = export(self.store, Path(out), request, self.settings, progress, wait=wait)
         return reports.export_report(self.store, Path(out), made)
 
     # --- look --------------------------------------------------------------------------------------------------------
@@ -488,7 +506,12 @@ class Map(AbstractContextManager["Map"]):
         if images is None:
             return report
         rows = evaluating.images(
-            self.store, images, lambda f, text: self._progress("evaluate", f, text), tiles=tiles, lpips=lpips
+            self.store,
+            images,
+            lambda f, text: self._progress("evaluate", f, text),
+            tiles=tiles,
+            lpips=lpips,
+            limits=self.settings.describe.object.limits,
         )
         return replace(report, images=rows)
 
@@ -651,4 +674,4 @@ class Map(AbstractContextManager["Map"]):
         """Register an ONNX model: checked, then copied (or referenced) and used by every later describe."""
         from gsmap.map import models
 
-        models.add(self.store, kind, path, preset, copy)
+        models.add(self.store, kind, path, preset, copy, self.settings.describe.object.limits)

@@ -6,13 +6,16 @@ import os
 from typing import Any
 
 from gsmap.describe.onnx.check import check_model
+from gsmap.errors import CorruptError
 from gsmap.store import Store
-from gsmap.types.model import ModelSpec, Tensor
+from gsmap.types.model import ModelLimits, ModelSpec, Tensor
 
 
-def add(store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool) -> ModelSpec:
+def add(
+    store: Store, kind: str, path: str | os.PathLike[str], preset: str, copy: bool, limits: ModelLimits
+) -> ModelSpec:
     """Check a model and keep it under its kind, in place of the one there was; see `check_model` for the errors."""
-    spec = check_model(kind, path, preset)
+    spec = check_model(kind, path, preset, limits)
     store.models.add(kind, path, kind=kind, options=spec.to_json(), copy=copy)
     return spec
 
@@ -26,13 +29,18 @@ def _spec(options: dict[str, Any], path: str) -> ModelSpec:
     def tensors(rows: list[dict[str, Any]]) -> tuple[Tensor, ...]:
         return tuple(Tensor(row["name"], tuple(row["shape"]), row["dtype"]) for row in rows)
 
-    return ModelSpec(
-        kind=options["kind"],
-        path=path,
-        sha256=options["sha256"],
-        preset=options["preset"],
-        mean=tuple(options["mean"]),
-        std=tuple(options["std"]),
-        inputs=tensors(options["inputs"]),
-        outputs=tensors(options["outputs"]),
-    )
+    try:
+        return ModelSpec(
+            kind=options["kind"],
+            path=path,
+            sha256=options["sha256"],
+            preset=options["preset"],
+            mean=tuple(options["mean"]),
+            std=tuple(options["std"]),
+            inputs=tensors(options["inputs"]),
+            outputs=tensors(options["outputs"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise CorruptError(
+            f"what the catalog says of the model {path} makes no sense ({error!r}): add it again"
+        ) from error

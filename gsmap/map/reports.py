@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from gsmap.errors import ConfigError
+from gsmap.errors import ConfigError, CorruptError
 from gsmap.methods import RecipeKey
 from gsmap.settings import leaves
 from gsmap.store import Store
@@ -462,7 +462,7 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
     old, new = store.revisions.get(before), store.revisions.get(after)
     assert old is not None
     assert new is not None
-    known = {scene.id: scene for scene in [*store.scenes.list(removed=True), *store.scenes.list()]}
+    known = _ByScene((scene.id, scene) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
     changes = diff(old, new, {scene.id: scene.bounds.mean(0) for scene in known.values()})
     return [
         PoseChangeRow(
@@ -564,6 +564,7 @@ def check_report(found: Check) -> CheckReport:
         orphans=found.orphans,
         num_groups=found.num_groups,
         num_bytes=found.num_bytes,
+        unverified=found.unverified,
     )
 
 
@@ -581,7 +582,14 @@ def prune_report(pruned: Pruned, dry_run: bool) -> PruneReport:
 
 def names(store: Store) -> dict[str, str]:
     """The name of every scene by its id, removed ones included."""
-    return {scene.id: scene.name for scene in [*store.scenes.list(removed=True), *store.scenes.list()]}
+    return _ByScene((scene.id, scene.name) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
+
+
+class _ByScene(dict[str, Any]):
+    """What is known of every scene, by its id. A row that names another one is not gsmap's."""
+
+    def __missing__(self, scene: str) -> NoReturn:
+        raise CorruptError(f"the catalog has results of scene {scene[:12]}, which it does not have: run gsmap check")
 
 
 def _refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, ...]:

@@ -11,8 +11,9 @@ from gsmap.map.stages.export import dirty_tiles
 from gsmap.map.stages.optimize import pose_inputs
 from gsmap.map.stages.register import stale
 from gsmap.store import Store
+from gsmap.store.leases import Lease
 from gsmap.types import Scene
-from gsmap.types.rows import MapStatus, TodoRow
+from gsmap.types.rows import AtWorkRow, MapStatus, TodoRow
 
 
 def status(store: Store, settings: Settings) -> MapStatus:
@@ -69,6 +70,14 @@ def status(store: Store, settings: Settings) -> MapStatus:
         tentative=len(tentative),
         revision=store.revisions.current(),
         metres_per_unit=_metres_per_unit(scenes),
+        at_work=at_work_rows(store.leases.others()),
+    )
+
+
+def at_work_rows(leases: Sequence[Lease]) -> tuple[AtWorkRow, ...]:
+    """Who is at work on what, as rows."""
+    return tuple(
+        AtWorkRow(what=one.what, task=one.task, host=one.host, process=one.pid, since=one.since) for one in leases
     )
 
 

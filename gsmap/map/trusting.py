@@ -35,8 +35,7 @@ def trust(path: str | os.PathLike[str]) -> TrustReport:
     found = _remembered(folder)
     map_id = found.map_id
     if map_id is None:  # an older gsmap made it: the database knows
-        with Store.open(folder, "r", catalog_url=found.url) as store:
-            map_id = store.id
+        map_id = Store.id_at(folder, found.url)
         trusting.write(folder, found.url, map_id)
     trusting.trust(map_id, found.url)
     return catalog_of(path)

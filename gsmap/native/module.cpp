@@ -9,6 +9,7 @@ namespace gsmap {
 void bind_correspondences(nb::module_ &);
 void bind_fit(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
+void bind_stopping(nb::module_ &);
 }
 
 NB_MODULE(_native, m) {
@@ -18,4 +19,5 @@ NB_MODULE(_native, m) {
     gsmap::bind_correspondences(m);
     gsmap::bind_fit(m);
     gsmap::bind_rasteriser(m);
+    gsmap::bind_stopping(m);
 }

@@ -177,7 +177,10 @@ def _of_type(value: Any, annotation: Any, name: str) -> Any:
             raise _wrong(value, annotation, name)
         return tuple(_of_type(item, kind, name) for item, kind in zip(value, inner, strict=True))
     if annotation is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:  # an integer of more than 308 digits
+            raise _wrong(value, annotation, name) from None
     if annotation is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if annotation in (str, bool) and isinstance(value, annotation):

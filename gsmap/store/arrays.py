@@ -10,6 +10,7 @@ This class is the seam for arrays elsewhere than in a local folder: nothing else
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -27,11 +28,13 @@ import numpy as np
 
 from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_file, sync_folder
 from gsmap.errors import BusyError, CorruptError
+from gsmap.store import layout
 from gsmap.store.columns import KINDS, is_digest
+from gsmap.store.explained import explained
+from gsmap.store.layout import CHUNK_ROWS, SHARD_ROWS
 
-CHUNK_ROWS = 16_384
-SHARD_ROWS = 16 * CHUNK_ROWS
 _ZSTD_LEVEL = 1
+_NOT_ITS_BYTES = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 @dataclass(frozen=True)
@@ -154,6 +157,7 @@ class Arrays:
         *,
         only: Sequence[str] | None = None,
         rows: Sequence[tuple[int, int]] | None = None,
+        shapes: Mapping[str, layout.Shape] | None = None,
     ) -> dict[str, np.ndarray]:
         """Read arrays of a group.
 
@@ -161,9 +165,10 @@ class Arrays:
             files: its manifest; a missing or short file is found before zarr turns it into zeros.
             only: names of the arrays to read.
             rows: ranges ``[start, stop)`` of rows, in order; all where None.
+            shapes: what the catalog says of the arrays; None for a length that it does not know.
 
         Raises:
-            CorruptError: a file is missing, short, or fails its checksum.
+            CorruptError: a file is missing, short, or fails its checksum, or gsmap does not write arrays so.
         """
         import zarr
 
@@ -175,10 +180,15 @@ class Arrays:
                 raise CorruptError(f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it")
             if found is None or found.st_size != file.size_bytes:
                 raise CorruptError(f"{path} is missing or cut off: run gsmap check, and ingest the scene again")
+        names = _arrays_in(files) if only is None else only
+        layout.check(place, {file.path: file.size_bytes for file in files}, names, shapes)
         try:
-            group = zarr.open_group(str(place), mode="r", zarr_format=3)
-            return {key: _rows(group[key], rows) for key in (group.array_keys() if only is None else only)}
+            group = zarr.open_group(str(place), mode="r", zarr_format=3, use_consolidated=False)
+            return {name: _rows(group[name], rows) for name in names}
         except Exception as error:  # zarr and its codecs raise whatever they stumbled over
+            if isinstance(error, OSError) and error.errno in _NOT_ITS_BYTES:
+                with explained(place):
+                    raise
             raise CorruptError(
                 f"{place} cannot be read ({type(error).__name__}: {error}): run gsmap check, and ingest the scene again"
             ) from error
@@ -196,8 +206,13 @@ class Arrays:
                 out.append(f"{path} is no plain file (a link, pipe or device)")
             elif found.st_size != file.size_bytes:
                 out.append(f"{path} has {found.st_size} bytes, {file.size_bytes} were written")
-            elif _sha256(path) != file.sha256:
-                out.append(f"{path} differs from what was written")
+            elif (problem := _content_problem(path, file.sha256)) is not None:
+                out.append(problem)
+        if not out:
+            try:
+                layout.check(place, {file.path: file.size_bytes for file in files}, _arrays_in(files))
+            except CorruptError as error:
+                out.append(str(error))
         extra = sorted(set(present) - {file.path for file in files})
         return out + [f"{place / name} does not belong there" for name in extra]
 
@@ -342,6 +357,12 @@ def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
     return target
 
 
+def _arrays_in(files: Sequence[StoredFile]) -> list[str]:
+    """The names of a group's arrays, by its manifest."""
+    found = (file.path.rpartition("/") for file in files)
+    return sorted(above for above, _, name in found if name == "zarr.json" and above)
+
+
 def _rows(array: Any, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:
     if rows is None:
         return np.asarray(array[...])
@@ -370,3 +391,11 @@ def _names(folder: Path) -> list[str]:
 def _sha256(path: Path) -> str:
     with open(open_file(path), "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _content_problem(path: Path, sha256: str) -> str | None:
+    try:
+        same = _sha256(path) == sha256
+    except OSError as error:  # a disk that fails is what `check` is there to find
+        return f"{path} cannot be read: {error.strerror or error}"
+    return None if same else f"{path} differs from what was written"

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import logging
 import os
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
@@ -15,13 +16,15 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, RootTransaction, create_engine
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
-from gsmap.errors import BusyError, ConfigError, MissingDependencyError, StoreError
-from gsmap.store import sqlite, trust
-from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
+from gsmap.store import digests, sqlite, trust
+from gsmap.store.explained import NOT_KEPT, explained, is_full, summary
+from gsmap.store.wal import log_of, read_log
 
 LOCK_FILE = "lock"
+_LOOKS = 3  # at pages that others are writing, before they are asked to wait
 _log = logging.getLogger("gsmap.store")
 
 
@@ -60,7 +63,23 @@ class Catalog:
         if self._writing is not None:
             yield self._writing
             return
-        with explained(self.folder), self.engine.connect() as connection, connection.begin():
+        with explained(self.folder), self._reading() as connection, connection.begin():
+            yield connection
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        """A connection; on a full disk one that needs no room there, for which writers wait meanwhile."""
+        try:
+            connection = self.engine.connect()
+        except (SQLAlchemyError, sqlite3.Error) as error:
+            if not self.is_sqlite or not sqlite.needs_room(error) or not is_full(self.folder):
+                raise
+            with self.still():
+                engine = sqlite.still_engine(self.folder / sqlite.FILE)
+                with engine.connect() as still:
+                    yield still
+            return
+        with connection:
             yield connection
 
     @contextlib.contextmanager
@@ -110,30 +129,139 @@ class Catalog:
             with explained(self.folder, NOT_KEPT):
                 raise error
         try:
-            patience_s = self.patience_s if patience_s is None else patience_s
-            deadline = time.monotonic() + patience_s
-            while True:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                except BlockingIOError:
-                    if time.monotonic() > deadline:
-                        raise BusyError(
-                            f"{self.folder}: others have been writing for {patience_s:g} s; try again later"
-                        ) from None
-                    time.sleep(0.01)
+            self._wait_for(handle, fcntl.LOCK_EX, self.patience_s if patience_s is None else patience_s)
             self._held.depth = 1
             yield
         finally:
             self._held.depth = 0
             os.close(handle)
 
-    def close(self) -> None:
-        """Leave one file at rest, unless others are still at it."""
-        if self.writable and self.is_sqlite:
-            with contextlib.suppress(BusyError), self.lock(patience_s=0.0):
-                self._fold(at_bytes=1)
-        self.engine.dispose()
+    def _wait_for(self, handle: int, how: int, patience_s: float) -> None:
+        deadline = time.monotonic() + patience_s
+        while True:
+            try:
+                fcntl.flock(handle, how | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise BusyError(
+                        f"{self.folder}: others have been writing for {patience_s:g} s; try again later"
+                    ) from None
+                time.sleep(0.01)
+
+    @contextlib.contextmanager
+    def still(self) -> Iterator[None]:
+        """Keep everybody from writing for a moment, without the right to write."""
+        if getattr(self._held, "depth", 0):
+            yield
+            return
+        try:
+            handle = os.open(self.folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:  # then nobody has ever written here, or nobody can
+            yield
+            return
+        try:
+            self._wait_for(handle, fcntl.LOCK_SH, self.patience_s)
+            yield
+        finally:
+            os.close(handle)
+
+    def verify(self) -> None:
+        """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.
+
+        Raises:
+            CorruptError: they differ.
+        """
+        if self.is_sqlite:
+            file = self.folder / sqlite.FILE
+            found = self.page_problems(at_most_bytes=digests.WHOLE_BYTES)
+            if found:
+                backup = digests.is_backup(file, sqlite.handle(self.engine))
+                if backup is None or read_log(log_of(file)).frames:
+                    raise CorruptError(digests.damaged(file, found))
+                if self.writable:  # somebody put it back
+                    with self.lock():
+                        digests.save(file, backup)
+
+    def page_problems(self, *, at_most_bytes: int | None = None) -> list[str]:
+        """What in the catalog's file and its log differs from what was written.
+
+        Args:
+            at_most_bytes: of a longer file look at the log alone.
+        """
+        file = self.folder / sqlite.FILE
+        with explained(self.folder):
+            for _ in range(_LOOKS):
+                found = self._look(file, at_most_bytes)
+                if not found:
+                    return []
+            with self.still():  # others were writing while we looked, or it is damage
+                return self._look(file, at_most_bytes)
+
+    def _look(self, file: Path, at_most_bytes: int | None) -> list[str]:
+        handle = sqlite.handle(self.engine)
+        try:
+            noted = digests.load(file)
+        except CorruptError as error:
+            return [str(error)]
+        log = read_log(log_of(file), handle.index)
+        if at_most_bytes is not None and (size := os.fstat(handle.number).st_size) > at_most_bytes:
+            _log.info("%s has %.0f MB: only gsmap check compares its pages with their digests", file, size / 1e6)
+            return [f"in its log {log.problem}"] if log.problem else []
+        return digests.problems(file, handle, noted, log)
+
+    def unverified(self) -> list[str]:
+        """Why the catalog's bytes cannot be compared with what was written; empty where they can."""
+        if self.is_sqlite:
+            if digests.digests_of(self.folder / sqlite.FILE).exists():
+                return []
+            return [
+                "the catalog was written by an older gsmap, which kept no digests of its pages: the next write does"
+            ]
+        if self.engine.dialect.name != "postgresql":
+            return ["the catalog lies in a database that gsmap knows nothing of"]
+        with self.read() as connection:
+            checks = connection.exec_driver_sql("SHOW data_checksums").scalar() == "on"
+        says = "on, so that it verifies what it reads" if checks else "off, so that nobody verifies it"
+        return [f"the catalog lies in a PostgreSQL server, whose own page checksums are {says}"]
+
+    def accept(self) -> list[str]:
+        """Take the catalog's pages for what was written, whatever they are; what differed, in words.
+
+        Raises:
+            CorruptError: SQLite cannot make sense of them.
+        """
+        if not self.is_sqlite:
+            raise ConfigError(f"{self.folder}: its catalog is no file of the map, so that there is nothing to accept")
+        with self.lock(), explained(self.folder):
+            found = self.page_problems()
+            with self.read() as connection:
+                wrong = sqlite.integrity_problems(connection)
+            if wrong:
+                raise CorruptError(
+                    f"{self.folder}: the catalog cannot be accepted, SQLite finds {summary(wrong)}: restore "
+                    f"{sqlite.FILE} from a backup"
+                )
+            sqlite.accept(self.engine, self.folder / sqlite.FILE)
+        return found
+
+    def close(self, *, fold: bool = True) -> None:
+        """Leave one file at rest, unless others are still at it.
+
+        Args:
+            fold: whether to touch anything; off where the map turned out to be damaged.
+        """
+        if not self.is_sqlite:
+            self.engine.dispose()
+            return
+        file = self.folder / sqlite.FILE
+        try:
+            if self.writable and fold:
+                with contextlib.suppress(BusyError), self.lock(patience_s=0.0):
+                    self._fold(at_bytes=1)
+                    sqlite.dispose(self.engine, file, tidy=True)
+        finally:
+            sqlite.dispose(self.engine, file, tidy=False)
 
     def _fold(self, at_bytes: int) -> None:
         """Fold the log in, under the lock. What was committed is in the log, so that a failure costs nothing."""
@@ -142,8 +270,10 @@ class Catalog:
         try:
             with explained(self.folder):
                 sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
+        except CorruptError:
+            raise
         except StoreError as error:
-            _log.warning("what was written is kept, but not yet folded into map.sqlite: %s", error)
+            _log.warning("what was written is kept, but not yet folded into %s: %s", sqlite.FILE, error)
 
 
 def commit(connection: Connection, transaction: RootTransaction) -> None:

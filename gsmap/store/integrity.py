@@ -12,16 +12,19 @@ from pathlib import Path
 from sqlalchemy import Connection, delete, not_, select, text, update
 
 from gsmap.durable import is_file, is_folder, remove_file
-from gsmap.errors import ConfigError, GsmapError, StoreError
+from gsmap.errors import ConfigError, DiskFullError, GsmapError, StoreError
 from gsmap.store import sqlite, staging
-from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile
+from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import explained
 from gsmap.store.groups import manifest
+from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
 from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress
+
+_AGAIN = "what was to be reclaimed and is still there goes with the next prune"
 
 
 @dataclass(frozen=True)
@@ -32,12 +35,14 @@ class Check:
         problems: one line each; empty for a sound map.
         orphans: folders that no row names (a crash left them; `prune` removes them); no harm.
         num_groups, num_bytes: what was read.
+        unverified: what cannot be compared with what was written, and why.
     """
 
     problems: tuple[str, ...]
     orphans: tuple[str, ...]
     num_groups: int
     num_bytes: int
+    unverified: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -84,15 +89,19 @@ def check(
         manifests = {group: manifest(connection, group) for group in named}
         unread = {group: kind for group, kind in named.items() if (group, manifests[group]) not in read}
         problems = _row_problems(connection, home)
+        spare = {group for _, group in _waste(connection, None).doomed}
+        if catalog.is_sqlite:
+            problems += sqlite.integrity_problems(connection)
     problems += [f"{arrays.root / name} does not belong there: remove it" for name in arrays.strangers()]
     problems += _odd_models(home)
     if catalog.is_sqlite:
-        with explained(catalog.folder):
-            problems += sqlite.integrity_problems(catalog.engine)
-            problems += sqlite.digest_problems(catalog.folder / sqlite.FILE)
+        problems += catalog.page_problems()
+    unverified = tuple(catalog.unverified())
     for i, (group, kind) in enumerate(unread.items()):
         if progress:
             progress(i / len(unread), f"{kind}/{group[:12]}")
+        if group in spare and not (arrays.root / kind / group).exists():
+            continue  # a prune on a full disk was interrupted: nothing claims it
         found = arrays.problems(kind, group, manifests[group])
         if not found:
             read.add((group, manifests[group]))
@@ -107,7 +116,7 @@ def check(
     num_bytes = sum(f.size_bytes for group in unread for f in manifests[group])
     if progress:
         progress(1.0, "checked")
-    return Check(tuple(problems), orphans, len(unread), num_bytes)
+    return Check(tuple(problems), orphans, len(unread), num_bytes, unverified)
 
 
 def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
@@ -124,42 +133,33 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
     """
     if keep_revisions is not None and keep_revisions < 0:
         raise ConfigError(f"the number of revisions to keep must not be negative, got {keep_revisions}")
-    Others(
-        arrays.root.parent, catalog.folder
-    ).groups()  # asked before anything is changed: a branch that cannot be read may need any of it
+    others = Others(arrays.root.parent, catalog.folder)
+    others.groups()  # asked before anything is changed: a branch that cannot be read may need any of it
     with contextlib.nullcontext() if dry_run else catalog.lock():
-        with contextlib.ExitStack() as stack:
-            connection = stack.enter_context(catalog.read() if dry_run else catalog.write())
-            kept, dropped = _revisions_to_keep(connection, keep_revisions)
-            named = select(poses.c.scene).where(poses.c.revision.in_(kept))
-            gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
-            of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
-            dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None))).all()
-            keys = list(connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars())
-            claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
-            claimed |= set(
-                connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars()
-            )
-            doomed = [(g.kind, g.id) for g in connection.execute(select(groups)) if g.id not in claimed]
-            if not dry_run:
-                ids = [group for _, group in doomed]
-                connection.execute(update(revisions).where(revisions.c.number.in_(dropped)).values(dropped_at=now()))
-                connection.execute(delete(graphs).where(graphs.c.key.in_(keys)))
-                connection.execute(update(scenes).where(scenes.c.group_id.in_(ids)).values(group_id=None))
-                for row in dead:
-                    boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
-                    connection.execute(boxes, {"s": row.number})
-                connection.execute(delete(files).where(files.c.group_id.in_(ids)))
-                connection.execute(delete(groups).where(groups.c.id.in_(ids)))
-        # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
-        reclaimed = reclaim(catalog, arrays, dry_run=dry_run, besides=doomed if dry_run else ())
+        with catalog.read() as connection:
+            waste = _waste(connection, keep_revisions)
+            spare = _waste(connection, None).doomed
+        # What no row names goes first: on a full disk that makes the room that rows need.
+        orphans = reclaim(catalog, arrays, dry_run=dry_run, besides=waste.doomed if dry_run else ())
+        num_bytes = orphans.num_bytes
+        if not dry_run:
+            try:
+                _drop_rows(catalog, waste)
+            except DiskFullError:  # then what nothing claims whatever is kept, which `check` does not miss
+                with explained(catalog.folder, _AGAIN), arrays.lock():
+                    for group in set(spare) - others.groups():
+                        num_bytes += arrays.size_bytes(*group)
+                        arrays.drop(*group)
+                _drop_rows(catalog, waste)
+            # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
+            num_bytes += reclaim(catalog, arrays).num_bytes
     return Pruned(
-        scenes=tuple(row.name for row in dead),
-        revisions=tuple(dropped),
-        num_graphs=len(keys),
-        num_orphans=len(set(reclaimed.groups) - set(doomed)),
-        num_models=reclaimed.num_models,
-        num_bytes=reclaimed.num_bytes,
+        scenes=tuple(name for name, _ in waste.scenes),
+        revisions=tuple(waste.revisions),
+        num_graphs=len(waste.graphs),
+        num_orphans=len(set(orphans.groups) - set(waste.doomed)),
+        num_models=orphans.num_models,
+        num_bytes=num_bytes,
         dry_run=dry_run,
     )
 
@@ -183,7 +183,7 @@ def reclaim(
         besides: groups that rows name and that go all the same.
     """
     home, others = arrays.root.parent, Others(arrays.root.parent, catalog.folder)
-    with explained(catalog.folder), contextlib.nullcontext() if dry_run else arrays.lock():
+    with explained(catalog.folder, _AGAIN), contextlib.nullcontext() if dry_run else arrays.lock():
         forgotten = _forgotten_models(catalog, others, home)
         # Asked under the lock of the arrays: nobody comes to name any of them from here on.
         with catalog.read() as connection:
@@ -203,6 +203,54 @@ def reclaim(
             bury_leftovers(home)
         num_bytes += arrays.drop_leftovers(dry_run=dry_run)
     return Reclaimed(tuple(bodies), len(forgotten), num_bytes)
+
+
+@dataclass(frozen=True)
+class _Waste:
+    """What may go.
+
+    Args:
+        revisions: numbers of those that are not kept.
+        scenes: names and numbers of removed scenes that no kept revision names.
+        graphs: keys of their graphs.
+        doomed: kinds and names of the groups that nothing claims then.
+    """
+
+    revisions: list[int]
+    scenes: list[tuple[str, int]]
+    graphs: list[str]
+    doomed: list[tuple[str, str]]
+
+
+def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
+    kept, dropped = _revisions_to_keep(connection, keep_revisions)
+    named = select(poses.c.scene).where(poses.c.revision.in_(kept))
+    gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
+    of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
+    dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None)))
+    keys = connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars()
+    claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
+    claimed |= set(connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars())
+    known = {(g.kind, g.id) for g in connection.execute(select(groups))}
+    return _Waste(
+        dropped,
+        [(row.name, row.number) for row in dead],
+        list(keys),
+        sorted(group for group in known if group[1] not in claimed),
+    )
+
+
+def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
+    ids = [group for _, group in waste.doomed]
+    with catalog.write() as connection:
+        connection.execute(update(revisions).where(revisions.c.number.in_(waste.revisions)).values(dropped_at=now()))
+        connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
+        connection.execute(update(scenes).where(scenes.c.group_id.in_(ids)).values(group_id=None))
+        for _, number in waste.scenes:
+            boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
+            connection.execute(boxes, {"s": number})
+        connection.execute(delete(files).where(files.c.group_id.in_(ids)))
+        connection.execute(delete(groups).where(groups.c.id.in_(ids)))
 
 
 def _row_problems(connection: Connection, home: Path) -> list[str]:

@@ -20,7 +20,7 @@ from sqlalchemy import ColumnElement, Connection, delete, func, select, update
 from sqlalchemy.dialects import postgresql
 from sqlalchemy.dialects import sqlite as sqlite_dialect
 
-from gsmap.errors import BusyError, GsmapError
+from gsmap.errors import BusyError, GsmapError, StoreError
 from gsmap.store.catalog import Catalog
 from gsmap.store.schema import leases
 from gsmap.types.holder import Holder, this_process
@@ -104,7 +104,10 @@ class Leases:
             self._verb = self._verb or task
         try:
             if is_first:
-                self.take([mine], task)
+                try:
+                    self.take([mine], task)
+                except StoreError as error:  # a full disk: what is to be done may need nothing written here
+                    _log.info("others are not told that this process is at work: %s", error)
             yield [lease for lease in self.others() if lease.what == what]
         finally:
             with self._lock:
@@ -213,11 +216,10 @@ class Leases:
             "expires_at": _text(now + timedelta(seconds=self._lease_s)),
         }
         insert = sqlite_dialect.insert if self._catalog.is_sqlite else postgresql.insert
-        ours = []
+        ours: set[str] = set()
         for what in sorted(whats):  # in one order for all, or two servers' connections wait for each other
-            made = insert(leases).values({"what": what, **row}).on_conflict_do_nothing()
-            if connection.execute(made).rowcount == 1:
-                ours.append(what)
+            made = insert(leases).values({"what": what, **row}).on_conflict_do_nothing().returning(leases.c.what)
+            ours.update(connection.execute(made).scalars())
         return [what for what in whats if what in ours]
 
     def _judged(self, connection: Connection, now: datetime) -> tuple[list[Lease], list[Lease]]:

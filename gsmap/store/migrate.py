@@ -20,19 +20,25 @@ if TYPE_CHECKING:
 def version(engine: Engine, folder: Path) -> str | None:
     """The migration a database is at; None where it has never seen one."""
     with explained(folder), engine.connect() as connection:
-        if not inspect(connection).has_table("alembic_version"):
-            return None
-        return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+        return _version(connection)
 
 
-def require_current(engine: Engine, folder: Path) -> None:
+def _version(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+
+
+def require_current(catalog: Catalog) -> None:
     """Refuse a database of another schema.
 
     Raises:
         SchemaVersionError: newer (get a newer gsmap) or older (``gsmap migrate``).
-        CorruptError: no schema at all.
+        CorruptError: no schema at all, or tables that gsmap did not make.
     """
-    found = version(engine, folder)
+    folder = catalog.folder
+    with catalog.read() as connection:
+        found = _version(connection)
     if found is None:
         raise CorruptError(f"{folder}: its catalog holds no gsmap tables; restore it from a backup")
     if found > schema.HEAD:
@@ -44,6 +50,36 @@ def require_current(engine: Engine, folder: Path) -> None:
         raise SchemaVersionError(
             f"{folder} was written by an older gsmap (schema {found}, now {schema.HEAD}): run gsmap migrate {folder}"
         )
+    if catalog.is_sqlite:  # a server's tables are the user's own
+        with catalog.read() as connection:
+            _require_tables(connection, folder)
+
+
+def _require_tables(connection: Connection, folder: Path) -> None:
+    """Refuse a file whose tables are not those of the schema: their types are what rows are trusted for, and a trigger
+    or a view would have gsmap's own statements do something else."""
+    extra = connection.execute(text("SELECT type, name FROM sqlite_master WHERE type IN ('trigger', 'view')")).first()
+    if extra is not None:
+        raise _not_ours(folder, f"has a {extra.type} ({extra.name!r})")
+    strict = {row.name: bool(row.strict) for row in connection.execute(text("PRAGMA table_list"))}
+    for name, table in schema.metadata.tables.items():
+        if not strict.get(name):
+            raise _not_ours(folder, f"has no table {name!r} with types that are kept to")
+        found = {
+            row.name: (row.type, bool(row.notnull), row.hidden)
+            for row in connection.execute(text(f"PRAGMA table_xinfo({name})"))
+        }
+        wanted = {c.name: (c.type.compile(connection.dialect), not c.nullable, 0) for c in table.columns}
+        if found != wanted:
+            odd = sorted(column for column in {*found, *wanted} if found.get(column) != wanted.get(column))
+            raise _not_ours(folder, f"has another column {name}.{odd[0]}")
+
+
+def _not_ours(folder: Path, what: str) -> CorruptError:
+    return CorruptError(
+        f"{folder}: its catalog {what}: gsmap did not make it so; restore it from a backup, and do not trust a map "
+        "that was sent to you so"
+    )
 
 
 def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str | None]:
@@ -56,7 +92,7 @@ def upgrade(catalog: Catalog, revision: str = "head") -> tuple[str | None, str |
     """
     before = version(catalog.engine, catalog.folder)
     if before is not None and before > schema.HEAD:
-        require_current(catalog.engine, catalog.folder)
+        require_current(catalog)
     if before == schema.HEAD and revision == "head":
         return before, before
     with catalog.lock():

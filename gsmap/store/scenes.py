@@ -12,12 +12,13 @@ from sqlalchemy import Connection, Row, insert, select, text, update
 from gsmap.errors import CorruptError, InputError, NotFoundError, StoreError
 from gsmap.geometry.morton import morton_order
 from gsmap.store import facts
-from gsmap.store.arrays import CHUNK_ROWS, Arrays, StoredFile, digest
+from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
 from gsmap.store.groups import has_group, manifest, publish
+from gsmap.store.layout import CHUNK_ROWS, Shape
 from gsmap.store.schema import CHUNK_BOXES, scenes
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import Progress
@@ -231,7 +232,7 @@ class Scenes:
             files = _manifest(connection, row)
             chunks = None if bounds is None else _touching(connection, row.number, np.asarray(bounds, np.float64))
         rows = None if chunks is None else _ranges(chunks, row.num_gaussians)
-        out = Gaussians(**self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows))
+        out = Gaussians(**self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows, shapes=_shapes(row)))
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)
@@ -248,8 +249,13 @@ class Scenes:
             row = _find(connection, ref)
             files = _manifest(connection, row)
         names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
-        pose, intrinsics, sizes, text_bytes = self._arrays.read(KIND, row.group_id, files, only=names).values()
-        image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
+        pose, intrinsics, sizes, text_bytes = self._arrays.read(
+            KIND, row.group_id, files, only=names, shapes=_shapes(row)
+        ).values()
+        try:
+            image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
+        except UnicodeDecodeError as error:
+            raise CorruptError(f"scene {row.name}: the names of its cameras are no text: ingest it again") from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
 
     def remove(self, ref: str) -> Scene:
@@ -419,6 +425,23 @@ def _scene(row: Row[Any], tags: tuple[str, ...]) -> Scene:
         antialiased=bool(row.antialiased),
         tags=tags,
     )
+
+
+def _shapes(row: Row[Any]) -> dict[str, Shape]:
+    """What a scene's row says of its arrays."""
+    n, c = row.num_gaussians, row.num_cameras
+    shapes: dict[str, Shape] = {
+        "means": (n, 3),
+        "quats": (n, 4),
+        "log_scales": (n, 3),
+        "logit_opacities": (n,),
+        "sh": (n, (row.sh_degree + 1) ** 2, 3),
+        "cameras.T_frame_camera": (c, 4, 4),
+        "cameras.intrinsics_px": (c, 4),
+        "cameras.sizes_px": (c, 2),
+        "cameras.names": (None,),
+    }
+    return shapes
 
 
 def _to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import uuid
 from collections.abc import Iterator
 from dataclasses import replace
@@ -124,7 +125,7 @@ class Store:
         """
         store = cls._connect(path, mode, catalog_url)
         try:
-            migrate.require_current(store.catalog.engine, store.folder)
+            migrate.require_current(store.catalog)
             if not store.catalog.is_sqlite:
                 store._check_id()
         except BaseException:
@@ -152,7 +153,7 @@ class Store:
         """Open for writing, a tag as well: what is purged goes from there, too."""
         store = cls._connect(path, "w", None, even_tags=True)
         try:
-            migrate.require_current(store.catalog.engine, store.folder)
+            migrate.require_current(store.catalog)
         except BaseException:
             store.close()
             raise
@@ -174,8 +175,33 @@ class Store:
         return versions
 
     @classmethod
+    def accept_catalog(cls, path: str | os.PathLike[str]) -> list[str]:
+        """Take a catalog that differs from what was written as it is, and note new digests: what differed, in words.
+
+        For salvage: SQLite must find it sound, but nobody knows whether its values are those that were written.
+
+        Raises:
+            CorruptError: SQLite cannot make sense of it.
+            ConfigError: the catalog is no file of the map.
+        """
+        with cls._connect(path, "w", None, verify=False, even_tags=True) as store:
+            return store.catalog.accept()
+
+    @classmethod
+    def id_at(cls, path: str | os.PathLike[str], catalog_url: str) -> str:
+        """The id of the map whose catalog is at a URL, whatever its schema; see `open` for the errors."""
+        with cls._connect(path, "r", catalog_url) as store:
+            return store.id
+
+    @classmethod
     def _connect(
-        cls, path: str | os.PathLike[str], mode: str, catalog_url: str | None, *, even_tags: bool = False
+        cls,
+        path: str | os.PathLike[str],
+        mode: str,
+        catalog_url: str | None,
+        *,
+        even_tags: bool = False,
+        verify: bool = True,
     ) -> Store:
         if mode not in ("r", "w"):
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
@@ -198,7 +224,14 @@ class Store:
                 engine = _catalog.url_engine(catalog_url)
             else:
                 engine = _catalog.open_engine(folder, writable=mode == "w")
-        return cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
+        store = cls(place, Catalog(folder, engine, writable=mode == "w", refusal=refusal if place.is_tag else ""))
+        try:
+            if verify:
+                store.catalog.verify()
+        except BaseException:
+            store.catalog.close(fold=False)
+            raise
+        return store
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -266,12 +299,16 @@ def _refuse_strange_entries(folder: Path) -> None:
 
     The folder itself may be a link. What lies deeper is looked at where it is used.
     """
-    with explained(folder), os.scandir(folder) as entries:
-        for entry in entries:
-            if not (entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)):
-                what = "a link" if entry.is_symlink() else "a pipe or a device"
+    with explained(folder):
+        for name in sorted(os.listdir(folder)):
+            try:
+                mode = os.lstat(folder / name).st_mode
+            except FileNotFoundError:
+                continue  # a file that was just replaced
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                what = "a link" if stat.S_ISLNK(mode) else "a pipe or a device"
                 raise CorruptError(
-                    f"{entry.path} is {what}: gsmap makes none in a map; put what belongs there in its place"
+                    f"{folder / name} is {what}: gsmap makes none in a map; put what belongs there in its place"
                 )
     sqlite.refuse_super_journal(folder / sqlite.FILE)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 
@@ -23,6 +23,19 @@ class Tensor:
 
 
 @dataclass(frozen=True)
+class ModelLimits:
+    """What a model may take: a file from elsewhere can ask for anything.
+
+    Args:
+        time_s: for loading it, and for each run.
+        memory_mb: beside what the libraries take; held on Linux.
+    """
+
+    time_s: float = 300.0
+    memory_mb: int = 8192
+
+
+@dataclass(frozen=True)
 class ModelSpec:
     """A checked ONNX model.
 
@@ -33,6 +46,7 @@ class ModelSpec:
         preset: how its pixels are scaled: a name, or ``mean=r,g,b;std=r,g,b``.
         mean, std: of rgb in [0, 1].
         inputs, outputs: as the file declares them.
+        limits: what it may take where it runs; no part of what it is.
     """
 
     kind: str
@@ -43,10 +57,11 @@ class ModelSpec:
     std: tuple[float, float, float]
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
+    limits: ModelLimits = field(default_factory=ModelLimits)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, for a catalog."""
-        return asdict(self)
+        return {name: value for name, value in asdict(self).items() if name != "limits"}
 
     @property
     def digest(self) -> str:

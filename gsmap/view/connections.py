@@ -13,12 +13,15 @@ import time
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 # A browser opens six; a second window and a reload beside it fit. Each holds a thread.
 MAX_CONNECTIONS = 16
 # To send a whole request, or the next one: what is slower is no browser on this machine.
 REQUEST_S = 10.0
 _ESTABLISHED = "01"
+
+Address = tuple[str, int]
 
 
 @dataclass(eq=False)
@@ -48,16 +51,16 @@ class LocalServer(HTTPServer):
     def __init__(self, port: int, handler: type[BaseHTTPRequestHandler]) -> None:
         self.open: dict[socket.socket, Connection] = {}
         self._lock = threading.Lock()
-        self._accepted: queue.SimpleQueue[tuple[socket.socket, object] | None] = queue.SimpleQueue()
+        self._accepted: queue.SimpleQueue[tuple[socket.socket, Any] | None] = queue.SimpleQueue()
         super().__init__(("127.0.0.1", port), handler)
         for _ in range(MAX_CONNECTIONS):
             threading.Thread(target=self._work, daemon=True).start()
 
-    def verify_request(self, request: object, client_address: object) -> bool:
-        """Whether the client may be another user's; asked before anything is read."""
-        return not is_of_another_user(client_address, self.server_address)
+    def verify_request(self, request: object, client_address: Any) -> bool:
+        """Whether the client may be answered; asked before anything is read."""
+        return not is_of_another_user(client_address, ("127.0.0.1", self.server_port))
 
-    def process_request(self, request: object, client_address: object) -> None:
+    def process_request(self, request: object, client_address: Any) -> None:
         assert isinstance(request, socket.socket)
         with self._lock:
             if len(self.open) >= MAX_CONNECTIONS:
@@ -76,7 +79,7 @@ class LocalServer(HTTPServer):
             for one in [c for c in self.open.values() if c.waiting_since is not None and c.waiting_since < late]:
                 self._forget(one)
 
-    def handle_error(self, request: object, client_address: object) -> None:
+    def handle_error(self, request: object, client_address: Any) -> None:
         """A client that goes away is no error, and nothing below the command line prints."""
 
     def server_close(self) -> None:
@@ -104,13 +107,12 @@ class LocalServer(HTTPServer):
                 self.shutdown_request(request)
 
 
-def is_of_another_user(client: object, server: object) -> bool:
+def is_of_another_user(client: Address, server: Address) -> bool:
     """Whether the socket at the other end of a connection on this machine is known to be of another user than this
     one and root. Linux tells; elsewhere, and of a socket that is closing, nothing is known."""
     if not sys.platform.startswith("linux"):
         return False
-    (client_host, client_port), (server_host, server_port) = client, server  # type: ignore[misc, attr-defined]
-    here, there = _hexadecimal(client_host, client_port), _hexadecimal(server_host, server_port)
+    here, there = _hexadecimal(*client), _hexadecimal(*server)
     for name, prefix in (("tcp", ""), ("tcp6", "0000000000000000FFFF0000")):  # an IPv6 socket may speak IPv4
         try:
             rows = Path("/proc/net", name).read_text(encoding="ascii").splitlines()[1:]

@@ -13,6 +13,7 @@ import pytest
 import typer.main
 
 import gsmap
+import gsmap.map
 import gsmap_synthetic
 from gsmap import formats
 from gsmap.cli.app import build
@@ -73,11 +74,18 @@ RUNS = {
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
     "migrate": "migrate MAP",
+    "backup": "backup MAP TMP/backup --verify --keep 1",
+    "backup --list": "backup MAP TMP/saved --list",
+    "restore": "restore TMP/saved TMP/restored.gsmap",
+    "clone": "clone MAP TMP/clone.gsmap",
     "trust": "trust TMP/remote.gsmap --yes",
     "view": "view MAP --no-browser",
     "demo": "demo TMP/demo",
 }
-SILENT = {"init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view"}
+SILENT = {
+    *("init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view"),
+    *("backup", "restore", "clone"),
+}
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""
 
 
@@ -96,6 +104,9 @@ def gsmap_run(
     monkeypatch.setattr(gsmap_synthetic, "write_captures", lambda folder, made: _link_captures(captures, folder))
 
     def call(line: str) -> Any:
+        if "TMP/saved" in line:
+            with gsmap.map.open(site) as m:
+                m.backup(tmp_path / "saved")
         places = {"MAP": site, "SITE": made_site, "TMP": tmp_path, "CAPTURES": captures}
         words = []
         for word in line.split():

@@ -24,7 +24,7 @@ LAYERS = [
     {"geometry"},
     {"methods"},
     {"settings"},
-    {"formats", "render"},
+    {"formats", "render", "networks"},
     {
         "store",
         "retrieve",
@@ -55,7 +55,7 @@ HOMES = {
     "zarr": {"store"},
     "gtsam": {"optimize"},
     "networkx": {"optimize"},
-    "onnxruntime": {"describe", "evaluate"},
+    "onnxruntime": {"networks"},
     "small_gicp": {"register"},
     "kiss_matcher": {"register"},
     "open3d": {"gsmap_synthetic"},

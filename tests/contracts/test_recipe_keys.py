@@ -44,8 +44,8 @@ ALTERNATIVES: dict[str, Any] = {
 }
 """Another value of a setting that takes only certain words."""
 
-NAMES_NOTHING = ("retrieve.", "export.", "evaluate.", "engine.", "merge.method")
-"""Settings that choose work (which pairs, which tiles, where it runs), and change no result."""
+NAMES_NOTHING = ("retrieve.", "export.", "evaluate.", "engine.", "merge.method", "describe.object.model_")
+"""Settings that choose work (which pairs, which tiles, where it runs, when it is given up), and change no result."""
 
 
 def _chosen_by(plural: str, switch: str, kind: str) -> dict[str, dict[str, Any]]:

@@ -121,3 +121,37 @@ def external(path: Path) -> Path:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.save(model, str(path), save_as_external_data=True, location="weights.bin", size_threshold=0)
     return path
+
+
+def endless(path: Path, *, grows: bool = False) -> Path:
+    """An image encoder that takes 2^62 turns of a loop; where it grows, each doubles what it holds."""
+    value = helper.make_tensor_value_info
+    turn = ("Concat", ["x", "x"]) if grows else ("Add", ["x", "one"])
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["go_on"], ["goes_on"]),
+            helper.make_node(*turn, ["y"], **({"axis": 0} if grows else {})),
+        ],
+        "body",
+        [value("i", TensorProto.INT64, []), value("go_on", TensorProto.BOOL, []), value("x", TensorProto.FLOAT, None)],
+        [value("goes_on", TensorProto.BOOL, []), value("y", TensorProto.FLOAT, None)],
+        [numpy_helper.from_array(np.ones(1, np.float32), "one")],
+    )
+    mean = helper.make_node("ReduceMean", ["pixels"], ["mean"], axes=[2, 3], keepdims=0)
+    loop = helper.make_node("Loop", ["turns", "go"], ["features"], body=body)
+    loop.input.append("mean")
+    constants = {"turns": np.array(2**62, np.int64), "go": np.array(True)}
+    shapes = [_value("pixels", ["n", 3, 8, 8])], [_value("features", ["n", 3])]
+    return _save(path, [mean, loop], *shapes, constants)
+
+
+def enormous(path: Path, numbers: int = 40_000_000_000) -> Path:
+    """An image encoder whose weights are 160 GB of zeros in a few bytes."""
+    nodes = [
+        helper.make_node("ConstantOfShape", ["shape"], ["zeros"]),
+        helper.make_node("ReduceSum", ["zeros"], ["zero"], keepdims=0),
+        helper.make_node("ReduceMean", ["pixels"], ["mean"], axes=[2, 3], keepdims=0),
+        helper.make_node("Add", ["mean", "zero"], ["features"]),
+    ]
+    shape = {"shape": np.array([numbers], np.int64)}
+    return _save(path, nodes, [_value("pixels", ["n", 3, 8, 8])], [_value("features", ["n", 3])], shape)

@@ -26,8 +26,9 @@ class _File:
             return self.synced
         if policy == "zeros":
             now, sure = bytes(self.data), self.synced
-            same = os.path.commonprefix([now, sure])
-            return now if now == sure else same + bytes(len(now) - len(same))
+            ends = (i for i, (a, b) in enumerate(zip(now, sure, strict=False)) if a != b)
+            same = next(ends, min(len(now), len(sure)))
+            return now[:same] + bytes(len(now) - same)
         return bytes(self.data)
 
 
@@ -74,7 +75,7 @@ class Disk:
         return top, name
 
     def _play(self, top: _Folder, change: Change) -> None:
-        if change.kind in "#!":
+        if change.kind in "#!?":
             return
         inside = os.path.relpath(change.path, self._root)
         if _passing(inside) or inside.endswith(" (deleted)"):

@@ -1,10 +1,11 @@
 """A process that has imported everything once, and runs verbs in forked children that it kills or fails.
 
-Started with the shim in ``LD_PRELOAD``; takes one JSON object a line and answers with one. `fault_client.py` speaks to it.
+Started with the shim in ``LD_PRELOAD``; takes one JSON object a line and answers with one; see `fault_client`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -191,10 +192,8 @@ class Server:
         for name in noted.read_text().split():
             if name not in sys.modules and name not in self._known and not name.startswith(("onnxruntime", "tests")):
                 self._known.add(name)
-                try:
+                with contextlib.suppress(BaseException):
                     importlib.import_module(name)
-                except BaseException:
-                    pass
 
     def _judge(
         self, verb: Verb, before: State, after: State, code: int | None, stderr: str, fired: bool, *, end: bool = False
@@ -205,22 +204,46 @@ class Server:
         if end and not now.same(after):
             out.lost.append(f"what was done is not there: {fault_judge.differences(after, now)}")
         out.tracebacks += fault_judge.tracebacks(stderr)
-        problems = _problems(site) if now.exists and verb.base != "older" else []
+        problems = self._problems() if verb.base != "older" else []
         out.lost += problems + fault_judge.tiles_problems(self.work)
         out.untrue += fault_judge.judge_words(code, stderr, before, after, now, whole=not problems)
         if code is None and not fired and not end:
             out.untrue.append("ended by a signal that nobody sent, or hung")
+        if code == 0 or end:
+            out.lost += self._then(verb)
         again, said = self._run(verb.line)
         out.tracebacks += fault_judge.tracebacks(said)
         ended = fault_judge.state(self.work)
         if again != 0 and not (verb.done_says and verb.done_says in said and now.same(after)):
             out.repeat.append(f"ended with {again}: {said.strip().splitlines()[-1:]}")
-        elif not ended.same(after):
+        elif not ended.same(after, history=True):
             out.repeat.append(f"ended otherwise than undisturbed: {fault_judge.differences(after, ended)}")
-        out.lost += [f"after the repeat: {p}" for p in _problems(site)]
+        out.lost += [f"after the repeat: {p}" for p in (*self._problems(), *self._then(verb))]
+        fault_judge.age(self.work)
         with Store.open(site) as store:
             store.prune()
         out.left += fault_judge.leftovers(self.work)
+        return out
+
+    def _problems(self) -> list[str]:
+        """What `check` finds in any map, or why one does not open."""
+        out = []
+        for place in fault_judge.catalogs(self.work):
+            home = place.parents[1] if place.parent.name == "branches" else place
+            try:
+                with Store.open(home if home == place else f"{home}@{place.name}", "r") as store:
+                    out += [f"check: {problem}" for problem in store.check().problems]
+            except Exception as error:
+                out.append(f"does not open: {error}")
+        return out
+
+    def _then(self, verb: Verb) -> list[str]:
+        """What does not work of what the verb was for."""
+        out = []
+        for line in verb.then:
+            code, stderr = self._run(line)
+            out += [f"gsmap {line} ended with {code}: {stderr[-300:]}"] if code else []
+        shutil.rmtree(self.work / "proof.gsmap", ignore_errors=True)
         return out
 
     def _forked(self, work: Callable[[], Any]) -> Any:
@@ -248,14 +271,6 @@ class Server:
         if not fine:
             raise RuntimeError(result)
         return result
-
-
-def _problems(site: Path) -> list[str]:
-    try:
-        with Store.open(site, "r") as store:
-            return [f"check: {problem}" for problem in store.check().problems]
-    except Exception as error:
-        return [f"does not open: {error}"]
 
 
 def _waited(pid: int) -> tuple[int | None, bool]:

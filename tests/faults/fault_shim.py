@@ -19,7 +19,7 @@ SOURCE = Path(__file__).with_name("shim.c")
 _HEAD = struct.Struct("=5Q")
 
 NAMES = {"w": "write", "f": "fsync", "t": "truncate", "u": "unlink", "d": "rmdir", "m": "mkdir", "r": "rename"}
-NAMES |= {"c": "create", "l": "link", "s": "symlink", "#": "mark", "!": "fired"}
+NAMES |= {"c": "create", "l": "link", "s": "symlink", "#": "mark", "!": "fired", "?": "nothing"}
 
 
 @dataclass(frozen=True)

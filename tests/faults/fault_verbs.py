@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap import formats
+from gsmap.cli import app
 from gsmap.types import Gaussians
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "schema_0001.tar.xz"
@@ -30,6 +31,7 @@ class Verb:
         done_says: what the repeated verb may say where the first run had come to its end.
         also: lines that are run first, undisturbed and unwatched.
         needs: a package without which there is no such verb.
+        then: lines that must work once it has come to its end, the first time and the second.
     """
 
     name: str
@@ -38,10 +40,12 @@ class Verb:
     done_says: str = ""
     also: tuple[str, ...] = ()
     needs: str = ""
+    then: tuple[str, ...] = ()
 
     @property
     def possible(self) -> bool:
-        return not self.needs or importlib.util.find_spec(self.needs) is not None
+        here = not self.needs or importlib.util.find_spec(self.needs) is not None
+        return here and self.line.split()[0] in app.VERBS
 
 
 BASES = {
@@ -62,8 +66,14 @@ BASES = {
     # Everything that prune takes: a removed scene with its graph, revisions, an orphan, what a dead writer left.
     "littered": ("placed", ("remove MAP b", "optimize MAP", "*litter")),
     "older": ("nothing", ("*older",)),
+    "kept": ("placed", ("backup MAP HERE/kept",)),
+    "grown": ("kept", ("ingest MAP IN/c.ply",)),
+    "branched": ("placed", ("branch MAP what-if", "edit MAP@what-if a --note later")),
+    "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
+
+RESTORED = ("restore HERE/kept HERE/proof.gsmap", "check HERE/proof.gsmap")
 
 VERBS = {
     verb.name: verb
@@ -91,6 +101,17 @@ VERBS = {
         Verb("prior", "placed", "prior MAP a --anchor"),
         Verb("edit", "placed", "edit MAP a --captured-at 2024-05-31 --note wet --tag hall"),
         Verb("settings", "placed", "settings MAP --set export.moved_m=0.01"),
+        Verb("backup", "placed", "backup MAP HERE/kept", then=RESTORED),
+        Verb("backup-again", "grown", "backup MAP HERE/kept", then=RESTORED),
+        Verb("backup-keep", "grown", "backup MAP HERE/kept --keep 1", then=RESTORED),
+        Verb("restore", "kept", "restore HERE/kept HERE/back.gsmap", done_says="is there already"),
+        Verb("clone", "placed", "clone MAP HERE/copy.gsmap", done_says="is there already"),
+        Verb("branch", "placed", "branch MAP what-if", done_says="exists already"),
+        Verb("branch-write", "branched", "edit MAP@what-if a --note wet --tag hall"),
+        Verb("branch-delete", "branched", "branch MAP what-if --delete", done_says="no branch"),
+        Verb("tag", "placed", "tag MAP handover", done_says="exists already"),
+        Verb("merge", "two", "merge MAP HERE/other.gsmap"),
+        Verb("split", "placed", "split MAP HERE/part.gsmap --scenes a", done_says="already"),
     )
 }
 """Verbs by name. A verb that is new is one line here."""
@@ -98,7 +119,13 @@ VERBS = {
 
 def words(line: str, folder: Path, samples: Path) -> list[str]:
     """The arguments of a line, in a folder that holds the map and the export."""
-    places = {"MAP": str(folder / "site.gsmap"), "OUT": str(folder / "out"), "IN": str(samples), "HERE": str(folder)}
+    places = {
+        "MAP": str(folder / "site.gsmap"),
+        "MAP@what-if": str(folder / "site.gsmap@what-if"),
+        "OUT": str(folder / "out"),
+        "IN": str(samples),
+        "HERE": str(folder),
+    }
     out = []
     for word in line.split():
         first, slash, rest = word.partition("/")
@@ -130,9 +157,9 @@ def write_samples(folder: Path) -> None:
     """Three captures of a few hundred Gaussians, poses for ``gsmap edge``, and models where onnx is installed."""
     folder.mkdir(parents=True)
     for seed, name in enumerate("abc"):
-        formats.write(folder / f"{name}.ply", _capture(seed))
+        formats.write(folder / f"{name}.ply", capture(seed))
         (folder / f"{name}.cameras.json").write_text(json.dumps(_frames(name)))
-    for name, x in (("pose", 1.5), ("pose2", 1.6)):
+    for name, x in (("pose", 5.0), ("pose2", 5.1)):
         pose = np.eye(4)
         pose[0, 3] = x
         np.savetxt(folder / f"{name}.txt", pose)
@@ -141,7 +168,7 @@ def write_samples(folder: Path) -> None:
             (folder / f"{name}.onnx").write_bytes(_encoder(window))
 
 
-def _capture(seed: int, count: int = 400) -> Gaussians:
+def capture(seed: int, count: int = 400) -> Gaussians:
     """Gaussians on the sides of a box of 4 x 3 x 2 m, of one texture."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(size=(count, 3))

@@ -93,7 +93,7 @@ static void put(const void *bytes, size_t n) {
     }
 }
 
-/* A record: kind, three lengths (path, other path, data) and an offset, then these three. */
+/* A record (of '?' where nothing came of a call, so that records and counts agree): kind, three lengths (path, other path, data) and an offset, then these three. */
 static void record(char kind, const char *path, const char *other, uint64_t offset, const void *data, uint64_t n) {
     struct { uint64_t kind, path, other, offset, data; } head = {
         (unsigned char)kind, strlen(path), strlen(other), offset, data ? n : 0};
@@ -142,7 +142,11 @@ static void after(int said) {
 static void record_written(int fd, const char *path, off_t start, ssize_t n) {
     char link[64], *data;
     int reader;
-    if (log_fd < 0 || n <= 0) return;
+    if (log_fd < 0) return;
+    if (n <= 0) {
+        record('?', path, "", 0, NULL, 0);
+        return;
+    }
     if (!with_data) {
         record('w', path, "", start, NULL, 0);
         return;
@@ -230,7 +234,7 @@ ssize_t copy_file_range(int from, off64_t *fo, int to, off64_t *o, size_t n, uns
         return -1; \
     } \
     done = call; \
-    if (done >= 0) record(kind, path, other, value, NULL, 0); \
+    record(done >= 0 ? kind : '?', path, other, value, NULL, 0); \
     after(said); \
     pthread_mutex_unlock(&lock); \
     return done
@@ -252,6 +256,11 @@ int ftruncate64(int fd, off64_t n) { REAL(ftruncate64); OPENED('t', fd, n, real(
 int truncate(const char *p, off_t n) {
     char path[PATH_MAX];
     REAL(truncate);
+    CHANGING(full(AT_FDCWD, p, path), 't', path, "", n, real(p, n));
+}
+int truncate64(const char *p, off64_t n) {
+    char path[PATH_MAX];
+    REAL(truncate64);
     CHANGING(full(AT_FDCWD, p, path), 't', path, "", n, real(p, n));
 }
 int unlink(const char *p) { REAL(unlink); NAMED('u', AT_FDCWD, p, real(p)); }

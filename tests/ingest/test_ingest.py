@@ -203,6 +203,14 @@ def test_large_finite_numbers_do_not_overflow_the_check():
     validate(replaced(box(), means=means))
 
 
+def test_cameras_of_impossible_images_are_refused():
+    c = looking()
+    sizes = c.sizes_px.copy()
+    sizes[2] = 2_000_000_000
+    with pytest.raises(InputError, match=r"2000000000 x 2000000000 pixels"):
+        validate(box(), Cameras(c.T_frame_camera, c.intrinsics_px, sizes))
+
+
 def test_cameras_of_another_scene_are_refused():
     c = looking()
     away = c.T_frame_camera.copy()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -126,16 +126,30 @@ class Described:
 
 
 @contextmanager
-def pairs_remembered() -> Iterator[None]:
-    """Register a pair once for all maps, in each direction: what is asked for is seen, not what it gives."""
+def pairs_remembered() -> Iterator[Callable[[], AbstractContextManager[None]]]:
+    """Register a pair once for all maps, in each direction: what is asked for is seen, not what it gives.
+
+    Yields:
+        A context in which pairs are registered anew all the same.
+    """
     known: dict[tuple[Any, ...], Any] = {}
     run_jobs = register_stage.run_jobs
+    anew = False
 
     def remembering(function: Any, jobs: Sequence[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
-        new = [k for k, job in enumerate(jobs) if job[1:] not in known]
+        new = [k for k, job in enumerate(jobs) if anew or job[1:] not in known]
         for i, edge in run_jobs(function, [jobs[k] for k in new], params):
             known[jobs[new[i]][1:]] = edge
         yield from ((k, known[job[1:]]) for k, job in enumerate(jobs))
 
+    @contextmanager
+    def registering_anew() -> Iterator[None]:
+        nonlocal anew
+        anew = True
+        try:
+            yield
+        finally:
+            anew = False
+
     with mock.patch.object(register_stage, "run_jobs", remembering):
-        yield
+        yield registering_anew

@@ -1,4 +1,4 @@
-"""The answer is a function of what was measured: not of the order of scenes, edges and priors, nor of how the map grew."""
+"""The answer is a function of what was measured: not of the order of scenes, edges, priors, nor of how a map grew."""
 
 from itertools import combinations
 
@@ -41,10 +41,11 @@ def shuffled(rng, *lists):
     return [[values[k] for k in rng.permutation(len(values))] for values in lists]
 
 
-@pytest.mark.parametrize("wrong_share", [0.0, 0.3])
+@pytest.mark.parametrize("wrong_share", [0.0, 0.6])
 def test_any_order_gives_the_same_answer(wrong_share):
-    world, rng = city(60, wrong_share, seed=3), np.random.default_rng(0)
-    priors = [Prior(world.ids[k], world.truth.item(k), np.full(7, 0.05)) for k in (3, 17, 40, 51)]
+    """With six edges in ten wrong, much is decided by what is tried first."""
+    world, rng = city(40, wrong_share, seed=0), np.random.default_rng(0)
+    priors = [Prior(world.ids[k], world.truth.item(k), np.full(7, 0.05)) for k in (3, 17, 25, 31)]
     for given in ([], priors):
         first = optimize(world.ids, world.edges, given)
         for _ in range(3):

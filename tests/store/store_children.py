@@ -7,7 +7,7 @@ import sys
 
 from store_samples import key, make_cameras, make_gaussians
 
-from gsmap.store import Store
+from gsmap.store import Store, sqlite
 from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
 
 # Every event of the interpreter that changes the disk; writing itself has none, but each file is opened first.
@@ -133,3 +133,33 @@ def messages(pipe) -> list:
 
 
 CODES = (errno.ENOSPC, errno.EIO)
+
+
+def fold_often(path: str, worker: int, count: int, pipe) -> None:
+    """A writer that folds the log in after every transaction."""
+    sqlite.CHECKPOINT_BYTES = 1
+    try:
+        with Store.open(path) as store:
+            for i in range(count):
+                store.exports.begin(f"/out/{worker}/{i}", revision=None, settings={"x": "y" * 5000})
+        pipe.send("done")
+    except BaseException as error:
+        pipe.send(repr(error))
+
+
+def open_often(path: str, mode: str, stop, pipe) -> None:
+    """A reader that opens the map, and so compares its pages with their digests, again and again."""
+    try:
+        rounds = 0
+        while not stop.is_set() or not rounds:
+            with Store.open(path, mode) as store:
+                store.exports.list()
+            rounds += 1
+        pipe.send(rounds)
+    except BaseException as error:
+        pipe.send(repr(error))
+
+
+def open_and_close(path: str, pipe) -> None:
+    with Store.open(path) as store:
+        pipe.send([scene.name for scene in store.scenes.list()])

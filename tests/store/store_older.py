@@ -1,8 +1,8 @@
 """A map that schema 0001 wrote, and what is in it.
 
-``schema_0001.tar.xz`` was made by gsmap at commit 0ff8db8: two scenes (the first with a date and a note), a graph of
-each, two registrations of the pair with a confirmation that was withdrawn, three revisions, an export with one tile,
-and a prior.
+``releases/0.1.0.tar.xz`` was made by gsmap 0.1.0 (commit 0ff8db8): two scenes (the first with a date and a note), a
+graph of each, two registrations of the pair with a confirmation that was withdrawn, three revisions, an export with one
+tile, and a prior.
 """
 
 import tarfile
@@ -13,7 +13,7 @@ from sqlalchemy import Connection, MetaData, insert, select, text
 from gsmap.store import Store
 from gsmap.types import EdgeOutcome, Provenance
 
-ARCHIVE = Path(__file__).with_name("schema_0001.tar.xz")
+ARCHIVE = Path(__file__).with_name("releases") / "0.1.0.tar.xz"
 TABLES = [
     *("about", "groups", "files", "scenes", "chunk_boxes", "graphs", "registrations", "verdicts"),
     *("revisions", "poses", "edges", "priors", "models", "exports", "tiles"),

@@ -5,7 +5,7 @@ import pytest
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import SchemaVersionError
-from gsmap.store import Store, branches, migrate, schema, sqlite
+from gsmap.store import Store, branches, digests, migrate, schema, sqlite
 from gsmap.store.catalog import Catalog
 
 
@@ -99,6 +99,7 @@ def test_a_newer_map_is_left_alone(tmp_path):
     connection.execute("UPDATE alembic_version SET version_num = '9999'")
     connection.commit()
     connection.close()
+    digests.note(tmp_path / "m" / "map.sqlite")
     before = (tmp_path / "m" / "map.sqlite").read_bytes()
     with pytest.raises(SchemaVersionError, match="upgrade gsmap"):
         Store.migrate(tmp_path / "m")

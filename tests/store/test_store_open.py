@@ -7,7 +7,7 @@ import pytest
 from store_samples import make_cameras, make_gaussians
 
 from gsmap.errors import BusyError, ConfigError, CorruptError, NotFoundError, SchemaVersionError, StoreError
-from gsmap.store import Store, schema
+from gsmap.store import Store, digests, schema
 
 
 def test_create_and_open(tmp_path):
@@ -63,6 +63,7 @@ def test_other_schema_is_refused(tmp_path, version, message):
     with sqlite3.connect(tmp_path / "m" / "map.sqlite") as connection:
         connection.execute("UPDATE alembic_version SET version_num = ?", (version,))
     connection.close()
+    digests.note(tmp_path / "m" / "map.sqlite")
     for mode in "rw":
         with pytest.raises(SchemaVersionError, match=message):
             Store.open(tmp_path / "m", mode)

@@ -12,7 +12,7 @@ from test_store_nouns import graph_of, layer, registration, tile
 import gsmap.map
 from gsmap.errors import ConfigError, CorruptError, StoreError
 from gsmap.store import Store, schema, trust
-from gsmap.store.arrays import CHUNK_ROWS
+from gsmap.store.layout import CHUNK_ROWS
 from gsmap.types import Prior, SceneGraph, Sim3
 
 

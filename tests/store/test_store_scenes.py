@@ -6,8 +6,8 @@ from store_samples import make_cameras, make_gaussians
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.morton import morton_order
 from gsmap.store import Store, scene_id
-from gsmap.store.arrays import CHUNK_ROWS
 from gsmap.store.boxes import chunk_boxes
+from gsmap.store.layout import CHUNK_ROWS
 from gsmap.types import Gaussians
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")

@@ -17,7 +17,7 @@ from gsmap.geometry.directions import level_frame
 from gsmap.methods import Family, MethodParams, RecipeKey, family
 from gsmap.render import backend
 from gsmap.types import Cameras, Gaussians, NodeLayer
-from gsmap.types.model import ModelSpec
+from gsmap.types.model import ModelLimits, ModelSpec
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 from gsmap.types.views import SceneContext
@@ -28,6 +28,9 @@ _NOT_COMPARED = (
     *("render_backend", "num_cameras", "longest_side_px", "near_m", "min_seen", "depth_tolerance"),
     *("c_mask", "min_points", "tau_asso", "min_views", "voxel_m"),
 )
+
+# What the layer is the same with: the backend is a part of the key by itself, a model beyond its limits makes none.
+_NOT_NAMED = ("render_backend", "model_time_s", "model_memory_mb")
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class Params:
         hops: how far along it.
         context_weight: length of the context against the feature's in the embedding.
         word_sharpness: of the softmax by which a feature is shared among the words of a context.
+        model_time_s: a model that loads, or runs once, for longer is ended, which is an error.
+        model_memory_mb: a model that takes more, beside what the libraries take, is ended likewise (on Linux).
     """
 
     segmenter: str = "auto"
@@ -76,11 +81,23 @@ class Params:
     hops: int = 3
     context_weight: float = 0.5
     word_sharpness: float = 20.0
+    model_time_s: float = ModelLimits.time_s
+    model_memory_mb: int = ModelLimits.memory_mb
 
     def __post_init__(self) -> None:
+        if not (self.model_time_s > 0 and self.model_memory_mb > 0):
+            raise ConfigError(
+                "model_time_s and model_memory_mb of describe.object must be positive, got "
+                f"{self.model_time_s} and {self.model_memory_mb}"
+            )
         for kind, name in (("segmenter", self.segmenter), ("embedder", self.embedder)):
             if name != "auto":
                 family(kind).get(name)
+
+    @property
+    def limits(self) -> ModelLimits:
+        """Of every model that runs."""
+        return ModelLimits(self.model_time_s, self.model_memory_mb)
 
 
 @dataclass(frozen=True)
@@ -102,7 +119,7 @@ class Resolved:
     def settings(self, models: Mapping[str, ModelSpec]) -> dict[str, Any]:
         """Plain settings that can change the layer: those of the chosen methods only, and the models' digests."""
         p = self.params
-        out = {field.name: plain(getattr(p, field.name)) for field in fields(p) if field.name != "render_backend"}
+        out = {field.name: plain(getattr(p, field.name)) for field in fields(p) if field.name not in _NOT_NAMED}
         out["segmenters"] = {p.segmenter: plain(p.segmenters[p.segmenter])}
         out["embedders"] = {p.embedder: plain(p.embedders[p.embedder])}
         return out | {"models": [models[kind].digest if kind in models else kind for kind in self.kinds]}
@@ -161,6 +178,8 @@ def object_layer(
     descriptor = descriptor_id(params or Params(), context.models)
     chosen = resolved(params or Params(), context.models)
     params = chosen.params
+    limited = {kind: replace(model, limits=params.limits) for kind, model in context.models.items()}
+    context = replace(context, models=limited)
     segmenter = _made(family("segmenter"), params.segmenter, params.segmenters, context)
     embedder = _made(family("embedder"), params.embedder, params.embedders, context)
     cloud, up, unit_m = context.cloud, context.up, context.unit_m

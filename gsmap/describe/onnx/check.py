@@ -7,11 +7,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from gsmap.describe.onnx.file import refuse_external_data
 from gsmap.describe.onnx.session import declared
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.methods import family
-from gsmap.types.model import ModelSpec
+from gsmap.networks import refuse_external_data
+from gsmap.types.model import ModelLimits, ModelSpec
 
 PRESETS = {  # mean and standard deviation of rgb in [0, 1]
     "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),
@@ -59,17 +59,21 @@ def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, 
     )
 
 
-def check_model(kind: str, path: str | os.PathLike[str], preset: str = "clip") -> ModelSpec:
+def check_model(
+    kind: str, path: str | os.PathLike[str], preset: str = "clip", limits: ModelLimits | None = None
+) -> ModelSpec:
     """Check that a file is an ONNX model of a kind, complete in itself, and that the methods that need one can use it.
 
     Args:
         kind: one of `kinds`.
         preset: see `parse_preset`.
+        limits: what the model may take while it is checked, and wherever this spec goes.
 
     Raises:
         ConfigError: an unknown kind or preset.
         NotFoundError: no such file.
-        InputError: not an ONNX model, weights in other files, or what a method's ``probe`` refuses.
+        InputError: not an ONNX model, weights in other files, one that takes too long or too much memory, or what a
+            method's ``probe`` refuses.
     """
     known = kinds()
     if kind not in known:
@@ -80,7 +84,8 @@ def check_model(kind: str, path: str | os.PathLike[str], preset: str = "clip") -
         raise NotFoundError(f"no model file at {path}")
     refuse_external_data(path)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    spec = ModelSpec(kind, str(path), sha256, preset, mean, std, *declared(path, sha256))
+    limits = limits or ModelLimits()
+    spec = ModelSpec(kind, str(path), sha256, preset, mean, std, *declared(path, sha256, limits), limits)
     for method in known[kind]:
         method.probe(spec)
     return spec

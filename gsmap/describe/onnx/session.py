@@ -1,51 +1,59 @@
-"""Running ONNX models; the one place that knows onnxruntime."""
+"""Running ONNX models, each in a process of its own (`gsmap.networks`)."""
 
 from __future__ import annotations
 
 import hashlib
-from functools import lru_cache
+import threading
 from pathlib import Path
 from typing import Any
 
 from gsmap.errors import InputError, NotFoundError
-from gsmap.types.model import ModelSpec, Tensor
+from gsmap.networks import ModelProcess
+from gsmap.types.model import ModelLimits, ModelSpec, Tensor
+
+_KEPT = 4  # processes: an encoder, a decoder, features, and one that takes the place of another
+_processes: dict[tuple[str, str, ModelLimits], ModelProcess] = {}
+_lock = threading.Lock()
 
 
-def open_session(spec: ModelSpec) -> Any:
-    """An onnxruntime session of a checked model.
+def open_session(spec: ModelSpec) -> ModelProcess:
+    """A checked model, ready to `run` within its limits.
 
     Raises:
         NotFoundError: the file is gone.
-        InputError: its bytes are not those that were checked.
+        InputError: its bytes are not those that were checked, or it does not load within its limits.
     """
     path = Path(spec.path)
     if not path.is_file():
         raise NotFoundError(f"model {spec.kind} is missing: {path}; add it again with `gsmap models add`")
     if hashlib.sha256(path.read_bytes()).hexdigest() != spec.sha256:
         raise InputError(f"model {spec.kind} has changed since it was added: {path}; add it again")
-    return _session(spec.path, spec.sha256)
+    return _process(spec.path, spec.sha256, spec.limits)
 
 
-def run(spec: ModelSpec, session: Any, outputs: list[str] | None, feed: dict[str, Any]) -> list[Any]:
-    """The session's outputs; what onnxruntime raises becomes an InputError that names the model."""
+def run(spec: ModelSpec, session: ModelProcess, outputs: list[str] | None, feed: dict[str, Any]) -> list[Any]:
+    """The session's outputs.
+
+    Raises:
+        InputError: what onnxruntime says of these inputs, or which limit the run went beyond.
+    """
     try:
         return list(session.run(outputs, feed))
-    except Exception as error:  # onnxruntime raises many types
+    except RuntimeError as error:
         given = ", ".join(f"{name} {list(value.shape)}" for name, value in feed.items())
-        reason = str(error).splitlines()[0][:200]
         raise InputError(
-            f"model {spec.kind} ({spec.path}) does not run on {given}: {reason}; add another with `gsmap models add`"
+            f"model {spec.kind} ({spec.path}) does not run on {given}: {error}; add another with `gsmap models add`"
         ) from error
 
 
-def declared(path: Path, sha256: str) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+def declared(path: Path, sha256: str, limits: ModelLimits) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Inputs and outputs of the model in a file whose bytes have this digest.
 
     Raises:
-        InputError: not a model that onnxruntime runs.
+        InputError: not a model that onnxruntime runs within the limits.
     """
-    session = _session(str(path), sha256)
-    return tuple(map(_tensor, session.get_inputs())), tuple(map(_tensor, session.get_outputs()))
+    session = _process(str(path), sha256, limits)
+    return session.inputs, session.outputs
 
 
 def misfit(spec: ModelSpec, problem: str) -> InputError:
@@ -54,19 +62,14 @@ def misfit(spec: ModelSpec, problem: str) -> InputError:
     return InputError(f"{spec.path} is not a {spec.kind} model: {problem}; its inputs are {have or 'none'}")
 
 
-@lru_cache(maxsize=4)
-def _session(path: str, sha256: str) -> Any:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # errors are raised as well
-    try:
-        return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime raises many types, all meaning that this file cannot be run
-        reason = str(error).splitlines()[0][:200]
-        raise InputError(f"{path} is not an ONNX model that can be run: {reason}") from error
-
-
-def _tensor(value: Any) -> Tensor:
-    shape = tuple(d if isinstance(d, int) and d > 0 else None for d in value.shape)
-    return Tensor(value.name, shape, value.type.removeprefix("tensor(").removesuffix(")"))
+def _process(path: str, sha256: str, limits: ModelLimits) -> ModelProcess:
+    """The process of a model; one that was not asked for lately makes room for it, once nobody else holds it."""
+    key = path, sha256, limits
+    with _lock:
+        found = _processes.pop(key, None)
+        if found is None or not found.is_alive:
+            found = ModelProcess(path, limits)
+        _processes[key] = found
+        while len(_processes) > _KEPT:
+            del _processes[next(iter(_processes))]
+    return found

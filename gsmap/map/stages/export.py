@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
+from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
-from gsmap.export.tileset import FILE_NAME, write_tilesets
+from gsmap.export.lock import folder_lock
+from gsmap.export.tileset import is_stale, write_tilesets
 from gsmap.map.settings import Settings
+from gsmap.map.sharing import noting
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_steps
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.store import Store
@@ -115,44 +117,76 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
     return Planned(revision, scenes, method, params, recipe, tiles)
 
 
-def export(store: Store, out: Path, request: Request, settings: Settings, progress: Progress) -> ExportResult:
+def export(
+    store: Store, out: Path, request: Request, settings: Settings, progress: Progress, *, wait: bool = False
+) -> ExportResult:
     """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what.
 
-    A map that was opened for reading is exported too; then only the folder's own manifest says what was made.
+    A map that was opened for reading, or whose disk is full, is exported too; then only the folder's own manifest says
+    what was made.
+
+    Args:
+        wait: where another export is at work in the folder, until it has ended.
+
+    Raises:
+        BusyError: another export is at work in the folder.
     """
     planned = plan(store, request, settings)
+    waited = False
+
+    def waiting(text: str) -> None:
+        nonlocal waited
+        waited = True
+        progress(0.0, text)
+
+    with folder_lock(out, wait=wait, waiting=waiting), store.leases.attend("export", f"export {out.resolve()}"):
+        if waited:
+            planned = plan(store, request, settings)  # the map may have other poses now
+        return _export(store, out, request, planned, settings, progress)
+
+
+def _export(
+    store: Store, out: Path, request: Request, planned: Planned, settings: Settings, progress: Progress
+) -> ExportResult:
+    """The export itself, in a folder that is ours alone."""
     asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
+    refused = [] if store.catalog.writable else [f"{store.location} is read-only"]
+    num_made = 0
 
     def noted(tile: Tile) -> None:
-        if not tile.path or not store.catalog.writable:  # nothing lies there, or nothing can be noted
+        nonlocal num_made
+        num_made += 1
+        if not tile.path or refused:  # nothing lies there, or nothing can be noted
             return
-        if not number:
-            number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
-        store.exports.add_tile(number[0], tile)
+        try:
+            if not number:
+                number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
+            store.exports.add_tile(number[0], tile)
+        except (DiskFullError, ReadOnlyError) as error:
+            refused.append(str(error))
 
-    result = export_tiles(
-        planned.tiles,
-        partial(_make, store, planned, request),
-        out,
-        map_id=store.id,
-        recipe=planned.recipe,
-        params=settings.export,
-        made=noted,
-        progress=progress,
-    )
-    is_new = result.recomputed or result.removed or not list(out.glob(f"*/{FILE_NAME}"))
-    if planned.recipe.is_tileset and is_new:
-        write_tilesets(out, result.tiles, request.tile_size_m)
-    if not store.catalog.writable:
-        _log.warning(
-            "%s is read-only: it does not know of this export, so gsmap status cannot watch %s", store.location, out
+    with noting(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
+        result = export_tiles(
+            planned.tiles,
+            partial(_make, store, planned, request),
+            out,
+            map_id=store.id,
+            recipe=planned.recipe,
+            params=settings.export,
+            made=noted,
+            progress=progress,
         )
-        return result
+    if planned.recipe.is_tileset and is_stale(out, result.tiles):
+        write_tilesets(out, result.tiles, request.tile_size_m)
     kept = {tile.path for tile in result.tiles}
-    gone = [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]
-    if gone:
-        store.exports.forget(out, gone)
+    if not refused and (gone := [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]):
+        try:
+            store.exports.forget(out, gone)
+        except (DiskFullError, ReadOnlyError) as error:
+            refused.append(str(error))
+    if refused:
+        _log.warning("%s: the map does not know all of this export, so gsmap status cannot watch %s", refused[0], out)
     return result
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gsmap.errors import ConfigError
 from gsmap.ingest import Capture, find_captures, given_date, read_capture, take_capture
+from gsmap.map.sharing import noting
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import StageProgress
@@ -59,11 +60,12 @@ def ingest(
     found = find_captures([Path(source) for source in sources if not isinstance(source, Gaussians)])
     if len(found) > 1 and (cameras is not None or name is not None):
         raise ConfigError(f"cameras and name are for one capture, {len(found)} were found: ingest them one by one")
-    results = []
-    for i, files in enumerate(found):
-        progress("ingest", i / len(found), files.name)
-        capture = read_capture(files, cameras=cameras, name=name, captured_at=captured_at, scale_policy=scale)
-        results.append(_add(store, capture, dates))
+    results: list[Ingested] = []
+    with noting(lambda: f"{len(results)} of {len(found)} captures are in the map"):
+        for i, files in enumerate(found):
+            progress("ingest", i / len(found), files.name)
+            capture = read_capture(files, cameras=cameras, name=name, captured_at=captured_at, scale_policy=scale)
+            results.append(_add(store, capture, dates))
     progress("ingest", 1.0, f"{len(results)} captures")
     return results
 

@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -109,19 +109,23 @@ class Backup:
         try:
             found = cls.at(place)
         except NotFoundError:
-            other = place.anything()
-            if other is not None:
-                raise StoreError(
-                    f"{place.url} holds other things ({other}): give the backup a place of its own"
-                ) from None
-            text = json.dumps({"format": FORMAT, "map_id": map_id}, indent=1).encode() + b"\n"
-            place.put(MARKER, [text], len(text))
-            found = cls.at(place)  # another backup may have begun there at the same moment
+            found = cls._begun(place, map_id)
         if found.map_id != map_id:
             raise StoreError(
                 f"{place.url} is a backup of another map ({found.map_id}, not {map_id}): give each map its own place"
             )
         return found
+
+    @classmethod
+    def _begun(cls, place: Place, map_id: str) -> Backup:
+        other = place.anything()
+        if other is None:
+            text = json.dumps({"format": FORMAT, "map_id": map_id}, indent=1).encode() + b"\n"
+            place.put(MARKER, [text], len(text))
+        try:
+            return cls.at(place)  # which another may have begun at the same moment
+        except NotFoundError:
+            raise StoreError(f"{place.url} holds other things ({other}): give the backup a place of its own") from None
 
     def names(self) -> list[str]:
         """Names of the snapshots, oldest first."""
@@ -197,7 +201,7 @@ class Backup:
             out[check_path(parts[3])] = StoredFile(parts[3], int(parts[2]), parts[1])
         return list(out.values())
 
-    def read(self, file: StoredFile) -> Iterator[bytes]:
+    def read(self, file: StoredFile) -> Generator[bytes, None, None]:
         """The bytes of an object, compared with its digest while they are read.
 
         Raises:

@@ -157,8 +157,8 @@ def _fetch_all(backup: Backup, files: list[StoredFile], folder: Path, progress: 
         parent.mkdir(parents=True, exist_ok=True)
 
     def fetch(file: StoredFile) -> None:
-        with _writing(folder):
-            _write(folder / file.path, backup.read(file))
+        with _writing(folder), contextlib.closing(backup.read(file)) as chunks:
+            _write(folder / file.path, chunks)
 
     with ThreadPoolExecutor(TRANSFERS) as pool:
         waiting = [pool.submit(fetch, file) for file in files]
@@ -187,7 +187,8 @@ def _link_all(store: Store, state: State, folder: Path, target: Path, progress: 
                 raise FileNotFoundError(errno.ENOENT, "not what was written", str(source))
             linked += 1
         except OSError:  # another disk, or one without links; or it is gone, which `read_file` explains
-            _write(place, read_file(store, file, folder))
+            with contextlib.closing(read_file(store, file, folder)) as chunks:
+                _write(place, chunks)
             copied, num_bytes = copied + 1, num_bytes + file.size_bytes
         progress(i / len(state.files), f"sharing, {i} of {len(state.files)} files")
     return Cloned(target, uuid.uuid4().hex, linked, copied, num_bytes)

@@ -231,7 +231,8 @@ class _Run:
 
         def send(file: StoredFile) -> None:
             self.lease.require()
-            self.backup.place.put(object_name(file.sha256), read_file(self.store, file, folder), file.size_bytes)
+            with contextlib.closing(read_file(self.store, file, folder)) as chunks:
+                self.backup.place.put(object_name(file.sha256), chunks, file.size_bytes)
             self._count(file)
 
         with ThreadPoolExecutor(TRANSFERS) as pool:

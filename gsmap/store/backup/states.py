@@ -8,7 +8,7 @@ import os
 import re
 import sqlite3
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -155,7 +155,7 @@ def check_path(path: object) -> str:
     return path
 
 
-def read_file(store: Store, file: StoredFile, folder: Path) -> Iterator[bytes]:
+def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, None, None]:
     """The bytes of a file that a state names, compared with its digest while they are read.
 
     Args:
@@ -165,12 +165,12 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Iterator[bytes]:
         Vanished: the map has it no longer, and its catalog says the same.
         CorruptError: it is missing or differs from what was written. Then what was read so far is of no use.
     """
-    copied = folder / file.path
-    path = copied if copied.is_file() else home_of(store) / file.path
+    immutable = file.path.split("/")[0] in (ARRAYS, MODELS)
+    path = (home_of(store) if immutable else folder) / file.path
     try:
         yield from checked(_chunks(path), file, str(path))
     except (CorruptError, FileNotFoundError, NotADirectoryError) as error:
-        if path != copied and not _still_named(store, file):
+        if immutable and not _still_named(store, file):
             raise Vanished(file.path) from error
         if isinstance(error, CorruptError):
             raise CorruptError(f"{error}: run gsmap check, and ingest the scene again") from error
@@ -211,7 +211,7 @@ def _capture_catalog(source: Catalog, folder: Path) -> State:
     file = folder / sqlite.FILE
     if source.is_sqlite:
         with explained(source.folder):
-            for problem in sqlite.digest_problems(source.folder / sqlite.FILE):
+            for problem in source.page_problems():
                 raise CorruptError(f"{problem}: run gsmap check; nothing was backed up")
             sqlite.backup(source.engine, file)
             for problem in sqlite.file_problems(file):

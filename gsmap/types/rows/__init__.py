@@ -11,6 +11,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -53,6 +54,7 @@ from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitRe
 
 __all__ = [
     "SCHEMA",
+    "AtWorkRow",
     "BackupReport",
     "BandRow",
     "BranchRow",

@@ -23,7 +23,7 @@ class SnapshotRow(Row):
         num_files: how many files it consists of.
         num_bytes: their size.
         num_bytes_new: how much of that was sent for it; the rest was there.
-        schema: of its catalog.
+        catalog_schema: number of its newest migration.
         gsmap_version: which gsmap took it.
     """
 
@@ -44,7 +44,7 @@ class SnapshotRow(Row):
     num_files: int
     num_bytes: int
     num_bytes_new: int
-    schema: str
+    catalog_schema: str
     gsmap_version: str
 
     @property
@@ -58,7 +58,7 @@ class BackupReport(Row):
     """What a backup did.
 
     Args:
-        target: where it went, without secrets.
+        dest: where it went, without secrets.
         snapshot: the state that was saved.
         num_files_new: how many files were sent; the rest was there.
         deleted: names of snapshots that ``--keep`` deleted.
@@ -68,9 +68,9 @@ class BackupReport(Row):
         notes: what a person should know.
     """
 
-    columns: ClassVar[Mapping[str, str]] = {"target": "backup", "num_files_new": "files sent"}
+    columns: ClassVar[Mapping[str, str]] = {"dest": "backup", "num_files_new": "files sent"}
 
-    target: str
+    dest: str
     snapshot: SnapshotRow
     num_files_new: int
     deleted: tuple[str, ...] = ()
@@ -87,15 +87,15 @@ class RestoreReport(Row):
     Args:
         path: the map.
         snapshot: the state that it has.
-        schema: of its catalog now; an older one than gsmap's asks for ``gsmap migrate``.
-        needs_migration: whether it does.
+        catalog_schema: number of its newest migration.
+        needs_migration: whether that is older than this gsmap's, so that ``gsmap migrate`` comes next.
     """
 
-    columns: ClassVar[Mapping[str, str]] = {"path": "map", "schema": "schema"}
+    columns: ClassVar[Mapping[str, str]] = {"path": "map", "catalog_schema": "schema"}
 
     path: str
     snapshot: SnapshotRow
-    schema: str
+    catalog_schema: str
     needs_migration: bool
 
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 from gsmap.types.rows.base import Row
 from gsmap.types.rows.exports import TileRow
+from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.pairs import EdgeRow
 from gsmap.types.rows.scenes import SceneRow
 from gsmap.types.rows.truth import EvaluationReport
@@ -47,6 +48,7 @@ class MapStatus(Row):
         tentative: scenes that rest on edges which no cycle confirms.
         revision: number of the newest revision; null before the first.
         metres_per_unit: metres in a unit of the map; null where no scene's scale is known.
+        at_work: what processes are at work on now, this one left out; what one that died was at work on is no more.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -64,6 +66,7 @@ class MapStatus(Row):
     tentative: int
     revision: int | None
     metres_per_unit: float | None
+    at_work: tuple[AtWorkRow, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,6 +133,7 @@ class CheckReport(Row):
         orphans: folders that an interrupted step left; no harm, `gsmap prune` removes them.
         num_groups: how many groups of arrays were read.
         num_bytes: how many bytes were read.
+        unverified: what could not be compared with what was written, and why.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"num_groups": "groups", "num_bytes": "bytes", "ok": "ok"}
@@ -139,6 +143,7 @@ class CheckReport(Row):
     orphans: tuple[str, ...]
     num_groups: int
     num_bytes: int
+    unverified: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,0 +1,175 @@
+"""The process that runs one ONNX model, within limits that it sets itself: memory, files, and the life of its parent.
+
+It is run as a script, knows nothing of gsmap, and is asked and answers over one socket (`gsmap.networks.process`
+is the other end): headers in JSON; arrays lie in memory that both share, what does not fit there follows its header.
+Nothing that is received is executed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import os
+import resource
+import socket
+import struct
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+_MAX_HEADER_BYTES = 1 << 20
+_ALIGNED = 64
+
+
+class Channel:
+    """One end of the conversation.
+
+    Args:
+        link: to the other end.
+        shared: the file of the shared memory.
+    """
+
+    def __init__(self, link: socket.socket, shared: int) -> None:
+        self.link, self.shared = link, shared
+        self._memory = mmap.mmap(-1, mmap.PAGESIZE)
+        self._size = 0
+
+    def reserve(self, size: int) -> None:
+        """Make the shared memory at least so large; for the end whose files are not limited."""
+        if size > self._size:
+            os.ftruncate(self.shared, size)
+
+    def send(self, header: dict[str, Any], arrays: list[np.ndarray]) -> None:
+        """Write one message."""
+        self._map()
+        listed, streamed, at = [], [], 0
+        for array in (np.asarray(a, order="C") for a in arrays):
+            place = at if at + array.nbytes <= self._size else None
+            listed.append({"dtype": array.dtype.str, "shape": array.shape, "at": place})
+            if place is None:
+                streamed.append(array)
+            elif array.size:
+                self._array(array.dtype, array.shape, place)[...] = array
+                at += -(-array.nbytes // _ALIGNED) * _ALIGNED
+        text = json.dumps(header | {"arrays": listed}).encode()
+        self.link.sendall(struct.pack("<I", len(text)) + text)
+        for array in streamed:
+            if array.size:
+                self.link.sendall(array.reshape(-1).view(np.uint8).data)
+
+    def receive(self, max_bytes: int, deadline: float | None = None) -> tuple[dict[str, Any], list[np.ndarray]]:
+        """Read one message; its arrays are good until the next one is sent.
+
+        Raises:
+            EOFError: the other end is gone.
+            TimeoutError: `time.monotonic` has come to the deadline.
+            ValueError: no message, or arrays of more bytes than ``max_bytes``.
+        """
+        (length,) = struct.unpack("<I", self._exactly(bytearray(4), deadline))
+        if length > _MAX_HEADER_BYTES:
+            raise ValueError(f"a header of {length} bytes")
+        header = json.loads(self._exactly(bytearray(length), deadline))
+        self._map()
+        arrays = []
+        for listed in header.pop("arrays"):
+            dtype, shape, place = np.dtype(listed["dtype"]), tuple(int(n) for n in listed["shape"]), listed["at"]
+            size = dtype.itemsize
+            for side in shape:
+                size *= side
+            max_bytes -= size
+            if dtype.hasobject or min(shape, default=0) < 0 or max_bytes < 0:
+                raise ValueError(f"an array of {dtype} {shape}")
+            if place is not None and size:
+                if place < 0 or place + size > self._size:
+                    raise ValueError(f"an array at byte {place}")
+                arrays.append(self._array(dtype, shape, place))
+                continue
+            arrays.append(np.empty(shape, dtype))
+            if size:
+                self._exactly(arrays[-1].reshape(-1).view(np.uint8), deadline)
+        return header, arrays
+
+    def _map(self) -> None:
+        """See the shared memory in the size that it has now."""
+        size = os.fstat(self.shared).st_size
+        if size != self._size:
+            self._memory, self._size = mmap.mmap(self.shared, size), size
+
+    def _array(self, dtype: np.dtype, shape: tuple[int, ...], place: int) -> np.ndarray:
+        return np.ndarray(shape, dtype, self._memory, place)
+
+    def _exactly(self, buffer: Any, deadline: float | None) -> Any:
+        """Fill the buffer."""
+        view = memoryview(buffer)
+        while len(view):
+            self.link.settimeout(None if deadline is None else max(deadline - time.monotonic(), 1e-3))
+            got = self.link.recv_into(view)
+            if not got:
+                raise EOFError("the other end is gone")
+            view = view[got:]
+        return buffer
+
+
+def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
+    """Load the model, say what it takes and gives, then run it as often as asked."""
+    channel = Channel(socket.socket(fileno=link), shared)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Of all processes this one goes first when the machine runs out of memory.
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
+        file.write("1000")
+    try:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 4  # errors are raised as well
+        _limit(memory_bytes)
+        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        ends = session.get_inputs(), session.get_outputs()
+        inputs, outputs = ([[t.name, list(t.shape), t.type] for t in end] for end in ends)
+        channel.send({"inputs": inputs, "outputs": outputs}, [])
+    except BaseException as error:
+        channel.send(_problem(error), [])
+        return
+    while True:
+        try:
+            asked, arrays = channel.receive(memory_bytes)
+        except EOFError:
+            return
+        try:
+            given = session.run(asked["outputs"], dict(zip(asked["names"], arrays, strict=True)))
+            if not all(isinstance(value, np.ndarray) and value.dtype.kind in "biufc" for value in given):
+                raise TypeError("it gives something else than arrays of numbers")
+            channel.send({}, given)
+            del given, arrays
+        except BaseException as error:
+            channel.send(_problem(error), [])
+
+
+def _limit(memory_bytes: int) -> None:
+    """From now on: so many bytes beyond what the libraries have mapped, no file made longer, no core dumped."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    with contextlib.suppress(OSError, ValueError):  # not Linux, where nothing limits the memory of a process
+        with open("/proc/self/statm") as file:
+            mapped = int(file.read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + memory_bytes, mapped + memory_bytes))
+
+
+def _end_with_parent() -> None:
+    """Its end of the pipe closes however the parent ends, SIGKILL included."""
+    os.read(0, 1)
+    os._exit(0)
+
+
+def _problem(error: BaseException) -> dict[str, Any]:
+    text = str(error) or type(error).__name__
+    lacks_memory = isinstance(error, MemoryError) or "bad_alloc" in text or "Failed to allocate memory" in text
+    return {"error": text.splitlines()[0][:300], "lacks_memory": lacks_memory}
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3], int(sys.argv[4]))

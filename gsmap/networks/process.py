@@ -1,0 +1,161 @@
+"""Models run in processes of their own, which end when a model takes too long, when nobody needs them, and with us."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import weakref
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.networks import child
+from gsmap.types.model import ModelLimits, Tensor
+
+_MIB = 1 << 20
+_MOST_S, _MOST_BYTES = 1e6, 1 << 50  # what the system takes for a timeout and a limit
+_PER_ARRAY_BYTES = 64  # of shared memory, so that each can be aligned
+
+
+class ModelProcess:
+    """An ONNX model, loaded in a process of its own.
+
+    Args:
+        path: of the file.
+        limits: seconds for loading it and for every run, and memory beside the libraries.
+
+    Attributes:
+        inputs, outputs: as the file declares them.
+
+    Raises:
+        InputError: not a model that onnxruntime runs within the limits.
+    """
+
+    inputs: tuple[Tensor, ...]
+    outputs: tuple[Tensor, ...]
+
+    def __init__(self, path: str, limits: ModelLimits) -> None:
+        self.path, self.limits = path, limits
+        self._memory_bytes = min(limits.memory_mb * _MIB, _MOST_BYTES)
+        self._time_s = min(limits.time_s, _MOST_S)
+        self._lock = threading.Lock()
+        self._given_bytes = 0
+        link, theirs = socket.socketpair()
+        shared = _shared_memory()
+        command = [sys.executable, "-P", child.__file__, str(theirs.fileno()), str(shared)]
+        self._process = subprocess.Popen(
+            [*command, path, str(self._memory_bytes)],
+            stdin=subprocess.PIPE,  # nothing is written to it: it closes when this process ends
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=(theirs.fileno(), shared),
+            start_new_session=True,  # Ctrl-C is for this process, which ends that one
+            env={**os.environ, "MALLOC_ARENA_MAX": "4"},  # each thread's own arena would count as memory
+        )
+        theirs.close()
+        self._channel = child.Channel(link, shared)
+        self.close = weakref.finalize(self, _end, self._process, link, shared)
+        said, _ = self._exchange("loading it", None, {})
+        if "error" in said:
+            self.close()
+            raise InputError(f"{path} is not an ONNX model that can be run: {said['error']}")
+        self.inputs, self.outputs = (_tensors(said[end]) for end in ("inputs", "outputs"))
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def is_alive(self) -> bool:
+        return self.close.alive and self._process.poll() is None
+
+    def run(self, outputs: list[str] | None, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """What the model gives for these inputs.
+
+        Args:
+            outputs: names; all without.
+
+        Raises:
+            InputError: it went beyond a limit, and its process was ended.
+            RuntimeError: what onnxruntime says.
+        """
+        given = ", ".join(f"{name} {list(value.shape)}" for name, value in feed.items())
+        with self._lock:
+            said, arrays = self._exchange(f"a run on {given}", outputs, feed)
+            arrays = [array.copy() for array in arrays]
+        if "error" in said:
+            raise RuntimeError(said["error"])
+        self._given_bytes = sum(array.nbytes + _PER_ARRAY_BYTES for array in arrays)
+        return arrays
+
+    def _exchange(
+        self, what: str, outputs: list[str] | None, feed: Mapping[str, np.ndarray]
+    ) -> tuple[dict[str, Any], list[np.ndarray]]:
+        """Its answer to inputs, or what it says when it has loaded; it is ended where there is none in time."""
+        deadline = time.monotonic() + self._time_s
+        try:
+            if feed:
+                taken = sum(array.nbytes + _PER_ARRAY_BYTES for array in feed.values())
+                self._channel.reserve(max(taken, self._given_bytes))
+                self._channel.link.settimeout(self._time_s)
+                self._channel.send({"outputs": outputs, "names": list(feed)}, list(feed.values()))
+            said, arrays = self._channel.receive(self._memory_bytes, deadline)
+        except TimeoutError as error:
+            self.close()
+            raise InputError(
+                f"model {self.path}: {what} took more than {self.limits.time_s:g} s and was ended: give it more with "
+                "--set describe.object.model_time_s=SECONDS, or take another model"
+            ) from error
+        except (EOFError, OSError, ValueError, LookupError, TypeError) as error:
+            self.close()
+            code = self._process.returncode
+            raise self._too_large(what, signal.Signals(-code).name if code < 0 else f"code {code}") from error
+        except BaseException:  # Ctrl-C: a run that goes on would answer the next question
+            self.close()
+            raise
+        if said.get("lacks_memory"):
+            self.close()
+            raise self._too_large(what, "no memory left")
+        return said, arrays
+
+    def _too_large(self, what: str, ended: str) -> InputError:
+        return InputError(
+            f"model {self.path}: {what} ended its process ({ended}), most likely for lack of memory: give it more than "
+            f"{self.limits.memory_mb} MB with --set describe.object.model_memory_mb=MB, or take another model"
+        )
+
+
+def _tensors(listed: list[Any]) -> tuple[Tensor, ...]:
+    return tuple(
+        Tensor(
+            str(name),
+            tuple(d if isinstance(d, int) and d > 0 else None for d in shape),
+            str(kind).removeprefix("tensor(").removesuffix(")"),
+        )
+        for name, shape, kind in listed
+    )
+
+
+def _shared_memory() -> int:
+    """A file without a name, in memory where the system can."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("gsmap-model")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
+def _end(process: subprocess.Popen[bytes], link: socket.socket, shared: int) -> None:
+    process.kill()
+    link.close()
+    os.close(shared)
+    process.wait()
+    if process.stdin is not None:
+        process.stdin.close()

@@ -1,0 +1,49 @@
+"""``gsmap check``: what it says of a catalog that differs, that cannot be verified, that a person accepts."""
+
+import sqlite3
+
+import pytest
+
+import gsmap.map
+from gsmap.cli.app import run
+
+
+@pytest.fixture
+def path(tmp_path):
+    gsmap.map.create(tmp_path / "site.gsmap").close()
+    return tmp_path / "site.gsmap"
+
+
+def said(capfd, *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as caught:
+        run(list(arguments))
+    out, err = capfd.readouterr()
+    return caught.value.code or 0, out, err
+
+
+def test_a_catalog_that_another_program_changed(path, capfd):
+    with sqlite3.connect(path / "map.sqlite") as connection:
+        connection.execute("UPDATE about SET gsmap_version = '0.0'")
+    connection.close()
+    for words in (["list", "scenes"], ["check"], ["prune"]):
+        code, _, err = said(capfd, words[0], str(path), *words[1:])
+        assert code == 1
+        assert "page " in err
+        assert "differs from what gsmap wrote" in err
+        assert "--accept-catalog" in err
+    code, _, err = said(capfd, "check", str(path), "--accept-catalog")
+    assert code == 0
+    assert "ACCEPTED: page " in err
+    assert "nobody knows" in err
+    code, _, err = said(capfd, "check", str(path), "--accept-catalog")
+    assert code == 0
+    assert "nothing to accept" in err
+    assert f"{path} is whole" in said(capfd, "check", str(path))[2]
+
+
+def test_a_catalog_that_cannot_be_verified_is_not_called_whole(path, capfd):
+    (path / "map.sqlite.digests").unlink()
+    code, out, err = said(capfd, "check", str(path))
+    assert code == 0
+    assert out.startswith("cannot verify the catalog: ")
+    assert "is whole" not in err

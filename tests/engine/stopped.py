@@ -1,0 +1,73 @@
+"""A run with two workers for the tests to send signals to: ``stopped.py WORD SECONDS``. Jobs do what WORD says."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+
+def sleep(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def compute(seconds: float) -> float:
+    """Native code that lets the interpreter go but does not come back."""
+    import numpy as np
+
+    deadline = time.monotonic() + seconds
+    big = np.ones((1500, 1500))
+    while time.monotonic() < deadline:
+        big @ big
+    return seconds
+
+
+def hog(seconds: float) -> float:
+    """Native code that keeps the interpreter to itself: nothing of Python runs in this process meanwhile."""
+    import ctypes
+
+    ctypes.PyDLL(None).sleep(int(seconds))
+    return seconds
+
+
+class Slow:
+    """What is raised in its finalizer is nowhere to be caught."""
+
+    def __del__(self) -> None:
+        print("in it", flush=True)
+        deadline = time.monotonic() + 1
+        while time.monotonic() < deadline:
+            pass
+
+
+def main() -> None:
+    from gsmap.engine.executors.local import Params, run_jobs
+
+    word, seconds = sys.argv[1], float(sys.argv[2])
+    print("begun", flush=True)
+    if word == "here":  # in the run's own process, where a signal finds native code
+        import ctypes
+
+        ctypes.CDLL(None).sleep(int(seconds))
+        return
+    if word == "hog here":
+        hog(seconds)
+    if word == "finalizer":
+        Slow()
+        while True:
+            pass
+    if word == "clean-up":  # that never ends
+        try:
+            time.sleep(seconds)
+        finally:
+            time.sleep(seconds)
+    job = {"sleep": sleep, "compute": compute, "hog": hog}[word]
+    for _ in run_jobs(job, [(seconds,)] * 6, Params(workers=2)):
+        pass
+
+
+if __name__ == "__main__":
+    from gsmap.cli.stopping import stoppable
+
+    with stoppable():
+        main()

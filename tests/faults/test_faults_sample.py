@@ -1,0 +1,89 @@
+"""A few points of every kind of verb, of the thousands that `tools/sweep_faults.py` goes through."""
+
+import re
+
+import pytest
+from fault_shim import MODES
+from fault_verbs import VERBS
+
+# Of each verb: how far into its changes (0 to 1), and in which way. The commit lies near the end.
+POINTS = {
+    "init": [(0.0, "kill-before"), (0.4, "kill-after"), (0.5, "enospc-ever"), (0.97, "kill-before")],
+    "ingest": [
+        (0.2, "kill-before"),
+        (0.5, "short-once"),
+        (0.6, "eio-once"),
+        (0.88, "kill-after"),
+        (0.9, "enospc-ever"),
+    ],
+    "ingest-two": [(0.5, "enospc-once"), (0.75, "kill-after"), (0.8, "eio-ever")],
+    "optimize": [(0.5, "kill-after"), (0.6, "enospc-once"), (0.6, "eio-once"), (0.9, "eio-ever")],
+    "export": [
+        (0.1, "kill-before"),
+        (0.2, "kill-after"),
+        (0.4, "enospc-ever"),
+        (0.5, "kill-before"),
+        (0.8, "eio-once"),
+    ],
+    "export-shrunk": [(0.5, "kill-after"), (0.8, "kill-before"), (0.9, "eio-once")],
+    "prune": [(0.4, "kill-before"), (0.5, "eio-ever"), (0.7, "kill-after"), (0.8, "enospc-once")],
+    "remove": [(0.3, "eio-once"), (0.5, "kill-after"), (0.5, "enospc-ever"), (0.7, "eio-ever"), (0.8, "kill-before")],
+    "models-add": [(0.4, "kill-after"), (0.45, "enospc-ever"), (0.6, "eio-once")],
+    "migrate": [(0.5, "kill-after"), (0.6, "enospc-once"), (0.9, "kill-before")],
+}
+CUTS = {"remove": 8, "ingest": 6, "export": 6, "models-add": 4, "prune": 4}
+
+
+def need(verb: str) -> None:
+    if not VERBS[verb].possible:
+        pytest.skip(f"needs the package {VERBS[verb].needs}")
+
+
+@pytest.mark.parametrize("verb", POINTS)
+def test_a_verb_that_is_disturbed(verb, client, sound):
+    need(verb)
+    count = len(client.ask("ops", verb=verb))
+    assert count > 10
+    sound([client.ask("point", verb=verb, n=1 + int(at * (count - 1)), mode=mode) for at, mode in POINTS[verb]])
+
+
+@pytest.mark.parametrize("verb", CUTS)
+def test_the_power_goes(verb, client, sound):
+    need(verb)
+    sound(client.ask("power", verb=verb, states=CUTS[verb]))
+
+
+def after(ops: list[str], *patterns: str) -> int:
+    """The number of the first change that matches the last pattern, after a match of the one before, and so on."""
+    n = 0
+    for pattern in patterns:
+        n = next(i for i, op in enumerate(ops[n:], n + 1) if re.search(pattern, op))
+    return n
+
+
+def test_a_tile_that_the_map_could_not_be_told_of_is_made_again(client, sound):
+    n = after(client.ask("ops", verb="export"), *["rename out/.partial"] * 3, "write .*-wal")
+    sound([client.ask("point", verb="export", n=n, mode=mode) for mode in ("enospc-once", "kill-before")])
+
+
+def test_what_an_export_had_begun_is_gone_though_nothing_is_to_be_done(client, sound):
+    ops = client.ask("ops", verb="export")
+    last = max(n for n, op in enumerate(ops, 1) if op == "rmdir out/.partial")
+    sound([client.ask("point", verb="export", n=last, mode="kill-before")])
+
+
+def test_tiles_that_were_to_go_go_in_the_end(client, sound):
+    first = after(client.ask("ops", verb="export-shrunk"), "unlink out/component")
+    sound([client.ask("point", verb="export-shrunk", n=n, mode="kill-before") for n in (first, first + 1)])
+
+
+def test_the_log_is_folded_in_once_at_the_end(client):
+    ops = [op for op in client.ask("ops", verb="ingest-two") if op.split()[0] in ("write", "fsync")]
+    folded = [n for n, op in enumerate(ops) if op == "write site.gsmap/map.sqlite"]
+    committed = [n for n, op in enumerate(ops) if op == "write site.gsmap/map.sqlite-wal"]
+    assert len(folded) > 3
+    assert min(folded) > max(committed)
+
+
+def test_every_way_to_fail_is_sampled():
+    assert {mode for points in POINTS.values() for _, mode in points} == set(MODES)

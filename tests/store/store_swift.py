@@ -1,0 +1,150 @@
+"""A real object store that speaks S3: OpenStack Swift with its S3 API, four servers on this machine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from datetime import timedelta
+from pathlib import Path
+
+BUCKET = "maps"
+ENVIRONMENT = {"AWS_ACCESS_KEY_ID": "test:tester", "AWS_SECRET_ACCESS_KEY": "testing", "AWS_REGION": "us-east-1"}
+
+_COMMON = """
+[DEFAULT]
+swift_dir = {root}
+devices = {root}/devices
+mount_check = false
+bind_ip = 127.0.0.1
+bind_port = {port}
+workers = 0
+user = {user}
+log_address = {root}/no-syslog
+fallocate_reserve = 0
+"""
+_BACKEND = """
+[pipeline:main]
+pipeline = {kind}-server
+[app:{kind}-server]
+use = egg:swift#{kind}
+"""
+_PROXY = """
+[pipeline:main]
+pipeline = catch_errors gatekeeper s3api tempauth slo proxy-server
+[app:proxy-server]
+use = egg:swift#proxy
+account_autocreate = true
+[filter:catch_errors]
+use = egg:swift#catch_errors
+[filter:gatekeeper]
+use = egg:swift#gatekeeper
+[filter:s3api]
+use = egg:swift#s3api
+[filter:tempauth]
+use = egg:swift#tempauth
+user_test_tester = testing .admin
+[filter:slo]
+use = egg:swift#slo
+"""
+
+
+def why_not(folder: Path) -> str:
+    """Why a server cannot be started here; empty where it can."""
+    try:
+        import swift  # noqa: F401
+    except ImportError:
+        return "needs OpenStack Swift (pip install swift)"
+    probe = folder / "probe"
+    probe.touch()
+    try:
+        os.setxattr(probe, "user.swift", b"x")
+    except OSError:
+        return f"Swift keeps metadata in extended attributes, which the disk of {folder} does not have"
+    return ""
+
+
+class Swift:
+    """The servers below one folder; ``url`` is where they speak S3."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.url = ""
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def __enter__(self) -> Swift:
+        import getpass
+
+        (self.root / "devices" / "d1").mkdir(parents=True)
+        (self.root / "swift.conf").write_text("[swift-hash]\nswift_hash_path_prefix = a\nswift_hash_path_suffix = b\n")
+        ports = dict(zip(("account", "container", "object", "proxy"), _free_ports(4), strict=True))
+        for kind, port in ports.items():
+            if kind != "proxy":
+                builder = self.root / f"{kind}.builder"
+                for words in (["create", "4", "1", "0"], ["add", f"r1z1-127.0.0.1:{port}/d1", "1"], ["rebalance"]):
+                    self._run("swift-ring-builder", str(builder), *words)
+            text = _COMMON.format(root=self.root, port=port, user=getpass.getuser())
+            text += _PROXY if kind == "proxy" else _BACKEND.format(kind=kind)
+            (self.root / f"{kind}.conf").write_text(text)
+            self._start(kind)
+        self.url = f"http://127.0.0.1:{ports['proxy']}"
+        for port in ports.values():
+            self._wait(port)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+    def make_bucket(self) -> None:
+        """An empty bucket, by the API itself: one signed request."""
+        import obstore
+        from obstore.store import S3Store
+
+        names = {name.lower(): value for name, value in ENVIRONMENT.items()}
+        store = S3Store(BUCKET, endpoint=self.url, client_options={"allow_http": True}, **names)
+        url = obstore.sign(store, "PUT", "", timedelta(minutes=1))
+        with urllib.request.urlopen(urllib.request.Request(url, method="PUT")) as answer:
+            assert answer.status == 200
+
+    def _program(self, name: str) -> str:
+        beside = Path(sys.executable).parent / name
+        return str(beside) if beside.exists() else shutil.which(name) or name
+
+    def _environment(self) -> dict[str, str]:
+        return {**os.environ, "SWIFT_CONF_FILE": str(self.root / "swift.conf")}
+
+    def _run(self, *words: str) -> None:
+        command = [self._program(words[0]), *words[1:]]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=self._environment())
+        assert done.returncode in (0, 1), done.stdout + done.stderr  # 1: a warning
+
+    def _start(self, kind: str) -> None:
+        with open(self.root / f"{kind}.log", "wb") as log:
+            command = [self._program(f"swift-{kind}-server"), str(self.root / f"{kind}.conf"), "-v"]
+            self._processes.append(subprocess.Popen(command, stdout=log, stderr=log, env=self._environment()))
+
+    def _wait(self, port: int) -> None:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    return
+            time.sleep(0.05)
+        logs = "".join((self.root / f).read_text() for f in os.listdir(self.root) if f.endswith(".log"))
+        raise AssertionError(f"Swift did not start: {logs[-3000:]}")
+
+
+def _free_ports(count: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(count)]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+    ports = [one.getsockname()[1] for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports

@@ -1,0 +1,384 @@
+"""A backup in a folder: what it saves, when it refuses, and what several at once do to each other."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from store_backups import fill, holdings
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
+from gsmap.store import Store
+from gsmap.store.backup import Backup, restore, save
+from gsmap.store.backup import saving as saving_module
+from gsmap.store.backup.places import FolderPlace, place_of
+from gsmap.store.backup.sharing import EXPIRES_S, SAVE, SWEEP, Lease
+
+
+@pytest.fixture
+def place(tmp_path):
+    return FolderPlace(tmp_path / "backup")
+
+
+@pytest.fixture
+def filled(store, tmp_path):
+    fill(store, tmp_path)
+    return store
+
+
+def objects(place):
+    return {path: path.stat().st_mtime_ns for path in (place.root / "objects").rglob("*") if path.is_file()}
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def array_of(store, scene, name="means/c/0/0"):
+    return store.catalog.folder / "arrays" / "scenes" / store.scenes.get(scene).id / name
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgres"])
+def test_a_restored_map_holds_what_was_saved(kind, tmp_path, place, request):
+    url = request.getfixturevalue("postgres_database") if kind == "postgres" else None
+    with Store.create(tmp_path / "m", catalog_url=url) as store:
+        fill(store, tmp_path)
+        map_id = store.id
+    before = holdings(tmp_path / "m")
+    with Store.open(tmp_path / "m") as store:
+        made = save(store, place)
+        assert [(b.target, b.snapshot) for b in store.backups.list()] == [(str(place.root), made.snapshot.name)]
+    assert made.snapshot.revision == 1
+    assert made.snapshot.counts["scenes"] == 2
+    restored = restore(place, tmp_path / "r")
+    assert restored.snapshot == made.snapshot
+    assert (tmp_path / "r" / "map.sqlite").is_file()  # also where the catalog was in PostgreSQL
+    assert holdings(tmp_path / "r") == before
+    with Store.open(tmp_path / "r") as store:
+        assert store.id == map_id
+        assert store.check().ok
+        store.scenes.add(make_gaussians(seed=9), make_cameras(), name="later")
+        assert store.check().ok
+
+
+def test_only_what_is_new_is_sent(filled, place):
+    save(filled, place)
+    before = objects(place)
+    again = save(filled, place)
+    assert again.num_files_new == 2  # the catalog and the list of files
+    assert {path: time for path, time in objects(place).items() if path in before} == before
+    scene, _ = filled.scenes.add(make_gaussians(seed=5), make_cameras(), name="c")
+    third = save(filled, place)
+    num_arrays = sum(1 for p in array_of(filled, scene.id).parents[3].rglob("*") if p.is_file())
+    assert 2 < third.num_files_new <= num_arrays + 2
+    assert third.snapshot.num_bytes_new < third.snapshot.num_bytes
+
+
+def test_a_damaged_map_is_not_backed_up(filled, place):
+    broken = array_of(filled, "b")
+    flip(broken)
+    with pytest.raises(CorruptError, match="differs") as caught:
+        save(filled, place)
+    assert str(broken) in str(caught.value)
+    assert Backup.at(place).names() == []
+    sizes = {p.name: p.stat().st_size for p in objects(place)}
+    assert all(saving_module.hashlib.sha256(p.read_bytes()).hexdigest() == p.name for p in objects(place)), sizes
+    filled.scenes.add(make_gaussians(300, seed=2), make_cameras(), name="b")  # mends it
+    save(filled, place)
+    broken.unlink()
+    save(filled, place)  # it is in the backup already
+    array_of(filled, "a", "quats/c/0/0").unlink()
+    shutil.rmtree(place.root)
+    with pytest.raises(CorruptError, match="missing"):
+        save(filled, place)
+
+
+def test_a_damaged_catalog_is_not_backed_up(tmp_path, place):
+    """A text in it changes on the disk while the map is open, which SQLite itself would not notice."""
+    with Store.create(tmp_path / "m") as store:
+        fill(store, tmp_path)
+    harm = "import sys; f = open(sys.argv[1], 'r+b'); d = f.read(); f.seek(d.rindex(b'settings') + 3); f.write(b'x')"
+    with Store.open(tmp_path / "m", "r") as store:
+        # by another process: to close the file in this one would drop the locks that SQLite has on it
+        subprocess.run([sys.executable, "-c", harm, tmp_path / "m" / "map.sqlite"], check=True)
+        with pytest.raises(CorruptError, match=r"map\.sqlite"):
+            save(store, place)
+    assert Backup.at(place).names() == []
+
+
+class Meddling(FolderPlace):
+    """A place at which something happens before an object is put."""
+
+    def __init__(self, root, before):
+        super().__init__(root)
+        self.before = before
+        self.puts = 0
+
+    def put(self, name, chunks, size_bytes):
+        if name.startswith("objects/"):
+            self.puts += 1
+            self.before(self.puts)
+        super().put(name, chunks, size_bytes)
+
+
+def test_scenes_that_are_pruned_meanwhile(filled, tmp_path, monkeypatch):
+    whole, tries = saving_module.capture, []
+
+    def capture(store, folder, **options):
+        state = whole(store, folder, **options)
+        if not tries:
+            filled.scenes.remove("b")
+            filled.prune(keep_revisions=0)
+        tries.append(state)
+        return state
+
+    monkeypatch.setattr(saving_module, "capture", capture)
+    made = save(filled, place_of(tmp_path / "backup"))
+    assert len(tries) == 2
+    assert made.snapshot.counts["scenes"] == 1
+    restore(place_of(tmp_path / "backup"), tmp_path / "r")
+    with Store.open(tmp_path / "r") as store:
+        assert [scene.name for scene in store.scenes.list()] == ["a"]
+        assert store.check().ok
+
+
+def test_scenes_that_are_pruned_all_the_time(filled, tmp_path, monkeypatch):
+    """Whatever is listed is gone before it is read: the last try holds the writers back."""
+    tries = []
+    whole = saving_module.capture
+
+    def capture(store, folder, **options):
+        state = whole(store, folder, **options)
+        tries.append(state)
+
+        def change():
+            with Store.open(store.catalog.folder) as other:
+                other.catalog.patience_s = 0.2
+                other.scenes.remove(f"n{len(tries) - 1}")
+                other.prune()
+                other.scenes.add(make_gaussians(50, seed=10 + len(tries)), make_cameras(), name=f"n{len(tries)}")
+
+        thread = threading.Thread(target=change)
+        thread.start()
+        thread.join()
+        return state
+
+    filled.scenes.add(make_gaussians(50, seed=10), make_cameras(), name="n0")
+    monkeypatch.setattr(saving_module, "capture", capture)
+    monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
+    save(filled, place_of(tmp_path / "backup"))
+    assert len(tries) == saving_module._TRIES + 1
+    restore(place_of(tmp_path / "backup"), tmp_path / "r")
+    assert Store.open(tmp_path / "r").check().ok
+
+
+def test_a_backup_that_is_interrupted_goes_on(filled, tmp_path):
+    class Stop(Exception):
+        pass
+
+    def stop(count):
+        if count > 5:
+            raise Stop
+
+    with pytest.raises(Stop):
+        save(filled, Meddling(tmp_path / "backup", stop))
+    place = place_of(tmp_path / "backup")
+    with pytest.raises(NotFoundError, match="no snapshot yet"):
+        restore(place, tmp_path / "r")
+    sent = len(objects(place))
+    assert sent > 0
+    save(filled, place)
+    restore(place, tmp_path / "r")
+    assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
+    assert list((place.root / "staging").iterdir()) == []
+    assert list((place.root / "leases").iterdir()) == []
+
+
+def test_verify_mends_what_the_map_has_and_tells_the_rest(filled, place, tmp_path):
+    filled.scenes.add(make_gaussians(seed=7), make_cameras(), name="old")
+    gone = array_of(filled, "old")
+    lost = place.root / "objects" / (sha := saving_module.hashlib.sha256(gone.read_bytes()).hexdigest())[:2] / sha
+    first = save(filled, place).snapshot
+    filled.scenes.remove("old")
+    filled.prune()
+    here = saving_module.hashlib.sha256(array_of(filled, "a").read_bytes()).hexdigest()
+    for path in (lost, place.root / "objects" / here[:2] / here):
+        flip(path)
+    with pytest.raises(CorruptError, match=f"{here}|{sha}"):
+        restore(place, tmp_path / "r", snapshot=first.name)
+    assert not (tmp_path / "r").exists()
+    said = save(filled, place, verify=True)
+    assert said.num_verified == len(objects(place)) - 2  # what it sent itself, it did not read again
+    assert len(said.problems) == 1
+    assert sha in said.problems[0]
+    assert first.name in said.problems[0]
+    restore(place, tmp_path / "r")
+    assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
+    with pytest.raises(CorruptError, match=sha):
+        restore(place, tmp_path / "r2", snapshot=first.name)
+    lost.unlink()
+    assert [sha in problem for problem in save(filled, place, verify=True).problems] == [True]
+
+
+def test_keep_deletes_old_snapshots_and_what_only_they_needed(filled, place, tmp_path):
+    filled.scenes.add(make_gaussians(seed=7), make_cameras(), name="old")
+    old = saving_module.hashlib.sha256(array_of(filled, "old").read_bytes()).hexdigest()
+    first = save(filled, place).snapshot
+    second = save(filled, place).snapshot
+    filled.scenes.remove("old")
+    filled.prune()
+    shutil.copy(place.root / "gsmap-backup.json", place.root / "objects" / "note.txt")  # not ours
+    made = save(filled, place, keep=2)
+    assert made.deleted == (first.name,)
+    assert Backup.at(place).names() == [second.name, made.snapshot.name]
+    assert (place.root / "objects" / old[:2] / old).is_file()
+    made = save(filled, place, keep=1)
+    assert made.num_bytes_freed > 0
+    assert Backup.at(place).names() == [made.snapshot.name]
+    assert not (place.root / "objects" / old[:2] / old).exists()
+    assert (place.root / "objects" / "note.txt").is_file()
+    needed = {f.sha256 for f in Backup.at(place).files(made.snapshot)} | {made.snapshot.files}
+    assert {p.name for p in objects(place)} - {"note.txt"} == needed
+    restore(place, tmp_path / "r")
+    assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
+    with pytest.raises(ConfigError, match="at least 1"):
+        save(filled, place, keep=0)
+
+
+def test_keep_deletes_nothing_when_a_snapshot_cannot_be_read(filled, place):
+    save(filled, place)
+    second = save(filled, place).snapshot
+    flip(place.root / "snapshots" / f"{second.name}.json")
+    before = objects(place)
+    with pytest.raises(CorruptError, match="damaged"):
+        save(filled, place, keep=2)
+    assert before.items() <= objects(place).items()
+
+
+def test_nothing_is_deleted_while_another_saves(filled, place):
+    save(filled, place)
+    with Lease(place, SAVE) as other:
+        before = objects(place)
+        made = save(filled, place, keep=1)
+        assert made.deleted == ()
+        assert "others are at work" in made.notes[0]
+        assert before.keys() <= objects(place).keys()
+        old = time.time() - EXPIRES_S - 60  # of one that died
+        os.utime(place.root / other.name, (old, old))
+        assert len(save(filled, place, keep=1).deleted) == 2
+
+
+def test_a_backup_waits_for_who_deletes(filled, place):
+    save(filled, place)
+    done = []
+    with Lease(place, SWEEP):
+        thread = threading.Thread(target=lambda: done.append(save(filled, place)))
+        thread.start()
+        thread.join(0.5)
+        assert thread.is_alive()
+        assert len(Backup.at(place).names()) == 1
+    thread.join(30)
+    assert len(done) == 1
+
+
+def test_one_whose_lease_was_taken_away_stops(filled, place):
+    def take(count):
+        if count == 3:
+            for path in (place.root / "leases").iterdir():
+                path.unlink()
+
+    meddling = Meddling(place.root, take)
+    save(filled, meddling)  # it is renewed; only who deletes must be sure of it
+    with Lease(place, SWEEP) as lease:
+        (place.root / lease.name).unlink()
+        with pytest.raises(StoreError, match="taken away"):
+            lease.others()
+        lease._renewed -= EXPIRES_S
+        with pytest.raises(StoreError, match="could not be reached"):
+            lease.require()
+
+
+def test_two_backups_at_once(filled, place, tmp_path):
+    made, errors = [], []
+
+    def run():
+        try:
+            with Store.open(filled.catalog.folder) as store:
+                made.append(save(store, place, keep=5))
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=run) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    assert len(Backup.at(place).names()) == 3
+    for i, one in enumerate(made):
+        restore(place, tmp_path / f"r{i}", snapshot=one.snapshot.name)
+        assert holdings(tmp_path / f"r{i}") == holdings(filled.catalog.folder)
+
+
+def test_places_that_are_refused(filled, place, tmp_path):
+    for target in ("ftp://host/x", "s3://key:secret@bucket/x", "s3:///x", "file://host/x", "s3://bucket/x?secret=1"):
+        with pytest.raises(ConfigError) as caught:
+            place_of(target)
+        assert "secret" not in str(caught.value)
+    assert place_of(f"file://{tmp_path}/a%20b").root == tmp_path / "a b"
+    with pytest.raises(ConfigError, match="inside the map"):
+        save(filled, FolderPlace(filled.catalog.folder / "backup"))
+    with pytest.raises(StoreError, match="other things"):
+        save(filled, FolderPlace(tmp_path))
+    save(filled, place)
+    with Store.create(tmp_path / "other") as other, pytest.raises(StoreError, match="another map"):
+        save(other, place)
+    with pytest.raises(NotFoundError, match="no backup"):
+        restore(FolderPlace(tmp_path / "nowhere"), tmp_path / "r")
+
+
+def test_a_map_that_cannot_be_written_is_backed_up(filled, place, tmp_path):
+    filled.close()
+    with Store.open(filled.catalog.folder, "r") as store:
+        made = save(store, place)
+    assert "does not remember" in made.notes[0]
+    restore(place, tmp_path / "r")
+    assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
+
+
+def test_branches_go_with_their_map(filled, place, tmp_path):
+    filled.close()
+    home = filled.catalog.folder
+    (home / "branches" / "what-if").mkdir(parents=True)
+    shutil.copy(home / "map.sqlite", home / "branches" / "what-if" / "map.sqlite")
+    (home / "branches" / "what-if" / "branch.json").write_text("{}")
+    with Store.open(home) as store:
+        save(store, place)
+    restore(place, tmp_path / "r")
+    kept = sorted(p.name for p in (tmp_path / "r" / "branches" / "what-if").iterdir())
+    assert kept[:2] == ["branch.json", "map.sqlite"]
+
+
+def test_a_full_disk(filled, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "none", disk], capture_output=True).returncode:
+        pytest.skip("needs the right to mount a small file system")
+    try:
+        with pytest.raises(StoreError, match="disk is full"):
+            save(filled, FolderPlace(disk / "backup"))
+        assert not list((disk / "backup" / "snapshots").glob("*"))
+        subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
+        save(filled, FolderPlace(disk / "backup"))
+        subprocess.run(["mount", "-o", "remount,size=700k", disk], check=True)
+        with pytest.raises(StoreError, match=r"room for|disk is full"):
+            restore(FolderPlace(disk / "backup"), disk / "r")
+        assert sorted(p.name for p in disk.iterdir()) == ["backup"]
+    finally:
+        subprocess.run(["umount", disk], check=True)

@@ -1,0 +1,481 @@
+"""A damaged page of the catalog is found, whatever happened to the map since; a sound one is never called damaged."""
+
+import random
+import shutil
+import sqlite3
+import sys
+from pathlib import Path
+
+import pytest
+import store_children
+from store_children import messages
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.errors import CorruptError, StoreError
+from gsmap.store import Store, digests, sqlite
+from gsmap.store.handles import Handle
+from gsmap.store.wal import index_note, log_of, read_log
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import check_flips
+
+PAGE = 4096
+
+
+@pytest.fixture
+def closed(tmp_path):
+    """A closed map of two scenes with free pages in its catalog."""
+    path = tmp_path / "site.gsmap"
+    check_flips.make_map(path)
+    return path
+
+
+def fill(store: Store, count: int = 3) -> None:
+    for i in range(count):
+        store.exports.begin(f"/out/{i}", revision=None, settings={"x": "y" * 9000})
+
+
+def flip(file: Path, offset: int) -> None:
+    with open(file, "rb+") as opened:
+        opened.seek(offset)
+        byte = opened.read(1)[0]
+        opened.seek(offset)
+        opened.write(bytes([byte ^ 4]))
+
+
+@pytest.mark.parametrize("count", [12, pytest.param(200, marks=pytest.mark.slow)])
+def test_every_flip_is_found(closed, count):
+    found, listed, of_catalog = check_flips.count_found(closed, count)
+    assert found == dict.fromkeys(check_flips.WAYS, count)
+    assert listed == of_catalog > 0
+    assert check_flips.checks(closed)
+
+
+def test_a_flip_in_each_page_and_in_its_digest_is_named(closed):
+    file = closed / sqlite.FILE
+    noted = digests.load(file)
+    assert noted.count * PAGE == file.stat().st_size
+    for number in range(1, noted.count + 1):
+        at = (number - 1) * PAGE + 100 + number
+        flip(file, at)
+        with pytest.raises(CorruptError, match=rf"page {number} of map.sqlite differs.*restore"):
+            Store.open(closed, "r")
+        flip(file, at)
+    side = digests.digests_of(file)
+    for at in range(0, side.stat().st_size, 31):
+        flip(side, at)
+        with pytest.raises(CorruptError, match=r"map.sqlite.digests is damaged"):
+            Store.open(closed, "r")
+        flip(side, at)
+    Store.open(closed, "r").close()
+
+
+def test_a_longer_and_a_shorter_file_are_found(closed):
+    file = closed / sqlite.FILE
+    whole = file.read_bytes()
+    for content in (whole + bytes(PAGE), whole[:-PAGE], whole[:-7], whole + b"x"):
+        file.write_bytes(content)
+        with pytest.raises(CorruptError):
+            Store.open(closed, "r")
+    file.write_bytes(whole)
+    Store.open(closed, "r").close()
+
+
+def test_damage_that_comes_while_a_map_is_open_is_not_blessed(closed):
+    """The next fold looks first: what was written stays in the log, and the damage stays to be seen."""
+    store = Store.open(closed)
+    file = closed / sqlite.FILE
+    noted = digests.load(file)
+    flip(file, file.stat().st_size - 50)
+    store.scenes.edit("monday", note="seen")  # in the log
+    with pytest.raises(CorruptError, match=f"page {noted.count} of map.sqlite differs"):
+        store.close()
+    assert digests.load(file) == noted
+    for mode in "rw":
+        with pytest.raises(CorruptError):
+            Store.open(closed, mode)
+    assert log_of(file).stat().st_size
+    flip(file, file.stat().st_size - 50)
+    with Store.open(closed) as store:  # nothing is lost once the page is as it was
+        assert "note" in [fact.kind for fact in store.scenes.facts("monday")]
+        assert store.check().ok
+    assert digests.load(file) != noted
+
+
+def stages_of_a_fold(path: Path, copies: Path, monkeypatch) -> list[Path]:
+    """The map as a kill would leave it at each step of folding the log in."""
+    copies.mkdir()
+
+    def keep(name: str) -> Path:
+        shutil.copytree(path, copies / name)
+        return copies / name
+
+    real_save, real_fold = digests.save, sqlite._folded
+
+    def save(file, noted):
+        keep(f"{len(list(copies.iterdir()))} before digests")
+        real_save(file, noted)
+        keep(f"{len(list(copies.iterdir()))} after digests")
+
+    def folded(engine):
+        done = real_fold(engine)
+        keep(f"{len(list(copies.iterdir()))} after the fold")
+        return done
+
+    store = Store.open(path)
+    fill(store, 8)
+    with monkeypatch.context() as patch:
+        patch.setattr(digests, "save", save)
+        patch.setattr(sqlite, "_folded", folded)
+        store.close()
+    out = sorted(copies.iterdir())
+    assert len(out) == 5
+    return out
+
+
+def test_killed_anywhere_in_a_fold(closed, tmp_path, monkeypatch):
+    stages = stages_of_a_fold(closed, tmp_path / "stages", monkeypatch)
+    before, under_way, after = (stages[i] / sqlite.FILE for i in (1, 1, 2))
+    noted = digests.load(before)
+    assert noted.next_count > noted.count
+    # In the middle some pages are new, some old, some not there yet; a power cut may tear the one being written.
+    rng = random.Random(3)
+    for i in range(6):
+        torn = tmp_path / "stages" / f"torn {i}"
+        shutil.copytree(stages[1], torn)
+        new, content = after.read_bytes(), bytearray(under_way.read_bytes())
+        written = sorted(n for n in noted.next if rng.random() < i / 5)
+        for number in written:
+            content.extend(bytes(max(0, number * PAGE - len(content))))
+            content[(number - 1) * PAGE : number * PAGE] = new[(number - 1) * PAGE : number * PAGE]
+        if i % 2 and written:
+            content[(written[-1] - 1) * PAGE + 512 : written[-1] * PAGE] = bytes(PAGE - 512)
+        (torn / sqlite.FILE).write_bytes(content)
+        stages.append(torn)
+    for stage in stages:
+        with Store.open(stage, "r") as store:
+            assert store.check().problems == (), stage.name
+        # What no fold was about to change is verified all the same.
+        spare = next(n for n in range(1, noted.count + 1) if n not in noted.next)
+        flip(stage / sqlite.FILE, spare * PAGE - 9)
+        with pytest.raises(CorruptError, match=f"page {spare} of"):
+            Store.open(stage)
+        flip(stage / sqlite.FILE, spare * PAGE - 9)
+        with Store.open(stage) as store:
+            assert len(store.exports.list()) == 8
+            store.scenes.edit("monday", note="after the kill")
+        assert digests.load(stage / sqlite.FILE).next_count == 0
+        with Store.open(stage, "r") as store:
+            assert store.check().problems == ()
+
+
+def test_a_page_that_was_folded_in_is_verified_without_the_log(closed, tmp_path, monkeypatch):
+    """Killed between the fold and its last note, pages may be old or new, and nothing else."""
+    stage = stages_of_a_fold(closed, tmp_path / "stages", monkeypatch)[2]
+    assert not log_of(stage / sqlite.FILE).exists() or not log_of(stage / sqlite.FILE).stat().st_size
+    for number in digests.load(stage / sqlite.FILE).next:
+        flip(stage / sqlite.FILE, number * PAGE - 9)
+        with pytest.raises(CorruptError, match=f"page {number} of"):
+            Store.open(stage, "r")
+        flip(stage / sqlite.FILE, number * PAGE - 9)
+
+
+def test_a_reader_that_keeps_the_log_from_being_folded_in(closed, monkeypatch):
+    monkeypatch.setattr(sqlite, "_READERS_S", 0.05)
+    file = closed / sqlite.FILE
+    with Store.open(closed) as store, Store.open(closed, "r") as reader:
+        fill(store)
+        with reader.catalog.read() as connection:
+            connection.exec_driver_sql("SELECT count(*) FROM exports").scalar()
+            monkeypatch.setattr(sqlite, "CHECKPOINT_BYTES", 1)
+            fill(store)
+            assert digests.load(file).next_count
+            Store.open(closed, "r").close()
+            fill(store)
+            assert store.check().problems == ()
+        fill(store)
+        assert not digests.load(file).next_count
+        assert store.check().problems == ()
+    assert not log_of(file).exists()
+    with Store.open(closed, "r") as store:
+        assert len(store.exports.list()) == 12
+
+
+def test_many_open_it_while_others_fold(tmp_path, start, context):
+    path = tmp_path / "m"
+    Store.create(path).close()
+    stop = context.Event()
+    readers = [start(store_children.open_often, str(path), mode, stop) for mode in "rrw"]
+    writers = [start(store_children.fold_often, str(path), i, 25) for i in range(3)]
+    for process, pipe in writers:
+        process.join(120)
+        assert messages(pipe) == ["done"]
+    stop.set()
+    for process, pipe in readers:
+        process.join(120)
+        (rounds,) = messages(pipe)
+        assert isinstance(rounds, int), rounds
+    with Store.open(path) as store:
+        assert len(store.exports.list()) == 75
+        assert store.check().problems == ()
+
+
+def test_reading_the_file_drops_no_lock_of_sqlite(tmp_path, start):
+    """Closing a handle on a file drops the process's locks on it; then another one that closes the map would take
+    itself for the last, remove the log, and what this one writes from then on would be lost."""
+    path = tmp_path / "m"
+    seen = []
+    with Store.create(path) as store:
+        sqlite.checkpoint(store.catalog.engine, path / sqlite.FILE, at_bytes=1)
+        for seed in range(3):
+            store_children.add(store, seed)
+            store.check()
+            process, pipe = start(store_children.open_and_close, str(path))
+            process.join()
+            seen += messages(pipe)
+        with Store.open(path, "r") as other:
+            other.check()
+        store_children.add(store, 3)
+        process, pipe = start(store_children.open_and_close, str(path))
+        process.join()
+        seen += messages(pipe)
+    names = [f"scene{i}" for i in range(4)]
+    assert seen == [names[:1], names[:2], names[:3], names]
+
+
+def test_handles_are_shared_and_closed_with_the_last(tmp_path):
+    (tmp_path / "a").write_bytes(b"x")
+    one, two = Handle(tmp_path / "a"), Handle(tmp_path / "a")
+    assert one.number == two.number
+    one.close()
+    one.close()
+    assert Path(f"/proc/self/fd/{two.number}").exists()
+    two.close()
+    assert not Path(f"/proc/self/fd/{two.number}").exists()
+
+
+def test_a_store_that_is_never_closed_does_not_fold_past_the_digests(tmp_path):
+    path = tmp_path / "m"
+    Store.create(path).close()
+    store = Store.open(path)
+    fill(store)
+    noted = digests.load(path / sqlite.FILE)
+    del store
+    import gc
+
+    gc.collect()
+    assert log_of(path / sqlite.FILE).stat().st_size
+    assert digests.load(path / sqlite.FILE) == noted
+    with Store.open(path) as store:
+        assert len(store.exports.list()) == 3
+        assert store.check().ok
+
+
+def test_more_threads_than_connections_are_kept(store, two_scenes):
+    from concurrent.futures import ThreadPoolExecutor
+    from threading import Barrier
+
+    together = Barrier(12)
+
+    def count(_: int) -> int:
+        with store.catalog.read() as connection:
+            together.wait(30)
+            return connection.exec_driver_sql("SELECT count(*) FROM scenes").scalar()
+
+    with ThreadPoolExecutor(12) as pool:
+        assert list(pool.map(count, range(12))) == [2] * 12
+
+
+# --- the log ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def killed(tmp_path):
+    """A map whose writer was killed: a log with ten commits, and its index."""
+    path = tmp_path / "site.gsmap"
+    Store.create(path).close()
+    store = Store.open(path)
+    fill(store, 10)
+    shutil.copytree(path, tmp_path / "killed.gsmap")
+    store.close()
+    return tmp_path / "killed.gsmap"
+
+
+@pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_flip_in_the_log_is_found(killed, count):
+    log = log_of(killed / sqlite.FILE)
+    rng = random.Random(1)
+    for _ in range(count):
+        at = rng.randrange(log.stat().st_size)
+        flip(log, at)
+        with pytest.raises(CorruptError, match="in its log"):
+            Store.open(killed)
+        flip(log, at)
+    with Store.open(killed) as store:
+        assert len(store.exports.list()) == 10
+
+
+def test_a_torn_end_of_the_log_is_no_damage(killed):
+    """A power cut leaves what was not synchronised in any order; it was not acknowledged either."""
+    log = log_of(killed / sqlite.FILE)
+    log.with_name("map.sqlite-shm").unlink()
+    whole = log.read_bytes()
+    frame = PAGE + 24
+    commits = [i for i in range(32, len(whole), frame) if int.from_bytes(whole[i + 4 : i + 8], "big")]
+    last = range(commits[-2] + frame, len(whole), frame)
+    assert len(last) > 2
+    for lost in last:
+        log.write_bytes(whole[:lost] + bytes(frame) + whole[lost + frame :])
+        assert read_log(log).problem == ""
+    for cut in (len(whole) - 1, len(whole) - 3 * frame - 100, 32, 20, 0):
+        log.write_bytes(whole[:cut])
+        assert read_log(log).problem == ""
+    log.write_bytes(whole[: last[0] + 50])
+    with Store.open(killed) as store:
+        assert len(store.exports.list()) == 9
+        assert store.check().ok
+
+
+def test_the_log_is_read_as_sqlite_reads_it(killed):
+    file = killed / sqlite.FILE
+    log = read_log(log_of(file), index_note(file))
+    content = bytearray(file.read_bytes().ljust(log.num_pages * PAGE, b"\0"))
+    frames = log_of(file).read_bytes()
+    for number, at in log.frames.items():
+        content[(number - 1) * PAGE : number * PAGE] = frames[at : at + PAGE]
+    with sqlite3.connect(file) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+    assert file.read_bytes() == content
+
+
+# --- maps without digests, and a person's word -----------------------------------------------------------------------
+
+
+def without_digests(path: Path) -> None:
+    digests.digests_of(path / sqlite.FILE).unlink()
+
+
+def test_what_cannot_be_verified_is_said(closed):
+    without_digests(closed)
+    with Store.open(closed, "r") as store:
+        report = store.check()
+    assert report.ok
+    assert "older gsmap" in report.unverified[0]
+    with Store.open(closed) as store:
+        store.scenes.edit("monday", note="a write")
+    with Store.open(closed, "r") as store:
+        assert store.check().unverified == ()
+
+
+def test_the_note_of_an_older_gsmap_counts_until_the_next_write(closed):
+    import hashlib
+    import json
+
+    file = closed / sqlite.FILE
+    without_digests(closed)
+    note, stamp = digests.older_digest_of(file), file.stat()
+    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+    note.write_text(json.dumps({"sha256": sha256, "size_bytes": stamp.st_size, "mtime_ns": stamp.st_mtime_ns}))
+    Store.open(closed, "r").close()
+    import os
+
+    flip(file, stamp.st_size - 50)
+    os.utime(file, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    with pytest.raises(CorruptError, match="differs from what gsmap wrote"):
+        Store.open(closed)
+    flip(file, stamp.st_size - 50)  # another time now
+    with Store.open(closed) as store:
+        assert note.exists()
+        store.scenes.edit("monday", note="a write")
+    assert not note.exists()
+    assert digests.load(file) is not None
+
+
+def test_damage_is_not_taken_for_what_was_written_where_there_are_no_digests(closed):
+    without_digests(closed)
+    file = closed / sqlite.FILE
+    store = Store.open(closed)
+    store.scenes.edit("monday", note="a write")
+    with open(file, "rb+") as opened:
+        opened.seek(4 * PAGE)
+        opened.write(b"\xff" * PAGE * 3)
+    with pytest.raises(CorruptError):
+        store.close()
+    assert not digests.digests_of(file).exists()
+
+
+def test_a_person_accepts_the_catalog(closed):
+    with sqlite3.connect(closed / sqlite.FILE) as connection:  # as the sqlite3 program does
+        connection.execute("UPDATE scenes SET name = 'renamed' WHERE name = 'monday'")
+    connection.close()
+    with pytest.raises(CorruptError, match=r"differ.* from what gsmap wrote.*--accept-catalog"):
+        Store.open(closed)
+    (said,) = Store.accept_catalog(closed)
+    assert "map.sqlite" in said
+    with Store.open(closed) as store:
+        assert [s.name for s in store.scenes.list()] == ["renamed", "tuesday"]
+        assert store.check().problems == ()
+    assert Store.accept_catalog(closed) == []
+
+
+def test_what_sqlite_finds_broken_cannot_be_accepted(closed):
+    noted = digests.load(closed / sqlite.FILE)
+    with open(closed / sqlite.FILE, "rb+") as opened:
+        opened.seek(4 * PAGE)
+        opened.write(b"\xff" * PAGE * 8)
+    with pytest.raises(StoreError):
+        Store.accept_catalog(closed)
+    assert digests.load(closed / sqlite.FILE) == noted
+
+
+def test_a_long_catalog_is_verified_by_check_alone(closed, monkeypatch):
+    """Opening it takes no seconds then, and a write blesses no damage: neither in pages it changes nor in others."""
+    monkeypatch.setattr(digests, "WHOLE_BYTES", 1000)
+    file = closed / sqlite.FILE
+    flip(file, file.stat().st_size - 50)
+    with Store.open(closed, "r") as store:
+        assert "differs" in store.check().problems[0]
+    with Store.open(closed) as store:
+        store.scenes.edit("monday", note="a write elsewhere")
+    with Store.open(closed, "r") as store:
+        assert "differs" in store.check().problems[0]
+    flip(file, file.stat().st_size - 50)
+    store = Store.open(closed)
+    store.scenes.edit("monday", note="a write there")
+    number = min(read_log(log_of(file)).frames)
+    flip(file, number * PAGE - 50)
+    with pytest.raises(CorruptError, match=f"page {number} of"):
+        store.close()
+    flip(file, number * PAGE - 50)
+    with Store.open(closed) as store:
+        assert store.check().ok
+
+
+def test_digests_survive_their_own_format(tmp_path):
+    noted = digests.Digests(PAGE, bytes(range(64)), 9, {7: b"a" * 16, 2: b"b" * 16})
+    (tmp_path / "x").touch()
+    digests.save(tmp_path / "x", noted)
+    assert digests.load(tmp_path / "x") == noted
+    assert digests.pages([1, 2, 3, 7, 9, 10]) == "pages 1-3, 7, 9-10"
+
+
+def test_a_backup_that_was_put_back_is_known(closed):
+    file = closed / sqlite.FILE
+    with Store.open(closed) as store:
+        sqlite.backup(store.catalog.engine, closed / "map.sqlite.0002.bak")
+        store.scenes.edit("monday", name="renamed")
+    shutil.copyfile(closed / "map.sqlite.0002.bak", file)
+    with Store.open(closed, "r") as store:
+        assert store.scenes.list()[0].name == "monday"
+    with Store.open(closed) as store:
+        store.scenes.remove("monday")
+    with Store.open(closed) as store:
+        assert store.check().ok
+
+
+def test_adding_to_a_map_whose_log_was_left_behind(killed):
+    with Store.open(killed) as store:
+        store.scenes.add(make_gaussians(), make_cameras(), name="a")
+        assert store.check().ok
+    assert not log_of(killed / sqlite.FILE).exists()
