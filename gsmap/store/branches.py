@@ -19,7 +19,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, delete, func, select, update
 
-from gsmap.durable import sync_file, sync_folder
+from gsmap.durable import is_file, is_folder, sync_file, sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
@@ -107,8 +107,8 @@ def places(home: Path) -> list[Place]:
     root = home / FOLDER
     found = []
     for folder in sorted(root.iterdir()) if root.is_dir() and not root.is_symlink() else ():
-        ours = _NAME.fullmatch(folder.name) and not folder.is_symlink() and (folder / sqlite.FILE).is_file()
-        if ours and (folder / _MARKER).is_file():
+        ours = _NAME.fullmatch(folder.name) and is_folder(folder) and is_file(folder / sqlite.FILE)
+        if ours and is_file(folder / _MARKER):
             found.append(Place(home, folder, folder.name, _told(folder)["kind"] == "tag"))
     return found
 
@@ -330,7 +330,7 @@ def _told(folder: Path) -> dict[str, str]:
             "kind": "tag" if told["kind"] == "tag" else "branch",
             **{k: str(told[k]) for k in ("parent", "created_at")},
         }
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {"kind": "tag", "parent": "", "created_at": ""}  # damaged: it is better not written to
 
 

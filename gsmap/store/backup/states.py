@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
+from gsmap.durable import is_file, is_folder
 from gsmap.errors import CorruptError, StoreError
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import catalog as _catalog
@@ -238,7 +239,10 @@ def _capture_branch(source: Path, folder: Path) -> State:
 
 
 def _branches(home: Path) -> list[str]:
-    return sorted(marker.parent.name for marker in (home / BRANCHES).glob(f"*/{BRANCH_FILE}"))
+    """Names of the folders of branches; what leads elsewhere is none."""
+    root = home / BRANCHES
+    names = sorted(os.listdir(root)) if is_folder(root) else []
+    return [name for name in names if is_folder(root / name) and is_file(root / name / BRANCH_FILE)]
 
 
 def _stored(path: Path, folder: Path) -> StoredFile:
