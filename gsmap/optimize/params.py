@@ -150,8 +150,8 @@ class Limits:
     """Sizes beyond which something cheaper is done.
 
     Args:
-        full_scenes: maps of no more scenes than this are always solved in full, in less time than one scene's pairs take
-            to register, so that their poses do not depend on the order in which the scenes came.
+        full_scenes: maps of no more scenes than this are always solved in full, in less time than one scene's pairs
+            take to register, so that their poses do not depend on the order in which the scenes came.
         marginal_scenes: components of more scenes get no covariances (noted in the answer): gtsam's cost 1 ms a scene
             at 1,000 scenes, 8 ms at 10,000.
         exact_hops: shortest paths, in scenes times sources, beyond which hops between scenes are estimated from their
