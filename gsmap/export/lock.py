@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
+from gsmap.durable import make_folder
 from gsmap.errors import BusyError, StoreError
 from gsmap.types.holder import Holder, this_process
 
@@ -60,8 +61,8 @@ def _locked(out: Path, wait: bool, waiting: Callable[[str], None] | None) -> tup
     """The open lock file, None where there can be none; and whether the folder was made for it."""
     path, told, fresh = out / LOCK_FILE, False, False
     while True:
-        with suppress(FileExistsError):
-            out.mkdir(parents=True)
+        if not out.is_dir():
+            make_folder(out)
             fresh = True
         try:
             handle = _opened(path)

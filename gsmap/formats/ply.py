@@ -7,6 +7,7 @@ abort the process on a malformed header, or allocate whatever it claims.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -258,7 +259,8 @@ def is_compressed(header: Header) -> bool:
 
 
 def _read_ascii(path: str | os.PathLike[str], header: Header, element: Element, skip: int) -> np.ndarray:
-    with open(path, "rb") as file:
+    with open(path, "rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of lines without data, which are left out
         file.seek(header.data_offset)
         try:
             rows = np.loadtxt(file, element.dtype, comments=None, skiprows=skip, max_rows=element.count, ndmin=1)

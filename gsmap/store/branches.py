@@ -19,7 +19,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, delete, func, select, update
 
-from gsmap.durable import sync_file, sync_folder
+from gsmap.durable import is_file, is_folder, sync_file, sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
@@ -107,8 +107,8 @@ def places(home: Path) -> list[Place]:
     root = home / FOLDER
     found = []
     for folder in sorted(root.iterdir()) if root.is_dir() and not root.is_symlink() else ():
-        ours = _NAME.fullmatch(folder.name) and not folder.is_symlink() and (folder / sqlite.FILE).is_file()
-        if ours and (folder / _MARKER).is_file():
+        ours = _NAME.fullmatch(folder.name) and is_folder(folder) and is_file(folder / sqlite.FILE)
+        if ours and is_file(folder / _MARKER):
             found.append(Place(home, folder, folder.name, _told(folder)["kind"] == "tag"))
     return found
 
@@ -158,7 +158,7 @@ class Branches:
             tag: it can never change.
 
         Raises:
-            ConfigError: the name cannot be or is taken, or a path of that kind exists; a catalog that is no file.
+            ConfigError: the name cannot be or is taken, or a path of that kind exists.
             StoreError: the map's folder cannot be written.
         """
         home = self._place.home
@@ -166,8 +166,6 @@ class Branches:
         if folder.exists() or Path(f"{home}@{name}").exists():
             taken = "a branch or tag" if folder.exists() else f"the path {home}@{name}"
             raise ConfigError(f"{taken} of the name {name!r} exists already: choose another name")
-        if not self._catalog.is_sqlite:
-            raise ConfigError(f"the catalog of {home} is on a server: only a map with a map.sqlite can have branches")
         if not os.access(home, os.W_OK):
             raise StoreError(f"{home} cannot be written, so it can get no branch: copy it to where it can be")
         staged = folder.with_name(f".{name}.{uuid.uuid4().hex[:8]}")
@@ -176,7 +174,7 @@ class Branches:
             try:
                 _make_folder(staged.parent)
                 staged.mkdir()
-                sqlite.backup(self._catalog.engine, staged / sqlite.FILE)
+                self._copy_catalog(staged)
                 if (self._place.folder / _SETTINGS).is_file():
                     shutil.copyfile(self._place.folder / _SETTINGS, staged / _SETTINGS)
                     sync_file(staged / _SETTINGS)
@@ -220,6 +218,17 @@ class Branches:
                 shutil.rmtree(dead, ignore_errors=True)
         finally:
             catalog.engine.dispose()
+
+    def _copy_catalog(self, folder: Path) -> None:
+        """The catalog as a ``map.sqlite`` in a folder; also where that of the map is on a server."""
+        if self._catalog.is_sqlite:
+            sqlite.backup(self._catalog.engine, folder / sqlite.FILE)
+            return
+        from gsmap.store.copying import copy_catalog, empty_catalog
+
+        made = empty_catalog(folder)
+        copy_catalog(self._catalog, made)
+        made.close()
 
     def _named(self, name: str) -> Place:
         for place in places(self._place.home):
@@ -321,7 +330,7 @@ def _told(folder: Path) -> dict[str, str]:
             "kind": "tag" if told["kind"] == "tag" else "branch",
             **{k: str(told[k]) for k in ("parent", "created_at")},
         }
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {"kind": "tag", "parent": "", "created_at": ""}  # damaged: it is better not written to
 
 

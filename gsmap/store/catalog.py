@@ -270,8 +270,8 @@ class Catalog:
         try:
             with explained(self.folder):
                 sqlite.checkpoint(self.engine, self.folder / sqlite.FILE, at_bytes=at_bytes)
-        except CorruptError:
-            raise
+        except CorruptError as error:
+            raise CorruptError(f"{error}; what was written since is kept in its log") from error
         except StoreError as error:
             _log.warning("what was written is kept, but not yet folded into %s: %s", sqlite.FILE, error)
 

@@ -90,11 +90,17 @@ def load(file: Path) -> Digests | None:
 
 
 def save(file: Path, digests: Digests) -> None:
-    """Replace the digests of a database, durably; the note of an older gsmap goes."""
+    """Replace the digests of a database, durably; the note of an older gsmap goes, and what a kill left of an attempt.
+
+    One at a time: under the writer lock, or where nobody else knows of the database yet.
+    """
+    for left in file.parent.glob(f".{digests_of(file).name}.*"):
+        left.unlink()
     head = _HEADER.pack(digests.page_size, digests.count, digests.next_count, len(digests.next))
     body = b"".join([_MAGIC, head, digests.pages, *(_ENTRY.pack(*entry) for entry in sorted(digests.next.items()))])
     write_whole(digests_of(file), lambda staged: staged.write_bytes(body + _digest(body)))
     older_digest_of(file).unlink(missing_ok=True)
+    older_digest_of(file).with_name(f".{older_digest_of(file).name}").unlink(missing_ok=True)
 
 
 def note(file: Path) -> None:

@@ -140,7 +140,7 @@ def _sqlite_said(code: int, folder: Path) -> _Said:
     if primary == sqlite3.SQLITE_FULL:
         return _FULL
     if primary in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-        found = sqlite.structure_damage(folder / sqlite.FILE)  # nothing is called damaged on one code's word
+        found = sqlite.damage(folder / sqlite.FILE)  # nothing is called damaged on one code's word
         if found:
             return CorruptError, f"the catalog is damaged: {summary(found)}", "restore map.sqlite from a backup"
         return StoreError, "the catalog could not be read", "its bytes are as they were written: try again"

@@ -160,6 +160,7 @@ def overwrite(catalog: Catalog) -> None:
     with catalog.lock(), explained(catalog.folder):
         if not catalog.is_sqlite:
             with catalog.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+                connection.execute(text("SET lock_timeout = '60s'"))  # it waits for all who read
                 connection.execute(text("VACUUM FULL"))
             return
         file = catalog.folder / sqlite.FILE

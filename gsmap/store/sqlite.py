@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 from sqlalchemy import Connection, Engine, NullPool, PoolProxiedConnection, QueuePool, create_engine, event
 
-from gsmap.durable import open_file
+from gsmap.durable import is_file, open_file
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store import digests
 from gsmap.store.handles import Handle
@@ -99,6 +99,7 @@ def engine(file: Path, *, writable: bool) -> Engine:
     Write transactions (`WRITE` in the execution options) begin IMMEDIATE: a deferred one that turns into a writer
     fails at once when another has written meanwhile, whatever the busy timeout. As many threads may use it as like.
     """
+    refuse_strange_files(file)
     uri = f"{file.resolve().as_uri()}?mode={'rw' if writable else 'ro'}"
     anchor = _Anchor(file)
 
@@ -187,11 +188,16 @@ def create_file(file: Path) -> None:
     digests.note(file)
 
 
-def refuse_super_journal(file: Path) -> None:
-    """Refuse a rollback journal that names a super-journal: SQLite would delete the file that it names.
+def refuse_strange_files(file: Path) -> None:
+    """Refuse a database that SQLite would come to other files by: a link in the place of one of its own files, or a
+    rollback journal that names a super-journal, which SQLite would delete.
 
-    gsmap's databases are in WAL mode and never attached to one another, so it is not of its making.
+    gsmap's databases are in WAL mode and never attached to one another, so such a journal is not of its making.
     """
+    for ending in ("", "-wal", "-shm", "-journal"):
+        path = file.with_name(file.name + ending)
+        if os.path.lexists(path) and not is_file(path):
+            raise CorruptError(f"{path} is a link, a pipe or a device: gsmap makes none; put a file in its place")
     journal = file.with_name(f"{file.name}-journal")
     try:
         with open(open_file(journal), "rb") as opened:
@@ -243,6 +249,18 @@ def file_problems(file: Path) -> list[str]:
     except sqlite3.DatabaseError as error:
         return [str(error)]
     return ([] if rows == ["ok"] else rows) + [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in odd]
+
+
+def damage(file: Path) -> list[str]:
+    """What is wrong with a file, by the digests of its pages or else by SQLite's own look; empty for a sound one."""
+    with contextlib.suppress(OSError), contextlib.closing(Handle(file)) as opened:
+        try:
+            found = digests.problems(file, opened, digests.load(file), read_log(log_of(file)))
+        except CorruptError as error:
+            found = [str(error)]
+        if found:
+            return found
+    return structure_damage(file)
 
 
 def structure_damage(file: Path) -> list[str]:

@@ -14,7 +14,7 @@ from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
-from gsmap.store import branches, integrity, migrate, schema, sqlite, staging, trust
+from gsmap.store import branches, integrity, migrate, schema, staging, trust
 from gsmap.store import catalog as _catalog
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
@@ -310,7 +310,6 @@ def _refuse_strange_entries(folder: Path) -> None:
                 raise CorruptError(
                     f"{folder / name} is {what}: gsmap makes none in a map; put what belongs there in its place"
                 )
-    sqlite.refuse_super_journal(folder / sqlite.FILE)
 
 
 def _make_catalog(folder: Path, url: str | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -10,13 +11,14 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
-from gsmap.durable import write_whole
+from gsmap.durable import open_file, write_whole
 from gsmap.errors import ConfigError, StoreError
 from gsmap.store import facts
 from gsmap.store import scenes as scene_rows
 from gsmap.store.arrays import Staged, StoredFile, link_or_copy
 from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.groups import has_group, manifest, name, publish
+from gsmap.store.models import model_path
 from gsmap.store.schema import (
     graphs,
     groups,
@@ -322,9 +324,12 @@ class Transfer:
                         f"model {row.name} stays the one of this map: graphs made with the other are stale"
                     )
             elif taken_back.get((row.name, row.sha256), "") < row.created_at:
-                if row.copied and not (self.into.home / row.path).is_file():
-                    (self.into.home / row.path).parent.mkdir(exist_ok=True)
-                    write_whole(self.into.home / row.path, partial(link_or_copy, self.source.home / row.path))
+                place = model_path(self.into.home, row)  # the other map may be a stranger's
+                if row.copied and not place.is_file():
+                    place.parent.mkdir(exist_ok=True)
+                    source = model_path(self.source.home, row)
+                    os.close(open_file(source))  # a plain file
+                    write_whole(place, partial(link_or_copy, source))
                 self.ours.execute(insert(models), _content(row))
                 self.counts["models"] += 1
                 self.notes.append(f"model {row.name} came along: graphs made without it are out of date")

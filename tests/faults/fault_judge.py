@@ -28,6 +28,11 @@ _PASSING = {
     "since",
     "snapshot",
 }
+# A merge puts what was said in two maps in one order of time, under new numbers.
+_RENUMBERED = {
+    *(("scene_facts", "number"), ("reviews", "number"), ("reviews", "registration")),
+    *(("registrations", "number"), ("registrations", "adopts")),
+}
 _LEFT_OUT = {"leases", "sqlite_sequence", "backups"}
 ALARM = re.compile(r"damaged|restore\b|corrupt|malformed", re.IGNORECASE)
 UNCHANGED = re.compile(r"nothing (was|has been) (changed|written|stored)", re.IGNORECASE)
@@ -105,7 +110,10 @@ def _rows(catalog: Path, place: str) -> dict[str, str]:
             for row in connection.execute(f'SELECT * FROM "{table}"'):
                 values = {name: _plain(row[name]) for name in row.keys()}  # noqa: SIM118
                 like = {name: _likeness(table, name, value) for name, value in values.items()}
-                out[json.dumps([place, table, values], sort_keys=True)] = json.dumps(
+                exact = {
+                    name: "*" if (table, name) in _RENUMBERED and value else value for name, value in values.items()
+                }
+                out[json.dumps([place, table, exact], sort_keys=True)] = json.dumps(
                     [place, table, like], sort_keys=True
                 )
         connection.close()

@@ -16,7 +16,7 @@ from gsmap import formats
 from gsmap.cli import app
 from gsmap.types import Gaussians
 
-OLDER = Path(__file__).resolve().parents[1] / "store" / "schema_0001.tar.xz"
+OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
 
 
@@ -111,7 +111,7 @@ VERBS = {
         Verb("branch-delete", "branched", "branch MAP what-if --delete", done_says="no branch"),
         Verb("tag", "placed", "tag MAP handover", done_says="exists already"),
         Verb("merge", "two", "merge MAP HERE/other.gsmap"),
-        Verb("split", "placed", "split MAP HERE/part.gsmap --scenes a", done_says="already"),
+        Verb("split", "placed", "split MAP HERE/part.gsmap --scenes a", done_says="exists already"),
     )
 }
 """Verbs by name. A verb that is new is one line here."""

@@ -135,7 +135,7 @@ def options(examples: int, steps: int) -> settings:
 
 
 class TestSite(Site.TestCase):
-    settings = options(3, 5)
+    settings = options(2, 4)
 
 
 @pytest.mark.slow

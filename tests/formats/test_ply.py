@@ -273,3 +273,10 @@ def test_further_properties_ride_along_and_are_skipped_when_read(tmp_path):
     header, body = content.split(b"end_header\n")
     assert header.endswith(b"property float scene\n")
     np.testing.assert_array_equal(np.frombuffer(body, "<f4").reshape(n, -1)[:, -1], np.arange(n) % 2)
+
+
+@pytest.mark.filterwarnings("error")
+def test_lines_without_data_among_ascii_rows_are_left_out_in_silence(tmp_path):
+    text = BASE.format(2).replace("binary_little_endian", "ascii") + "end_header\n"
+    (tmp_path / "a.ply").write_text(text + "1 " * 14 + "\n\n \n" + "2 " * 14 + "\n")
+    np.testing.assert_array_equal(read(tmp_path / "a.ply").means[:, 0], [1, 2])

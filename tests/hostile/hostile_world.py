@@ -17,7 +17,7 @@ import gsmap.map
 from gsmap import formats
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.methods import RecipeKey
-from gsmap.store import Store
+from gsmap.store import Store, digests
 from gsmap.types import Cameras, Gaussians, NodeLayer, PoseGraph, Prior, Registration, SceneGraph, ScenePose, Sim3
 
 MAX_MEMORY = 6 << 30  # of address space beyond what is mapped already; far below what a bomb would take
@@ -121,6 +121,7 @@ class World:
     @classmethod
     def copied(cls, good: Path, root: Path) -> World:
         shutil.copytree(good, root, dirs_exist_ok=True)
+        shutil.copytree(root / "home" / "mine.gsmap", root / "into.gsmap")
         return cls(root)
 
     def id_of(self, name: str = "a") -> str:
@@ -146,6 +147,7 @@ class World:
         finally:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             connection.close()
+            digests.note(self.map / "map.sqlite")  # a stranger has gsmap, too
 
     def set(self, statement: str, *values: object) -> None:
         with self.sql() as connection:

@@ -15,6 +15,7 @@ from typing import NoReturn
 import hostile_arrays
 import hostile_catalogs
 import hostile_files
+import hostile_values
 import pytest
 from hostile_world import CASES, MAX_MEMORY, VERBS, Case, World, everything_in
 
@@ -27,6 +28,7 @@ from gsmap.texts import escaped
 assert hostile_arrays
 assert hostile_catalogs
 assert hostile_files
+assert hostile_values
 
 _LIMIT_S = 60
 _RAW = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]|\xc2[\x80-\x9f]|\xe2\x80[\xaa-\xae]")
@@ -134,12 +136,15 @@ def test_nothing_outside_is_touched(
         "HOME": world.home,
         "CAPTURES": world.captures,
         "IDA": world.id_of("a"),
+        "INTO": world.root / "into.gsmap",
     }
     hostile_case.plant(world)
     before = everything_in(world.home)
     said, failed = b"", {}
     for line in hostile_case.verbs or VERBS:
-        words = [re.sub(r"^(MAP|TILES|HOME|CAPTURES|IDA)", lambda m: str(places[m[0]]), w) for w in line.split(" ")]
+        words = [
+            re.sub(r"^(MAP|TILES|HOME|CAPTURES|IDA|INTO)", lambda m: str(places[m[0]]), w) for w in line.split(" ")
+        ]
         code, output = run(words)
         assert code in (0, 1, 2), (line, code, output)
         assert not _RAW.search(output), (line, output)

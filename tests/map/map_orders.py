@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import combinations
@@ -136,11 +136,23 @@ def pairs_remembered() -> Iterator[Callable[[], AbstractContextManager[None]]]:
     run_jobs = register_stage.run_jobs
     anew = False
 
-    def remembering(function: Any, jobs: Sequence[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
-        new = [k for k, job in enumerate(jobs) if anew or job[1:] not in known]
-        for i, edge in run_jobs(function, [jobs[k] for k in new], params):
-            known[jobs[new[i]][1:]] = edge
-        yield from ((k, known[job[1:]]) for k, job in enumerate(jobs))
+    def remembering(function: Any, jobs: Iterable[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
+        asked: list[tuple[Any, ...]] = []
+
+        def noted() -> Iterator[tuple[Any, ...]]:
+            for job in jobs:  # taken one by one, as there is room
+                asked.append(job[1:])
+                yield job
+
+        if anew:
+            for i, edge in run_jobs(function, noted(), params):
+                known[asked[i]] = edge
+                yield i, edge
+            return
+        for i, job in enumerate(noted()):
+            if asked[i] not in known:
+                ((_, known[asked[i]]),) = run_jobs(function, [job], params)
+            yield i, known[asked[i]]
 
     @contextmanager
     def registering_anew() -> Iterator[None]:

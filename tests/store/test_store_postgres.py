@@ -52,6 +52,7 @@ def test_the_whole_store_on_postgres(tmp_path, postgres_database):
         assert store.prune().scenes == ()
         assert store.prune(keep_revisions=0).scenes == ("a-2",)
         assert store.check().ok
+        assert "PostgreSQL" in store.check().unverified[0]
     with pytest.raises(StoreError, match="holds a map already"):
         Store.create(tmp_path / "other", catalog_url=postgres_database)
     assert not (tmp_path / "other").exists()

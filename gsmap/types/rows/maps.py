@@ -229,7 +229,7 @@ class ViewReport(Row):
     """The page that is being served.
 
     Args:
-        url: where it is, on this machine only.
+        url: where it is, on this machine only, with the token that opens it.
     """
 
     columns: ClassVar[Mapping[str, str]] = {"url": "page"}
