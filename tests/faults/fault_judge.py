@@ -33,7 +33,7 @@ _RENUMBERED = {
     *(("scene_facts", "number"), ("reviews", "number"), ("reviews", "registration")),
     *(("registrations", "number"), ("registrations", "adopts")),
 }
-_RANDOM = {("about", "id"), ("revisions", "provenance")}  # which names the map of a part by its random id
+_RANDOM = {("about", "id"), ("revisions", "origin")}  # an origin names maps by their random ids
 _LEFT_OUT = {"leases", "sqlite_sequence", "backups"}
 ALARM = re.compile(r"damaged|restore\b|corrupt|malformed", re.IGNORECASE)
 UNCHANGED = re.compile(r"nothing (was|has been) (changed|written|stored)", re.IGNORECASE)
