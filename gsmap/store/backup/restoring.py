@@ -26,7 +26,7 @@ from gsmap.errors import (
     StoreError,
 )
 from gsmap.store import catalog as _catalog
-from gsmap.store import migrate, schema, sqlite, trust
+from gsmap.store import migrate, schema, sqlite, staging, trust
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
@@ -166,15 +166,10 @@ def _free(path: str | os.PathLike[str]) -> Path:
 
 @contextlib.contextmanager
 def _staged(target: Path) -> Iterator[Path]:
-    """An empty folder beside the target, on the same disk; whatever is left of it at the end is deleted."""
-    folder = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        with _writing(target):
-            folder.mkdir()
-            (folder / ARRAYS).mkdir()
-            yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    """A folder beside the target, on the same disk; what is left of it goes at the end, or with the next one."""
+    with _writing(target), staging.beside(target) as folder:
+        (folder / ARRAYS).mkdir()
+        yield folder
 
 
 def _fetch_all(backup: Backup, files: list[StoredFile], folder: Path, progress: Progress) -> None:
