@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 import tempfile
@@ -82,7 +83,10 @@ def compare(place: str, captures: Captures, args: argparse.Namespace, folder: Pa
     at.mkdir()
     described = Described.of(at / "described.gsmap", captures)
     rng, names = np.random.default_rng(args.seed), list(captures)
-    orders = [names] + [[names[k] for k in rng.permutation(len(names))] for _ in range(args.orders - 1)]
+    orders = [names]
+    while len(orders) < min(args.orders, math.factorial(len(names))):
+        order = [names[k] for k in rng.permutation(len(names))]
+        orders += [order] if order not in orders else []
     rows: list[Row] = []
     first: Outcome | None = None
     print(f"{place}: {len(names)} captures, {sum(len(g) for g, _ in captures.values())} Gaussians", flush=True)

@@ -149,7 +149,9 @@ def image_encoder() -> bytes:
 
 
 def pack(path: Path, out: Path) -> None:
-    def nobody(entry: tarfile.TarInfo) -> tarfile.TarInfo:
+    def nobody(entry: tarfile.TarInfo) -> tarfile.TarInfo | None:
+        if entry.name.endswith("-shm") or (entry.name.endswith("-wal") and entry.size == 0):
+            return None  # nothing that a closed map needs
         entry.uid = entry.gid = 0
         entry.uname = entry.gname = ""
         return entry

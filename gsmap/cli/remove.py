@@ -49,7 +49,7 @@ def command(
 def _tell(report: PurgeReport, map: str) -> None:
     """What is left to do, and by which command."""
     for name in report.branches:
-        say(f"{name} still has it: gsmap remove {map} {report.scene} --purge --branches")
+        say(f"{name} still has it: gsmap remove {map} {report.scene_id} --purge --branches")
     for name in report.backups:
         say(f"the backup {name} may hold it")
     for name in report.exports:

@@ -39,7 +39,7 @@ def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
         merged = merging.merge(store, other)
     return MergeReport(
         map=store.location,
-        source=os.fspath(source),
+        from_map=os.fspath(source),
         num_scenes=merged.scenes,
         num_removed=merged.removed,
         num_known=merged.known,
@@ -72,7 +72,7 @@ def split(store: Store, out: str | os.PathLike[str], chosen: Sequence[str]) -> S
         sync_folder(folder.parent)
     return SplitReport(
         map=os.fspath(out),
-        source=store.location,
+        from_map=store.location,
         scene_names=names,
         num_graphs=merged.graphs,
         num_registrations=merged.registrations,
@@ -131,7 +131,7 @@ def purge_report(purged: Sequence[tuple[str, Purge]]) -> PurgeReport:
         rows.update(one.receipt["rows"])
     maps = tuple(dict.fromkeys(location for location, _ in purged))
     return PurgeReport(
-        scene=purged[0][1].scene,
+        scene_id=purged[0][1].scene,
         maps=maps,
         num_rows=dict(rows),
         num_groups=total("num_groups"),

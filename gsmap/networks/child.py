@@ -8,6 +8,7 @@ Nothing that is received is executed.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import mmap
 import os
@@ -117,7 +118,7 @@ class Channel:
 def main(link: int, shared: int, path: str, memory_bytes: int) -> None:
     """Load the model, say what it takes and gives, then run it as often as asked."""
     channel = Channel(socket.socket(fileno=link), shared)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _end_with_parent()
     # Of all processes this one goes first when the machine runs out of memory.
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
         file.write("1000")
@@ -160,9 +161,16 @@ def _limit(memory_bytes: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """Its end of the pipe closes however the parent ends, SIGKILL included."""
-    os.read(0, 1)
-    os._exit(0)
+    """Its end of the pipe closes however the parent ends, SIGKILL included, and that ends this process."""
+    if sys.platform.startswith("linux"):  # by the kernel's hand, whatever keeps the threads here
+        fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(0, fcntl.F_SETFL, fcntl.fcntl(0, fcntl.F_GETFL) | os.O_ASYNC)
+
+    def wait() -> None:
+        os.read(0, 1)
+        os._exit(0)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _problem(error: BaseException) -> dict[str, Any]:

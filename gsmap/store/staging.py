@@ -17,7 +17,7 @@ _STAGED = r"\.{name}\.[0-9a-f]{{8}}"
 # Files that are replaced in one step (`gsmap.durable.write_whole`), and how old one must be to be nobody's.
 _STAGED_FILE = re.compile(r"\.(settings\.toml|catalog\.url|map\.sqlite[a-z0-9.]*)\.[0-9a-f]{8}|\.map\.sqlite\.sha256")
 _ABANDONED_S = 60.0
-_PART = re.compile(r"arrays|lock|\.?(map\.sqlite|catalog\.url).*")  # of a map that is being made
+_PART = re.compile(r"arrays|models|branches|lock|\.?(map\.sqlite|catalog\.url|settings\.toml).*")  # of a map
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from hostile_world import everything_in, make_cameras, make_gaussians
 
 from gsmap import durable
 from gsmap.errors import ConfigError, CorruptError, StoreError
-from gsmap.store import Store, layout, trust
+from gsmap.store import Store, layout, sqlite, trust
 from gsmap.store.arrays import Arrays
 from gsmap.texts import control_characters, escaped
 
@@ -176,6 +176,17 @@ def test_only_postgresql_holds_a_catalog(tmp_path):
     with pytest.raises(ConfigError, match="PostgreSQL"):
         Store.create(tmp_path / "m", catalog_url=f"sqlite:///{tmp_path}/other.sqlite")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", ["", "-wal", "-shm", "-journal"])
+def test_sqlite_opens_no_link(tmp_path, home, ending):
+    """Branches and others are opened without opening a store."""
+    sqlite.create_file(tmp_path / "map.sqlite")
+    file = tmp_path / f"map.sqlite{ending}"
+    file.unlink(missing_ok=True)
+    file.symlink_to(home / "photos" / "1.jpg")
+    with pytest.raises(CorruptError, match="is a link"):
+        sqlite.engine(tmp_path / "map.sqlite", writable=False)
 
 
 def test_texts():

@@ -106,6 +106,16 @@ def test_everything_in_it_is_listed_and_shown(opened: Map) -> None:
     assert opened.status().scenes == len(scenes)
 
 
+def test_its_branches_and_tags_open(site: Path) -> None:
+    names = sorted(path.name for path in (site / "branches").glob("*"))
+    for path in (str(site), *(f"{site}@{name}" for name in names)):
+        if version(site / "branches" / path.rpartition("@")[2] if "@" in path else site) < schema.HEAD:
+            gsmap.map.migrate(path)
+        with gsmap.map.open(path) as m:
+            assert m.scene_rows()
+            assert m.check().problems == ()
+
+
 def test_it_is_exported_edited_and_updated(opened: Map, tmp_path: Path) -> None:
     first = opened.export(tmp_path / "tiles", tile_size_m=0, merge="voxel")
     assert sum(tile.num_gaussians for tile in first.tiles) > 0

@@ -12,7 +12,7 @@ import pytest
 from store_backups import fill, holdings
 from store_samples import make_cameras, make_gaussians
 
-from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
+from gsmap.errors import ConfigError, CorruptError, DiskFullError, NotFoundError, StoreError
 from gsmap.store import Store
 from gsmap.store.backup import Backup, restore, save
 from gsmap.store.backup import saving as saving_module
@@ -383,13 +383,13 @@ def test_a_full_disk(filled, tmp_path):
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "none", disk], capture_output=True).returncode:
         pytest.skip("needs the right to mount a small file system")
     try:
-        with pytest.raises(StoreError, match="disk is full"):
+        with pytest.raises(DiskFullError, match="disk is full"):
             save(filled, FolderPlace(disk / "backup"))
         assert not list((disk / "backup" / "snapshots").glob("*"))
         subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
         save(filled, FolderPlace(disk / "backup"))
         subprocess.run(["mount", "-o", "remount,size=700k", disk], check=True)
-        with pytest.raises(StoreError, match=r"room for|disk is full"):
+        with pytest.raises(DiskFullError, match=r"room for|disk is full"):
             restore(FolderPlace(disk / "backup"), disk / "r")
         assert sorted(p.name for p in disk.iterdir()) == ["backup"]
     finally:

@@ -2,24 +2,21 @@
 
 import random
 import shutil
-import sqlite3
 import sys
 from pathlib import Path
 
 import pytest
 import store_children
+from page_samples import PAGE, fill, flip
 from store_children import messages
-from store_samples import make_cameras, make_gaussians
 
-from gsmap.errors import CorruptError, StoreError
+from gsmap.errors import CorruptError
 from gsmap.store import Store, digests, sqlite
 from gsmap.store.handles import Handle
-from gsmap.store.wal import index_note, log_of, read_log
+from gsmap.store.wal import log_of, read_log
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import check_flips
-
-PAGE = 4096
 
 
 @pytest.fixture
@@ -28,19 +25,6 @@ def closed(tmp_path):
     path = tmp_path / "site.gsmap"
     check_flips.make_map(path)
     return path
-
-
-def fill(store: Store, count: int = 3) -> None:
-    for i in range(count):
-        store.exports.begin(f"/out/{i}", revision=None, settings={"x": "y" * 9000})
-
-
-def flip(file: Path, offset: int) -> None:
-    with open(file, "rb+") as opened:
-        opened.seek(offset)
-        byte = opened.read(1)[0]
-        opened.seek(offset)
-        opened.write(bytes([byte ^ 4]))
 
 
 @pytest.mark.parametrize("count", [12, pytest.param(200, marks=pytest.mark.slow)])
@@ -169,6 +153,37 @@ def test_killed_anywhere_in_a_fold(closed, tmp_path, monkeypatch):
             assert store.check().problems == ()
 
 
+def test_a_catalog_that_shrinks(closed, tmp_path, monkeypatch):
+    with Store.open(closed) as store:
+        fill(store, 8)
+    with Store.open(closed) as store:
+        store.exports.begin("/out/more", revision=None)
+        with store.catalog.write() as connection:
+            connection.exec_driver_sql("DELETE FROM exports")
+    before = (closed / sqlite.FILE).stat().st_size
+    store = Store.open(closed)
+    raw = store.catalog.engine.raw_connection()
+    raw.driver_connection.execute("VACUUM")
+    raw.close()
+    real = sqlite._folded
+
+    def folded(engine):
+        shutil.copytree(closed, tmp_path / "before")
+        done = real(engine)
+        shutil.copytree(closed, tmp_path / "after")
+        return done
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sqlite, "_folded", folded)
+        store.close()
+    assert (closed / sqlite.FILE).stat().st_size < before
+    for path in (tmp_path / "before", tmp_path / "after", closed):
+        for mode in "rwr":
+            with Store.open(path, mode) as store:
+                assert store.check().problems == ()
+                assert len(store.scenes.list()) == 2
+
+
 def test_a_page_that_was_folded_in_is_verified_without_the_log(closed, tmp_path, monkeypatch):
     """Killed between the fold and its last note, pages may be old or new, and nothing else."""
     stage = stages_of_a_fold(closed, tmp_path / "stages", monkeypatch)[2]
@@ -286,149 +301,6 @@ def test_more_threads_than_connections_are_kept(store, two_scenes):
         assert list(pool.map(count, range(12))) == [2] * 12
 
 
-# --- the log ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def killed(tmp_path):
-    """A map whose writer was killed: a log with ten commits, and its index."""
-    path = tmp_path / "site.gsmap"
-    Store.create(path).close()
-    store = Store.open(path)
-    fill(store, 10)
-    shutil.copytree(path, tmp_path / "killed.gsmap")
-    store.close()
-    return tmp_path / "killed.gsmap"
-
-
-@pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.slow)])
-def test_a_flip_in_the_log_is_found(killed, count):
-    log = log_of(killed / sqlite.FILE)
-    rng = random.Random(1)
-    for _ in range(count):
-        at = rng.randrange(log.stat().st_size)
-        flip(log, at)
-        with pytest.raises(CorruptError, match="in its log"):
-            Store.open(killed)
-        flip(log, at)
-    with Store.open(killed) as store:
-        assert len(store.exports.list()) == 10
-
-
-def test_a_torn_end_of_the_log_is_no_damage(killed):
-    """A power cut leaves what was not synchronised in any order; it was not acknowledged either."""
-    log = log_of(killed / sqlite.FILE)
-    log.with_name("map.sqlite-shm").unlink()
-    whole = log.read_bytes()
-    frame = PAGE + 24
-    commits = [i for i in range(32, len(whole), frame) if int.from_bytes(whole[i + 4 : i + 8], "big")]
-    last = range(commits[-2] + frame, len(whole), frame)
-    assert len(last) > 2
-    for lost in last:
-        log.write_bytes(whole[:lost] + bytes(frame) + whole[lost + frame :])
-        assert read_log(log).problem == ""
-    for cut in (len(whole) - 1, len(whole) - 3 * frame - 100, 32, 20, 0):
-        log.write_bytes(whole[:cut])
-        assert read_log(log).problem == ""
-    log.write_bytes(whole[: last[0] + 50])
-    with Store.open(killed) as store:
-        assert len(store.exports.list()) == 9
-        assert store.check().ok
-
-
-def test_the_log_is_read_as_sqlite_reads_it(killed):
-    file = killed / sqlite.FILE
-    log = read_log(log_of(file), index_note(file))
-    content = bytearray(file.read_bytes().ljust(log.num_pages * PAGE, b"\0"))
-    frames = log_of(file).read_bytes()
-    for number, at in log.frames.items():
-        content[(number - 1) * PAGE : number * PAGE] = frames[at : at + PAGE]
-    with sqlite3.connect(file) as connection:
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    connection.close()
-    assert file.read_bytes() == content
-
-
-# --- maps without digests, and a person's word -----------------------------------------------------------------------
-
-
-def without_digests(path: Path) -> None:
-    digests.digests_of(path / sqlite.FILE).unlink()
-
-
-def test_what_cannot_be_verified_is_said(closed):
-    without_digests(closed)
-    with Store.open(closed, "r") as store:
-        report = store.check()
-    assert report.ok
-    assert "older gsmap" in report.unverified[0]
-    with Store.open(closed) as store:
-        store.scenes.edit("monday", note="a write")
-    with Store.open(closed, "r") as store:
-        assert store.check().unverified == ()
-
-
-def test_the_note_of_an_older_gsmap_counts_until_the_next_write(closed):
-    import hashlib
-    import json
-
-    file = closed / sqlite.FILE
-    without_digests(closed)
-    note, stamp = digests.older_digest_of(file), file.stat()
-    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
-    note.write_text(json.dumps({"sha256": sha256, "size_bytes": stamp.st_size, "mtime_ns": stamp.st_mtime_ns}))
-    Store.open(closed, "r").close()
-    import os
-
-    flip(file, stamp.st_size - 50)
-    os.utime(file, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
-    with pytest.raises(CorruptError, match="differs from what gsmap wrote"):
-        Store.open(closed)
-    flip(file, stamp.st_size - 50)  # another time now
-    with Store.open(closed) as store:
-        assert note.exists()
-        store.scenes.edit("monday", note="a write")
-    assert not note.exists()
-    assert digests.load(file) is not None
-
-
-def test_damage_is_not_taken_for_what_was_written_where_there_are_no_digests(closed):
-    without_digests(closed)
-    file = closed / sqlite.FILE
-    store = Store.open(closed)
-    store.scenes.edit("monday", note="a write")
-    with open(file, "rb+") as opened:
-        opened.seek(4 * PAGE)
-        opened.write(b"\xff" * PAGE * 3)
-    with pytest.raises(CorruptError):
-        store.close()
-    assert not digests.digests_of(file).exists()
-
-
-def test_a_person_accepts_the_catalog(closed):
-    with sqlite3.connect(closed / sqlite.FILE) as connection:  # as the sqlite3 program does
-        connection.execute("UPDATE scenes SET name = 'renamed' WHERE name = 'monday'")
-    connection.close()
-    with pytest.raises(CorruptError, match=r"differ.* from what gsmap wrote.*--accept-catalog"):
-        Store.open(closed)
-    (said,) = Store.accept_catalog(closed)
-    assert "map.sqlite" in said
-    with Store.open(closed) as store:
-        assert [s.name for s in store.scenes.list()] == ["renamed", "tuesday"]
-        assert store.check().problems == ()
-    assert Store.accept_catalog(closed) == []
-
-
-def test_what_sqlite_finds_broken_cannot_be_accepted(closed):
-    noted = digests.load(closed / sqlite.FILE)
-    with open(closed / sqlite.FILE, "rb+") as opened:
-        opened.seek(4 * PAGE)
-        opened.write(b"\xff" * PAGE * 8)
-    with pytest.raises(StoreError):
-        Store.accept_catalog(closed)
-    assert digests.load(closed / sqlite.FILE) == noted
-
-
 def test_a_long_catalog_is_verified_by_check_alone(closed, monkeypatch):
     """Opening it takes no seconds then, and a write blesses no damage: neither in pages it changes nor in others."""
     monkeypatch.setattr(digests, "WHOLE_BYTES", 1000)
@@ -461,24 +333,3 @@ def test_digests_survive_their_own_format(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x", "x.digests"]
     assert digests.load(tmp_path / "x") == noted
     assert digests.pages([1, 2, 3, 7, 9, 10]) == "pages 1-3, 7, 9-10"
-
-
-def test_a_backup_that_was_put_back_is_known(closed):
-    file = closed / sqlite.FILE
-    with Store.open(closed) as store:
-        sqlite.backup(store.catalog.engine, closed / "map.sqlite.0002.bak")
-        store.scenes.edit("monday", name="renamed")
-    shutil.copyfile(closed / "map.sqlite.0002.bak", file)
-    with Store.open(closed, "r") as store:
-        assert store.scenes.list()[0].name == "monday"
-    with Store.open(closed) as store:
-        store.scenes.remove("monday")
-    with Store.open(closed) as store:
-        assert store.check().ok
-
-
-def test_adding_to_a_map_whose_log_was_left_behind(killed):
-    with Store.open(killed) as store:
-        store.scenes.add(make_gaussians(), make_cameras(), name="a")
-        assert store.check().ok
-    assert not log_of(killed / sqlite.FILE).exists()

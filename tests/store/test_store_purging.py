@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from sqlalchemy import event
 from store_children import changes_disk
 from store_samples import key, make_cameras, make_gaussians
 
@@ -82,6 +83,8 @@ def test_nothing_of_it_is_left(place):
     shutil.copy(place / "map.sqlite", place / "map.sqlite.0002.bak")  # what a migration left
     assert finds(place, NAME, NOTE, SOURCE, secret)
     with gsmap.map.open(place) as m:
+        # Some builds of SQLite overwrite what they delete by themselves.
+        event.listen(m.store.catalog.engine, "begin", lambda c: c.exec_driver_sql("PRAGMA secure_delete = OFF"))
         report = m.purge(NAME)
         assert [s.name for s in m.scenes()] == ["hall", "attic"]
         assert m.check().ok
@@ -92,7 +95,7 @@ def test_nothing_of_it_is_left(place):
     assert [t for t, lines in rows.items() if any(secret in str(v) for line in lines for v in line)] == ["purges"]
     (receipt,) = rows["purges"]
     assert NAME not in str(receipt)
-    assert report.scene == secret
+    assert report.scene_id == secret
     assert report.num_rows == {
         **{"scenes": 1, "graphs": 1, "registrations": 2, "reviews": 1, "poses": 2, "edges": 2, "priors": 1},
         **{"facts": 6, "leases": 0, "tiles": 0, "revisions": 2},
@@ -209,7 +212,7 @@ def test_tiles_made_with_it_go(place, tmp_path):
         assert not (out / ".partial").exists()
         assert json.loads((out / "tiles.json").read_text())["tiles"] == []
         assert sorted(foreign.rglob("*")) == kept
-        assert finds(out, NAME, report.scene) == []
+        assert finds(out, NAME, report.scene_id) == []
         m.export(out, tile_size_m=0, merge="union")
         assert len(list(out.rglob("*.ply"))) == 1
 

@@ -10,7 +10,7 @@ from store_backups import PASSING, files_of, fill, holdings, make_snapshot, put,
 from store_older import check_all, unpack
 from store_samples import make_cameras, make_gaussians
 
-from gsmap.errors import CorruptError, NotFoundError, SchemaVersionError, StoreError
+from gsmap.errors import CorruptError, DiskError, NotFoundError, SchemaVersionError, StoreError
 from gsmap.store import Store
 from gsmap.store.backup import Backup, clone, restore, save
 from gsmap.store.backup import restoring as restoring_module
@@ -359,3 +359,19 @@ def test_a_clone_of_a_map_in_postgres(tmp_path, postgres_database):
         assert (tmp_path / "c" / "map.sqlite").is_file()
         assert [scene.name for scene in store.scenes.list()] == ["a", "b"]
         assert store.check().ok
+
+
+def test_a_disk_that_fails_when_all_is_in_place(site, place, tmp_path, monkeypatch):
+    with Store.open(site) as store:
+        save(store, place)
+    whole = restoring_module.sync_folder
+
+    def fail(folder):
+        if folder == tmp_path:
+            raise OSError(5, os.strerror(5))
+        whole(folder)
+
+    monkeypatch.setattr(restoring_module, "sync_folder", fail)
+    with pytest.raises(DiskError, match="in place and whole"):
+        restore(place, tmp_path / "r")
+    assert holdings(tmp_path / "r") == holdings(site)

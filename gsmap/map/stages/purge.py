@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gsmap.durable import remove_file, remove_tree
 from gsmap.errors import GsmapError, NotFoundError
+from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.write import STAGING
 from gsmap.store import Store, purging
@@ -76,7 +77,12 @@ def _finish(store: Store, begun: Purge) -> Purge:
     tiles = _Tiles()
     for target in begun.receipt["pending"]["targets"]:
         try:
-            _clean(store, Path(target), begun.scene, tiles)
+            out = Path(target)
+            if os.path.lexists(out / FILE_NAME):
+                with folder_lock(out):
+                    _clean(store, out, begun.scene, tiles)
+            else:
+                tiles.unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME}")
         except (OSError, GsmapError) as error:
             tiles.unreachable.append(f"{target}: {error}")
     gone = {"tile_files": tiles.tile_files, "cleaned": tiles.cleaned, "unreachable": tiles.unreachable}
@@ -85,12 +91,9 @@ def _finish(store: Store, begun: Purge) -> Purge:
 
 def _clean(store: Store, out: Path, scene: str, found: _Tiles) -> None:
     """Delete the tiles of one folder that were made with a scene; only in a folder that holds this map's export."""
-    if not os.path.lexists(out / FILE_NAME):
-        found.unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME}")
-        return
     manifest = Manifest.load(out, store.id)
     made_with_it = {at: tile for at, tile in manifest.tiles.items() if scene in tile.poses}
-    remove_tree(out, STAGING)  # what an interrupted export left may be such a tile; a running one is to begin anew
+    remove_tree(out, STAGING)  # what an interrupted export left may be such a tile
     for tile in made_with_it.values():
         if tile.path:
             remove_file(out, *tile.path.split("/"))

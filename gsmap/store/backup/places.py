@@ -18,7 +18,16 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gsmap.durable import sync_folder
-from gsmap.errors import ConfigError, GsmapError, MissingDependencyError, NotFoundError, StoreError
+from gsmap.errors import (
+    ConfigError,
+    DiskError,
+    DiskFullError,
+    GsmapError,
+    MissingDependencyError,
+    NotFoundError,
+    ReadOnlyError,
+    StoreError,
+)
 
 CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
 SINGLE_PUT_BYTES = 64 << 20  # up to this size an object is one request; above, its parts appear as one at the end
@@ -202,9 +211,12 @@ class FolderPlace:
             raise
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise StoreError(
-                    f"{self.url}: the disk is full; make room and run it again: what is there is kept"
-                ) from (error)
+                text = f"{self.url}: the disk is full; make room and run it again: what is there is kept"
+                raise DiskFullError(text) from error
+            if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+                raise ReadOnlyError(f"{self.url} cannot be written or read here ({error.strerror})") from error
+            if error.errno == errno.EIO:
+                raise DiskError(f"{self.url}: the disk failed ({error.filename or error.strerror})") from error
             if error.errno == errno.ELOOP:
                 raise StoreError(f"{error.filename} is a link: a backup has none; it may lead anywhere") from error
             raise StoreError(f"{self.url}: {error.strerror or error} ({error.filename or 'no name'})") from error

@@ -16,9 +16,17 @@ from pathlib import Path
 from sqlalchemy import delete, inspect, null, select, text, update
 
 from gsmap.durable import sync_folder
-from gsmap.errors import CorruptError, GsmapError, NotFoundError, StoreError
+from gsmap.errors import (
+    CorruptError,
+    DiskError,
+    DiskFullError,
+    GsmapError,
+    NotFoundError,
+    ReadOnlyError,
+    StoreError,
+)
 from gsmap.store import catalog as _catalog
-from gsmap.store import migrate, schema, sqlite, trust
+from gsmap.store import migrate, schema, sqlite, staging, trust
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
@@ -32,6 +40,11 @@ from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
 
 _TRIES = 4  # states to begin with where others prune meanwhile
+_KINDS = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), DiskFullError),
+    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), ReadOnlyError),
+    errno.EIO: DiskError,
+}
 _log = logging.getLogger("gsmap.store")
 
 
@@ -103,6 +116,7 @@ def restore(
         _synchronise(folder)
         _put_in_place(folder, target)
         undo.pop_all()
+        _confirm(target)
     if catalog_url is not None:
         trust.remember(target)
     return Restored(target, chosen, state.schema)
@@ -126,6 +140,7 @@ def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silen
             _rename(folder, made.map_id)
             _synchronise(folder)
             _put_in_place(folder, target)
+            _confirm(target)
             _note(store, made)
             return made
     raise StoreError(f"{store.catalog.folder}: others pruned it faster than it could be copied; run it again")
@@ -151,15 +166,10 @@ def _free(path: str | os.PathLike[str]) -> Path:
 
 @contextlib.contextmanager
 def _staged(target: Path) -> Iterator[Path]:
-    """An empty folder beside the target, on the same disk; whatever is left of it at the end is deleted."""
-    folder = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        with _writing(target):
-            folder.mkdir()
-            (folder / ARRAYS).mkdir()
-            yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    """A folder beside the target, on the same disk; what is left of it goes at the end, or with the next one."""
+    with _writing(target), staging.beside(target) as folder:
+        (folder / ARRAYS).mkdir()
+        yield folder
 
 
 def _fetch_all(backup: Backup, files: list[StoredFile], folder: Path, progress: Progress) -> None:
@@ -309,7 +319,7 @@ def _own_catalog(folder: Path) -> Catalog:
 def _require_room(folder: Path, num_bytes: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < num_bytes:
-        raise StoreError(f"{folder} has room for {free / 1e6:.0f} MB, the map needs {num_bytes / 1e6:.0f} MB")
+        raise DiskFullError(f"{folder} has room for {free / 1e6:.0f} MB, the map needs {num_bytes / 1e6:.0f} MB")
 
 
 def _synchronise(folder: Path) -> None:
@@ -324,7 +334,16 @@ def _synchronise(folder: Path) -> None:
 
 def _put_in_place(folder: Path, target: Path) -> None:
     os.rename(folder, target)  # replaces nothing but an empty folder
-    sync_folder(target.parent)
+
+
+def _confirm(target: Path) -> None:
+    """Make the name survive a power cut; the map is there already, so that nothing is taken back."""
+    try:
+        sync_folder(target.parent)
+    except OSError as error:
+        raise DiskError(
+            f"{target} is in place and whole, but the disk did not confirm it ({error.strerror}): check the disk"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -333,4 +352,5 @@ def _writing(target: Path) -> Iterator[None]:
         yield
     except OSError as error:
         said = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-        raise StoreError(f"{target} was not made: {said}") from error
+        kind = _KINDS.get(error.errno or 0, StoreError)
+        raise kind(f"{target} was not made: {said}") from error

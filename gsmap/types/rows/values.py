@@ -49,7 +49,7 @@ class MergeReport(Row):
 
     Args:
         map: the map that took it in.
-        source: the map that it came from; that one is as it was.
+        from_map: the map that it came from; that one is as it was.
         num_scenes: scenes that are new here, or live again.
         num_removed: scenes that are removed here now, or came as removed ones of older revisions.
         num_known: scenes that both maps had.
@@ -77,7 +77,7 @@ class MergeReport(Row):
     }
 
     map: str
-    source: str
+    from_map: str
     num_scenes: int
     num_removed: int
     num_known: int
@@ -100,7 +100,7 @@ class SplitReport(Row):
 
     Args:
         map: its folder.
-        source: the map that it is part of; that one is as it was.
+        from_map: the map that it is part of; that one is as it was.
         scene_names: its scenes.
         num_graphs: their graphs.
         num_registrations: registrations of pairs among them.
@@ -118,7 +118,7 @@ class SplitReport(Row):
     }
 
     map: str
-    source: str
+    from_map: str
     scene_names: tuple[str, ...]
     num_graphs: int
     num_registrations: int
@@ -132,7 +132,7 @@ class PurgeReport(Row):
     """The receipt of a scene that was forgotten: what went, and where else it may live.
 
     Args:
-        scene: its id; nothing else of it is kept.
+        scene_id: its id; nothing else of it is kept.
         maps: the map and the branches that it was taken out of.
         num_rows: rows that went, by what they were.
         num_groups: groups of arrays that were deleted.
@@ -149,7 +149,7 @@ class PurgeReport(Row):
     """
 
     columns: ClassVar[Mapping[str, str]] = {
-        "scene": "scene",
+        "scene_id": "scene",
         "num_groups": "groups",
         "num_bytes": "bytes",
         "num_tiles": "tiles",
@@ -157,7 +157,7 @@ class PurgeReport(Row):
         "backups": "perhaps in",
     }
 
-    scene: str
+    scene_id: str
     maps: tuple[str, ...]
     num_rows: Mapping[str, int]
     num_groups: int

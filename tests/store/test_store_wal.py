@@ -1,0 +1,80 @@
+"""What a log holds is what SQLite finds in it; what SQLite would drop of it without a word is found."""
+
+import random
+import shutil
+import sqlite3
+
+import pytest
+from page_samples import PAGE, fill, flip
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.errors import CorruptError
+from gsmap.store import Store, sqlite
+from gsmap.store.wal import index_note, log_of, read_log
+
+
+@pytest.fixture
+def killed(tmp_path):
+    """A map whose writer was killed: a log with ten commits, and its index."""
+    path = tmp_path / "site.gsmap"
+    Store.create(path).close()
+    store = Store.open(path)
+    fill(store, 10)
+    shutil.copytree(path, tmp_path / "killed.gsmap")
+    store.close()
+    return tmp_path / "killed.gsmap"
+
+
+@pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_flip_in_the_log_is_found(killed, count):
+    log = log_of(killed / sqlite.FILE)
+    rng = random.Random(1)
+    for _ in range(count):
+        at = rng.randrange(log.stat().st_size)
+        flip(log, at)
+        with pytest.raises(CorruptError, match="in its log"):
+            Store.open(killed)
+        flip(log, at)
+    with Store.open(killed) as store:
+        assert len(store.exports.list()) == 10
+
+
+def test_a_torn_end_of_the_log_is_no_damage(killed):
+    """A power cut leaves what was not synchronised in any order; it was not acknowledged either."""
+    log = log_of(killed / sqlite.FILE)
+    log.with_name("map.sqlite-shm").unlink()
+    whole = log.read_bytes()
+    frame = PAGE + 24
+    commits = [i for i in range(32, len(whole), frame) if int.from_bytes(whole[i + 4 : i + 8], "big")]
+    last = range(commits[-2] + frame, len(whole), frame)
+    assert len(last) > 2
+    for lost in last:
+        log.write_bytes(whole[:lost] + bytes(frame) + whole[lost + frame :])
+        assert read_log(log).problem == ""
+    for cut in (len(whole) - 1, len(whole) - 3 * frame - 100, 32, 20, 0):
+        log.write_bytes(whole[:cut])
+        assert read_log(log).problem == ""
+    log.write_bytes(whole[: last[0] + 50])
+    with Store.open(killed) as store:
+        assert len(store.exports.list()) == 9
+        assert store.check().ok
+
+
+def test_the_log_is_read_as_sqlite_reads_it(killed):
+    file = killed / sqlite.FILE
+    log = read_log(log_of(file), index_note(file))
+    content = bytearray(file.read_bytes().ljust(log.num_pages * PAGE, b"\0"))
+    frames = log_of(file).read_bytes()
+    for number, at in log.frames.items():
+        content[(number - 1) * PAGE : number * PAGE] = frames[at : at + PAGE]
+    with sqlite3.connect(file) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+    assert file.read_bytes() == content
+
+
+def test_adding_to_a_map_whose_log_was_left_behind(killed):
+    with Store.open(killed) as store:
+        store.scenes.add(make_gaussians(), make_cameras(), name="a")
+        assert store.check().ok
+    assert not log_of(killed / sqlite.FILE).exists()
