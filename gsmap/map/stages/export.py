@@ -151,20 +151,23 @@ def _export(
     """The export itself, in a folder that is ours alone."""
     asked = plain(asdict(replace(request, merge=planned.method)))
     number: list[int] = []
-    refused = [] if store.catalog.writable else [f"{store.location} is read-only"]
+    refused = "" if store.catalog.writable else f"{store.location} is read-only"
     num_made = 0
 
+    def note(tile: Tile) -> None:
+        if not number:
+            number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
+        store.exports.add_tile(number[0], tile)
+
     def noted(tile: Tile) -> None:
-        nonlocal num_made
+        nonlocal num_made, refused
         num_made += 1
         if not tile.path or refused:  # nothing lies there, or nothing can be noted
             return
         try:
-            if not number:
-                number.append(store.exports.begin(out, revision=planned.revision, settings=asked))
-            store.exports.add_tile(number[0], tile)
+            note(tile)
         except (DiskFullError, ReadOnlyError) as error:
-            refused.append(str(error))
+            refused = str(error)
 
     with noting(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
         result = export_tiles(
@@ -179,14 +182,20 @@ def _export(
         )
     if planned.recipe.is_tileset and is_stale(out, result.tiles):
         write_tilesets(out, result.tiles, request.tile_size_m)
-    kept = {tile.path for tile in result.tiles}
-    if not refused and (gone := [tile.path for tile in store.exports.tiles(out) if tile.path not in kept]):
-        try:
-            store.exports.forget(out, gone)
+    if store.catalog.writable:
+        refused = ""
+        try:  # what an interrupted export, or one that could not be noted, left untold is told now
+            known = {tile.path: tile for tile in store.exports.tiles(out)}
+            for tile in result.tiles:
+                same = known.pop(tile.path, None)
+                if tile.path and (same is None or (same.key, same.sha256) != (tile.key, tile.sha256)):
+                    note(tile)
+            if known:
+                store.exports.forget(out, known)
         except (DiskFullError, ReadOnlyError) as error:
-            refused.append(str(error))
+            refused = str(error)
     if refused:
-        _log.warning("%s: the map does not know all of this export, so gsmap status cannot watch %s", refused[0], out)
+        _log.warning("%s: the map does not know all of this export, so gsmap status cannot watch %s", refused, out)
     return result
 
 
