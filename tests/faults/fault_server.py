@@ -26,6 +26,7 @@ from fault_shim import MODES, PASS, Shim, changes
 from fault_verbs import BASES, FUNCTIONS, VERBS, Verb, copy_map, words, write_samples
 
 from gsmap.cli.app import run
+from gsmap.errors import GsmapError
 from gsmap.store import Store
 
 PATIENCE_S = 120.0
@@ -220,8 +221,11 @@ class Server:
             out.repeat.append(f"ended otherwise than undisturbed: {fault_judge.differences(after, ended)}")
         out.lost += [f"after the repeat: {p}" for p in (*self._problems(), *self._then(verb))]
         fault_judge.age(self.work)
-        with Store.open(site) as store:
-            store.prune()
+        try:
+            with Store.open(site) as store:
+                store.prune()
+        except GsmapError as error:
+            out.lost.append(f"does not open to be pruned: {error}")
         out.left += fault_judge.leftovers(self.work)
         return out
 
