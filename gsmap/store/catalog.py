@@ -170,10 +170,12 @@ class Catalog:
         """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.
 
         Raises:
-            CorruptError: they differ.
+            CorruptError: they differ, or the file is not in WAL mode: what is written would go past its digests.
         """
         if self.is_sqlite:
             file = self.folder / sqlite.FILE
+            if self.writable and not sqlite.has_log(file):
+                raise CorruptError(digests.damaged(file, ["another program changed its journal mode"]))
             found = self.page_problems(at_most_bytes=digests.WHOLE_BYTES)
             if found:
                 backup = digests.is_backup(file, sqlite.handle(self.engine))

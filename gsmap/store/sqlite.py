@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sqlite3
 import threading
@@ -181,11 +182,23 @@ def dispose(engine: Engine, file: Path, *, tidy: bool) -> None:
 
 
 def create_file(file: Path) -> None:
-    """An empty database in WAL mode; the mode stays with the file."""
+    """An empty database in WAL mode; the mode stays with the file.
+
+    Raises:
+        OSError: the disk failed, so that SQLite left the mode as it was and said nothing of it.
+    """
     connection = sqlite3.connect(file)
     connection.execute("PRAGMA journal_mode = WAL")
     connection.close()
+    if not has_log(file):
+        raise OSError(errno.EIO, "SQLite could not set its journal mode", str(file))
     digests.note(file)
+
+
+def has_log(file: Path) -> bool:
+    """Whether a database is in WAL mode: what is written goes to its log, and nowhere else until that is folded in."""
+    with contextlib.closing(Handle(file)) as opened:
+        return os.pread(opened.number, 2, 18) == b"\2\2"  # file format write and read version
 
 
 def refuse_strange_files(file: Path) -> None:
@@ -225,6 +238,12 @@ def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
 
 def accept(engine: Engine, file: Path) -> None:
     """Take the pages that there are for what was written, whatever they are; only under the writer lock."""
+    if not has_log(file):  # another program changed it
+        connection = engine.raw_connection()
+        try:
+            _driver(connection).execute("PRAGMA journal_mode = WAL")
+        finally:
+            connection.close()
     if _log_bytes(file):
         digests.fold(file, handle(engine), lambda: _folded(engine), accept=True)
     else:

@@ -10,7 +10,7 @@ import store_children
 from page_samples import PAGE, fill, flip
 from store_children import messages
 
-from gsmap.errors import CorruptError
+from gsmap.errors import CorruptError, DiskError
 from gsmap.store import Store, digests, sqlite
 from gsmap.store.handles import Handle
 from gsmap.store.wal import log_of, read_log
@@ -333,3 +333,29 @@ def test_digests_survive_their_own_format(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x", "x.digests"]
     assert digests.load(tmp_path / "x") == noted
     assert digests.pages([1, 2, 3, 7, 9, 10]) == "pages 1-3, 7, 9-10"
+
+
+def test_a_catalog_in_another_journal_mode_is_refused_until_it_is_accepted(closed):
+    """What is written in any other mode goes past the digests."""
+    import sqlite3
+
+    file = closed / sqlite.FILE
+    with sqlite3.connect(file) as connection:
+        assert connection.execute("PRAGMA journal_mode = DELETE").fetchone() == ("delete",)
+    connection.close()
+    digests.note(file)
+    with pytest.raises(CorruptError, match="journal mode.*--accept-catalog"):
+        Store.open(closed)
+    Store.accept_catalog(closed)
+    with Store.open(closed) as store:
+        store.scenes.edit(store.scenes.list()[0].id, note="written")
+    with Store.open(closed) as store:
+        assert store.check().ok
+
+
+def test_a_disk_that_fails_while_the_mode_is_set_makes_no_map(tmp_path, monkeypatch):
+    """SQLite stays in the mode that it was in, and raises nothing."""
+    monkeypatch.setattr(sqlite, "has_log", lambda file: False)
+    with pytest.raises(DiskError):
+        Store.create(tmp_path / "m")
+    assert not list(tmp_path.iterdir())
