@@ -344,7 +344,7 @@ def test_a_catalog_in_another_journal_mode_is_refused_until_it_is_accepted(close
         assert connection.execute("PRAGMA journal_mode = DELETE").fetchone() == ("delete",)
     connection.close()
     digests.note(file)
-    with pytest.raises(CorruptError, match="journal mode.*--accept-catalog"):
+    with pytest.raises(CorruptError, match=r"journal mode.*--accept-catalog"):
         Store.open(closed)
     Store.accept_catalog(closed)
     with Store.open(closed) as store:
