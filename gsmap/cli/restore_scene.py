@@ -20,11 +20,12 @@ def command(
 ) -> None:
     """Bring back a removed scene whose arrays are still there, or take a scene of another map.
 
-    It comes with its graphs, its edges to scenes that are here, and what people said of it.
+    It comes with its graphs, its edges to scenes that are here, and what people said of it. With --from, arrays of it
+    that are here and damaged are mended.
 
     Example: `gsmap restore-scene site.gsmap monday`
     """
     with opened(map) as m:
         row = m.restore_scene(scene, source)
-    say(f"{row.name} is back; run: gsmap update {map}")
+    say(f"{row.name} is here and whole; run: gsmap update {map}")
     print_rows("restore-scene", row, json, "scene")

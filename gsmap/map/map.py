@@ -638,7 +638,10 @@ class Map(AbstractContextManager["Map"]):
         return as_values.purge_report(purge(self.store, ref, branches=branches))
 
     def restore_scene(self, ref: str, source: str | os.PathLike[str] | None = None) -> SceneRow:
-        """``gsmap restore-scene MAP SCENE``: bring back a removed scene, or (``source``) take one of another map."""
+        """``gsmap restore-scene MAP SCENE``: bring back a removed scene, or (``source``) take one of another map.
+
+        With ``source``, arrays of it that are here and damaged are mended.
+        """
         return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source))
 
     def check(self) -> CheckReport:

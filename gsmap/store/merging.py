@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, func, insert, select
 
-from gsmap.errors import NotFoundError
+from gsmap.errors import CorruptError, NotFoundError
 from gsmap.settings import FILE_NAME, load
+from gsmap.store.groups import manifest
 from gsmap.store.joint import joined, restricted
 from gsmap.store.revisions import newest_poses
+from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import about, edges, poses, revisions, scenes
 from gsmap.store.store import Store
 from gsmap.store.transfer import Transfer, between
@@ -100,22 +102,39 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
 def bring_scene(into: Store, source: Store, scene: str) -> Merged:
     """Bring one scene of another map (by id), its graphs, and its edges to scenes that are here.
 
+    Where it is here already, arrays of it that are damaged are mended.
+
     Raises:
         NotFoundError: it was forgotten here on demand.
         CorruptError: its arrays are missing or damaged there; nothing was changed.
     """
-    with between(into, source, only={scene}) as transfer:
+    with between(into, source, only={scene}, mend=True) as transfer:
         if scene not in transfer.wanted:
             raise NotFoundError(
                 f"scene {scene} was forgotten in {into.location} on demand: ingest its capture if it is to come back"
             )
         transfer.scenes()
+        if into.home.samefile(source.home):
+            _check_shared(transfer, scene)
         if into.scenes.removed_at(scene) is not None:  # whatever was said before: it is asked for now
             into.scenes.restore(scene)
         transfer.graphs()
         transfer.pairs()
         transfer.priors()
         return replace(_merged(transfer, None), notes=())
+
+
+def _check_shared(transfer: Transfer, scene: str) -> None:
+    """Refuse a scene whose arrays are damaged, where both catalogs are of one map and there are no others."""
+    group = transfer.ours.execute(select(scenes.c.group_id).where(scenes.c.id == scene)).scalar_one()
+    if group is None:
+        return
+    problems = transfer.into.arrays.problems(SCENES, group, manifest(transfer.ours, group))
+    if problems:
+        raise CorruptError(
+            f"the arrays of scene {scene} are damaged, and {transfer.source.location} has the very same: bring them "
+            f"from another map or a restored backup ({problems[0]})"
+        )
 
 
 def _merged(transfer: Transfer, revision: int | None) -> Merged:

@@ -7,13 +7,14 @@ copies of the catalog and what deleted rows left in its file, and completes the 
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Row, Table, delete, insert, select, text, update
+from sqlalchemy import Connection, Row, Table, delete, func, insert, select, text, update
 
 from gsmap.durable import files_below, is_file, remove_file
 from gsmap.errors import BusyError
@@ -23,7 +24,6 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import explained
 from gsmap.store.schema import (
     CHUNK_BOXES,
-    backups,
     edges,
     exports,
     files,
@@ -88,12 +88,13 @@ def begin(store: Store, scene: str) -> Purge:
         scene: id of a scene that the catalog has, living or removed.
     """
     Others(store.home, store.folder).groups()  # asked first: what of its arrays another branch names must be known
+    of_map = _backups_of_map(store)
     with store.catalog.write() as connection:
         row = connection.execute(select(scenes).where(scenes.c.id == scene)).one()
         names = _names(connection, row)
         linked = _linked_files(store, connection, scene)
         targets = sorted(connection.execute(select(exports.c.target).distinct()).scalars())
-        elsewhere = _backups(connection, row.ingested_at)
+        elsewhere = _backups(connection, row, of_map)
         counts = _delete_rows(connection, row)
         _scrub(connection, scene, names)
         mentions = _mentions(connection, scene, names)
@@ -139,6 +140,18 @@ def finish(store: Store, purge: Purge, tiles_gone: Mapping[str, Any]) -> Purge:
     with store.catalog.write() as connection:
         connection.execute(update(purges).where(purges.c.number == purge.number).values(receipt=receipt))
     return Purge(purge.number, purge.scene, receipt, purge.created_at)
+
+
+def recheck(store: Store) -> None:
+    """Bring what the receipts say of other catalogs up to date: a scene may be gone from these by now."""
+    for one in listed(store):
+        if not one.is_done or not one.receipt["branches"]:
+            continue
+        still = [place.location for place in holders(store, one.scene)]
+        if still != one.receipt["branches"]:
+            with store.catalog.write() as connection:
+                row = purges.c.number == one.number
+                connection.execute(update(purges).where(row).values(receipt={**one.receipt, "branches": still}))
 
 
 def holders(store: Store, scene: str) -> list[Place]:
@@ -276,10 +289,32 @@ def _mentions(connection: Connection, scene: str, names: set[str]) -> list[str]:
 # --- what lies elsewhere ---------------------------------------------------------------------------------------------
 
 
-def _backups(connection: Connection, since: str) -> list[str]:
-    """Snapshots that were taken since the scene came."""
-    rows = connection.execute(select(backups).order_by(backups.c.number))
-    return [f"{row.target} {row.snapshot}" for row in rows if row.created_at >= since]
+def _backups_of_map(store: Store) -> list[tuple[str, str]]:
+    """(when, name) of each snapshot; the map itself knows of those that were taken since a branch was made."""
+    with contextlib.ExitStack() as stack:
+        catalogs = [store]
+        if store.branch:
+            catalogs.insert(0, stack.enter_context(Store.open(store.home, "r")))
+        every = [backup for one in catalogs for backup in one.backups.list()]
+    return [(one.created_at, f"{one.target} {one.snapshot}") for one in every]
+
+
+def _backups(connection: Connection, scene: Row[Any], of_map: Iterable[tuple[str, str]]) -> list[str]:
+    """Snapshots that were taken since the scene first came, and those that an earlier purge of it told of."""
+    pairs = (registrations.c.target == scene.id) | (registrations.c.source == scene.id)
+    # `ingested_at` is its last arrival, and scenes that an old gsmap ingested have no fact of their first.
+    firsts = [
+        select(func.min(scene_facts.c.created_at)).where(scene_facts.c.scene == scene.id),
+        select(func.min(registrations.c.created_at)).where(pairs),
+        select(func.min(revisions.c.created_at))
+        .join(poses, poses.c.revision == revisions.c.number)
+        .where(poses.c.scene == scene.id),
+    ]
+    seen = [connection.execute(query).scalar() for query in firsts]
+    since = min([scene.ingested_at, *(when for when in seen if when is not None)])
+    earlier = connection.execute(select(purges.c.receipt).where(purges.c.scene == scene.id).order_by(purges.c.number))
+    told = [name for receipt in earlier.scalars() for name in receipt["backups"]]
+    return list(dict.fromkeys([*told, *(name for when, name in of_map if when >= since)]))
 
 
 def _linked_files(store: Store, connection: Connection, scene: str) -> int:

@@ -39,13 +39,16 @@ _MERGE = "merge"  # author of a name that a scene got because its own was taken:
 
 
 @contextlib.contextmanager
-def between(into: Store, source: Store, only: Collection[str] | None = None) -> Iterator[Transfer]:
+def between(
+    into: Store, source: Store, only: Collection[str] | None = None, *, mend: bool = False
+) -> Iterator[Transfer]:
     """One transaction on ``into``, in which scenes come from one state of ``source``; committed when the block ends.
 
     Their arrays are linked or copied beside their places first, so that the transaction is short.
 
     Args:
         only: ids of the scenes to bring; None for all, the removed ones included.
+        mend: read the arrays of these that are here, too, and bring those that are damaged again.
 
     Raises:
         ConfigError: a map into itself.
@@ -55,12 +58,12 @@ def between(into: Store, source: Store, only: Collection[str] | None = None) -> 
     if same_home and into.folder.samefile(source.folder):
         raise ConfigError(f"{into.location} and {source.location} are the same map: name two")
     with contextlib.ExitStack() as stack:
-        staged: Mapping[tuple[str, str], Staged] = {}
+        staged: dict[tuple[str, str], Staged] = {}
         if not same_home:
             with source.arrays.lock():  # what this state of it names is not reclaimed until it is ours, too
                 theirs = stack.enter_context(source.catalog.read())
                 with into.catalog.read() as ours:
-                    missing = _missing_groups(ours, theirs, only)
+                    missing = _missing_groups(into, ours, theirs, only, mend)
                 staged = stack.enter_context(into.arrays.stage_copies(source.arrays, missing))
         ours = stack.enter_context(into.catalog.write())
         into.catalog.hold(into.arrays.lock())
@@ -85,7 +88,7 @@ class Transfer:
         ours: Connection,
         theirs: Connection,
         only: Collection[str] | None,
-        staged: Mapping[tuple[str, str], Staged] | None,
+        staged: dict[tuple[str, str], Staged] | None,
     ) -> None:
         self.into, self.source = into, source
         self.ours, self.theirs = ours, theirs
@@ -211,13 +214,14 @@ class Transfer:
             scene_rows.put_boxes(self.ours, number, boxes)
 
     def _bring_group(self, kind: str, group: str | None) -> None:
-        if group is None or has_group(self.ours, group):
+        staged = None if self._staged is None or group is None else self._staged.pop((kind, group), None)
+        if group is None or (staged is None and has_group(self.ours, group)):
             return
         files = manifest(self.theirs, group)
         if self._staged is None:
             name(self.ours, kind, group, files)  # of the same map: it lies there already
-        elif (kind, group) in self._staged:
-            publish(self.into.catalog, self.ours, self.into.arrays, self._staged[kind, group], kind, group)
+        elif staged is not None:
+            publish(self.into.catalog, self.ours, self.into.arrays, staged, kind, group)
             self.counts["bytes"] += sum(file.size_bytes for file in files)
         else:
             raise StoreError(f"{self.into.location} was pruned meanwhile; nothing was changed: try again")
@@ -226,10 +230,13 @@ class Transfer:
 
     def graphs(self) -> None:
         """Their scene graphs; where both maps have one under a key, this map's stays."""
-        here = set(self.ours.execute(select(graphs.c.key)).scalars())
+        here = {row.key: row.group_id for row in self.ours.execute(select(graphs.c.key, graphs.c.group_id))}
         for row in self.theirs.execute(select(graphs).order_by(graphs.c.created_at)).all():
-            if row.key not in here and row.scene in self.wanted:
+            if row.scene not in self.wanted:
+                continue
+            if row.key not in here or row.group_id == here[row.key]:
                 self._bring_group(GRAPHS, row.group_id)
+            if row.key not in here:
                 self.recipe(row.recipe)
                 self.ours.execute(insert(graphs), dict(row._mapping))
                 self.counts["graphs"] += 1
@@ -336,18 +343,22 @@ class Transfer:
 
 
 def _missing_groups(
-    ours: Connection, theirs: Connection, only: Collection[str] | None
+    into: Store, ours: Connection, theirs: Connection, only: Collection[str] | None, mend: bool
 ) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
-    """Manifests of the groups that wanted scenes need and this map lacks, by (kind, id)."""
+    """Manifests of the groups that wanted scenes need and this map lacks (or has damaged), by (kind, id)."""
     named = [(scene_rows.KIND, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
-    known = set(ours.execute(select(graphs.c.key)).scalars())
+    known = {row.key: row.group_id for row in ours.execute(select(graphs.c.key, graphs.c.group_id))}
     made = theirs.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id))
-    named += [(GRAPHS, row.scene, row.group_id) for row in made if row.key not in known]
+    named += [(GRAPHS, row.scene, row.group_id) for row in made if known.get(row.key, row.group_id) == row.group_id]
     here, forgotten = set(ours.execute(select(groups.c.id)).scalars()), _forgotten(ours)
+
+    def is_lacking(kind: str, group: str) -> bool:
+        return group not in here or (mend and bool(into.arrays.problems(kind, group, manifest(ours, group))))
+
     return {
         (kind, group): manifest(theirs, group)
         for kind, scene, group in named
-        if group is not None and group not in here and scene not in forgotten and (only is None or scene in only)
+        if group is not None and scene not in forgotten and (only is None or scene in only) and is_lacking(kind, group)
     }
 
 

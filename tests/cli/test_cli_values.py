@@ -128,6 +128,21 @@ def test_a_scene_that_was_pruned_comes_from_a_tag(site: Path, cli: Run) -> None:
     assert cli("check", site).code == 0
 
 
+def test_a_damaged_scene_is_mended_from_another_map(site: Path, cli: Run, tmp_path: Path) -> None:
+    assert cli("split", site, tmp_path / "copy.gsmap", "--scenes", "odd:one").code == 0
+    scene = cli("show", site, "odd:one", "--json").json["id"]
+    files = [p for p in (site / "arrays" / "scenes" / scene).rglob("*") if p.is_file()]
+    victim = max(files, key=lambda path: path.stat().st_size)
+    content = victim.read_bytes()
+    victim.unlink()  # the copy has the same file
+    victim.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert cli("check", site).code == 1
+    done = cli("restore-scene", site, "odd:one", "--from", tmp_path / "copy.gsmap")
+    assert done.code == 0
+    assert "odd:one is here and whole" in done.stderr
+    assert cli("check", site).code == 0
+
+
 def test_a_purge_says_where_else_it_may_live(site: Path, cli: Run) -> None:
     cli("tag", site, "v1")
     assert cli("remove", site, "odd:one", "--branches").code == 2

@@ -437,3 +437,50 @@ def test_a_scene_comes_from_another_map(store, other):
     assert store.registrations.get(a, b) is not None
     assert len(store.registrations.current()) == 1
     assert store.check().ok
+
+
+def damage(store, kind, group):
+    """Turn a byte of a group's largest file."""
+    path = max(
+        (p for p in (store.home / "arrays" / kind / group).rglob("*") if p.is_file()), key=lambda p: p.stat().st_size
+    )
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.unlink()  # it may have other names
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_damaged_arrays_come_from_another_map(store, other, removed):
+    for one in (store, other):
+        a = add(one, 1)
+        describe(one, a)
+    graph = next(p.name for p in (store.home / "arrays" / "graphs").iterdir())
+    before, rows = bytes_of(store.home / "arrays"), [dump(store)[table] for table in ("files", "groups", "graphs")]
+    damage(store, "scenes", a)
+    damage(store, "graphs", graph)
+    if removed:
+        store.scenes.remove(a)
+    assert not store.check().ok
+    damage(other, "scenes", a)
+    with pytest.raises(CorruptError, match="on that map"):
+        bring_scene(store, other, a)
+    assert (store.scenes.removed_at(a) is not None) == removed
+    shutil.rmtree(other.home / "arrays" / "scenes" / a)
+    other.scenes.add(make_gaussians(60, seed=1), make_cameras(), name="scene1")
+    brought = bring_scene(store, other, a)
+    assert brought.num_bytes > 0
+    assert store.check().ok
+    assert bytes_of(store.home / "arrays") == before
+    assert [s.id for s in store.scenes.list()] == [a]
+    assert [dump(store)[table] for table in ("files", "groups", "graphs")] == rows
+    assert bring_scene(store, other, a).num_bytes == 0
+    assert len(store.scenes.gaussians(a)) == 60
+
+
+def test_damaged_arrays_cannot_come_from_a_branch_of_the_same_map(store):
+    a = add(store, 1)
+    store.branches.make("b")
+    damage(store, "scenes", a)
+    with Store.open(f"{store.home}@b", "r") as branch, pytest.raises(CorruptError, match="the very same"):
+        bring_scene(store, branch, a)

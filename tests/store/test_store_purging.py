@@ -14,7 +14,7 @@ from store_samples import key, make_cameras, make_gaussians
 
 import gsmap
 from gsmap.errors import BusyError, NotFoundError
-from gsmap.store import Store
+from gsmap.store import Store, purging
 from gsmap.store.merging import merge
 from gsmap.types import EdgeOutcome, PoseGraph, Prior, Provenance, Registration, SceneGraph, ScenePose, Sim3
 
@@ -300,3 +300,159 @@ def test_killed_anywhere_the_same_command_finishes(tmp_path, start, stride):
             break
         deaths += 1
     assert deaths >= 3
+
+
+def _export_tree(m, out):
+    """3D Tiles of a map whose tiles of 2 m have coarser levels above them."""
+    m.export(out, tile_size_m=2, merge="union", format="3dtiles")
+    folder = out / "component_0"
+    assert list((folder / "levels").iterdir())
+    return folder
+
+
+def test_coarser_levels_go_and_come_again(place, tmp_path):
+    secret = make(place)
+    out = tmp_path / "out"
+    with gsmap.map.open(place) as m:
+        folder = _export_tree(m, out)
+        levels = {p.name: p.read_bytes() for p in (folder / "levels").iterdir()}
+        report = m.purge(secret)
+        assert list(out.rglob("*.glb")) == []
+        assert not folder.exists()
+        assert report.num_tiles >= len(levels) + 1
+        m.export(out, tile_size_m=2, merge="union", format="3dtiles")
+        assert (folder / "tileset.json").is_file()
+        for level in (folder / "levels").iterdir():
+            assert level.read_bytes() not in levels.values()
+
+
+def test_levels_of_an_export_that_was_killed_go(place, tmp_path):
+    """The tiles are of today, but the levels above them are from before the scene was removed."""
+    secret = make(place)
+    out = tmp_path / "out"
+    with gsmap.map.open(place) as m:
+        folder = _export_tree(m, out)
+        before = {p.name for p in (folder / "levels").iterdir()}
+        m.remove(secret)
+        m.optimize()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("gsmap.map.stages.export.write_tilesets", lambda *a: None)
+            m.export(out, tile_size_m=2, merge="union", format="3dtiles")
+        tiles = set(folder.glob("*.glb"))
+        assert {p.name for p in (folder / "levels").iterdir()} == before
+        report = m.purge(secret)
+        assert str(out) in report.exports
+        assert not (folder / "levels").exists()
+        assert not (folder / "tileset.json").exists()
+        assert set(folder.glob("*.glb")) == tiles  # made without it
+
+
+def test_levels_of_other_components_stay(place, tmp_path):
+    secret = make(place)
+    out = tmp_path / "out"
+    with gsmap.map.open(place) as m:
+        graph = m.store.revisions.get()
+        poses = {s: p if s != secret else ScenePose(s, p.S_map_scene, 1, "placed") for s, p in graph.poses.items()}
+        m.store.revisions.save(PoseGraph(poses, {}))
+        folder = _export_tree(m, out)
+        kept = {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+        assert (out / "component_1" / "tileset.json").is_file()
+        m.purge(secret)
+        assert not (out / "component_1").exists()
+        assert {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()} == kept
+
+
+def test_files_that_an_export_had_still_to_delete_go(place, tmp_path):
+    secret = make(place)
+    out = tmp_path / "out"
+    with gsmap.map.open(place) as m:
+        m.export(out, tile_size_m=0, merge="union")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("gsmap.export.write._remove_doomed", lambda *a: None)
+            m.remove(secret)
+            m.optimize()
+            m.export(out, tile_size_m=0, merge="union", format="spz")
+        old = list(out.rglob("*.ply"))
+        kept = list(out.rglob("*.spz"))
+        assert old
+        assert json.loads((out / "tiles.json").read_text())["doomed"]
+        report = m.purge(secret)
+        assert report.num_tiles == len(old)
+        assert list(out.rglob("*.ply")) == []
+        assert list(out.rglob("*.spz")) == kept
+        assert "doomed" not in json.loads((out / "tiles.json").read_text())
+
+
+def test_killed_among_the_levels_the_next_purge_finishes(place, tmp_path, start):
+    secret = make(place)
+    out = tmp_path / "out"
+    with gsmap.map.open(place) as m:
+        _export_tree(m, out)
+    manifest = (out / "tiles.json").read_bytes()
+    process, _ = start(_die_at_manifest, str(place), secret)
+    process.join()
+    assert process.exitcode == 9
+    assert (out / "tiles.json").read_bytes() == manifest
+    with gsmap.map.open(place) as m:
+        report = m.purge(secret)
+    assert report.exports == (str(out),)
+    assert [p for p in out.rglob("*") if p.name != "tiles.json"] == []
+    assert secret not in (out / "tiles.json").read_text()
+
+
+def _die_at_manifest(path, secret, pipe):
+    """Die when all files of the folder are gone and its manifest is not written yet."""
+    from gsmap.export.manifest import Manifest
+
+    Manifest.save = lambda *_: os._exit(9)
+    with gsmap.map.open(path) as m:
+        m.purge(secret)
+
+
+@pytest.mark.parametrize("again", ["restored", "ingested", "purged"])
+def test_backups_since_the_scene_first_came_are_told_of(place, again):
+    secret = make(place)
+    with gsmap.map.open(place) as m:
+        m.store.backups.add("/mnt/b", "first", 10)
+        if again == "purged":
+            m.purge(secret)
+        else:
+            m.remove(secret)
+        if again == "restored":
+            m.restore_scene(secret)
+        else:
+            m.store.scenes.add(make_gaussians(80, seed=1), make_cameras(), name="anew")
+        m.store.backups.add("/mnt/b", "second", 10)
+        assert m.purge(secret).backups == ("/mnt/b first", "/mnt/b second")
+
+
+def test_backups_from_before_it_came_are_not_told_of(place):
+    make(place)
+    with gsmap.map.open(place) as m:
+        m.store.backups.add("/mnt/b", "before", 10)
+        late = m.store.scenes.add(make_gaussians(50, seed=9), make_cameras(), name="late")[0]
+        assert m.purge(late.id).backups == ()
+
+
+def test_a_branch_knows_the_backups_of_its_map(place):
+    secret = make(place)
+    with gsmap.map.open(place) as m:
+        m.branch("b")
+        m.store.backups.add("/mnt/b", "both", 10)
+    with gsmap.map.open(f"{place}@b") as branch:
+        assert branch.purge(secret).backups == ("/mnt/b both",)
+
+
+def test_a_receipt_is_true_after_the_branches_were_purged(place):
+    secret = make(place)
+    with gsmap.map.open(place) as m:
+        m.branch("b")
+        m.branch("c")
+        assert len(m.purge(NAME).branches) == 2
+        m.delete_branch("c")
+        assert m.purge(secret).branches == (f"{place}@b",)
+        assert m.purge(secret, branches=True).branches == ()
+        report = m.purge(secret)
+        assert report.branches == ()
+        assert report.maps == (str(place),)
+        assert all(row.receipt["branches"] == [] for row in purging.listed(m.store))

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsmap.durable import remove_file, remove_tree
+from gsmap.durable import files_below, refuse_links, remove_empty_folder, remove_file, remove_tree
 from gsmap.errors import GsmapError, NotFoundError
 from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
+from gsmap.export.tileset import FILE_NAME as TILESET
+from gsmap.export.tileset import LEVELS_FOLDER, is_stale
 from gsmap.export.write import STAGING
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
+
+_COMPONENT = re.compile(r"component_\d+")
 
 
 @dataclass
@@ -45,16 +50,19 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
         catalogs = [store]
         if branches:
             catalogs += [stack.enter_context(Store.open_even_tag(place.location)) for place in store.others()]
-        done = [(one.location, _finish(one, p)) for one in catalogs for p in purging.listed(one) if not p.is_done]
+        done = [(one, _finish(one, p)) for one in catalogs for p in purging.listed(one) if not p.is_done]
         scene = _scene(catalogs, ref)
         if scene is None:
-            earlier = [(one.location, p) for one in catalogs for p in purging.listed(one) if p.scene == ref]
-            if not done and not earlier:
+            done = done or [(one, p) for one in catalogs for p in purging.listed(one) if p.scene == ref]
+            if not done:
                 raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes")
-            return done or earlier
-        holding = [one for one in catalogs if _holds(one, scene)]
-        begun = [(one, purging.begin(one, scene)) for one in holding]
-        return [(one.location, _finish(one, one_purge)) for one, one_purge in begun]
+        else:
+            holding = [one for one in catalogs if _holds(one, scene)]
+            begun = [(one, purging.begin(one, scene)) for one in holding]
+            done = [(one, _finish(one, one_purge)) for one, one_purge in begun]
+        for one in catalogs:
+            purging.recheck(one)
+        return [(one.location, p) for one, made in done for p in purging.listed(one) if p.number == made.number]
 
 
 def _scene(catalogs: Sequence[Store], ref: str) -> str | None:
@@ -90,15 +98,45 @@ def _finish(store: Store, begun: Purge) -> Purge:
 
 
 def _clean(store: Store, out: Path, scene: str, found: _Tiles) -> None:
-    """Delete the tiles of one folder that were made with a scene; only in a folder that holds this map's export."""
+    """Delete what one folder holds of a scene; only in a folder that holds this map's export.
+
+    Tiles made with it; what no tile is any more, but an export had still to delete; and the coarser levels of 3D Tiles
+    and tilesets of components that had either, or whose levels may be of earlier tiles. The manifest comes last, so
+    that an interrupted purge finds all of it again.
+    """
     manifest = Manifest.load(out, store.id)
     made_with_it = {at: tile for at, tile in manifest.tiles.items() if scene in tile.poses}
-    remove_tree(out, STAGING)  # what an interrupted export left may be such a tile
-    for tile in made_with_it.values():
-        if tile.path:
-            remove_file(out, *tile.path.split("/"))
-            found.tile_files += 1
-    if made_with_it:
-        manifest.tiles = {at: tile for at, tile in manifest.tiles.items() if at not in made_with_it}
+    kept = {at: tile for at, tile in manifest.tiles.items() if at not in made_with_it}
+    paths = {tile.path for tile in made_with_it.values() if tile.path}
+    paths |= manifest.doomed - {tile.path for tile in kept.values()} - {""}
+    for leftover in [out / STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
+        remove_tree(out, *leftover.relative_to(out).parts)  # what an interrupted export left may be such a tile
+    gone = len(paths)
+    touched = {path.split("/")[0] for path in paths}
+    for folder in _component_folders(out):
+        tiles = [tile for tile in kept.values() if tile.path.startswith(f"{folder}/")]
+        if folder in touched or not tiles or is_stale(out, tiles):
+            gone += _drop_levels(out, folder)
+    for path in paths:
+        remove_file(out, *path.split("/"))
+    for folder in _component_folders(out):
+        remove_empty_folder(out, folder)
+    if made_with_it or manifest.doomed:
+        manifest.tiles, manifest.doomed = kept, set()
         manifest.save(out)
+    if gone or made_with_it:
+        found.tile_files += gone
         found.cleaned.append(str(out))
+
+
+def _component_folders(out: Path) -> list[str]:
+    return sorted(path.name for path in out.glob("component_*") if _COMPONENT.fullmatch(path.name))
+
+
+def _drop_levels(out: Path, folder: str) -> int:
+    """Delete a component's tileset and coarser levels; the next export makes them again. How many levels there were."""
+    refuse_links(out, folder, LEVELS_FOLDER)
+    levels = len(files_below(out / folder / LEVELS_FOLDER))
+    remove_file(out, folder, TILESET)  # first: it names the levels
+    remove_tree(out, folder, LEVELS_FOLDER)
+    return levels

@@ -137,12 +137,13 @@ class PurgeReport(Row):
         num_rows: rows that went, by what they were.
         num_groups: groups of arrays that were deleted.
         num_bytes: bytes on disk of these.
-        num_tiles: files of tiles made with it that were deleted; `gsmap export` makes those places again without it.
+        num_tiles: files of tiles made with it, of coarser levels above them, and of what an export had still to delete,
+            that were deleted; `gsmap export` makes those places again without it.
         exports: the folders that these lay in.
         unreachable: folders that were exported to and could not be looked into, and why.
         catalog_copies: copies of the catalog, left by migrations, that were deleted.
         branches: branches and tags of the map that still have it: the arrays stay for these. `--branches` purges them.
-        backups: snapshots, taken since it came, that may hold it.
+        backups: snapshots, taken since it first came, that may hold it.
         linked_files: how many of its files had other names on the same disk: a map that it was merged or split into, or
             a clone, has it.
         mentions: what people wrote elsewhere in the map with its name or id in it.
