@@ -244,8 +244,16 @@ def pose_graph(path: Path) -> None:
 
 
 def manifest(folder: Path) -> list[bytes]:
-    tile = Tile("k", 0, np.array([[0.0, 0, 0], [1, 1, 1]]), {"s": Sim3.identity()}, 3, {"stage": "merge"}, path="a.ply")
-    Manifest("m" * 32, {(0, "a"): tile}, {"a.ply": 10}).save(folder)
+    tile = Tile(
+        "k",
+        0,
+        np.array([[0.0, 0, 0], [1, 1, 1]]),
+        {"s": Sim3.identity()},
+        3,
+        {"stage": "merge"},
+        path="component_0/a.ply",
+    )
+    Manifest("m" * 32, {(0, "a"): tile}, {"component_0/a.ply": 10}).save(folder)
     new = json.loads((folder / "tiles.json").read_bytes())
     return [json.dumps(new).encode(), json.dumps({**new, "version": 1}).encode()]
 

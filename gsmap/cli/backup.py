@@ -34,8 +34,10 @@ def command(
 ) -> None:
     """Save the map as it is now, while others go on writing to it. Only what the backup lacks is sent.
 
-    A damaged map is not backed up. Exit code 1 where `--verify` finds damage that the map cannot mend. S3 is reached as
-    `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and `AWS_ENDPOINT_URL` say.
+    Of the map the catalog and what is sent are read; where those are damaged, nothing is saved. Damage that came to
+    files after they were sent is found by `gsmap check` alone, and the backup keeps the sound bytes. Exit code 1 where
+    `--verify` finds damage in the backup that the map cannot mend. S3 is reached as `AWS_ACCESS_KEY_ID`,
+    `AWS_SECRET_ACCESS_KEY`, `AWS_REGION` and `AWS_ENDPOINT_URL` say.
 
     Example: `gsmap backup site.gsmap /mnt/backup/site --keep 30`
     """

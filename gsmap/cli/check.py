@@ -34,7 +34,8 @@ def command(
             print(f"cannot verify the catalog: {text(why)}")
     if not report.ok:
         count = len(report.problems)
-        say(f"{count} problems in {map}: restore the files named from a backup, or ingest their scenes again")
+        again = "restore files from a backup, or ingest (of graphs: describe) their scenes again"
+        say(f"{count} problems in {map}: {again}")
         raise typer.Exit(1)
     say(f"nothing wrong was found in {map}" if report.unverified else f"{map} is whole")
 

@@ -18,7 +18,7 @@ def command(
     preset: Preset = None,
     json: AsJson = False,
 ) -> None:
-    """Make the scene graph of every scene that lacks one.
+    """Make the scene graph of every scene that lacks one, and of scenes that are named also where it is damaged.
 
     Example: `gsmap describe site.gsmap`
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import time
 from collections.abc import Mapping
@@ -137,10 +138,9 @@ def _entry(name: str, tile: Tile, num_bytes: int) -> dict[str, object]:
 
 def _text(path: Path) -> str:
     with open(open_file(path), "rb") as file:
-        content = file.read(_MAX_BYTES + 1)
-    if len(content) > _MAX_BYTES:
-        raise ValueError(f"it has more than {_MAX_BYTES} bytes")
-    return content.decode()
+        if os.fstat(file.fileno()).st_size > _MAX_BYTES:
+            raise ValueError(f"it has more than {_MAX_BYTES} bytes")
+        return file.read().decode()
 
 
 def _checked_path(path: Any) -> str:

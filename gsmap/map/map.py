@@ -217,12 +217,16 @@ class Map(AbstractContextManager["Map"]):
         return [reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added]
 
     def describe(self, *scenes: str) -> list[GraphRow]:
-        """The scene graph of every scene (or of those named), made where the present recipe has not made it yet."""
+        """The scene graph of every scene, made where the present recipe has not made it yet.
+
+        Args:
+            scenes: only these; and where their graph is damaged it is made again.
+        """
         from gsmap.map.stages.describe import describe
 
         wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
         with at_work(self.store, "describe"):
-            keys = describe(self.store, wanted, self.settings, self._progress)
+            keys = describe(self.store, wanted, self.settings, self._progress, verify=bool(scenes))
         return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
 
     def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:

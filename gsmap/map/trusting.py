@@ -20,8 +20,13 @@ def catalog_of(path: str | os.PathLike[str]) -> TrustReport:
         CorruptError: it names something else than a PostgreSQL database.
     """
     found = _remembered(Path(path))
-    known = found.map_id is not None and trusting.trusted().get(found.map_id) == found.url
-    return TrustReport(map=str(path), server=found.server, database=found.database, user=found.user, trusted=known)
+    return TrustReport(
+        map=str(path),
+        server=found.server,
+        database=found.database,
+        user=found.user,
+        trusted=trusting.is_trusted(found),
+    )
 
 
 def trust(path: str | os.PathLike[str]) -> TrustReport:

@@ -111,7 +111,7 @@ class Arrays:
         """Held by the one who puts groups into their places, until a committed row names them, or who reclaims them.
 
         Several catalogs may name these arrays (`gsmap.store.branches`), so that the writer lock of one does not do. Who
-        holds it takes no writer lock of a catalog that others know. Again in the same thread: nothing.
+        holds it waits for no lock of a catalog that others know. Again in the same thread: nothing.
 
         Raises:
             BusyError: another process kept it for ``patience_s``.
@@ -179,7 +179,7 @@ class Arrays:
             if found is not None and not stat.S_ISREG(found.st_mode):
                 raise CorruptError(f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it")
             if found is None or found.st_size != file.size_bytes:
-                raise CorruptError(f"{path} is missing or cut off: run gsmap check, and ingest the scene again")
+                raise CorruptError(f"{path} is missing or cut off: {layout.mend(kind)}")
         names = _arrays_in(files) if only is None else only
         layout.check(place, {file.path: file.size_bytes for file in files}, names, shapes)
         try:
@@ -189,9 +189,8 @@ class Arrays:
             if isinstance(error, OSError) and error.errno in _NOT_ITS_BYTES:
                 with explained(place):
                     raise
-            raise CorruptError(
-                f"{place} cannot be read ({type(error).__name__}: {error}): run gsmap check, and ingest the scene again"
-            ) from error
+            said = f"{place} cannot be read ({type(error).__name__}: {error})"
+            raise CorruptError(f"{said}: {layout.mend(kind)}") from error
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         """What differs from the manifest, after reading every byte."""
@@ -349,9 +348,7 @@ def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
         mine.parent.mkdir(parents=True, exist_ok=True)
         link_or_copy(path, mine)
         if _sha256(mine) != file.sha256:
-            raise CorruptError(
-                f"{path} differs from what was written: run gsmap check on that map, and repair it first"
-            )
+            raise CorruptError(f"{path} differs from what was written: run gsmap check on that map, repair it first")
     for path in [*(p for p in target.rglob("*") if p.is_dir()), target]:
         sync_folder(path)
     return target

@@ -129,42 +129,21 @@ class Catalog:
             with explained(self.folder, NOT_KEPT):
                 raise error
         try:
-            self._wait_for(handle, fcntl.LOCK_EX, self.patience_s if patience_s is None else patience_s)
+            _wait_for(self.folder, handle, fcntl.LOCK_EX, self.patience_s if patience_s is None else patience_s)
             self._held.depth = 1
             yield
         finally:
             self._held.depth = 0
             os.close(handle)
 
-    def _wait_for(self, handle: int, how: int, patience_s: float) -> None:
-        deadline = time.monotonic() + patience_s
-        while True:
-            try:
-                fcntl.flock(handle, how | fcntl.LOCK_NB)
-                return
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    raise BusyError(
-                        f"{self.folder}: others have been writing for {patience_s:g} s; try again later"
-                    ) from None
-                time.sleep(0.01)
-
     @contextlib.contextmanager
     def still(self) -> Iterator[None]:
-        """Keep everybody from writing for a moment, without the right to write."""
-        if getattr(self._held, "depth", 0):
+        """Keep everybody from writing for a moment, without the right to write.
+
+        Not to be begun by who holds the lock of the arrays: a writer waits for that one while we wait for this one.
+        """
+        with contextlib.nullcontext() if getattr(self._held, "depth", 0) else still(self.folder, self.patience_s):
             yield
-            return
-        try:
-            handle = os.open(self.folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
-        except OSError:  # then nobody has ever written here, or nobody can
-            yield
-            return
-        try:
-            self._wait_for(handle, fcntl.LOCK_SH, self.patience_s)
-            yield
-        finally:
-            os.close(handle)
 
     def verify(self) -> None:
         """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.
@@ -276,6 +255,33 @@ class Catalog:
             raise CorruptError(f"{error}; what was written since is kept in its log") from error
         except StoreError as error:
             _log.warning("what was written is kept, but not yet folded into %s: %s", sqlite.FILE, error)
+
+
+@contextlib.contextmanager
+def still(folder: Path, patience_s: float) -> Iterator[None]:
+    """See `Catalog.still`; of the catalog in a folder."""
+    try:
+        handle = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:  # then nobody has ever written here, or nobody can
+        yield
+        return
+    try:
+        _wait_for(folder, handle, fcntl.LOCK_SH, patience_s)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _wait_for(folder: Path, handle: int, how: int, patience_s: float) -> None:
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(handle, how | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                raise BusyError(f"{folder}: others have been writing for {patience_s:g} s; try again later") from None
+            time.sleep(0.01)
 
 
 def commit(connection: Connection, transaction: RootTransaction) -> None:

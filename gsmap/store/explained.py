@@ -33,7 +33,8 @@ UNCERTAIN = "whether this last step was kept shows once that is mended; what was
 LITTLE_BYTES = 64 << 10  # with less than this left a disk is full: SQLite's index of its log alone takes half of it
 
 _Said = tuple[type[StoreError], str, str]  # the error, what is wrong, and what to do
-_FULL: _Said = (DiskFullError, "the disk is full", "free some space (gsmap prune may) and try again")
+PRUNE_MAY = " (gsmap prune may)"
+_FULL: _Said = (DiskFullError, "the disk is full", f"free some space{PRUNE_MAY} and try again")
 _READ_ONLY: _Said = (ReadOnlyError, "the disk is read-only", "")
 _DENIED: _Said = (ReadOnlyError, "permission is missing", "check who may read and write there")
 _FAILED: _Said = (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Row, delete, insert, select
+from sqlalchemy import Connection, Row, delete, insert, select
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
@@ -15,7 +15,7 @@ from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import has_group, manifest, publish
+from gsmap.store.groups import manifest, publish, unname
 from gsmap.store.matrices import from_array, to_array
 from gsmap.store.scenes import resolve
 from gsmap.store.schema import graphs, scenes
@@ -57,7 +57,7 @@ class Graphs:
         self._arrays = arrays
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
-        """Keep a graph; the same again changes nothing, another one under the same key takes its place.
+        """Keep a graph; another one under the same key takes its place, the same again mends damaged bytes.
 
         Args:
             key: its recipe; among its inputs is the scene.
@@ -86,12 +86,15 @@ class Graphs:
         staging = self._arrays.stage(arrays)
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             old = connection.execute(select(graphs).where(mine)).first()
+            known = manifest(connection, group_id)
+            if not known or self._arrays.problems(KIND, group_id, known):
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
             if old is not None and old.group_id == group_id:
                 return _stored(old)
             resolve(connection, graph.scene_id)
-            if not has_group(connection, group_id):
-                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
             connection.execute(delete(graphs).where(mine))
+            if old is not None and self._is_damaged(connection, old.group_id):
+                unname(connection, old.group_id)
             made = {"recipe": recipes.keep(connection, key), "group_id": group_id, "created_at": now()}
             connection.execute(insert(graphs), row | made)
             return _stored(connection.execute(select(graphs).where(mine)).one())
@@ -129,6 +132,25 @@ class Graphs:
         """Those of the keys (as digests) that a graph is kept under."""
         with self._catalog.read() as connection:
             return recipes.kept(connection, graphs.c.key, keys)
+
+    def damaged(self, keys: Iterable[RecipeKey | str]) -> set[str]:
+        """Those of the keys (as digests) whose graph differs from what was written; every byte of them is read."""
+        wanted = {recipes.digest_of(key) for key in keys}
+        with self._catalog.read() as connection:
+            rows = connection.execute(select(graphs.c.key, graphs.c.group_id)).all()
+            return {row.key for row in rows if row.key in wanted and self._is_damaged(connection, row.group_id)}
+
+    def forget(self, keys: Iterable[RecipeKey | str]) -> None:
+        """Drop graphs; their arrays go with the next prune."""
+        mine = graphs.c.key.in_({recipes.digest_of(key) for key in keys})
+        with self._catalog.write() as connection:
+            group_ids = connection.execute(select(graphs.c.group_id).where(mine)).scalars().all()
+            connection.execute(delete(graphs).where(mine))
+            for group_id in group_ids:
+                unname(connection, group_id)
+
+    def _is_damaged(self, connection: Connection, group_id: str) -> bool:
+        return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
 
     def list(self) -> list[StoredGraph]:
         """The graphs of all living scenes, oldest first."""

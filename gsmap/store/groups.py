@@ -38,6 +38,12 @@ def name(connection: Connection, kind: str, group_id: str, manifest: Sequence[St
     connection.execute(insert(files), rows)
 
 
+def unname(connection: Connection, group_id: str) -> None:
+    """Let a group count no longer; whoever claimed it is changed in the same transaction."""
+    connection.execute(delete(files).where(files.c.group_id == group_id))
+    connection.execute(delete(groups).where(groups.c.id == group_id))
+
+
 def manifest(connection: Connection, group_id: str) -> tuple[StoredFile, ...]:
     """The files a group must have, with their digests."""
     rows = connection.execute(select(files).where(files.c.group_id == group_id).order_by(files.c.path))

@@ -8,6 +8,7 @@ import os
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 from sqlalchemy import Connection, delete, not_, select, text, update
 
@@ -17,7 +18,7 @@ from gsmap.store import sqlite, staging
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.explained import explained
+from gsmap.store.explained import PRUNE_MAY, explained
 from gsmap.store.groups import manifest
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
@@ -76,11 +77,13 @@ def check(
     progress: Progress | None = None,
     *,
     read: set[tuple[str, tuple[StoredFile, ...]]] | None = None,
+    location: str | None = None,
 ) -> Check:
     """Read every byte of the map and compare it with what was written; see `Check`.
 
     Args:
         read: groups that are known to be as this manifest says, and need not be read again; those that are, are added.
+        location: what opens the map for writing, to name in advice; None for one that cannot be written.
     """
     read = set() if read is None else read
     home = arrays.root.parent
@@ -107,7 +110,9 @@ def check(
             read.add((group, manifests[group]))
         if found:  # unless it was pruned or mended meanwhile
             with catalog.read() as connection:
-                problems += found if manifest(connection, group) == manifests[group] else []
+                if manifest(connection, group) == manifests[group]:
+                    helps = _graph_advice(connection, group, location) if kind == "graphs" else ""
+                    problems += [problem + helps for problem in found]
     try:
         named_by_any = named.items() | {(group, kind) for kind, group in Others(home, catalog.folder).groups()}
         orphans = tuple(f"{kind}/{name}" for kind, name in arrays.groups() if (name, kind) not in named_by_any)
@@ -130,9 +135,17 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
 
     Raises:
         ConfigError: a negative number of revisions.
+        DiskFullError: even what could be reclaimed first did not make the room that rows need.
     """
     if keep_revisions is not None and keep_revisions < 0:
         raise ConfigError(f"the number of revisions to keep must not be negative, got {keep_revisions}")
+    try:
+        return _prune(catalog, arrays, keep_revisions, dry_run)
+    except DiskFullError as error:  # no advice to do what is being done
+        raise DiskFullError(str(error).replace(PRUNE_MAY, "")) from error
+
+
+def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run: bool) -> Pruned:
     others = Others(arrays.root.parent, catalog.folder)
     others.groups()  # asked before anything is changed: a branch that cannot be read may need any of it
     with contextlib.nullcontext() if dry_run else catalog.lock():
@@ -251,6 +264,20 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
             connection.execute(boxes, {"s": number})
         connection.execute(delete(files).where(files.c.group_id.in_(ids)))
         connection.execute(delete(groups).where(groups.c.id.in_(ids)))
+
+
+def _graph_advice(connection: Connection, group: str, location: str | None) -> str:
+    """Which scene a damaged graph is of, and what makes it whole."""
+    of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
+    found = connection.execute(select(scenes).select_from(of_scene).where(graphs.c.group_id == group)).first()
+    if found is None:
+        return f" (a graph that nothing needs: gsmap prune {quote(location)})" if location else ""
+    if location is None:
+        return f" (the graph of scene {found.name}: restore the file from a backup)"
+    again = f"gsmap describe {quote(location)} {quote(found.name)}"
+    if found.removed_at is not None:
+        again = f"gsmap restore-scene {quote(location)} {found.id[:12]}, then {again}"
+    return f" (the graph of scene {found.name}: {again} makes it again)"
 
 
 def _row_problems(connection: Connection, home: Path) -> list[str]:

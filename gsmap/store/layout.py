@@ -64,9 +64,13 @@ def check(
             raise ValueError(f"its arrays would take {total:.3g} bytes, far more than such files can hold")
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, struct.error) as error:
         said = str(error) if type(error) is ValueError else f"its zarr metadata makes no sense ({error!r})"
-        raise CorruptError(
-            f"{at}: {said}; gsmap did not write that: run gsmap check, and ingest the scene again"
-        ) from error
+        raise CorruptError(f"{at}: {said}; gsmap did not write that: {mend(place.parent.name)}") from error
+
+
+def mend(kind: str) -> str:
+    """What to do about a damaged group of this kind."""
+    again = "make the graph again (gsmap describe MAP SCENE)" if kind == "graphs" else "ingest the scene again"
+    return f"run gsmap check, and {again}"
 
 
 def _check_array(place: Path, name: str, sizes: Mapping[str, int], known: Shape | None) -> int:

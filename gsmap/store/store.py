@@ -62,6 +62,7 @@ class Store:
         self.folder = place.folder
         self.branch = place.branch
         self.location = place.location
+        self.is_tag = place.is_tag
         self.arrays = Arrays(place.home / "arrays")
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
@@ -260,11 +261,19 @@ class Store:
         With the map itself its branches and tags are checked, too; a branch alone where that is what is open.
         """
         read: set[tuple[str, tuple[StoredFile, ...]]] = set()
-        found = integrity.check(self.catalog, self.arrays, progress, read=read)
+        found = integrity.check(
+            self.catalog, self.arrays, progress, read=read, location=None if self.is_tag else self.location
+        )
         for place in branches.places(self.home) if not self.branch else ():
             try:
                 with Store.open(place.location, "r") as other:
-                    more = integrity.check(other.catalog, other.arrays, progress, read=read)
+                    more = integrity.check(
+                        other.catalog,
+                        other.arrays,
+                        progress,
+                        read=read,
+                        location=None if place.is_tag else place.location,
+                    )
             except StoreError as error:
                 more = Check((str(error),), (), 0, 0)
             problems = tuple(f"{place.branch}: {problem}" for problem in more.problems)

@@ -3,7 +3,7 @@
 A map may come from a stranger, and its ``catalog.url`` would have gsmap connect to any server with the user's password
 (``PGPASSWORD``, ``~/.pgpass``). So a URL that a map remembers is used only where the user said so: by making the map
 with it, by ``gsmap trust``, or in the environment variable `ENVIRONMENT`. The yes is kept in the user's configuration,
-by the map's id, without password, and holds for that very URL.
+by the map's id, without password, and holds for those very URLs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,7 +102,7 @@ def named_url(folder: Path) -> str:
     if named := os.environ.get(ENVIRONMENT):
         return named
     found = remembered(folder)
-    if found.map_id is not None and trusted().get(found.map_id) == found.url:
+    if is_trusted(found):
         return found.url
     raise StoreError(
         f"{folder} would connect to {found.server} (database {found.database!r}, user {found.user!r}), which you have "
@@ -111,8 +110,17 @@ def named_url(folder: Path) -> str:
     )
 
 
-def trusted() -> dict[str, str]:
-    """The URLs (without password) that this user trusts, by map id.
+def is_trusted(found: Remembered) -> bool:
+    """Whether this user trusts the very URL that a map remembers.
+
+    Raises:
+        StoreError: as `trusted`.
+    """
+    return found.map_id is not None and found.url in trusted().get(found.map_id, ())
+
+
+def trusted() -> dict[str, tuple[str, ...]]:
+    """The URLs (without password) that this user trusts, by map id: a restored map has the id of the one it was.
 
     Raises:
         StoreError: the user's file of them cannot be read.
@@ -120,13 +128,15 @@ def trusted() -> dict[str, str]:
     path = config_file()
     try:
         found = json.loads(path.read_text(encoding="utf-8"))["catalogs"]
-        if not all(isinstance(key, str) and isinstance(url, str) for key, url in found.items()):
+        # Once there was one URL, and no list, for an id.
+        known = {key: (urls,) if isinstance(urls, str) else tuple(urls) for key, urls in found.items()}
+        if not all(isinstance(key, str) and all(isinstance(url, str) for url in known[key]) for key in known):
             raise TypeError("it maps ids to URLs")
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"{path} cannot be read ({error}): mend it, or remove it and trust your maps again") from error
-    return dict(found)
+    return known
 
 
 def trust(map_id: str, url: str) -> None:
@@ -137,8 +147,9 @@ def trust(map_id: str, url: str) -> None:
         handle = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)  # two at once would forget what one of them says
-            known: Mapping[str, str] = {**trusted(), map_id: url}
-            text = json.dumps({"catalogs": dict(known)}, indent=1) + "\n"
+            known = trusted()
+            known[map_id] = tuple(dict.fromkeys((*known.get(map_id, ()), url)))
+            text = json.dumps({"catalogs": known}, indent=1) + "\n"
             write_whole(path, lambda staged: _write_private(staged, text))
         finally:
             os.close(handle)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import stat
 import time
@@ -156,11 +157,24 @@ def test_whom_the_user_trusts_is_the_users_own_file(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     trust.trust("0" * 32, "postgresql://me@here/a")
     trust.trust("1" * 32, "postgresql://me@here/b")
-    assert trust.trusted() == {"0" * 32: "postgresql://me@here/a", "1" * 32: "postgresql://me@here/b"}
+    trust.trust("1" * 32, "postgresql://me@here/b")
+    assert trust.trusted() == {"0" * 32: ("postgresql://me@here/a",), "1" * 32: ("postgresql://me@here/b",)}
     assert stat.S_IMODE(trust.config_file().stat().st_mode) == 0o600
-    trust.config_file().write_text("[]")
-    with pytest.raises(StoreError, match="mend it"):
-        trust.trusted()
+    for text in ("[]", '{"catalogs": {"0": 5}}', '{"catalogs": {"0": [5]}}'):
+        trust.config_file().write_text(text)
+        with pytest.raises(StoreError, match="mend it"):
+            trust.trusted()
+
+
+def test_a_map_that_was_restored_to_another_database_leaves_the_first_one_trusted(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    trust.config_file().parent.mkdir()
+    trust.config_file().write_text(json.dumps({"catalogs": {"0" * 32: "postgresql://me@here/a"}}))  # of an older gsmap
+    trust.trust("0" * 32, "postgresql://me@here/b")
+    for database, known in (("a", True), ("b", True), ("c", False)):
+        assert trust.is_trusted(trust.Remembered(f"postgresql://me@here/{database}", "0" * 32)) == known
+    assert not trust.is_trusted(trust.Remembered("postgresql://me@here/a", "1" * 32))
+    assert not trust.is_trusted(trust.Remembered("postgresql://me@here/a", None))
 
 
 def test_where_a_remembered_catalog_lies(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import gsmap.map
-from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
+from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, StoreError
 from gsmap.map import Map
 from gsmap.map.stages.describe import graph_keys
 from gsmap.map.stages.export import Request
@@ -85,6 +86,48 @@ def _graph(scene: str, n: int = 4) -> SceneGraph:
         descriptor_id="test",
     )
     return SceneGraph(scene, {"objects": layer}, np.array([0.0, 0, 1]), 1.0)
+
+
+def test_a_scene_that_is_named_gets_its_damaged_graph_again(site: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    described: list[str] = []
+
+    def jobs(job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
+        for i, (_, scene, *_) in enumerate(arguments):
+            described.append(scene)
+            yield i, _graph(scene)
+
+    def spoil(which: str = "*") -> None:
+        for path in site.store.home.glob(f"arrays/graphs/{which}/0.positions/zarr.json"):
+            path.write_bytes(b"")
+
+    monkeypatch.setattr("gsmap.map.stages.describe.run_jobs", jobs)
+    hall, stairs, _ = (scene.id for scene in site.scenes())
+    spoil()
+    with pytest.raises(CorruptError, match="gsmap describe MAP SCENE"):
+        site.describe()  # it reads none of them before it says what they hold
+    assert described == []
+    row = site.describe("hall")[0]
+    assert (described, row.layers[0].num_nodes) == ([hall], 4)
+    problems = site.check().problems
+    assert len(problems) == 2
+    assert not any("scene hall" in problem for problem in problems)
+    assert f"scene stairs: gsmap describe {site.store.location} stairs makes it again" in problems[0] + problems[1]
+    site.describe("stairs", "attic:east", "hall")
+    assert described[:2] == [hall, stairs]
+    assert (len(described), site.check().problems) == (3, ())
+    site.describe("hall")
+    assert len(described) == 3
+    # One of another recipe cannot be made again, and goes.
+    kept = site.store.graphs.save(
+        _graph(hall, 5), replace(graph_keys(site.store, site.scenes(), site.settings)[hall], method="older")
+    )
+    assert site.store.graphs.damaged([kept.key]) == set()
+    site.describe("hall")
+    assert site.store.graphs.find(kept.key) is not None
+    spoil()
+    site.describe("hall")
+    assert site.store.graphs.find(kept.key) is None
+    assert len(site.check().problems) == 2
 
 
 def test_a_pair_is_registered_once_from_its_lower_id_to_its_higher(site: Map, tried: list[tuple[str, str]]) -> None:

@@ -1,5 +1,6 @@
 """A backup in a folder: what it saves, when it refuses, and what several at once do to each other."""
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -18,6 +19,7 @@ from gsmap.store.backup import Backup, restore, save
 from gsmap.store.backup import saving as saving_module
 from gsmap.store.backup.places import FolderPlace, place_of
 from gsmap.store.backup.sharing import EXPIRES_S, SAVE, SWEEP, Lease
+from gsmap.store.catalog import Catalog
 
 
 @pytest.fixture
@@ -39,6 +41,11 @@ def flip(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
+
+
+def restored(place, path):
+    restore(place, path)
+    return Store.open(path, "r")
 
 
 def array_of(store, scene, name="means/c/0/0"):
@@ -92,8 +99,12 @@ def test_a_damaged_map_is_not_backed_up(filled, place):
     assert all(saving_module.hashlib.sha256(p.read_bytes()).hexdigest() == p.name for p in objects(place)), sizes
     filled.scenes.add(make_gaussians(300, seed=2), make_cameras(), name="b")  # mends it
     save(filled, place)
-    broken.unlink()
-    save(filled, place)  # it is in the backup already
+    for spoil in (lambda: flip(broken), broken.unlink):
+        spoil()
+        save(filled, place)  # it is in the backup already, which keeps the sound bytes
+        assert not filled.check().ok
+    with restored(place, place.root.with_name("r")) as whole:
+        assert whole.check().ok
     array_of(filled, "a", "quats/c/0/0").unlink()
     shutil.rmtree(place.root)
     with pytest.raises(CorruptError, match="missing"):
@@ -177,6 +188,70 @@ def test_scenes_that_are_pruned_all_the_time(filled, tmp_path, monkeypatch):
     assert len(tries) == saving_module._TRIES + 1
     restore(place_of(tmp_path / "backup"), tmp_path / "r")
     assert Store.open(tmp_path / "r").check().ok
+
+
+@pytest.mark.parametrize("branch", ["", "@what-if"])
+def test_the_last_try_waits_for_a_writer_who_waits_for_the_arrays(filled, tmp_path, monkeypatch, branch):
+    """Pages that seem to differ are looked at again when nobody writes; who has arrays to publish must get on."""
+    filled.branches.make("what-if")
+    begun, errors = threading.Event(), []
+
+    def write():
+        try:
+            with Store.open(f"{filled.location}{branch}") as other:
+                other.catalog.patience_s = 5.0
+                with other.catalog.write():
+                    begun.set()
+                    time.sleep(0.5)  # the backup has come to where it waits
+                    with other.arrays.lock(5.0):
+                        pass
+        except Exception as error:
+            errors.append(error)
+
+    look = Catalog._look
+    monkeypatch.setattr(saving_module, "_TRIES", 0)
+    monkeypatch.setattr(Catalog, "_look", lambda c, *args: ["changing"] if is_locked(c.folder) else look(c, *args))
+    thread = threading.Thread(target=write)
+    thread.start()
+    assert begun.wait(5.0)
+    began = time.monotonic()
+    save(filled, place_of(tmp_path / "backup"))
+    thread.join()
+    assert errors == []
+    assert time.monotonic() - began < 4.0
+
+
+def is_locked(folder):
+    """Whether a writer is at work on the catalog there."""
+    with open(folder / "lock", "rb") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False
+
+
+def test_what_is_listed_is_not_asked_for_again(filled, tmp_path):
+    class Counting(FolderPlace):
+        asked = 0
+        lagging = False
+
+        def size_bytes(self, name):
+            self.asked += 1
+            return super().size_bytes(name)
+
+        def list(self, prefix):
+            found = super().list(prefix)
+            if prefix == "objects/" and self.lagging:
+                found.popitem()
+            return found
+
+    place = Counting(tmp_path / "backup")
+    assert save(filled, place).num_files_new > 20
+    assert place.asked == 0
+    place.lagging = True  # what a listing lacks may be there all the same
+    save(filled, place)
+    assert place.asked == 1
 
 
 def test_a_backup_that_is_interrupted_goes_on(filled, tmp_path):

@@ -131,6 +131,17 @@ def test_prune_makes_room_on_a_full_disk(full):
         assert store.check().problems == ()
 
 
+def test_prune_that_cannot_make_room_does_not_advise_to_prune(disk, run):
+    with Store.create(disk / "m.gsmap") as store:
+        store.scenes.add(make_gaussians(600), make_cameras(), name="kept")
+    fill(disk)
+    code, said = run("prune", disk / "m.gsmap")
+    assert (code, "the disk is full" in said, "free some space and try again" in said) == (1, True, True), said
+    assert "gsmap prune" not in said
+    code, said = run("edit", disk / "m.gsmap", "kept", "--name", "other")
+    assert "gsmap prune may" in said
+
+
 def test_prune_drops_what_no_row_names_first(disk, monkeypatch):
     from gsmap.store import integrity
 

@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import fields, replace
 
 import numpy as np
@@ -5,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from store_samples import key, make_cameras, make_gaussians
 
-from gsmap.errors import ConfigError, InputError, NotFoundError, StoreError
+from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, StoreError
 from gsmap.store import MANUAL, Pruned, Store
 from gsmap.types import (
     EdgeOutcome,
@@ -86,6 +87,64 @@ def test_graph_round_trip(store, two_scenes):
             assert type(a) is type(b)
             assert getattr(a, "dtype", None) == getattr(b, "dtype", None)
             np.testing.assert_array_equal(a, b, part.name)
+
+
+def test_a_damaged_graph_is_mended_by_saving_it_again(store, two_scenes):
+    scene, made = two_scenes[0].id, key("describe", two_scenes[0].id)
+    graph = SceneGraph(scene, {"objects": layer()})
+    kept = store.graphs.save(graph, made)
+    assert store.graphs.damaged([made, key("describe", "other")]) == set()
+    (place,) = (store.folder / "arrays" / "graphs").iterdir()
+    broken = next(path for path in place.rglob("zarr.json") if path.parent != place)
+    content = broken.read_bytes()
+    for spoil in (broken.unlink, lambda: broken.write_bytes(b"x" * len(content)), lambda: shutil.rmtree(place)):
+        spoil()
+        assert store.graphs.damaged([made]) == {made.digest}
+        with pytest.raises(CorruptError, match=r"gsmap describe MAP SCENE") as caught:
+            store.graphs.load(scene, made)
+        assert "ingest" not in str(caught.value)
+        (problem, *_) = store.check().problems
+        assert f"scene scene0: gsmap describe {store.location} scene0" in problem
+        assert store.graphs.save(graph, made) == kept
+        assert (store.check().problems, store.graphs.damaged([made])) == ((), set())
+        assert broken.read_bytes() == content
+        assert store.graphs.load(scene, made).num_nodes == 7
+
+
+def test_a_damaged_graph_that_another_replaces_is_no_problem_any_more(store, two_scenes):
+    scene, made = two_scenes[0].id, key("describe", two_scenes[0].id)
+
+    def spoil():
+        for path in store.folder.glob("arrays/graphs/*/zarr.json"):
+            path.write_bytes(b"")
+        return store.check().problems
+
+    for replaced in (lambda: store.graphs.save(SceneGraph(scene), made), lambda: store.graphs.forget([made])):
+        store.graphs.save(SceneGraph(scene, {"objects": layer()}), made)
+        store.prune()
+        assert len(spoil()) == 1
+        replaced()
+        assert store.check().ok
+        assert store.prune().num_orphans == 1
+    assert store.graphs.find(made) is None
+    for m in (3, 4):
+        store.graphs.save(SceneGraph(scene, {"objects": layer(m)}), made)
+    found = spoil()  # one that was replaced before it was damaged
+    assert len(found) == 2
+    assert sum(f"nothing needs: gsmap prune {store.location})" in problem for problem in found) == 1
+
+
+def test_a_damaged_graph_of_a_tag_or_of_a_removed_scene(store, two_scenes):
+    scene = two_scenes[0].id
+    store.graphs.save(SceneGraph(scene, {"objects": layer()}), key("describe", scene))
+    store.branches.make("v1", tag=True)
+    store.scenes.remove("scene0")
+    for path in store.folder.glob("arrays/graphs/*/zarr.json"):
+        path.unlink()
+    of_map, of_tag = store.check().problems
+    assert f"gsmap restore-scene {store.location} {scene[:12]}, then gsmap describe {store.location} scene0" in of_map
+    assert of_tag.startswith("v1: ")
+    assert "scene scene0: restore the file from a backup" in of_tag
 
 
 def test_graphs_by_key(store, two_scenes):

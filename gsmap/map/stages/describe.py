@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 
@@ -32,11 +32,16 @@ def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
 
 
 def describe(
-    store: Store, scenes: Sequence[Scene], settings: Settings, progress: StageProgress
+    store: Store, scenes: Sequence[Scene], settings: Settings, progress: StageProgress, *, verify: bool = False
 ) -> dict[str, RecipeKey]:
-    """Make the graphs that are missing, reading none of the others; returns the key of each scene's graph."""
+    """Make the graphs that are missing; returns the key of each scene's graph.
+
+    Args:
+        verify: read the graphs that are there, and make those again that are damaged; else none of them is read.
+    """
     keys = graph_keys(store, scenes, settings)
-    lacking = set(without_graph(store, keys))
+    damaged = store.graphs.damaged(keys.values()) if verify else set()
+    lacking = {*without_graph(store, keys), *(scene for scene, key in keys.items() if key.digest in damaged)}
     missing = [scene for scene in scenes if scene.id in lacking]
     specs = models.specs(store)
     # A worker elsewhere must not choose another renderer than the one that the key names.
@@ -44,7 +49,11 @@ def describe(
     params = replace(settings.describe, object=replace(settings.describe.object, render_backend=rendered_by))
     names = {keys[scene.id].digest: scene.name for scene in missing}
     jobs = {keys[scene.id].digest: (store.location, scene.id, specs, params) for scene in missing}
-    shared = SharedJobs(store, "describe", "graph", jobs, store.graphs.kept, progress)
+
+    def done(wanted: Collection[str]) -> set[str]:
+        return store.graphs.kept(wanted) - store.graphs.damaged(damaged.intersection(wanted))
+
+    shared = SharedJobs(store, "describe", "graph", jobs, done, progress)
     results = shared.results(lambda arguments: run_jobs(describe_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
     kept = noting(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")
@@ -52,4 +61,8 @@ def describe(
         for key, graph in results:
             store.graphs.save(graph, keys[graph.scene_id])
             shared.saved(key, f"{names[key]}: {graph.num_nodes} nodes")
+    if verify:  # those of other recipes cannot be made again, and nothing needs them any more
+        others = [graph.key for graph in store.graphs.list() if graph.scene in keys]
+        if beyond_help := store.graphs.damaged(others):
+            store.graphs.forget(beyond_help)
     return keys

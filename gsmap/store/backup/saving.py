@@ -16,7 +16,7 @@ from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import FolderPlace, Place
 from gsmap.store.backup.repository import OBJECTS, SNAPSHOTS, Backup, Snapshot, digest_of, listed, object_name
 from gsmap.store.backup.sharing import SAVE, SWEEP, Lease
-from gsmap.store.backup.states import State, Vanished, capture, home_of, read_file
+from gsmap.store.backup.states import State, Vanished, capture, home_of, read_file, still
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
@@ -154,9 +154,13 @@ class _Run:
     def save(self) -> Snapshot:
         """States are begun with until all of one is there."""
         for trial in range(_TRIES + 1):
-            reclaiming = self.store.arrays.lock() if trial == _TRIES else contextlib.nullcontext()
-            with reclaiming, self._folder() as folder:
-                state = capture(self.store, folder)
+            with contextlib.ExitStack() as until_sent, self._folder() as folder:
+                if trial == _TRIES:
+                    with still(self.store):  # first, in the order of writers, who may wait for the other lock with it
+                        until_sent.enter_context(self.store.arrays.lock())
+                        state = capture(self.store, folder)
+                else:
+                    state = capture(self.store, folder)
                 with contextlib.suppress(Vanished):
                     self._send(state, folder)
                     return self._write(state)
@@ -256,7 +260,9 @@ class _Run:
         there = self._there()
         for file in [own, *state.files]:
             name = object_name(file.sha256)
-            if file.size_bytes not in (there.get(file.sha256), self.backup.place.size_bytes(name)):
+            listed_so = there.get(file.sha256) == file.size_bytes
+            # A listing may lag behind; asking for each object alone is a request for each.
+            if not listed_so and self.backup.place.size_bytes(name) != file.size_bytes:
                 raise StoreError(f"{self.backup.place.url} lost {name}: run it again")
         snapshot = Snapshot(
             name="",

@@ -24,6 +24,7 @@ from gsmap.store.branches import places
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.explained import explained
+from gsmap.store.layout import mend
 from gsmap.store.models import FOLDER as MODELS
 
 if TYPE_CHECKING:
@@ -99,6 +100,16 @@ def capture(store: Store, folder: Path, *, branches: bool = True) -> State:
     return State(
         state.map_id, created_at, state.schema, tuple(files[p] for p in sorted(files)), state.revision, state.counts
     )
+
+
+@contextlib.contextmanager
+def still(store: Store) -> Iterator[None]:
+    """Keep everybody from writing to any catalog of a map, so that `capture` inside waits for nobody."""
+    with contextlib.ExitStack() as held:
+        held.enter_context(store.catalog.still())
+        for place in places(home_of(store)):
+            held.enter_context(_catalog.still(place.folder, store.catalog.patience_s))
+        yield
 
 
 def read_state(file: Path, created_at: str = "") -> State:
@@ -181,11 +192,15 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
         if immutable and not _still_named(store, file):
             raise Vanished(file.path) from error
         if isinstance(error, CorruptError):
-            raise CorruptError(f"{error}: run gsmap check, and ingest the scene again") from error
-        helps = "run gsmap check and ingest the scene again, or gsmap prune if one was interrupted"
-        raise CorruptError(f"{path} is missing: {helps}") from error
+            raise CorruptError(f"{error}: {_mend(file)}") from error
+        raise CorruptError(f"{path} is missing: {_mend(file)}, or gsmap prune if one was interrupted") from error
     except OSError as error:
         raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _mend(file: StoredFile) -> str:
+    top, kind, *_ = file.path.split("/")
+    return mend(kind) if top == ARRAYS else "restore it from a backup"
 
 
 def checked(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[bytes]:
