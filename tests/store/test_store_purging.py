@@ -383,13 +383,14 @@ def test_files_that_an_export_had_still_to_delete_go(place, tmp_path):
         assert "doomed" not in json.loads((out / "tiles.json").read_text())
 
 
-def test_killed_among_the_levels_the_next_purge_finishes(place, tmp_path, start):
+@pytest.mark.parametrize("at", ["remove_file", "save"])
+def test_killed_among_the_levels_the_next_purge_finishes(place, tmp_path, start, at):
     secret = make(place)
     out = tmp_path / "out"
     with gsmap.map.open(place) as m:
         _export_tree(m, out)
     manifest = (out / "tiles.json").read_bytes()
-    process, _ = start(_die_at_manifest, str(place), secret)
+    process, _ = start(_die_cleaning, str(place), secret, at)
     process.join()
     assert process.exitcode == 9
     assert (out / "tiles.json").read_bytes() == manifest
@@ -400,11 +401,12 @@ def test_killed_among_the_levels_the_next_purge_finishes(place, tmp_path, start)
     assert secret not in (out / "tiles.json").read_text()
 
 
-def _die_at_manifest(path, secret, pipe):
-    """Die when all files of the folder are gone and its manifest is not written yet."""
+def _die_cleaning(path, secret, at, pipe):
+    """Die before the first file of the folder goes, or when all are gone and its manifest is to be written."""
     from gsmap.export.manifest import Manifest
+    from gsmap.map.stages import purge
 
-    Manifest.save = lambda *_: os._exit(9)
+    setattr(Manifest if at == "save" else purge, at, lambda *_: os._exit(9))
     with gsmap.map.open(path) as m:
         m.purge(secret)
 
