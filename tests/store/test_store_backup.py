@@ -162,8 +162,8 @@ def test_scenes_that_are_pruned_meanwhile(filled, tmp_path, monkeypatch):
 
 def test_scenes_that_are_pruned_all_the_time(filled, tmp_path, monkeypatch):
     """Whatever is listed is gone before it is read: the last try holds the writers back."""
-    tries = []
-    whole = saving_module.capture
+    tries, threads = [], []
+    whole, send = saving_module.capture, saving_module._Run._send
 
     def capture(store, folder, **options):
         state = whole(store, folder, **options)
@@ -171,20 +171,23 @@ def test_scenes_that_are_pruned_all_the_time(filled, tmp_path, monkeypatch):
 
         def change():
             with Store.open(store.catalog.folder) as other:
-                other.catalog.patience_s = 0.2
                 other.scenes.remove(f"n{len(tries) - 1}")
                 other.prune()
                 other.scenes.add(make_gaussians(50, seed=10 + len(tries)), make_cameras(), name=f"n{len(tries)}")
 
-        thread = threading.Thread(target=change)
-        thread.start()
-        thread.join(2.0)  # the last one waits for the backup
+        threads.append(threading.Thread(target=change))
+        threads[-1].start()
         return state
+
+    def send_after_change(*arguments):
+        threads[-1].join(2.0)  # the last one waits for the backup
+        send(*arguments)
 
     filled.scenes.add(make_gaussians(50, seed=10), make_cameras(), name="n0")
     monkeypatch.setattr(saving_module, "capture", capture)
-    monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
+    monkeypatch.setattr(saving_module._Run, "_send", send_after_change)
     save(filled, place_of(tmp_path / "backup"))
+    threads[-1].join()
     assert len(tries) == saving_module._TRIES + 1
     restore(place_of(tmp_path / "backup"), tmp_path / "r")
     assert Store.open(tmp_path / "r").check().ok
