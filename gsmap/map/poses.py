@@ -14,6 +14,7 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.formats import colmap, g2o, nerfstudio, tum
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.map import reports
+from gsmap.map.one_state import of_one_state
 from gsmap.store import Store
 from gsmap.types import Cameras, Edge, Scene, ScenePose
 from gsmap.types.rows import SCHEMA
@@ -21,6 +22,7 @@ from gsmap.types.rows import SCHEMA
 FORMATS = ("tum", "g2o", "colmap", "nerfstudio", "json")
 
 
+@of_one_state
 def write_poses(store: Store, out: Path, format: str) -> list[Path]:
     """Write the newest poses of all placed scenes; returns the files or folders written.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from gsmap.errors import ConfigError, CorruptError
+from gsmap.map.one_state import of_one_state
 from gsmap.methods import RecipeKey
 from gsmap.settings import leaves
 from gsmap.store import Store
@@ -54,6 +55,7 @@ EDGE_STATUSES = ("accepted", "rejected", "no_match")
 # --- scenes ----------------------------------------------------------------------------------------------------------
 
 
+@of_one_state
 def scene_rows(
     store: Store,
     *,
@@ -89,6 +91,7 @@ def scene_rows(
     ]
 
 
+@of_one_state
 def scene_row(store: Store, scene: Scene) -> SceneRow:
     """The row of one scene."""
     nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
@@ -113,6 +116,7 @@ def _scene_row(scene: Scene, placed: PoseGraph | None, num_nodes: int | None, no
     )
 
 
+@of_one_state
 def scene_report(store: Store, scene: Scene, graph: SceneGraph | None, graph_note: str = "") -> SceneReport:
     """Everything known of one scene.
 
@@ -251,6 +255,7 @@ def graph_row(store: Store, scene: Scene, key: RecipeKey) -> GraphRow:
     )
 
 
+@of_one_state
 def pose_rows(store: Store) -> list[PoseRow]:
     """Where every placed living scene lies, oldest scene first."""
     placed = store.revisions.get()
@@ -272,6 +277,7 @@ def pose_rows(store: Store) -> list[PoseRow]:
 # --- pairs -----------------------------------------------------------------------------------------------------------
 
 
+@of_one_state
 def edge_rows(
     store: Store,
     *,
@@ -304,12 +310,14 @@ def edge_rows(
     ]
 
 
+@of_one_state
 def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
     """The current edges of the pairs of these registrations, in their order."""
     rows = {frozenset((row.target, row.source)): row for row in _edge_rows(store, store.registrations.current())}
     return [rows[frozenset((edge.target, edge.source))] for edge in made]
 
 
+@of_one_state
 def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
     """The current edge of a pair; one that has none (a lone measurement was withdrawn) is ``never registered``."""
     current = store.registrations.get(a.id, b.id)
@@ -354,6 +362,7 @@ def _edge_row(stored: StoredRegistration, placed: PoseGraph | None, name_of: Map
 _USED: dict[str, bool | str] = {"used": True, "tentative": "tentative", "unused": False}
 
 
+@of_one_state
 def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
     """Everything known of one pair: its current edge, the evidence it rests on, and all that was said before."""
     current = store.registrations.get(a.id, b.id)
@@ -403,6 +412,7 @@ def _never_registered(a: Scene, b: Scene) -> dict[str, Any]:
 # --- revisions -------------------------------------------------------------------------------------------------------
 
 
+@of_one_state
 def revision_rows(store: Store) -> list[RevisionRow]:
     """Every answer of the optimiser, oldest first."""
     name_of = names(store)
@@ -421,6 +431,7 @@ def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionR
     return [row for row in rows if since is None or _is_after(row.created_at, since)]
 
 
+@of_one_state
 def revision_row(store: Store, number: int) -> RevisionRow:
     """One answer of the optimiser."""
     found = next(revision for revision in store.revisions.list() if revision.number == number)
@@ -451,6 +462,7 @@ def _revision_row(revision: Revision, graph: PoseGraph | None, name_of: Mapping[
     )
 
 
+@of_one_state
 def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRow]:
     """How each scene differs between two revisions, measured at its middle.
 
@@ -481,6 +493,7 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
     ]
 
 
+@of_one_state
 def update_report(store: Store, ingested: Sequence[IngestRow]) -> UpdateReport:
     """What an update took in, and the map as it is now."""
     revisions = store.revisions.list()
@@ -495,6 +508,7 @@ def update_report(store: Store, ingested: Sequence[IngestRow]) -> UpdateReport:
 # --- exports, models, settings, upkeep -------------------------------------------------------------------------------
 
 
+@of_one_state
 def tile_rows(store: Store) -> list[TileRow]:
     """Every tile of every folder exported to."""
     name_of = names(store)
@@ -505,6 +519,7 @@ def tile_rows(store: Store) -> list[TileRow]:
     ]
 
 
+@of_one_state
 def export_report(store: Store, out: Path, made: ExportResult) -> ExportReport:
     """What an export did."""
     name_of = names(store)
@@ -580,6 +595,7 @@ def prune_report(pruned: Pruned, dry_run: bool) -> PruneReport:
     )
 
 
+@of_one_state
 def names(store: Store) -> dict[str, str]:
     """The name of every scene by its id, removed ones included."""
     return _ByScene((scene.id, scene.name) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Sequence
 
+from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.map.stages.export import dirty_tiles
@@ -16,6 +17,7 @@ from gsmap.types import Scene
 from gsmap.types.rows import AtWorkRow, MapStatus, TodoRow
 
 
+@of_one_state
 def status(store: Store, settings: Settings) -> MapStatus:
     """``gsmap status MAP``, from the catalog alone: no array is read, nothing is computed."""
     at = shlex.quote(store.location)

@@ -6,10 +6,12 @@ from functools import partial
 from pathlib import Path
 
 from gsmap.map import reports
+from gsmap.map.one_state import of_one_state
 from gsmap.store import Store
 from gsmap.view import ViewEdge, ViewMap, ViewScene
 
 
+@of_one_state
 def view_of(store: Store) -> ViewMap:
     """The living scenes, each with its newest graph, and the edges between them."""
     placed = store.revisions.get()

@@ -59,12 +59,20 @@ class Catalog:
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Connection]:
-        """A transaction that sees one state of the map, whatever others write (inside `write`: that transaction)."""
-        if self._writing is not None:
-            yield self._writing
+        """A transaction that sees one state of the map, whatever others write.
+
+        Inside another one of the same thread, or inside `write`, it is that one.
+        """
+        within = self._writing or getattr(self._held, "reading", None)
+        if within is not None:
+            yield within
             return
         with explained(self.folder), self._reading() as connection, connection.begin():
-            yield connection
+            self._held.reading = connection
+            try:
+                yield connection
+            finally:
+                self._held.reading = None
 
     @contextlib.contextmanager
     def _reading(self) -> Iterator[Connection]:
@@ -80,6 +88,8 @@ class Catalog:
                     yield still
             return
         with connection:
+            if not self.is_sqlite:  # else each statement would see what is newest
+                connection = connection.execution_options(isolation_level="REPEATABLE READ")
             yield connection
 
     @contextlib.contextmanager

@@ -1,0 +1,51 @@
+"""What is read inside one reading is of one moment, whatever others write meanwhile."""
+
+import pytest
+from store_samples import make_cameras, make_gaussians
+
+from gsmap.map import reports
+from gsmap.store import Store
+
+
+def add(store, seed):
+    return store.scenes.add(make_gaussians(seed=seed), make_cameras(), name=f"scene{seed}")[0]
+
+
+def see_one_state(store, other):
+    add(store, 1)
+    with store.catalog.read():
+        assert [scene.name for scene in store.scenes.list()] == ["scene1"]
+        add(other, 2)
+        assert [scene.name for scene in store.scenes.list()] == ["scene1"]
+    assert [scene.name for scene in store.scenes.list()] == ["scene1", "scene2"]
+
+
+def test_on_sqlite(store):
+    with Store.open(store.folder) as other:
+        see_one_state(store, other)
+
+
+def test_on_postgres(tmp_path, postgres_database):
+    with (
+        Store.create(tmp_path / "m", catalog_url=postgres_database) as store,
+        Store.open(tmp_path / "m", catalog_url=postgres_database) as other,
+    ):
+        see_one_state(store, other)
+
+
+@pytest.mark.parametrize("report", [reports.scene_rows, reports.edge_rows, reports.pose_rows, reports.revision_rows])
+def test_reports_read_inside_one(store, report, monkeypatch):
+    """The first thing that a report asks for is asked for inside a reading that lasts until its end."""
+    add(store, 1)
+    depth = []
+    read = type(store.catalog).read
+
+    def watched(catalog):
+        depth.append(getattr(catalog._held, "reading", None))
+        return read(catalog)
+
+    monkeypatch.setattr(type(store.catalog), "read", watched)
+    report(store)
+    assert depth[0] is None
+    assert len(depth) > 1
+    assert all(depth[1:])
