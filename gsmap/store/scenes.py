@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -232,7 +232,9 @@ class Scenes:
             files = _manifest(connection, row)
             chunks = None if bounds is None else _touching(connection, row.number, np.asarray(bounds, np.float64))
         rows = None if chunks is None else _ranges(chunks, row.num_gaussians)
-        out = Gaussians(**self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows, shapes=_shapes(row)))
+        with self._unless_pruned(row):
+            arrays = self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows, shapes=_shapes(row))
+        out = Gaussians(**arrays)
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)
@@ -249,14 +251,28 @@ class Scenes:
             row = _find(connection, ref)
             files = _manifest(connection, row)
         names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
-        pose, intrinsics, sizes, text_bytes = self._arrays.read(
-            KIND, row.group_id, files, only=names, shapes=_shapes(row)
-        ).values()
+        with self._unless_pruned(row):
+            arrays = self._arrays.read(KIND, row.group_id, files, only=names, shapes=_shapes(row))
+        pose, intrinsics, sizes, text_bytes = arrays.values()
         try:
             image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
         except UnicodeDecodeError as error:
             raise CorruptError(f"scene {row.name}: the names of its cameras are no text: ingest it again") from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
+
+    @contextlib.contextmanager
+    def _unless_pruned(self, row: Row[Any]) -> Iterator[None]:
+        """Tell arrays that others reclaimed while they were read from damaged ones."""
+        try:
+            yield
+        except CorruptError:
+            with self._catalog.read() as connection:
+                found = _by_id(connection, row.id)
+            if found is None or found.group_id is None:
+                raise NotFoundError(
+                    f"scene {row.name!r} was removed and its arrays were pruned while they were read"
+                ) from None
+            raise
 
     def remove(self, ref: str) -> Scene:
         """Leave a tombstone: gone from lists and from the next revision, its bytes kept until they are pruned."""

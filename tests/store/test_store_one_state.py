@@ -3,6 +3,7 @@
 import pytest
 from store_samples import make_cameras, make_gaussians
 
+from gsmap.errors import NotFoundError
 from gsmap.map import reports
 from gsmap.store import Store
 
@@ -49,3 +50,19 @@ def test_reports_read_inside_one(store, report, monkeypatch):
     assert depth[0] is None
     assert len(depth) > 1
     assert all(depth[1:])
+
+
+@pytest.mark.parametrize("read", ["gaussians", "cameras"])
+def test_arrays_that_are_pruned_while_they_are_read_are_not_called_damaged(store, monkeypatch, read):
+    add(store, 1)
+    real = store.arrays.read
+
+    def after_a_prune(*args, **options):
+        with Store.open(store.folder) as other:
+            other.scenes.remove("scene1")
+            other.prune()
+        return real(*args, **options)
+
+    monkeypatch.setattr(store.arrays, "read", after_a_prune)
+    with pytest.raises(NotFoundError, match="pruned while"):
+        getattr(store.scenes, read)("scene1")
