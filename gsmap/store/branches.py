@@ -17,15 +17,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sqlalchemy import Connection, delete, func, select, update
+from sqlalchemy import Connection, func, select
 
 from gsmap.durable import is_file, is_folder, sync_file, sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.store import sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.catalog import Catalog, now, open_engine
+from gsmap.store.copying import copy_catalog, empty_catalog, make_own
 from gsmap.store.explained import explained
-from gsmap.store.schema import about, exports, files, groups, leases, models, revisions, scenes, tiles
+from gsmap.store.schema import exports, files, groups, leases, models, revisions, scenes, tiles
 
 FOLDER = "branches"
 _MARKER = "branch.json"
@@ -181,7 +182,8 @@ class Branches:
                 told = {"kind": "tag" if tag else "branch", "parent": self._place.branch, "created_at": now()}
                 (staged / _MARKER).write_text(json.dumps(told))
                 sync_file(staged / _MARKER)
-                _make_own(staged)
+                # Who is at work on it and where it was exported to is of the map.
+                make_own(staged, (leases, tiles, exports), id=uuid.uuid4().hex)
                 sync_folder(staged)
                 os.rename(staged, folder)
                 sync_folder(folder.parent)
@@ -224,8 +226,6 @@ class Branches:
         if self._catalog.is_sqlite:
             sqlite.backup(self._catalog.engine, folder / sqlite.FILE)
             return
-        from gsmap.store.copying import copy_catalog, empty_catalog
-
         made = empty_catalog(folder)
         copy_catalog(self._catalog, made)
         made.close()
@@ -301,26 +301,6 @@ def _make_folder(folder: Path) -> None:
     if not folder.exists():
         folder.mkdir()
         sync_folder(folder.parent)
-
-
-def _make_own(folder: Path) -> None:
-    """Let a copied catalog be another map: its revisions are those of the map that it was copied from."""
-    catalog = Catalog(folder, sqlite.engine(folder / sqlite.FILE, writable=True), writable=True)
-    with catalog.write() as connection:
-        parent = connection.execute(select(about.c.id)).scalar_one()
-        for number in (
-            connection.execute(select(revisions.c.number).where(revisions.c.origin.is_(None))).scalars().all()
-        ):
-            origin = {"map": parent, "number": number}
-            connection.execute(update(revisions).where(revisions.c.number == number).values(origin=origin))
-        connection.execute(update(about).values(id=uuid.uuid4().hex))
-        for table in (
-            leases,
-            tiles,
-            exports,
-        ):  # these are of the map: who is at work on it, and where it was exported to
-            connection.execute(delete(table))
-    catalog.close()
 
 
 def _told(folder: Path) -> dict[str, str]:
