@@ -16,15 +16,7 @@ from pathlib import Path
 from sqlalchemy import delete, inspect, select, text
 
 from gsmap.durable import sync_folder
-from gsmap.errors import (
-    CorruptError,
-    DiskError,
-    DiskFullError,
-    GsmapError,
-    NotFoundError,
-    ReadOnlyError,
-    StoreError,
-)
+from gsmap.errors import CorruptError, DiskError, DiskFullError, GsmapError, NotFoundError, StoreError, of_system
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, staging, trust
 from gsmap.store.arrays import StoredFile
@@ -40,11 +32,6 @@ from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
 
 _TRIES = 4  # states to begin with where others prune meanwhile
-_KINDS = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), DiskFullError),
-    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), ReadOnlyError),
-    errno.EIO: DiskError,
-}
 _log = logging.getLogger("gsmap.store")
 
 
@@ -321,6 +308,6 @@ def _writing(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        said = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-        kind = _KINDS.get(error.errno or 0, StoreError)
+        kind = of_system(error)
+        said = "the disk is full" if kind is DiskFullError else error.strerror or str(error)
         raise kind(f"{target} was not made: {said}") from error
