@@ -23,7 +23,8 @@ from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
-from gsmap.store.backup.states import ARRAYS, BRANCHES, State, Vanished, capture, read_file, read_state
+from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
+from gsmap.store.branches import FOLDER as BRANCHES
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog, make_own, own_catalog
 from gsmap.store.explained import explained

@@ -19,6 +19,8 @@ from gsmap.store import catalog as _catalog
 from gsmap.store import sqlite
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import CHUNK_BYTES
+from gsmap.store.branches import FOLDER as BRANCHES
+from gsmap.store.branches import MARKER as BRANCH_FILE
 from gsmap.store.branches import places
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
@@ -30,10 +32,6 @@ if TYPE_CHECKING:
     from gsmap.store.store import Store
 
 ARRAYS = "arrays"
-BRANCHES = "branches"
-BRANCH_FILE = "branch.json"
-
-
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
