@@ -626,7 +626,7 @@ class Map(AbstractContextManager["Map"]):
 
         Args:
             island: those of this component.
-            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of the island, else of component 0.
+            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of that component, else of component 0.
             scenes: those of these names.
         """
         return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))

@@ -162,8 +162,7 @@ class Store:
 
     def others(self) -> list[Place]:
         """Where the other catalogs over the same arrays lie: the map, its branches, its tags."""
-        every = (Place(self.home, self.home), *branches.places(self.home))
-        return [place for place in every if place.folder != self.folder]
+        return branches.other_places(self.home, self.folder)
 
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
