@@ -1,6 +1,7 @@
 """The frozen nouns of gsmap. numpy only: they travel between stages, processes and machines."""
 
 from gsmap.types.cameras import Cameras
+from gsmap.types.change import CHANGE_KINDS, Change, ChangeKind, ChangeReport
 from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
 from gsmap.types.merging import MergeResult, PlacedScene
@@ -12,7 +13,11 @@ from gsmap.types.sim3 import Sim3
 from gsmap.types.tile import Tile
 
 __all__ = [
+    "CHANGE_KINDS",
     "Cameras",
+    "Change",
+    "ChangeKind",
+    "ChangeReport",
     "Edge",
     "EdgeOutcome",
     "FileInfo",

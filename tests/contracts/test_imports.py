@@ -25,6 +25,7 @@ LAYERS = [
     {"methods"},
     {"settings"},
     {"formats", "render", "networks"},
+    {"compare"},
     {
         "store",
         "retrieve",
@@ -33,6 +34,7 @@ LAYERS = [
         "register",
         "optimize",
         "merge",
+        "change",
         "export",
         "evaluate",
         "view",
