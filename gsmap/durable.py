@@ -67,7 +67,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     sync_folder(path.parent)
 
 
-def lock_within(patience_s: float, handle: int, how: int, busy: str) -> None:
+def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
     """Lock an open file or folder (``how``: `fcntl.LOCK_EX`, `fcntl.LOCK_SH`); the kernel frees it with the process.
 
     Raises:

@@ -129,7 +129,7 @@ class Arrays:
             return
         handle = os.open(self.root, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            lock_within(patience_s, handle, fcntl.LOCK_EX, f"{self.root}: others have been writing arrays")
+            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.root}: others have been writing arrays")
             self._held.depth = 1
             yield
         finally:

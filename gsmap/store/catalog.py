@@ -140,7 +140,7 @@ class Catalog:
                 raise error
         try:
             patience_s = self.patience_s if patience_s is None else patience_s
-            lock_within(patience_s, handle, fcntl.LOCK_EX, f"{self.folder}: others have been writing")
+            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.folder}: others have been writing")
             self._held.depth = 1
             yield
         finally:
@@ -277,7 +277,7 @@ def still(folder: Path, patience_s: float) -> Iterator[None]:
         yield
         return
     try:
-        lock_within(patience_s, handle, fcntl.LOCK_SH, f"{folder}: others have been writing")
+        lock_within(handle, fcntl.LOCK_SH, patience_s, f"{folder}: others have been writing")
         yield
     finally:
         os.close(handle)
