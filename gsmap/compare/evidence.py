@@ -21,16 +21,17 @@ class Evidence:
 
     Args:
         through, on_surface, hidden: (N,) int32 views.
-        colour_differs: (N,) int32 of those where it lies on the surface, here of either capture.
         colour_seen: (N,) int32 views, of either capture, in which its colour could be compared.
+        chroma, lightness: (N, 2) and (N,) float32 means, over these views, of by how much the newer's colour differs.
         state: (N,) int8, one of the five, after neighbours have voted.
     """
 
     through: np.ndarray
     on_surface: np.ndarray
     hidden: np.ndarray
-    colour_differs: np.ndarray
     colour_seen: np.ndarray
+    chroma: np.ndarray
+    lightness: np.ndarray
     state: np.ndarray
 
 
@@ -41,43 +42,74 @@ class Tally:
         self.through = np.zeros(count, dtype=np.int32)
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
-        self.colour_differs = np.zeros(count, dtype=np.int32)
         self.colour_seen = np.zeros(count, dtype=np.int32)
+        self.chroma = np.zeros((count, 2), dtype=np.float32)
+        self.lightness = np.zeros(count, dtype=np.float32)
 
     def evidence(self, points: np.ndarray, shows: np.ndarray, params: Params) -> Evidence:
         """The counts and what they come to; ``shows`` (N,) says which Gaussians are part of a surface and vote."""
-        counts = (self.through, self.on_surface, self.hidden, self.colour_differs, self.colour_seen)
-        return Evidence(*counts, states(*counts, points, shows, params))
+        often = np.maximum(self.colour_seen, 1).astype(np.float32)
+        chroma, lightness = self.chroma / often[:, None], self.lightness / often
+        near = _Neighbours(points, shows, params)
+        state = self._geometry(near, params)
+        same = state == SAME
+        seen = same & (self.colour_seen >= 2) & shows
+        paint = _painted(points, chroma, lightness, seen, near, params)
+        state[same & paint] = REPAINTED
+        return Evidence(
+            self.through, self.on_surface, self.hidden, self.colour_seen, chroma, lightness, state
+        )
+
+    def _geometry(self, near: _Neighbours, params: Params) -> np.ndarray:
+        through, on = near.sums(self.through), near.sums(self.on_surface)
+        judged, own = self.through + self.on_surface, self.through + self.on_surface
+        few, share = params.min_views, params.min_share
+        state = np.full(len(judged), UNSEEN, dtype=np.int8)
+        state[(judged < few) & (self.hidden >= few)] = HIDDEN
+        enough = judged >= few
+        # A Gaussian counts as much as all of its neighbours together.
+        weight = judged / np.maximum(through + on, 1)
+        part = (self.through + weight * through) / np.maximum(own + weight * (through + on), 1e-9)
+        state[enough] = np.where(part[enough] >= share, GONE, SAME)
+        return state
 
 
-def states(
-    through: np.ndarray,
-    on_surface: np.ndarray,
-    hidden: np.ndarray,
-    colour_differs: np.ndarray,
-    colour_seen: np.ndarray,
+class _Neighbours:
+    """The nearest Gaussians that show, of each."""
+
+    def __init__(self, points: np.ndarray, shows: np.ndarray, params: Params) -> None:
+        from scipy.spatial import cKDTree
+
+        self.rows = np.flatnonzero(shows)
+        self.index = np.zeros((len(points), 0), dtype=np.int64)
+        self.distance = np.zeros((len(points), 0))
+        if len(self.rows):
+            tree = cKDTree(points[self.rows])
+            count = min(params.neighbours, len(self.rows))
+            self.distance, self.index = tree.query(points, count, distance_upper_bound=params.cell_m)
+            self.distance, self.index = (v.reshape(len(points), -1) for v in (self.distance, self.index))
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """(N, ...) sums of values (N, ...) over the neighbours within reach."""
+        padded = np.concatenate([values[self.rows], np.zeros_like(values[:1])])
+        out: np.ndarray = padded[self.index].sum(1, dtype=np.float64)
+        return out
+
+
+def _painted(
     points: np.ndarray,
-    shows: np.ndarray,
+    chroma: np.ndarray,
+    lightness: np.ndarray,
+    seen: np.ndarray,
+    near: _Neighbours,
     params: Params,
 ) -> np.ndarray:
-    """(N,) int8 states: of each Gaussian by itself, then those of a cell by the majority of what is decided there."""
-    judged = through + on_surface
-    few, share = params.min_views, params.min_share
-    state = np.full(len(points), UNSEEN, dtype=np.int8)
-    state[(judged < few) & (hidden >= few)] = HIDDEN
-    state[(judged >= few) & (on_surface >= (1 - share) * judged)] = SAME
-    paint = (state == SAME) & (colour_seen >= few) & (colour_differs >= share * colour_seen)
-    state[paint] = REPAINTED
-    state[(through >= few) & (through >= share * judged)] = GONE
-    if not len(points):
-        return state
-    cell = voxel_labels(points, params.cell_m)
-    count = int(cell.max()) + 1
-    votes = np.stack([np.bincount(cell, shows & (state == s), count) for s in (SAME, REPAINTED, GONE)])
-    decided = votes.sum(0)
-    # Paint and presence are voted upon in their cell; a cell is only turned over by two thirds of at least three.
-    for row, name in enumerate((SAME, REPAINTED, GONE)):
-        clear = (votes[row] * 3 >= decided * 2) & (votes[row] >= 3)
-        turned = clear[cell] & (state >= SAME)
-        state[turned] = name
-    return state
+    """(N,) whether the mean difference of colour around a Gaussian is more than light and noise explain."""
+    count = np.maximum(near.sums(seen.astype(np.int32)), 1)
+    mean = near.sums(np.where(seen[:, None], np.column_stack([chroma, lightness]), 0)) / count[:, None]
+    if not seen.any():
+        return np.zeros(len(points), dtype=bool)
+    spread = 1.4826 * np.median(np.abs(mean[seen]), axis=0)
+    limit = np.maximum([params.min_chroma, params.min_chroma, params.min_lightness], params.colour_spreads * spread)
+    out: np.ndarray = (np.abs(mean) > limit).any(1) & (count >= 3)
+    return out

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.compare.params import Params
 from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.voxels import voxel_labels
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
@@ -37,6 +37,16 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
+class Placed:
+    """Which points fall in a picture (``index``), on which pixels, at which depth ``z``."""
+
+    index: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    z: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Looks:
     """One capture, rendered once from a bounded number of its own cameras.
 
@@ -46,6 +56,7 @@ class Looks:
         surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen.
         times_seen: (N,) int32 pictures in which a Gaussian lies on the surface that is shown.
         sure: per view (H, W) bool, solid, and a surface that enough of the capture's views saw.
+        placed: per view, where its own Gaussians fall in it.
     """
 
     scene: PlacedScene
@@ -53,6 +64,7 @@ class Looks:
     surface: np.ndarray
     times_seen: np.ndarray
     sure: tuple[np.ndarray, ...]
+    placed: tuple[Placed, ...]
 
     @property
     def gaussians(self) -> Gaussians:
@@ -70,14 +82,25 @@ def look(scene: PlacedScene, params: Params | None = None) -> Looks:
         views.append(view)
         np.maximum(largest, weight, out=largest)
     times_seen = np.zeros(count, dtype=np.int32)
-    points = scene.gaussians.means.astype(np.float64)
-    for view in views:
-        at = place(points, view, params.nearest_m)
+    placed = tuple(place(scene.gaussians.means, view, params.nearest_m) for view in views)
+    for view, at in zip(views, placed, strict=True):
         margin = params.least_tolerance_m
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
         times_seen[at.index[on]] += 1
-    sure = tuple(v.solid & (times_seen[v.dominant_id] >= params.min_views) & (v.dominant_id >= 0) for v in views)
-    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sure)
+    well = _best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
+    sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
+    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sure, placed)
+
+
+def _best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
+    """(N,) the largest count in each point's cell: a place was seen as often as what shows it best."""
+    if not len(points):
+        return counts
+    cell = voxel_labels(points, cell_m)
+    best = np.zeros(int(cell.max()) + 1, dtype=counts.dtype)
+    np.maximum.at(best, cell, counts)
+    out: np.ndarray = best[cell]
+    return out
 
 
 def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
@@ -89,22 +112,12 @@ def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
     return [small[i] for i in range(len(small))]
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """Which points fall in a picture (``index``), on which pixels, at which depth ``z``."""
-
-    index: np.ndarray
-    row: np.ndarray
-    column: np.ndarray
-    z: np.ndarray
-
-
 def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
     """Points (N, 3) in a view, those alone that lie in the picture and beyond ``nearest_m``."""
     pixels, z = project(points, view.camera.T_camera_frame[0], view.camera.intrinsics_px[0])
     index = np.flatnonzero(in_image(pixels, z, view.camera.sizes_px[0], near=nearest_m))
-    column, row = pixels[index].astype(np.int64).T
-    return Placed(index, row, column, z[index])
+    column, row = pixels[index].astype(np.int32).T
+    return Placed(index.astype(np.int32), row, column, z[index])
 
 
 def _view(gaussians: Gaussians, camera: Cameras, params: Params) -> tuple[View, np.ndarray]:
@@ -151,8 +164,3 @@ def _over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
     rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
     out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
     return out
-
-
-def surfaces_of(looks: Sequence[Looks]) -> list[Gaussians]:
-    """Of each capture what its own pictures show."""
-    return [one.gaussians if one.surface.all() else one.gaussians[one.surface] for one in looks]
