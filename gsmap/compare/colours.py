@@ -37,17 +37,24 @@ class Balance:
         out: np.ndarray = np.exp((self.slope - 1) * grey + self.offset)
         return out
 
+    def applied(self, colour: np.ndarray) -> np.ndarray:
+        """Colours (..., 3) of the first as the second would show them."""
+        logs = np.log(np.clip(colour, 0, 1) + np.float32(_FLOOR))
+        out = np.exp(logs * self.slope.astype(np.float32) + self.offset.astype(np.float32)) - np.float32(_FLOOR)
+        return np.clip(out, 0, 1).astype(np.float32)
+
     def differences(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far colours (..., 3) of both differ in chroma (..., 2) and lightness (...), as seen in [0, 1].
 
         Ratios, so that shading cancels in the chroma, times the brightness, for nobody sees the hue of what is black.
         """
-        log_a = np.log(np.clip(a, 0, 1) + np.float32(_FLOOR))
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
         expected = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
-        ratio = np.log(np.clip(b, 0, 1) + np.float32(_FLOOR)) - expected
-        bright = np.minimum(np.maximum(b.max(-1), np.exp(expected).max(-1)), 1)
-        chroma = np.stack([ratio[..., 0] - ratio[..., 1], ratio[..., 2] - ratio[..., 1]], axis=-1)
-        return chroma * bright[..., None], ratio.mean(-1) * bright
+        ratio, brightest = log_b - expected, np.maximum(log_b, expected)
+        red, green, blue = (brightest[..., c] for c in range(3))
+        bright = np.minimum(np.exp(np.maximum(np.maximum(red, green), blue)), 1)
+        red, green, blue = (ratio[..., c] * bright for c in range(3))
+        return np.stack([red - green, blue - green], axis=-1), (red + green + blue) / 3
 
 
 IDENTITY = Balance(np.ones(3), np.zeros(3), 0.0, 0.0)
@@ -75,12 +82,12 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
             offset[channel] = mean_y - slope[channel] * mean_x
     line = Balance(slope, offset, 0.0, 0.0)
     chroma, lightness = line.differences(a[::step], b[::step])
-    spread = 1.4826 * float(np.median(np.abs(chroma).max(-1)))
+    spread = 1.4826 * float(np.median(np.maximum(*np.abs(chroma).T)))
     return Balance(slope, offset, spread, 1.4826 * float(np.median(np.abs(lightness))))
 
 
 def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray, params: Params) -> np.ndarray:
     """Where colours differ by more than light and noise explain."""
-    return (np.abs(chroma).max(-1) > max(params.min_chroma, params.colour_spreads * line.chroma_spread)) | (
+    return (np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1])) > max(params.min_chroma, params.colour_spreads * line.chroma_spread)) | (
         np.abs(lightness) > max(params.min_lightness, params.colour_spreads * line.lightness_spread)
     )

@@ -185,6 +185,8 @@ def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolera
     tally.through[at.index[through]] += 1
     tally.hidden[at.index[hidden]] += 1
     tally.on_surface[at.index[on]] += 1
+    looked = through | on
+    tally.sharpness[at.index[looked]] += view.pixels_a_metre(at.z[looked]) ** 2
     _add_colour(tally, at, on, picture)
 
 

@@ -21,6 +21,7 @@ class Evidence:
 
     Args:
         through, on_surface, hidden: (N,) int32 views.
+        sharpness: (N,) float32 as in `Looks`, over the other's views that looked at it or through it.
         colour_seen: (N,) int32 views, of either capture, in which its colour could be compared.
         chroma, lightness: (N, 2) and (N,) float32 means, over these views, of by how much the newer's colour differs.
         state: (N,) int8, one of the five, after neighbours have voted.
@@ -29,6 +30,7 @@ class Evidence:
     through: np.ndarray
     on_surface: np.ndarray
     hidden: np.ndarray
+    sharpness: np.ndarray
     colour_seen: np.ndarray
     chroma: np.ndarray
     lightness: np.ndarray
@@ -42,6 +44,7 @@ class Tally:
         self.through = np.zeros(count, dtype=np.int32)
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
+        self.sharpness = np.zeros(count, dtype=np.float32)
         self.colour_seen = np.zeros(count, dtype=np.int32)
         self.chroma = np.zeros((count, 2), dtype=np.float32)
         self.lightness = np.zeros(count, dtype=np.float32)
@@ -56,20 +59,20 @@ class Tally:
         seen = same & (self.colour_seen >= 2) & shows
         paint = _painted(points, chroma, lightness, seen, near, params)
         state[same & paint] = REPAINTED
-        return Evidence(
-            self.through, self.on_surface, self.hidden, self.colour_seen, chroma, lightness, state
-        )
+        counts = self.through, self.on_surface, self.hidden, self.sharpness, self.colour_seen
+        return Evidence(*counts, chroma, lightness, state)
 
     def _geometry(self, near: _Neighbours, params: Params) -> np.ndarray:
         through, on = near.sums(self.through), near.sums(self.on_surface)
-        judged, own = self.through + self.on_surface, self.through + self.on_surface
+        judged = self.through + self.on_surface
         few, share = params.min_views, params.min_share
         state = np.full(len(judged), UNSEEN, dtype=np.int8)
-        state[(judged < few) & (self.hidden >= few)] = HIDDEN
-        enough = judged >= few
+        state[self.hidden >= few] = HIDDEN
         # A Gaussian counts as much as all of its neighbours together.
-        weight = judged / np.maximum(through + on, 1)
-        part = (self.through + weight * through) / np.maximum(own + weight * (through + on), 1e-9)
+        own = judged / np.maximum(through + on, 1)
+        total = judged + own * (through + on)
+        part = (self.through + own * through) / np.maximum(total, 1e-9)
+        enough = (judged >= 1) & (judged + near.sums(judged) / np.maximum(near.count, 1) >= 2 * few)
         state[enough] = np.where(part[enough] >= share, GONE, SAME)
         return state
 
@@ -88,6 +91,12 @@ class _Neighbours:
             count = min(params.neighbours, len(self.rows))
             self.distance, self.index = tree.query(points, count, distance_upper_bound=params.cell_m)
             self.distance, self.index = (v.reshape(len(points), -1) for v in (self.distance, self.index))
+
+    @property
+    def count(self) -> np.ndarray:
+        """(N,) neighbours within reach."""
+        out: np.ndarray = (self.index < len(self.rows)).sum(1)
+        return out
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """(N, ...) sums of values (N, ...) over the neighbours within reach."""

@@ -35,6 +35,11 @@ class View:
     solid: np.ndarray
     dominant_id: np.ndarray
 
+    def pixels_a_metre(self, z: np.ndarray) -> np.ndarray:
+        """How finely the picture shows what lies at depths z."""
+        out: np.ndarray = (self.camera.intrinsics_px[0, 0] / z).astype(np.float32)
+        return out
+
 
 @dataclass(frozen=True, eq=False)
 class Placed:
@@ -55,6 +60,7 @@ class Looks:
         views: V pictures of it.
         surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen.
         times_seen: (N,) int32 pictures in which a Gaussian lies on the surface that is shown.
+        sharpness: (N,) float32 sum over these of (pixels a metre)^2: more looks and nearer ones see better.
         sure: per view (H, W) bool, solid, and a surface that enough of the capture's views saw.
         placed: per view, where its own Gaussians fall in it.
     """
@@ -63,6 +69,7 @@ class Looks:
     views: tuple[View, ...]
     surface: np.ndarray
     times_seen: np.ndarray
+    sharpness: np.ndarray
     sure: tuple[np.ndarray, ...]
     placed: tuple[Placed, ...]
 
@@ -81,15 +88,16 @@ def look(scene: PlacedScene, params: Params | None = None) -> Looks:
         view, weight = _view(scene.gaussians, camera, params)
         views.append(view)
         np.maximum(largest, weight, out=largest)
-    times_seen = np.zeros(count, dtype=np.int32)
+    times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
     placed = tuple(place(scene.gaussians.means, view, params.nearest_m) for view in views)
     for view, at in zip(views, placed, strict=True):
         margin = params.least_tolerance_m
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
         times_seen[at.index[on]] += 1
+        sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
     well = _best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
-    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sure, placed)
+    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sharpness, sure, placed)
 
 
 def _best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:

@@ -36,9 +36,9 @@ class Params:
     nearest_m: float = 0.2
     least_tolerance_m: float = 0.03
     most_tolerance_m: float = 0.1
-    tolerance_spreads: float = 5.0
+    tolerance_spreads: float = 3.5
     tolerance_share: float = 0.01
-    min_views: int = 3
+    min_views: int = 2
     min_share: float = 0.6
     min_chroma: float = 0.05
     min_lightness: float = 0.15
