@@ -14,7 +14,8 @@ from gsmap.compare.comparing import (
     compare,
 )
 from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, Evidence
-from gsmap.compare.looks import Looks, View, look
+from gsmap.compare.joining import joined, outdated
+from gsmap.compare.looks import Looks, View, grown, look
 from gsmap.compare.params import Params
 
 VERSION = 1
@@ -40,5 +41,8 @@ __all__ = [
     "Pictured",
     "View",
     "compare",
+    "grown",
+    "joined",
     "look",
+    "outdated",
 ]
