@@ -29,14 +29,15 @@ class Pictured:
         own: the capture's own view.
         other: the other's surfaces from the same camera.
         outcome: (H, W) uint8, one of the five outcomes.
-        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour, own less other, where the outcome is AGREE
-            or COLOUR.
+        one: (H, W) bool, both show one surface, well seen or not.
+        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour there, own less other.
         sign: 1 for a view of the newer capture, -1 for one of the older: by which differences become newer less older.
     """
 
     own: View
     other: View
     outcome: np.ndarray
+    one: np.ndarray
     chroma: np.ndarray
     lightness: np.ndarray
     sign: int = 1
@@ -148,20 +149,20 @@ def _outcomes(
     """``line`` takes the older's colours to the newer's."""
     base, share = tolerance
     gap = base + share * own.depth
+    one = own.solid & other.solid & _one_surface(own, other, tolerance)
     both = sure & other.solid
-    one = both & _one_surface(own, other, tolerance)
     chroma, lightness = (
         line.differences(other.colour, own.colour) if sign > 0 else line.differences(own.colour, other.colour)
     )
     # Noise of single pixels is not paint.
     chroma, lightness = _smooth(chroma), _smooth(lightness[..., None])[..., 0]
     outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
-    outcome[one] = AGREE
-    outcome[one & differ(line, chroma, lightness, params)] = COLOUR
+    outcome[one & sure] = AGREE
+    outcome[one & sure & differ(line, chroma, lightness, params)] = COLOUR
     # Beyond both neighbourhoods' extremes: a pixel off at an edge proves nothing.
     outcome[both & (other.far < own.near - gap)] = OTHER_BEFORE
     outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND
-    return Pictured(own, other, outcome, sign * chroma, sign * lightness, sign)
+    return Pictured(own, other, outcome, one, sign * chroma, sign * lightness, sign)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
@@ -177,7 +178,7 @@ def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolera
     view, (base, share) = picture.own, tolerance
     near, far = view.near[at.row, at.column], view.far[at.row, at.column]
     gap = base + share * at.z
-    known = sure[at.row, at.column]
+    known = view.solid[at.row, at.column]
     through = known & (at.z < near - gap)
     hidden = known & (at.z > far + gap)
     # Where depths jump within a few pixels, lying somewhere between proves nothing.
@@ -186,6 +187,7 @@ def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolera
     tally.hidden[at.index[hidden]] += 1
     tally.on_surface[at.index[on]] += 1
     looked = through | on
+    tally.sure[at.index[looked & sure[at.row, at.column]]] += 1
     tally.sharpness[at.index[looked]] += view.pixels_a_metre(at.z[looked]) ** 2
     _add_colour(tally, at, on, picture)
 
@@ -198,8 +200,7 @@ def _count_colour(tally: Tally, at: Placed, picture: Pictured, tolerance: tuple[
 
 def _add_colour(tally: Tally, at: Placed, on: np.ndarray, picture: Pictured) -> None:
     row, column, index = at.row[on], at.column[on], at.index[on]
-    outcome = picture.outcome[row, column]
-    one = (outcome == AGREE) | (outcome == COLOUR)
+    one = picture.one[row, column]
     row, column, index = row[one], column[one], index[one]
     tally.colour_seen[index] += 1
     tally.chroma[index] += picture.sign * picture.chroma[row, column]

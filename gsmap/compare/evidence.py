@@ -21,6 +21,7 @@ class Evidence:
 
     Args:
         through, on_surface, hidden: (N,) int32 views.
+        sure: (N,) int32 views that looked at it or through it and saw that surface well.
         sharpness: (N,) float32 as in `Looks`, over the other's views that looked at it or through it.
         colour_seen: (N,) int32 views, of either capture, in which its colour could be compared.
         chroma, lightness: (N, 2) and (N,) float32 means, over these views, of by how much the newer's colour differs.
@@ -30,6 +31,7 @@ class Evidence:
     through: np.ndarray
     on_surface: np.ndarray
     hidden: np.ndarray
+    sure: np.ndarray
     sharpness: np.ndarray
     colour_seen: np.ndarray
     chroma: np.ndarray
@@ -44,6 +46,7 @@ class Tally:
         self.through = np.zeros(count, dtype=np.int32)
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
+        self.sure = np.zeros(count, dtype=np.int32)
         self.sharpness = np.zeros(count, dtype=np.float32)
         self.colour_seen = np.zeros(count, dtype=np.int32)
         self.chroma = np.zeros((count, 2), dtype=np.float32)
@@ -56,10 +59,10 @@ class Tally:
         near = _Neighbours(points, shows, params)
         state = self._geometry(near, params)
         same = state == SAME
-        seen = same & (self.colour_seen >= 2) & shows
+        seen = same & (self.colour_seen >= 1) & shows
         paint = _painted(points, chroma, lightness, seen, near, params)
         state[same & paint] = REPAINTED
-        counts = self.through, self.on_surface, self.hidden, self.sharpness, self.colour_seen
+        counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
 
     def _geometry(self, near: _Neighbours, params: Params) -> np.ndarray:
@@ -72,7 +75,8 @@ class Tally:
         own = judged / np.maximum(through + on, 1)
         total = judged + own * (through + on)
         part = (self.through + own * through) / np.maximum(total, 1e-9)
-        enough = (judged >= 1) & (judged + near.sums(judged) / np.maximum(near.count, 1) >= 2 * few)
+        # One look at a surface that others of the capture's views saw too, or a few at what none but they saw.
+        enough = (judged >= 1) & ((self.sure + near.sums(self.sure) >= 1) | (judged >= few))
         state[enough] = np.where(part[enough] >= share, GONE, SAME)
         return state
 
