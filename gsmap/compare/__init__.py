@@ -15,7 +15,8 @@ from gsmap.compare.comparing import (
 )
 from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, Evidence
 from gsmap.compare.joining import joined, outdated
-from gsmap.compare.looks import Looks, View, grown, look
+from gsmap.compare.looks import Looks, View, look
+from gsmap.compare.neighbourhoods import grown
 from gsmap.compare.params import Params
 
 VERSION = 1

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.compare.neighbourhoods import over_3x3
 from gsmap.compare.params import Params
 
 _FLOOR = 0.03  # added before logarithms: what is darker is noise
@@ -43,18 +44,49 @@ class Balance:
         out = np.exp(logs * self.slope.astype(np.float32) + self.offset.astype(np.float32)) - np.float32(_FLOOR)
         return np.clip(out, 0, 1).astype(np.float32)
 
-    def differences(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far colours (..., 3) of both differ in chroma (..., 2) and lightness (...), as seen in [0, 1].
+    def differences(self, a: np.ndarray, b: np.ndarray, both: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far two pictures (H, W, 3) of one view differ in chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
 
         Ratios, so that shading cancels in the chroma, times the brightness, for nobody sees the hue of what is black.
+        Only what no pixel nearby explains counts: texture that lies half a pixel off is no paint.
+
+        Args:
+            both: (H, W) bool, pixels that show one surface; others explain nothing.
         """
         log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
-        expected = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
-        ratio, brightest = log_b - expected, np.maximum(log_b, expected)
-        red, green, blue = (brightest[..., c] for c in range(3))
-        bright = np.minimum(np.exp(np.maximum(np.maximum(red, green), blue)), 1)
-        red, green, blue = (ratio[..., c] * bright for c in range(3))
-        return np.stack([red - green, blue - green], axis=-1), (red + green + blue) / 3
+        log_a = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
+        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
+        apart = [_apart(x, y, both) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True)]
+        return np.stack(apart[:2], axis=-1), apart[2]
+
+    def left_over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Differences of single colours (K, 3): chroma (K, 2) and lightness (K,)."""
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
+        log_a = log_a * self.slope + self.offset
+        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
+        red, blue, light = ((y - x) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True))
+        return np.stack([red, blue], axis=-1), light
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    """(...,) largest of three channels (..., 3)."""
+    out: np.ndarray = np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
+    return out
+
+
+def _tones(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Red over green, blue over green, and lightness, of logarithms of colours (..., 3)."""
+    red, green, blue = logs[..., 0], logs[..., 1], logs[..., 2]
+    return red - green, blue - green, (red + green + blue) / 3
+
+
+def _apart(a: np.ndarray, b: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """(H, W) by how much b lies above a (below: negative), beyond the ranges of both over 3 x 3 pixels."""
+    infinite = np.float32(np.inf)
+    low_a, low_b = (over_3x3(np.where(both, v, infinite), np.minimum) for v in (a, b))
+    high_a, high_b = (over_3x3(np.where(both, v, -infinite), np.maximum) for v in (a, b))
+    out: np.ndarray = np.where(both, np.maximum(low_b - high_a, 0) + np.minimum(high_b - low_a, 0), 0)
+    return out
 
 
 IDENTITY = Balance(np.ones(3), np.zeros(3), 0.0, 0.0)
@@ -81,7 +113,7 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
             slope[channel] = np.clip(covariance / ((weight * centred**2).sum() + prior), 0.4, 2.5)
             offset[channel] = mean_y - slope[channel] * mean_x
     line = Balance(slope, offset, 0.0, 0.0)
-    chroma, lightness = line.differences(a[::step], b[::step])
+    chroma, lightness = line.left_over(a[::step], b[::step])
     spread = 1.4826 * float(np.median(np.maximum(*np.abs(chroma).T)))
     return Balance(slope, offset, spread, 1.4826 * float(np.median(np.abs(lightness))))
 

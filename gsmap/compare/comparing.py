@@ -30,8 +30,7 @@ class Pictured:
         other: the other's surfaces from the same camera.
         outcome: (H, W) uint8, one of the five outcomes.
         one: (H, W) bool, both show one surface, well seen or not.
-        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour there, own less other.
-        sign: 1 for a view of the newer capture, -1 for one of the older: by which differences become newer less older.
+        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour there, newer less older.
     """
 
     own: View
@@ -40,7 +39,6 @@ class Pictured:
     one: np.ndarray
     chroma: np.ndarray
     lightness: np.ndarray
-    sign: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,26 +149,15 @@ def _outcomes(
     gap = base + share * own.depth
     one = own.solid & other.solid & _one_surface(own, other, tolerance)
     both = sure & other.solid
-    chroma, lightness = (
-        line.differences(other.colour, own.colour) if sign > 0 else line.differences(own.colour, other.colour)
-    )
-    # Noise of single pixels is not paint.
-    chroma, lightness = _smooth(chroma), _smooth(lightness[..., None])[..., 0]
+    older, newer = (other, own) if sign > 0 else (own, other)
+    chroma, lightness = line.differences(older.colour, newer.colour, one)
     outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
     outcome[one & sure] = AGREE
     outcome[one & sure & differ(line, chroma, lightness, params)] = COLOUR
     # Beyond both neighbourhoods' extremes: a pixel off at an edge proves nothing.
     outcome[both & (other.far < own.near - gap)] = OTHER_BEFORE
     outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND
-    return Pictured(own, other, outcome, one, sign * chroma, sign * lightness, sign)
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """(H, W, K) means over 3 x 3 pixels."""
-    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    out: np.ndarray = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
-    return out
+    return Pictured(own, other, outcome, one, chroma, lightness)
 
 
 def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolerance: tuple[float, float]) -> None:
@@ -203,8 +190,8 @@ def _add_colour(tally: Tally, at: Placed, on: np.ndarray, picture: Pictured) -> 
     one = picture.one[row, column]
     row, column, index = row[one], column[one], index[one]
     tally.colour_seen[index] += 1
-    tally.chroma[index] += picture.sign * picture.chroma[row, column]
-    tally.lightness[index] += picture.sign * picture.lightness[row, column]
+    tally.chroma[index] += picture.chroma[row, column]
+    tally.lightness[index] += picture.lightness[row, column]
 
 
 def pictures(comparison: Comparison) -> Iterator[Pictured]:

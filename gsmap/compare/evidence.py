@@ -62,6 +62,7 @@ class Tally:
         seen = same & (self.colour_seen >= 1) & shows
         paint = _painted(points, chroma, lightness, seen, near, params)
         state[same & paint] = REPAINTED
+        _follow(state, near)
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
 
@@ -126,3 +127,12 @@ def _painted(
     limit = np.maximum([params.min_chroma, params.min_chroma, params.min_lightness], params.colour_spreads * spread)
     out: np.ndarray = (np.abs(mean) > limit).any(1) & (count >= 3)
     return out
+
+
+def _follow(state: np.ndarray, near: _Neighbours) -> None:
+    """What nobody judged goes with those around it that were, where most of these are gone or repainted."""
+    votes = np.stack([near.sums((state == s).astype(np.int32)) for s in (SAME, REPAINTED, GONE)])
+    open_ = state < SAME
+    most = votes.argmax(0)
+    sure = (votes.max(0) >= 3) & (2 * votes.max(0) > votes.sum(0)) & (most > 0)
+    state[open_ & sure] = np.array([SAME, REPAINTED, GONE], dtype=np.int8)[most[open_ & sure]]

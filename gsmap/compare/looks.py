@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.compare.neighbourhoods import extremes, shrunk
 from gsmap.compare.params import Params
 from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.voxels import voxel_labels
@@ -144,31 +145,5 @@ def view_of(
     """A picture with what its neighbourhoods say."""
     opaque = alpha > params.min_alpha
     near, far = extremes(depth, opaque)
-    solid = opaque & _shrunk(opaque)
+    solid = opaque & shrunk(opaque)
     return View(camera, np.clip(colour, 0, 1), depth, near, far, solid, dominant_id)
-
-
-def extremes(depth: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) lowest and highest opaque depth over 3 x 3 pixels; inf and -inf where nothing is opaque."""
-    low = np.where(opaque, depth, np.float32(np.inf))
-    high = np.where(opaque, depth, np.float32(-np.inf))
-    return _over_3x3(low, np.minimum), _over_3x3(high, np.maximum)
-
-
-def _shrunk(mask: np.ndarray) -> np.ndarray:
-    return _over_3x3(mask, np.logical_and)
-
-
-def grown(mask: np.ndarray, times: int = 1) -> np.ndarray:
-    """A mask (H, W) with every pixel beside it, ``times`` times."""
-    for _ in range(times):
-        mask = _over_3x3(mask, np.logical_or)
-    return mask
-
-
-def _over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
-    """The ufunc over each pixel's 3 x 3 neighbourhood; the border repeats."""
-    padded = np.pad(values, 1, mode="edge")
-    rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
-    out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
-    return out
