@@ -138,9 +138,7 @@ def with_prefer(method: str, params: Any, prefer: str) -> Any:
         raise ConfigError(f"prefer is one of {', '.join(PREFERENCES)}, got {prefer!r}")
     if hasattr(params, "prefer"):
         return replace(params, prefer=prefer)
-    if hasattr(params, "newer_wins") and prefer != "best":
-        return replace(params, newer_wins=prefer == "newest")
-    takes = [other for other in methods() if hasattr(merger(other).Params(), "prefer")] or ["tto"]
+    takes = [other for other in methods() if hasattr(merger(other).Params(), "prefer")]
     raise ConfigError(f"merge method {method!r} prefers nobody: leave --prefer out, or use {' or '.join(takes)}")
 
 
