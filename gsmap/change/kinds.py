@@ -6,19 +6,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.change.sides import Side
-from gsmap.change.things import Thing
+from gsmap.change.things import Paint
+from gsmap.types.change import ChangeKind
 
 _RING_M = 0.15  # what lies this close around a change of colour on the same plane is what it is compared with
 _PLANE_M = 0.04
 _STANDS_OUT = 0.45  # an edge this much fainter than in the other capture is none
 _FEWEST = 6  # cells of a ring
-_IN_PLACE = 0.4  # share of the smaller box that lies in the other's
 
 
-def kind_of_paint(thing: Thing, sides: tuple[Side, Side]) -> str:
+def kind_of_paint(paint: Paint, sides: tuple[Side, Side]) -> ChangeKind:
     """``disappeared`` and ``appeared`` where a flat thing's edges are gone or new, else ``recoloured``."""
-    before = _edge(sides[0], thing.older_paint, sides[1], thing.newer_paint)
-    after = _edge(sides[1], thing.newer_paint, sides[0], thing.older_paint)
+    before = _edge(sides[0], paint.cells[0], sides[1], paint.cells[1])
+    after = _edge(sides[1], paint.cells[1], sides[0], paint.cells[0])
     if before is None or after is None:
         return "recoloured"
     if after < _STANDS_OUT * before:
@@ -58,17 +58,3 @@ def _deeper(side: Side, inside: np.ndarray, row: np.ndarray) -> np.ndarray:
     near = near.reshape(len(row), -1)
     out: np.ndarray = side.colours[inside][near].mean(1)
     return out
-
-
-def box_of(points: np.ndarray) -> np.ndarray:
-    """(2, 3) lowest and highest corner."""
-    return np.stack([points.min(0), points.max(0)])
-
-
-def in_place(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two things (cells (N, 3) each) take the same place."""
-    box_a, box_b = box_of(a), box_of(b)
-    low, high = np.maximum(box_a[0], box_b[0]), np.minimum(box_a[1], box_b[1])
-    shared = np.prod(np.maximum(high - low, 0) + 0.02)
-    smaller = min(np.prod(box[1] - box[0] + 0.02) for box in (box_a, box_b))
-    return bool((high > low - 0.05).all() and shared >= _IN_PLACE * smaller)

@@ -18,7 +18,8 @@ class Params:
         voxel_m: size of the cells that a change is reported in.
         reach_m: cells nearer to each other than this belong to one thing.
         min_area_m2: a thing with less changed surface is not reported.
-        min_colour_area_m2: nor one that changed its colour alone on less.
+        min_paint: a change of colour is reported from this multiple of ``min_chroma`` or ``min_lightness`` on, and
+        most_leak: where no more than this share of it goes on around its edges, as that of light and shadow does.
         min_share: share of the looks of a neighbourhood that must have gone through it for it to have changed.
         min_chroma, min_lightness: colours, in [0, 1], that differ by less, exposure balanced, are one.
         colour_spreads: nor do those within that many robust standard deviations of what agrees.
@@ -32,7 +33,8 @@ class Params:
     voxel_m: float = 0.1
     reach_m: float = 0.1
     min_area_m2: float = 0.015
-    min_colour_area_m2: float = 0.04
+    min_paint: float = 1.9
+    most_leak: float = 0.2
     min_share: float = 0.5
     min_chroma: float = 0.05
     min_lightness: float = 0.15
