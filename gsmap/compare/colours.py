@@ -82,7 +82,7 @@ def _tones(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _apart(a: np.ndarray, b: np.ndarray, both: np.ndarray) -> np.ndarray:
     """(H, W) by how much b lies above a (below: negative), beyond the ranges of both over 3 x 3 pixels."""
-    infinite = np.float32(np.inf)
+    infinite = np.float32(1e3)  # beyond all logarithms of colours
     low_a, low_b = (over_3x3(np.where(both, v, infinite), np.minimum) for v in (a, b))
     high_a, high_b = (over_3x3(np.where(both, v, -infinite), np.maximum) for v in (a, b))
     out: np.ndarray = np.where(both, np.maximum(low_b - high_a, 0) + np.minimum(high_b - low_a, 0), 0)

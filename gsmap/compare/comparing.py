@@ -172,6 +172,8 @@ def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolera
     on = known & ~through & ~hidden & (far - near < 4 * gap)
     tally.through[at.index[through]] += 1
     tally.hidden[at.index[hidden]] += 1
+    grazed = view.opaque[at.row, at.column] & (at.z < view.depth[at.row, at.column] - gap)
+    tally.grazed[at.index[grazed]] += 1
     tally.on_surface[at.index[on]] += 1
     looked = through | on
     tally.sure[at.index[looked & sure[at.row, at.column]]] += 1

@@ -39,6 +39,9 @@ class Evidence:
     state: np.ndarray
 
 
+_PART = 0.3  # of a difference that a Gaussian must have itself, where its neighbours have it
+
+
 class Tally:
     """Counts of evidence, while it is gathered."""
 
@@ -46,6 +49,7 @@ class Tally:
         self.through = np.zeros(count, dtype=np.int32)
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
+        self.grazed = np.zeros(count, dtype=np.int32)  # views in which it is before the surface, though perhaps at an edge
         self.sure = np.zeros(count, dtype=np.int32)
         self.sharpness = np.zeros(count, dtype=np.float32)
         self.colour_seen = np.zeros(count, dtype=np.int32)
@@ -60,9 +64,9 @@ class Tally:
         state = self._geometry(near, params)
         same = state == SAME
         seen = same & (self.colour_seen >= 1) & shows
-        paint = _painted(points, chroma, lightness, seen, near, params)
+        paint = _painted(np.column_stack([chroma, lightness]), seen, self.colour_seen, near, params)
         state[same & paint] = REPAINTED
-        _follow(state, near)
+        _follow(state, near, self.grazed > 0)
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
 
@@ -111,28 +115,35 @@ class _Neighbours:
 
 
 def _painted(
-    points: np.ndarray,
-    chroma: np.ndarray,
-    lightness: np.ndarray,
-    seen: np.ndarray,
-    near: _Neighbours,
-    params: Params,
+    own: np.ndarray, seen: np.ndarray, views: np.ndarray, near: _Neighbours, params: Params
 ) -> np.ndarray:
-    """(N,) whether the mean difference of colour around a Gaussian is more than light and noise explain."""
-    count = np.maximum(near.sums(seen.astype(np.int32)), 1)
-    mean = near.sums(np.where(seen[:, None], np.column_stack([chroma, lightness]), 0)) / count[:, None]
+    """(N,) whether the colours of a Gaussian differ by more than light and noise explain.
+
+    Args:
+        own: (N, 3) mean differences, two of chroma and one of lightness.
+        seen: (N,) which have one.
+        views: (N,) of how many views it is the mean.
+    """
     if not seen.any():
-        return np.zeros(len(points), dtype=bool)
+        return seen
+    count = near.sums(seen.astype(np.int32))
+    mean = near.sums(np.where(seen[:, None], own, 0)) / np.maximum(count, 1)[:, None]
     spread = 1.4826 * np.median(np.abs(mean[seen]), axis=0)
     limit = np.maximum([params.min_chroma, params.min_chroma, params.min_lightness], params.colour_spreads * spread)
-    out: np.ndarray = (np.abs(mean) > limit).any(1) & (count >= 3)
+    alone = (np.abs(own) > limit).any(1) & (views >= params.min_views)
+    # With those around it: what has no part in the difference does not share it.
+    together = ((np.abs(mean) > limit) & (own * np.sign(mean) > _PART * limit)).any(1) & (count >= 3)
+    out: np.ndarray = alone | together
     return out
 
 
-def _follow(state: np.ndarray, near: _Neighbours) -> None:
+def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray) -> None:
     """What nobody judged goes with those around it that were, where most of these are gone or repainted."""
     votes = np.stack([near.sums((state == s).astype(np.int32)) for s in (SAME, REPAINTED, GONE)])
     open_ = state < SAME
     most = votes.argmax(0)
-    sure = (votes.max(0) >= 3) & (2 * votes.max(0) > votes.sum(0)) & (most > 0)
+    sure = (votes.max(0) >= 3) & (2 * votes.max(0) > votes.sum(0))
+    state[open_ & grazed & ~(sure & (most == 0))] = GONE
+    open_ = state < SAME
+    sure &= most > 0
     state[open_ & sure] = np.array([SAME, REPAINTED, GONE], dtype=np.int8)[most[open_ & sure]]

@@ -24,7 +24,8 @@ class View:
         depth: (H, W) float32 camera-space z, metres.
         near, far: (H, W) float32 lowest and highest depth over 3 x 3 pixels: at an edge a depth is a mixture of what
             lies before and behind it, and proves nothing between the two.
-        solid: (H, W) bool, opaque, and so are the eight neighbours.
+        opaque: (H, W) bool, shows a surface.
+        solid: (H, W) bool, so it does, and so do the eight neighbours.
         dominant_id: (H, W) int32 Gaussian of the capture that shows most, -1 for none.
     """
 
@@ -33,6 +34,7 @@ class View:
     depth: np.ndarray
     near: np.ndarray
     far: np.ndarray
+    opaque: np.ndarray
     solid: np.ndarray
     dominant_id: np.ndarray
 
@@ -146,4 +148,4 @@ def view_of(
     opaque = alpha > params.min_alpha
     near, far = extremes(depth, opaque)
     solid = opaque & shrunk(opaque)
-    return View(camera, np.clip(colour, 0, 1), depth, near, far, solid, dominant_id)
+    return View(camera, np.clip(colour, 0, 1), depth, near, far, opaque, solid, dominant_id)
