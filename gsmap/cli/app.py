@@ -28,6 +28,7 @@ VERBS = (
     "reject",
     "edge",
     "prior",
+    "changes",
     "edit",
     "export",
     "list",

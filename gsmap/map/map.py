@@ -24,6 +24,9 @@ from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
     BackupReport,
     BranchRow,
+    ChangeDetail,
+    ChangeRow,
+    ChangesReport,
     CheckReport,
     CloneReport,
     EdgeRow,
@@ -254,16 +257,25 @@ class Map(AbstractContextManager["Map"]):
         add_edge(self.store, a, b, S_target_source, sigmas, note)
         return reports.edge_row(self.store, a, b)
 
-    def confirm(self, pair: str, note: str = "", *, withdraw: bool = False) -> EdgeRow:
-        """Vouch for the edge of a pair ``A:B``: it is used whatever the votes say. ``withdraw`` takes a review back."""
-        return self._review(pair, "withdraw" if withdraw else "confirm", note)
+    def confirm(self, what: str, note: str = "", *, withdraw: bool = False) -> EdgeRow | ChangeRow:
+        """Vouch for the edge of a pair ``A:B``: it is used whatever the votes say; or for a change (``c12``).
 
-    def reject(self, pair: str, note: str = "", *, withdraw: bool = False) -> EdgeRow:
-        """Rule out the edge of a pair ``A:B``. ``withdraw`` takes a review back."""
-        return self._review(pair, "withdraw" if withdraw else "reject", note)
+        Args:
+            withdraw: take the last review back.
+        """
+        return self._review(what, "withdraw" if withdraw else "confirm", note)
 
-    def _review(self, pair: str, review: str, note: str) -> EdgeRow:
-        a, b = self._pair(pair)
+    def reject(self, what: str, note: str = "", *, withdraw: bool = False) -> EdgeRow | ChangeRow:
+        """Rule out the edge of a pair ``A:B``, or a change (``c12``) that is none; see `confirm`."""
+        return self._review(what, "withdraw" if withdraw else "reject", note)
+
+    def _review(self, what: str, review: str, note: str) -> EdgeRow | ChangeRow:
+        from gsmap.map import changes
+
+        if (number := changes.number_of(what)) is not None:
+            self.store.changes.review(number, review, note)
+            return changes.change_row(self.store, number)
+        a, b = self._pair(what)
         self.store.registrations.review(a.id, b.id, review, note)
         return reports.edge_row(self.store, a, b)
 
@@ -317,6 +329,56 @@ class Map(AbstractContextManager["Map"]):
         """Take back what was told of where a scene lies."""
         self.store.priors.remove(scene)
 
+    # --- changes -----------------------------------------------------------------------------------------------------
+
+    def changes(
+        self,
+        pair: str | None = None,
+        *,
+        since: str | None = None,
+        between: Sequence[str] | None = None,
+        as_of: str | None = None,
+        min_confidence: float = 0.0,
+    ) -> ChangesReport:
+        """What changed from each capture to those that were taken of the same places just before it.
+
+        What has not been compared under these settings and at these poses is compared first, unless the map is open for
+        reading only.
+
+        Args:
+            pair: only the two captures of ``A:B``; damaged arrays of theirs are made again.
+            since: only where the newer capture is dated after this, ISO 8601.
+            between: two dates: only where the newer capture is dated after the first, at or before the second.
+            as_of: only where it is dated at or before this.
+            min_confidence: only changes that are at least as sure.
+
+        Raises:
+            NotFoundError: the map has no poses yet, or no such scene.
+            InputError: of the two captures that are named, nobody knows which is newer.
+        """
+        from gsmap.map.changes import changes_report, within
+        from gsmap.map.stages.change import compare, wanted
+
+        asked = wanted(self.store, self.settings, None if pair is None else self._pair(pair))
+        asked = within(asked, since, between, as_of)
+        if self.store.catalog.writable:
+            with at_work(self.store, "changes"):
+                compare(self.store, asked, self.settings, self._progress, verify=pair is not None)
+        return changes_report(self.store, self.settings, asked, min_confidence=min_confidence)
+
+    def show_change(self, name: str) -> ChangeDetail:
+        """``gsmap show MAP c12``: everything known of one change.
+
+        Raises:
+            NotFoundError: no change is called so, or it is no longer found.
+        """
+        from gsmap.map import changes
+
+        number = changes.number_of(name)
+        if number is None:
+            raise NotFoundError(f"no change is called {name!r}: they are called c1, c2, ... (gsmap changes MAP)")
+        return changes.change_detail(self.store, number)
+
     # --- export ------------------------------------------------------------------------------------------------------
 
     def export(
@@ -332,6 +394,8 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        prefer: str | None = None,
+        as_of: str | None = None,
         wait: bool = False,
     ) -> ExportReport:
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
@@ -347,6 +411,10 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            prefer: whom to believe where captures disagree: ``newest``, ``best`` (whoever saw it best) or ``both``; by
+                default what the merger's settings say.
+            as_of: only captures dated at or before this (ISO 8601; of a day, its end) take part, those without a date
+                left out; poses are those of the revision all the same.
             wait: where another export is at work in the folder, until it has ended.
 
         Raises:
@@ -365,13 +433,15 @@ class Map(AbstractContextManager["Map"]):
             steps=steps,
             budget_s=budget_s,
             provenance=provenance,
+            prefer=prefer,
+            as_of=as_of,
         )
 
         def progress(fraction: float, text: str) -> None:
             self._progress("export", fraction, text)
 
-        made = export(self.store, Path(out), request, self.settings, progress, wait=wait)
-        return reports.export_report(self.store, Path(out), made)
+        made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait)
+        return reports.export_report(self.store, Path(out), made, notes)
 
     # --- look --------------------------------------------------------------------------------------------------------
 
@@ -409,9 +479,11 @@ class Map(AbstractContextManager["Map"]):
         status: str | None = None,
         after: str | None = None,
         tag: str | None = None,
+        as_of: str | None = None,
     ) -> list[SceneRow]:
-        """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date, or with a tag."""
-        return reports.scene_rows(self.store, component=component, status=status, after=after, tag=tag)
+        """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date or at or before
+        one, or with a tag."""
+        return reports.scene_rows(self.store, component=component, status=status, after=after, tag=tag, as_of=as_of)
 
     def edge_rows(
         self,
@@ -420,9 +492,10 @@ class Map(AbstractContextManager["Map"]):
         status: str | None = None,
         after: str | None = None,
         tag: str | None = None,
+        as_of: str | None = None,
     ) -> list[EdgeRow]:
         """``gsmap list MAP edges``: all, or those of one status, registered after a date, between scenes as asked."""
-        return reports.edge_rows(self.store, component=component, status=status, after=after, tag=tag)
+        return reports.edge_rows(self.store, component=component, status=status, after=after, tag=tag, as_of=as_of)
 
     def revision_rows(self) -> list[RevisionRow]:
         """``gsmap list MAP revisions``."""

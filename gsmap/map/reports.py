@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from gsmap.errors import ConfigError, CorruptError
+from gsmap.map.dates import is_after, is_until, last_of, parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.methods import RecipeKey
 from gsmap.settings import leaves
@@ -63,6 +63,7 @@ def scene_rows(
     status: str | None = None,
     after: str | None = None,
     tag: str | None = None,
+    as_of: str | None = None,
 ) -> list[SceneRow]:
     """The living scenes, oldest first.
 
@@ -71,12 +72,14 @@ def scene_rows(
         status: only those of this one, see `SceneRow`.
         after: ISO 8601; only those captured (or else ingested) after it.
         tag: only those that have it.
+        as_of: ISO 8601; only those dated at or before it, those without a date left out.
 
     Raises:
         ConfigError: no such status, or a date that is none.
     """
     _one_of(status, SCENE_STATUSES)
-    since = _date(after)
+    since = None if after is None else parsed(after)
+    until = None if as_of is None else last_of(as_of)
     placed = store.revisions.get()
     nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
     said = store.scenes.latest_notes()
@@ -86,8 +89,9 @@ def scene_rows(
         for row in rows
         if (component is None or row.component == component)
         and (status is None or row.status == status)
-        and (since is None or _is_after(row.captured_at or row.ingested_at, since))
+        and (since is None or is_after(row.captured_at or row.ingested_at, since))
         and (tag is None or tag in row.tags)
+        and (until is None or is_until(row.captured_at, until))
     ]
 
 
@@ -285,6 +289,7 @@ def edge_rows(
     status: str | None = None,
     after: str | None = None,
     tag: str | None = None,
+    as_of: str | None = None,
 ) -> list[EdgeRow]:
     """The current edge of every pair that was tried.
 
@@ -292,21 +297,22 @@ def edge_rows(
         component, tag: only those both of whose scenes are in it, or have it.
         status: only those of this one.
         after: ISO 8601; only those registered after it.
+        as_of: ISO 8601; only those both of whose scenes are dated at or before it.
 
     Raises:
         ConfigError: no such status, or a date that is none.
     """
     _one_of(status, EDGE_STATUSES)
-    since = _date(after)
+    since = None if after is None else parsed(after)
     inside = None
-    if component is not None or tag is not None:
-        inside = {row.id for row in scene_rows(store, component=component, tag=tag)}
+    if component is not None or tag is not None or as_of is not None:
+        inside = {row.id for row in scene_rows(store, component=component, tag=tag, as_of=as_of)}
     return [
         row
         for row in _edge_rows(store, store.registrations.current())
         if (inside is None or {row.target, row.source} <= inside)
         and (status is None or row.status == status)
-        and (since is None or _is_after(row.registered_at, since))
+        and (since is None or is_after(row.registered_at, since))
     ]
 
 
@@ -427,8 +433,8 @@ def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionR
     Raises:
         ConfigError: a date that is none.
     """
-    since = _date(after)
-    return [row for row in rows if since is None or _is_after(row.created_at, since)]
+    since = None if after is None else parsed(after)
+    return [row for row in rows if since is None or is_after(row.created_at, since)]
 
 
 @of_one_state
@@ -474,7 +480,7 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
     old, new = store.revisions.get(before), store.revisions.get(after)
     assert old is not None
     assert new is not None
-    known = _ByScene((scene.id, scene) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
+    known = scenes_by_id(store)
     changes = diff(old, new, {scene.id: scene.bounds.mean(0) for scene in known.values()})
     return [
         PoseChangeRow(
@@ -520,7 +526,7 @@ def tile_rows(store: Store) -> list[TileRow]:
 
 
 @of_one_state
-def export_report(store: Store, out: Path, made: ExportResult) -> ExportReport:
+def export_report(store: Store, out: Path, made: ExportResult, notes: Sequence[str] = ()) -> ExportReport:
     """What an export did."""
     name_of = names(store)
     return ExportReport(
@@ -529,6 +535,7 @@ def export_report(store: Store, out: Path, made: ExportResult) -> ExportReport:
         recomputed=made.recomputed,
         reused=made.reused,
         removed=made.removed,
+        notes=tuple(notes),
     )
 
 
@@ -598,7 +605,12 @@ def prune_report(pruned: Pruned, dry_run: bool) -> PruneReport:
 @of_one_state
 def names(store: Store) -> dict[str, str]:
     """The name of every scene by its id, removed ones included."""
-    return _ByScene((scene.id, scene.name) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
+    return _ByScene((scene, found.name) for scene, found in scenes_by_id(store).items())
+
+
+def scenes_by_id(store: Store) -> dict[str, Scene]:
+    """Every scene by its id, removed ones included."""
+    return _ByScene((scene.id, scene) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
 
 
 class _ByScene(dict[str, Any]):
@@ -615,18 +627,3 @@ def _refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, 
 def _one_of(value: str | None, known: Sequence[str]) -> None:
     if value is not None and value not in known:
         raise ConfigError(f"there is no status {value!r}: choose one of {', '.join(known)}")
-
-
-def _date(text: str | None) -> datetime | None:
-    if text is None:
-        return None
-    try:
-        found = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise ConfigError(f"{text!r} is not a date: write it as 2024-05-31 or 2024-05-31T12:00:00+02:00") from error
-    return found if found.tzinfo else found.replace(tzinfo=UTC)
-
-
-def _is_after(text: str | None, since: datetime) -> bool:
-    found = _date(text)
-    return found is not None and found > since

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import describe, engine, export, merge, optimize, register, retrieve
+from gsmap import change, describe, engine, export, merge, optimize, register, retrieve
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
+from gsmap.map import visits
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
 
@@ -50,6 +51,8 @@ class Settings:
         optimize: how poses are solved.
         merge: how captures become one.
         export: how tiles are planned and kept.
+        visits: which captures are compared for changes.
+        change: how changes between two captures are found.
         evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
@@ -60,6 +63,8 @@ class Settings:
     optimize: optimize.Params = field(default_factory=optimize.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)
+    visits: visits.Params = field(default_factory=visits.Params)
+    change: change.Params = field(default_factory=change.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 

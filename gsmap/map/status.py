@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Sequence
 
+from gsmap.map.changes import num_open
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
@@ -59,6 +60,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add("tentative", len(tentative), f"gsmap list {at} scenes --status tentative", "scenes on edges no cycle confirms")
     undecided = [pair for pair in (graph.undecided if graph else ()) if set(pair) <= set(keys)]
     add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
+    add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in keys]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
     isolated = [pose for pose in poses if pose.status == "isolated"]

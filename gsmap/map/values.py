@@ -50,6 +50,8 @@ def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
         num_facts=merged.facts,
         num_priors=merged.priors,
         num_models=merged.models,
+        num_comparisons=merged.comparisons,
+        num_change_reviews=merged.change_reviews,
         num_revisions=merged.revisions,
         renamed=dict(merged.renamed),
         revision=merged.revision,

@@ -24,6 +24,9 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import explained
 from gsmap.store.schema import (
     CHUNK_BOXES,
+    change_reviews,
+    changes,
+    comparisons,
     edges,
     exports,
     files,
@@ -51,11 +54,13 @@ _REMARKS: tuple[tuple[Table, tuple[str, ...]], ...] = (
     (registrations, ("reason", "notes")),
     (revisions, ("notes", "provenance")),
     (edges, ("reason",)),
+    (comparisons, ("notes",)),
     (tiles, ("notes",)),
 )
 _WORDS: tuple[tuple[Table, str, str], ...] = (
     (scene_facts, "value", "scene"),
     (reviews, "note", "pair"),
+    (change_reviews, "note", "change"),
     (revisions, "note", "number"),
 )
 
@@ -207,18 +212,26 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> Counter[str]:
     affected = set(connection.execute(select(poses.c.revision).where(poses.c.scene == scene)).scalars())
     drop("reviews", reviews, reviews.c.pair.contains(scene))
     drop("registrations", registrations, pairs)
+    with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
+    of_changes = changes.c.comparison.in_(select(comparisons.c.number).where(with_it))
+    drop("change_reviews", change_reviews, change_reviews.c.change.in_(select(changes.c.number).where(of_changes)))
+    drop("changes", changes, of_changes)
+    drop("comparisons", comparisons, with_it)
     drop("edges", edges, (edges.c.target == scene) | (edges.c.source == scene))
     drop("poses", poses, poses.c.scene == scene)
     drop("priors", priors, priors.c.scene == scene)
     drop("facts", scene_facts, scene_facts.c.scene == scene)
     drop("leases", leases, leases.c.what.contains(scene))
-    with_it = [tile.number for tile in connection.execute(select(tiles.c.number, tiles.c.poses)) if scene in tile.poses]
-    drop("tiles", tiles, tiles.c.number.in_(with_it))
+    made_with_it = [
+        tile.number for tile in connection.execute(select(tiles.c.number, tiles.c.poses)) if scene in tile.poses
+    ]
+    drop("tiles", tiles, tiles.c.number.in_(made_with_it))
     drop("graphs", graphs, graphs.c.scene == scene)
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
     claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
     claimed |= set(connection.execute(select(graphs.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
     connection.execute(delete(files).where(files.c.group_id.in_(unclaimed)))
     connection.execute(delete(groups).where(groups.c.id.in_(unclaimed)))
@@ -319,13 +332,13 @@ def _backups(connection: Connection, scene: Row[Any], of_map: Iterable[tuple[str
 
 def _linked_files(store: Store, connection: Connection, scene: str) -> int:
     """How many of its files have other names on this disk: another map that it was merged or split into, a clone."""
-    ids = [
-        ("scenes", scene),
-        *(
-            ("graphs", g)
-            for g in connection.execute(select(graphs.c.group_id).where(graphs.c.scene == scene)).scalars()
-        ),
-    ]
+    with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
+    of_scene = {
+        "graphs": select(graphs.c.group_id).where(graphs.c.scene == scene),
+        "changes": select(comparisons.c.group_id).where(with_it, comparisons.c.group_id.is_not(None)),
+    }
+    ids = [("scenes", scene)]
+    ids += [(kind, group) for kind, query in of_scene.items() for group in connection.execute(query).scalars()]
     found = (files_below(store.arrays.root / kind / name) for kind, name in ids)
     return sum(entry.st_nlink > 1 for group in found for entry in group.values())
 

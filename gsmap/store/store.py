@@ -20,6 +20,7 @@ from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
+from gsmap.store.changes import Changes
 from gsmap.store.copying import empty_catalog
 from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
@@ -39,10 +40,10 @@ from gsmap.version import __version__
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
-    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that changes something is one
-    transaction, durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole.
-    Threads may share a store; processes open their own.
+    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``changes``,
+    ``revisions``, ``priors``, ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that
+    changes something is one transaction, durable when it returns; `transaction` makes several of them one. Killed
+    anywhere, the map opens whole. Threads may share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -69,6 +70,7 @@ class Store:
         self.recipes = Recipes(catalog)
         self.graphs = Graphs(catalog, self.arrays)
         self.registrations = Registrations(catalog)
+        self.changes = Changes(catalog, self.arrays)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
         self.models = Models(catalog, self.arrays)

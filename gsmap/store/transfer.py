@@ -32,6 +32,7 @@ from gsmap.store.schema import (
     scenes,
 )
 from gsmap.store.store import Store
+from gsmap.store.transfer_changes import named_groups
 from gsmap.types.plain import canonical
 
 Content = dict[str, Any]
@@ -110,7 +111,7 @@ class Transfer:
         for row in self._rows:
             if row.id in self._forgotten:
                 continue
-            self._bring_group(scene_rows.KIND, row.group_id)
+            self.bring_group(scene_rows.KIND, row.group_id)
             mine = self.ours.execute(select(scenes).where(scenes.c.id == row.id)).first()
             if mine is None:
                 self._add_scene(row)
@@ -210,7 +211,7 @@ class Transfer:
         if len(boxes):
             scene_rows.put_boxes(self.ours, number, boxes)
 
-    def _bring_group(self, kind: str, group: str | None) -> None:
+    def bring_group(self, kind: str, group: str | None) -> None:
         staged = None if self._staged is None or group is None else self._staged.pop((kind, group), None)
         if group is None or (staged is None and has_group(self.ours, group)):
             return
@@ -232,7 +233,7 @@ class Transfer:
             if row.scene not in self.wanted:
                 continue
             if row.key not in here or row.group_id == here[row.key]:
-                self._bring_group(GRAPHS, row.group_id)
+                self.bring_group(GRAPHS, row.group_id)
             if row.key not in here:
                 self.recipe(row.recipe)
                 self.ours.execute(insert(graphs), dict(row._mapping))
@@ -347,6 +348,7 @@ def _missing_groups(
     known = {row.key: row.group_id for row in ours.execute(select(graphs.c.key, graphs.c.group_id))}
     made = theirs.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id))
     named += [(GRAPHS, row.scene, row.group_id) for row in made if known.get(row.key, row.group_id) == row.group_id]
+    named += named_groups(ours, theirs, only)
     here, forgotten = set(ours.execute(select(groups.c.id)).scalars()), _forgotten(ours)
 
     def is_lacking(kind: str, group: str) -> bool:

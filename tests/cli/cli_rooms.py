@@ -1,4 +1,4 @@
-"""Captures for the tests of this room, made in a moment: parts of a textured room, as files with known truth."""
+"""What the tests of this room share: parts of a textured room as files with known truth, and changes of a map."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+import gsmap.map
 from gsmap import formats
+from gsmap.change import recipe_key
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.geometry.transforms import transform_gaussians
-from gsmap.types import Gaussians, Sim3
+from gsmap.types import Change, ChangeReport, Gaussians, Sim3
 
 SIZE = np.array([6.0, 4.0, 2.5])
 
@@ -94,3 +96,18 @@ def _views(low: float, high: float) -> np.ndarray:
             pose[:3, 3] = [x, SIZE[1] / 2, 1.5]
             views.append(pose)
     return np.array(views)
+
+
+def save_changes(site: Path) -> None:
+    """What a comparison of left and right might have found, so that nothing is rendered here."""
+    box, rows = np.array([[0.0, 0, 0], [0.5, 0.5, 1]]), np.arange(5, dtype=np.int32)
+    moved = Sim3(np.eye(3), np.array([1.0, 0, 0]))
+    chair = Change("moved", box, box.astype(np.float32), rows, rows[:3], moved, "half", 0.875, {"through": 6.0})
+    report = ChangeReport((chair,), 0.75, np.array([1.0, 1.125, 0.875]), ("it was dark",))
+    with gsmap.map.open(site) as m:
+        m.edit("left", captured_at="2026-05-30")
+        m.edit("right", captured_at="2026-05-31")
+        left, right = (m.pose_graph().poses[m.store.scenes.get(name).id] for name in ("left", "right"))
+        where = {"older": left.scene, "newer": right.scene, "S_frame_newer": right.S_map_scene}
+        where |= {"S_newer_older": right.S_map_scene.inverse() @ left.S_map_scene}
+        m.store.changes.save(report, recipe_key(m.settings.change).of(left.scene, right.scene), **where)

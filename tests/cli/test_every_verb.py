@@ -11,7 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
+<<<<<<< HEAD
 from tiny_encoder import image_encoder
+=======
+from cli_rooms import save_changes
+>>>>>>> t/verbs
 
 import gsmap
 import gsmap.map
@@ -48,8 +52,11 @@ RUNS = {
     "status": "status MAP",
     "confirm": "confirm MAP left:right --note seen",
     "reject": "reject MAP left:right --note mirrored",
+    "confirm CHANGE": "confirm MAP c1 --note seen",
+    "reject CHANGE": "reject MAP c1 --note shadow",
     "edge": "edge MAP left:right --pose TMP/pose.txt --sigma 0.5,0.02 --note tape",
     "prior": "prior MAP left --anchor",
+    "changes": "changes MAP",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",
     "list scenes": "list MAP scenes",
@@ -58,6 +65,7 @@ RUNS = {
     "list tiles": "list MAP tiles",
     "show SCENE": "show MAP left",
     "show A:B": "show MAP left:right",
+    "show CHANGE": "show MAP c1",
     "diff": "diff MAP 1 2",
     "poses": "poses MAP",
     "settings": "settings MAP",
@@ -105,6 +113,8 @@ def gsmap_run(
     monkeypatch.setattr(gsmap_synthetic, "write_captures", lambda folder, made: _link_captures(captures, folder))
 
     def call(line: str) -> Any:
+        if "c1" in line.split() or "changes" in line.split():
+            save_changes(site)
         if "TMP/saved" in line:
             with gsmap.map.open(site) as m:
                 m.backup(tmp_path / "saved")

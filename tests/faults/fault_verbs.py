@@ -70,6 +70,17 @@ BASES = {
     "kept": ("placed", ("backup MAP HERE/kept",)),
     "grown": ("kept", ("ingest MAP IN/c.ply",)),
     "branched": ("placed", ("branch MAP what-if", "edit MAP@what-if a --note later")),
+    # One room on two days, and on the second a box is gone.
+    "visited": (
+        "empty",
+        (
+            "ingest MAP IN/then.ply --captured-at 2026-01-01 --scale known",
+            "ingest MAP IN/now.ply --captured-at 2026-02-01 --scale known",
+            "edge MAP then:now --pose IN/same.txt --sigma 0.1,0.001",
+            "optimize MAP",
+        ),
+    ),
+    "compared": ("visited", ("changes MAP",)),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
@@ -98,6 +109,8 @@ VERBS = {
         Verb("migrate", "older", "migrate MAP"),
         Verb("confirm", "placed", "confirm MAP a:b"),
         Verb("reject", "placed", "reject MAP a:b"),
+        Verb("changes", "visited", "changes MAP"),
+        Verb("confirm-change", "compared", "confirm MAP c1 --note seen"),
         Verb("edge", "placed", "edge MAP a:b --pose IN/pose2.txt --sigma 1,0.1"),
         Verb("prior", "placed", "prior MAP a --anchor"),
         Verb("edit", "placed", "edit MAP a --captured-at 2024-05-31 --note wet --tag hall"),
@@ -160,7 +173,10 @@ def write_samples(folder: Path) -> None:
     for seed, name in enumerate("abc"):
         formats.write(folder / f"{name}.ply", capture(seed))
         (folder / f"{name}.cameras.json").write_text(json.dumps(_frames(name)))
-    for name, x in (("pose", 5.0), ("pose2", 5.1)):
+    for name, box in (("then", True), ("now", False)):
+        formats.write(folder / f"{name}.ply", room(box))
+        (folder / f"{name}.cameras.json").write_text(json.dumps(_looks()))
+    for name, x in (("pose", 5.0), ("pose2", 5.1), ("same", 0.0)):
         pose = np.eye(4)
         pose[0, 3] = x
         np.savetxt(folder / f"{name}.txt", pose)
@@ -178,6 +194,45 @@ def capture(seed: int, count: int = 400) -> Gaussians:
     colours = np.sin(points * [3.0, 4.0, 5.0])[:, None]
     flat = np.full((count, 3), np.log(0.05))
     return Gaussians(points, np.tile([1.0, 0, 0, 0], (count, 1)), flat, np.full(count, 3.0), colours)
+
+
+def room(with_box: bool) -> Gaussians:
+    """The same box from the inside, closed, and in it one to be missed."""
+    points, sizes = [_sides((0, 0, 0), (4, 3, 2), 0.2)], [0.09]
+    if with_box:
+        points.append(_sides((2, 1.2, 0), (2.6, 1.8, 1), 0.1))
+        sizes.append(0.05)
+    scales = np.concatenate([np.full((len(part), 3), np.log(size)) for part, size in zip(points, sizes, strict=True)])
+    every = np.concatenate(points)
+    count, colours = len(every), np.sin(every * [3.0, 4.0, 5.0])[:, None]
+    return Gaussians(every, np.tile([1.0, 0, 0, 0], (count, 1)), scales, np.full(count, 5.0), colours)
+
+
+def _sides(low: tuple[float, ...], high: tuple[float, ...], step: float) -> np.ndarray:
+    """(N, 3) points on the six sides of a box."""
+    sides = []
+    for axis in range(3):
+        grid = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
+        for end in (low[axis], high[axis]):
+            grid[axis] = np.array([end])
+            sides.append(np.stack(np.meshgrid(*grid), -1).reshape(-1, 3))
+    return np.concatenate(sides)
+
+
+def _looks() -> list[dict[str, object]]:
+    """Cameras around the middle, which they see."""
+    frames = []
+    for i, (x, y) in enumerate(((0.6, 0.6), (3.4, 0.6), (3.4, 2.4), (0.6, 2.4), (2.3, 0.4), (0.5, 1.5))):
+        ahead = np.array([2.3 - x, 1.5 - y, -0.4])
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(ahead, right), ahead], 1)
+        frames.append(
+            {"id": i, "img_name": f"{i}", "width": 64, "height": 48, "position": [x, y, 1.4]}
+            | {"rotation": axes.tolist(), "fx": 30.0, "fy": 30.0}
+        )
+    return frames
 
 
 def _frames(name: str) -> list[dict[str, object]]:

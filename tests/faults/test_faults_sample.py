@@ -12,6 +12,7 @@ POINTS = {
     "ingest": [(0.5, "short-once"), (0.6, "eio-once"), (0.88, "kill-after")],
     "optimize": [(0.5, "kill-after"), (0.6, "enospc-once")],
     "export": [(0.1, "kill-before"), (0.3, "enospc-ever")],
+    "changes": [(0.5, "kill-after"), (0.6, "enospc-once")],
     "prune": [(0.4, "kill-before"), (0.5, "eio-ever")],
     "remove": [(0.3, "eio-once"), (0.5, "kill-after"), (0.7, "eio-ever")],
     "models-add": [(0.4, "kill-after"), (0.6, "eio-once")],

@@ -10,6 +10,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
+from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.maps import (
@@ -58,8 +59,12 @@ __all__ = [
     "BackupReport",
     "BandRow",
     "BranchRow",
+    "ChangeDetail",
+    "ChangeRow",
+    "ChangesReport",
     "CheckReport",
     "CloneReport",
+    "ComparisonRow",
     "ComponentErrorRow",
     "ConvertReport",
     "DemoReport",

@@ -1,0 +1,175 @@
+"""From changed cells to changed things."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.change.components import components, groups
+from gsmap.change.params import Params
+from gsmap.change.sides import Side
+from gsmap.change.structure import planes
+
+_SMOOTH_M = 0.08  # neighbours that a cell asks
+_FEWEST_LOOKS = 3  # views through a neighbourhood, and pixels that compared its colour
+_FAINT = 0.6  # strength from which a cell may belong to something that changed its colour
+_WHOLE = 0.4  # of a thing of which this share of what was judged has changed, all has
+_LINK_M = 0.08  # cells of one thing, where nothing but the room's shell is between things
+_RING_M = (0.04, 0.12)  # how far from a change of colour its surroundings begin and end
+_BEHIND_M = 0.15  # a change of colour on a wall, so close to a thing that came or went, is its back or its shadow
+_BEHIND = 0.5  # ... if this share of it is
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """What is known of the cells of one capture, after each has asked its neighbours.
+
+    Args:
+        plane: (M,) of the room's shell, -1 for what is none; the same numbers in both captures.
+        thing: (M,) cluster of the cells that are no shell, -1 for the shell.
+        moved: (M,) bool, the other capture looked through.
+        painted: (M,) bool, on the other's surface, in another colour.
+        judged: (M,) bool, the other capture has looked at or through.
+        strength: (M,) of the difference of colour, as a multiple of what counts.
+        offset_m: (M,) of the other's surface behind this one.
+    """
+
+    plane: np.ndarray
+    thing: np.ndarray
+    moved: np.ndarray
+    painted: np.ndarray
+    judged: np.ndarray
+    strength: np.ndarray
+    offset_m: np.ndarray
+
+
+def judge(sides: tuple[Side, Side], params: Params) -> tuple[Cells, Cells]:
+    """Which cells of each capture changed, and how."""
+    points = np.concatenate([side.points for side in sides])
+    normals = np.concatenate([side.normals for side in sides])
+    plane = planes(points, normals, params.cell_m / np.sqrt(2))
+    cut = len(sides[0])
+    return _judge(sides[0], plane[:cut], params), _judge(sides[1], plane[cut:], params)
+
+
+def _judge(side: Side, plane: np.ndarray, params: Params) -> Cells:
+    through, on = side.around(side.through, _SMOOTH_M), side.around(side.on, _SMOOTH_M)
+    moved = (through >= _FEWEST_LOOKS) & (through >= params.min_share * (through + on)) & (side.through >= side.on)
+    looks = side.around(side.looks, _SMOOTH_M)
+    strength = side.around(side.strength * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
+    offset_looks = side.around(side.offset_looks, _SMOOTH_M)
+    offset = side.around(side.offset_m * side.offset_looks, _SMOOTH_M) / np.maximum(offset_looks, 1)
+    painted = ~moved & (looks >= _FEWEST_LOOKS) & (strength >= _FAINT)
+    plane = np.where(moved, -1, plane)  # What one can walk through is no wall.
+    thing = np.full(len(side), -1, dtype=np.int64)
+    thing[plane < 0] = components(side.points[plane < 0], _LINK_M)
+    judged = (side.through + side.on > 0) | (side.looks > 0)
+    return Cells(plane, thing, moved, painted, judged, strength, offset)
+
+
+_NONE = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """What one capture shows of something that changed.
+
+    Args:
+        cells: (K,) of the whole of it.
+        moved, painted: those that the other capture looked through, or saw in another colour.
+        behind: cells of the shell of the room that changed their colour since it stood or stands before them.
+    """
+
+    cells: np.ndarray
+    moved: np.ndarray
+    painted: np.ndarray
+    behind: np.ndarray = field(default_factory=lambda: _NONE)
+
+    @property
+    def changed(self) -> np.ndarray:
+        return np.concatenate([self.moved, self.painted])
+
+
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """A change of colour on one surface, as both captures show it: cells of each, and how clear it is."""
+
+    cells: tuple[np.ndarray, np.ndarray]
+    strength: float
+    leak: float
+    is_shell: bool
+
+
+def things_of(side: Side, cells: Cells, painted: np.ndarray, params: Params) -> list[Thing]:
+    """Things of one capture that changed, largest first; ``painted`` (M,) bool are the cells of clear paint."""
+    fewest = max(2, round(params.min_area_m2 / params.cell_m**2))
+    changed = (cells.moved | painted) & (cells.thing >= 0)
+    count = int(cells.thing.max(initial=-1)) + 1
+    total = np.bincount(cells.thing[cells.judged & (cells.thing >= 0)], minlength=count)
+    share = np.bincount(cells.thing[changed], minlength=count) / np.maximum(total, 1)
+    whole = (share >= _WHOLE)[cells.thing] & (cells.thing >= 0)
+    # What is changed only in part is cut out; what is changed as a whole is kept together.
+    kind = np.where(whole, cells.thing, -1)
+    found = []
+    for group in groups(side.points, np.flatnonzero(changed | whole), params.reach_m, fewest, kind):
+        moved, tinted = group[cells.moved[group]], group[painted[group] & ~cells.moved[group]]
+        if len(moved) + len(tinted) >= fewest:
+            found.append(Thing(group, moved, tinted))
+    return sorted(found, key=lambda t: (-len(t.cells), int(t.cells[0])))
+
+
+def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params) -> list[Paint]:
+    """Clusters of cells, of both captures together, that changed their colour on one plane, or off all planes."""
+    rows = [np.flatnonzero(c.painted) for c in cells]
+    points = np.concatenate([side.points[r] for side, r in zip(sides, rows, strict=True)])
+    plane = np.concatenate([c.plane[r] for c, r in zip(cells, rows, strict=True)])
+    fewest = max(2, round(params.min_area_m2 / params.cell_m**2))
+    found = []
+    for group in groups(points, np.arange(len(points)), params.reach_m, fewest, plane):
+        parts = rows[0][group[group < len(rows[0])]], rows[1][group[group >= len(rows[0])] - len(rows[0])]
+        if min(len(parts[0]), len(parts[1])) * 4 < fewest:  # Both captures must show it.
+            continue
+        strengths = np.concatenate([c.strength[p] for c, p in zip(cells, parts, strict=True)])
+        leaks = [_leak(s, c, p) for s, c, p in zip(sides, cells, parts, strict=True)]
+        found.append(Paint(parts, float(strengths.mean()), float(np.mean(leaks)), bool(plane[group[0]] >= 0)))
+    return found
+
+
+def _leak(side: Side, cells: Cells, inside: np.ndarray) -> float:
+    """How much of a change of colour goes on around it: paint ends at an edge, light and shadow fade."""
+    if not len(inside):
+        return 0.0
+    around = (side.looks > 0) & ~cells.moved
+    around[inside] = False
+    outside = np.flatnonzero(around)
+    distance, _ = cKDTree(side.points[inside]).query(side.points[outside], distance_upper_bound=_RING_M[1])
+    ring = outside[np.isfinite(distance) & (distance > _RING_M[0])]
+    if len(ring) < 6:
+        return 0.0
+    return float(np.median(cells.strength[ring]) / max(np.median(cells.strength[inside]), 1e-6))
+
+
+def behind(things: list[Thing], sides: tuple[Side, Side], paint: Paint, which: list[int]) -> int | None:
+    """The thing (its place in the list) that came or went before a change of colour on a wall, if one did.
+
+    Args:
+        which: whose capture each thing is, 0 the older and 1 the newer.
+    """
+    owners = [k for k, t in enumerate(things) if len(t.moved)]
+    if not owners:
+        return None
+    points = [sides[which[k]].points[things[k].moved] for k in owners]
+    owner = np.repeat(owners, [len(p) for p in points])
+    at = np.concatenate([side.points[p] for side, p in zip(sides, paint.cells, strict=True)])
+    distance, row = cKDTree(np.concatenate(points)).query(at, distance_upper_bound=_BEHIND_M)
+    near = np.isfinite(distance)
+    if near.mean() < _BEHIND:
+        return None
+    return int(np.bincount(owner[row[near]]).argmax())
+
+
+def with_behind(thing: Thing, cells: np.ndarray) -> Thing:
+    """The thing, and what changed its colour on the wall behind it."""
+    return replace(thing, behind=np.union1d(thing.behind, cells))
