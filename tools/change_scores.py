@@ -43,6 +43,7 @@ class Truth:
 
     folder: Path
     _views: dict[tuple[str, str], Views] = field(default_factory=dict)
+    _clouds: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @cached_property
     def times(self) -> list[str]:
@@ -153,21 +154,29 @@ def changed_voxels(truth: Truth, before: str, after: str) -> list[tuple[dict[str
 
 def _cloud(truth: Truth, time: str) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) that a capture saw, thinned to 2.5 cm, and the ids of their objects."""
-    views, cameras = truth.views(time), truth.cameras(time)
-    height, width = views.ids.shape[1:]
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    points, ids = [], []
-    for row in range(len(cameras)):
-        fx, fy, cx, cy = cameras.intrinsics_px[row]
-        depth = views.depths_m[row]
-        local = np.stack([(x - cx) / fx * depth, (y - cy) / fy * depth, depth], axis=-1)[depth > 0]
-        T = cameras.T_frame_camera[row]
-        points.append(local @ T[:3, :3].T + T[:3, 3])
-        ids.append(views.ids[row][depth > 0])
-    cloud, owner = np.concatenate(points), np.concatenate(ids)
-    keys = np.column_stack([np.floor(cloud / 0.025), owner]).astype(np.int32)
-    _, first = np.unique(keys, axis=0, return_index=True)
-    return cloud[first], owner[first]
+    if time not in truth._clouds:
+        views, cameras = truth.views(time), truth.cameras(time)
+        height, width = views.ids.shape[1:]
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        points, ids = [], []
+        for row in range(len(cameras)):
+            fx, fy, cx, cy = cameras.intrinsics_px[row]
+            depth = views.depths_m[row]
+            local = np.stack([(x - cx) / fx * depth, (y - cy) / fy * depth, depth], axis=-1)[depth > 0]
+            T = cameras.T_frame_camera[row]
+            cloud, owner = _thinned(local @ T[:3, :3].T + T[:3, 3], views.ids[row][depth > 0])
+            points.append(cloud)
+            ids.append(owner)
+        truth._clouds[time] = _thinned(np.concatenate(points), np.concatenate(ids))
+    return truth._clouds[time]
+
+
+def _thinned(points: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One point of each object in each cube of 2.5 cm."""
+    cells = np.floor(points / 0.025).astype(np.int64) + (1 << 15)
+    keys = ((cells[:, 0] << 48) | (cells[:, 1] << 32) | (cells[:, 2] << 16)) + ids
+    _, first = np.unique(keys, return_index=True)
+    return points[first], ids[first]
 
 
 # --- changes ----------------------------------------------------------------------------------------------------------

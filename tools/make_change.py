@@ -105,12 +105,13 @@ def make(out: Path, seed: int, visits: tuple[Visit, ...], args: argparse.Namespa
     """Build a place, visit it, and write the captures and the truth."""
     place = synthetic.make_place(seed)
     routes = default_routes(place, 3)
-    places, shuts, films = {}, {}, {}
+    places, shuts, films, walked = {}, {}, {}, set()
     for k, visit in enumerate(visits):
         began = time.process_time()
         rng = np.random.default_rng([seed, k, 9])
         route = routes[visit.route]
-        edits = random_edits(place, rng, rooms=route, **asked(visit.edits)) if visit.edits != "none" else []
+        known = [room for room in route if room in walked] or route  # What nobody saw before cannot be told to change.
+        edits = random_edits(place, rng, rooms=known, **asked(visit.edits)) if visit.edits != "none" else []
         if k:
             place = edit_place(place, edits, light=visit.light)
         exposure = {}
@@ -139,6 +140,7 @@ def make(out: Path, seed: int, visits: tuple[Visit, ...], args: argparse.Namespa
         }
         (out / "truth" / f"{visit.name}.json").write_text(json.dumps(truth, indent=1))
         places[visit.name], shuts[visit.name], films[visit.name] = place, shut, frames.cameras
+        walked |= set(route)
         print(f"{seed} {visit.name}: {len(gaussians)} Gaussians, {time.process_time() - began:.0f} CPU s", flush=True)
     _write_truth(out, places, shuts, films)
 
