@@ -7,7 +7,7 @@ capture there. Only what both captures observed counts as a change: nobody can k
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -190,13 +190,13 @@ class Claim:
         kind: appeared, disappeared, moved, recoloured, replaced or lighting (which claims no change of any thing).
         voxels_m: (n, 3) centres of the voxels that changed, of `VOXEL_M` or smaller; of what moved, before and after.
         S_after_before: (4, 4) of what moved, else None.
-        symmetric: it says itself that its turn cannot be known.
+        symmetry: of what moved, what it says of itself: "none", "half" or "any".
     """
 
     kind: str
     voxels_m: np.ndarray
     S_after_before: np.ndarray | None = None
-    symmetric: bool = False
+    symmetry: str = "none"
 
 
 def read_claims(entries: Sequence[Mapping[str, Any]], S_place_frame: Sim3) -> list[Claim]:
@@ -207,8 +207,22 @@ def read_claims(entries: Sequence[Mapping[str, Any]], S_place_frame: Sim3) -> li
         moved = entry.get("S_after_before")
         T = None if moved is None else S @ np.array(moved) @ np.linalg.inv(S)
         voxels = S_place_frame.apply(np.array(entry["voxels_m"], np.float64).reshape(-1, 3))
-        claims.append(Claim(entry["kind"], voxels, T, bool(entry.get("symmetric", False))))
+        claims.append(Claim(entry["kind"], voxels, T, entry.get("symmetry", "none")))
     return claims
+
+
+def claims_of(changes: Iterable[Any], S_place_frame: Sim3) -> list[Claim]:
+    """The same from gsmap's own changes."""
+    rows = (
+        {
+            "kind": c.kind,
+            "voxels_m": c.voxels,
+            "S_after_before": None if c.S_after_before is None else c.S_after_before.matrix(),
+            "symmetry": c.symmetry,
+        }
+        for c in changes
+    )
+    return read_claims(list(rows), S_place_frame)
 
 
 def score_changes(truth: Truth, before: str, after: str, claims: Sequence[Claim]) -> dict[str, Any]:
@@ -226,6 +240,7 @@ def score_changes(truth: Truth, before: str, after: str, claims: Sequence[Claim]
     all_claimed = _stacked([c.voxels_m for c in claims])
     right = [bool((_distances(c.voxels_m, all_true) <= 0.15).mean() >= 0.5) for c in claims]
     objects, moves = [], {"moved_true": 0, "moved_right": 0, "moved_symmetric": 0, "moved_symmetric_right": 0}
+    moves["moved_symmetric_said"] = 0
     answered = set()
     for change, voxels in must:
         near = [(_distances(voxels, c.voxels_m) <= VOXEL_M).mean() for c in claims]
@@ -246,6 +261,7 @@ def score_changes(truth: Truth, before: str, after: str, claims: Sequence[Claim]
             answered |= set(good)
             moves["moved_symmetric" if symmetric else "moved_true"] += 1
             moves["moved_symmetric_right" if symmetric else "moved_right"] += bool(good)
+            moves["moved_symmetric_said"] += symmetric and any(claims[k].symmetry != "none" for k in good)
             row["move_errors"] = [(round(metres, 3), round(degrees, 1)) for _, metres, degrees in errors]
         objects.append(row)
     claimed = [k for k, c in enumerate(claims) if c.S_after_before is not None]
@@ -282,9 +298,9 @@ def move_error(change: Mapping[str, Any], S_after_before: np.ndarray | None) -> 
     metres = float(np.linalg.norm(((S_after_before - true) @ middle)[:3]))
     turn = S_after_before[:3, :3] @ true[:3, :3].T
     upright = float(np.degrees(np.arccos(np.clip(turn[2, 2] / np.cbrt(np.linalg.det(turn)), -1, 1))))
-    if change["symmetry"] == "any turn":
+    if change["symmetry"] == "any":
         return metres, upright
-    turns = [np.eye(3), np.diag([-1.0, -1, 1])] if change["symmetry"] == "half-turn" else [np.eye(3)]
+    turns = [np.eye(3), np.diag([-1.0, -1, 1])] if change["symmetry"] == "half" else [np.eye(3)]
     return metres, min(_degrees(turn @ t) for t in turns)
 
 

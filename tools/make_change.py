@@ -56,7 +56,7 @@ _FALSE = (_T0, Visit("e1", exposure=True), Visit("n1", light="night"), Visit("s1
 SETS: dict[str, dict[int, tuple[Visit, ...]]] = {
     # Constants may be chosen on these ...
     "dev": {
-        101: (_T0, _T1, Visit("t2", "moved:3,removed:1,added:1,small:1", route=1)),
+        101: (_T0, _T1, Visit("t2", "moved:2,removed:1,added:1,small:1", route=1)),
         202: (_T0, _T1),
         303: (_T0, replace(_T1, exposure=True)),
     },
@@ -84,6 +84,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=54, help="per visit")
     parser.add_argument("--gaussians", type=int, default=40_000, help="per visit")
     parser.add_argument("--size", type=int, default=320, help="longer side of the pictures, pixels")
+    parser.add_argument("--texel", type=float, default=0.008, help="edge of a texel of the place, metres")
     args = parser.parse_args()
     if (args.set is None) == (args.seed is None):
         parser.error("give either --set or --seed")
@@ -103,7 +104,7 @@ def main() -> int:
 
 def make(out: Path, seed: int, visits: tuple[Visit, ...], args: argparse.Namespace) -> None:
     """Build a place, visit it, and write the captures and the truth."""
-    place = synthetic.make_place(seed)
+    place = synthetic.make_place(seed, texel_m=args.texel)
     routes = default_routes(place, 3)
     places, shuts, films, walked = {}, {}, {}, set()
     for k, visit in enumerate(visits):

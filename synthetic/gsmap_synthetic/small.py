@@ -35,7 +35,7 @@ def books(s: Surfaces, rng: np.random.Generator, w: float, d: float) -> None:
 
 
 SMALL = {
-    "books": Piece(books, (0.26, 0.3), (0.19, 0.22), symmetry="half-turn", small=True),
-    "box": Piece(box, (0.2, 0.3), (0.16, 0.24), symmetry="half-turn", small=True),
-    "vase": Piece(vase, (0.15, 0.2), (0.15, 0.2), symmetry="any turn", small=True),
+    "books": Piece(books, (0.26, 0.3), (0.19, 0.22), symmetry="half", small=True),
+    "box": Piece(box, (0.2, 0.3), (0.16, 0.24), symmetry="half", small=True),
+    "vase": Piece(vase, (0.15, 0.2), (0.15, 0.2), symmetry="any", small=True),
 }

@@ -26,7 +26,7 @@ class PlaceObject:
             the middle of its back on the floor.
         size_m: (width, depth) of its footprint, from x = -width / 2 and y = 0; zeros where it has none.
         symmetry: which turns about the vertical through the footprint's middle leave it (nearly) as it is: "none",
-            "half-turn" or "any turn".
+            "half" or "any".
         wall: the wall of its room that it hangs on, -1 for none; its ``span_m`` along that wall.
         paint: 0 as it was built, else the seed of what it was painted with.
         present: whether it is there; what was taken away keeps its id.
