@@ -28,7 +28,7 @@ from gsmap.store.change_rows import (
     same_changes,
 )
 from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish
+from gsmap.store.groups import manifest, publish, unless_pruned
 from gsmap.store.layout import Shape
 from gsmap.store.matrices import from_array, from_pose
 from gsmap.store.scenes import living_ids, resolve, scene_name
@@ -160,7 +160,8 @@ class Changes:
         if found.changes:
             counts = _counts(found.changes)
             shapes: dict[str, Shape] = {name: (sum(counts[name]), *_PARTS[name][0][1:]) for name in _PARTS}
-            arrays = self._arrays.read(KIND, group_id, files, only=tuple(shapes), shapes=shapes)
+            with unless_pruned(self._catalog, group_id, f"comparison {comparison} was dropped or made again"):
+                arrays = self._arrays.read(KIND, group_id, files, only=tuple(shapes), shapes=shapes)
             where = f"{KIND}/{group_id}"
             parts = _parts(arrays, found.changes, sizes[found.older], sizes[found.newer], where)
         of_type = (_change(stored, part) for stored, part in zip(found.changes, parts, strict=True))

@@ -1,7 +1,8 @@
 """What is read inside one reading is of one moment, whatever others write meanwhile."""
 
+import numpy as np
 import pytest
-from store_samples import key, make_cameras, make_gaussians
+from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 
 from gsmap.errors import NotFoundError
 from gsmap.map import reports
@@ -67,6 +68,14 @@ def test_a_graph_that_is_pruned_while_it_is_read_is_not_called_damaged(store, mo
     prune_when_read(store, monkeypatch)
     with pytest.raises(NotFoundError, match="pruned while"):
         store.graphs.load(scene)
+
+
+def test_a_comparison_that_is_pruned_while_it_is_read_is_not_called_damaged(store, monkeypatch):
+    older, newer = (add(store, seed).id for seed in (1, 2))
+    kept = save_comparison(store, older, newer, made_change(np.array([[0.0, 0, 0], [1, 1, 1]])))
+    prune_when_read(store, monkeypatch)
+    with pytest.raises(NotFoundError, match="pruned while"):
+        store.changes.load(kept.number)
 
 
 def prune_when_read(store, monkeypatch):
