@@ -34,13 +34,14 @@ from gsmap.store.columns import (
     a_graph,
     a_matrix,
     a_pose,
+    a_thinning,
     an_object,
     poses_by_scene,
     sigmas,
     texts,
 )
 
-HEAD = "0003"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0004"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
@@ -114,6 +115,7 @@ scenes = _table(
     Column("notes", Json(texts), nullable=False),
     Column("group_id", Digest, ForeignKey("groups.id")),  # null once pruned
     Column("removed_at", Text),  # the tombstone
+    Column("thinned", Json(a_thinning)),  # of a scene that is kept compact (`gsmap.store.compact`)
     CheckConstraint("scale_policy in ('auto', 'known', 'unknown')", name="scale_policy"),
 )
 Index(
