@@ -19,6 +19,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from tiny_encoder import image_encoder
 
 import gsmap.map
 from gsmap.map import Map
@@ -131,21 +132,6 @@ def register(m: Map) -> None:
             saved = m.store.registrations.save(found, recipe.of(*key.inputs, "another") if turn else key)
             first = first or saved.number
         m.store.registrations.adopt(first)
-
-
-def image_encoder() -> bytes:
-    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
-    from onnx import TensorProto, helper
-
-    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
 def pack(path: Path, out: Path) -> None:

@@ -46,6 +46,7 @@ VERBS = (
     "restore-scene",
     "check",
     "prune",
+    "thin",
     "migrate",
     "backup",
     "restore",

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.compare.params import Params
-from gsmap.geometry.voxels import voxel_labels
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind

@@ -23,7 +23,7 @@ from gsmap.formats import tiles3d
 from gsmap.types import MergeResult, Tile
 from gsmap.types.progress import Progress, silent
 
-STAGING = ".partial"
+_STAGING = ".partial"
 Make = Callable[[PlannedTile, Progress], MergeResult]
 _At = tuple[int, str]  # component and name of a tile
 
@@ -89,18 +89,16 @@ def export_tiles(
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
-    _remove_leftovers(out)
-    if not todo and not gone and not manifest.doomed and out.exists():
-        return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
-
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     try:
+        if not todo and not gone and not manifest.doomed and out.exists():
+            return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
         make_folder(out)
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
-        remove_tree(out, STAGING)  # it may not be ours, and hold links
-        (out / STAGING).mkdir()
+        remove_tree(out, _STAGING)  # it may not be ours, and hold links
+        (out / _STAGING).mkdir()
         work = _finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers, report.give_up)
         with closing(work) as finished:
             for at, tile, num_bytes in finished:
@@ -126,7 +124,9 @@ def export_tiles(
             ) from error
         raise
     finally:
-        _remove_leftovers(out)
+        for left in leftovers(out):
+            with suppress(OSError, CorruptError):
+                remove_tree(out, *left)
     tiles = [manifest.tiles[at] for at in sorted(planned)]
     return ExportResult(tiles, len(todo), reused, len(gone), manifest.notes + _told(news))
 
@@ -145,7 +145,7 @@ def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, repor
     path, digest, num_bytes = "", "", 0
     if len(content.gaussians):
         path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
-        staged = out / STAGING / path.replace("/", "_")
+        staged = out / _STAGING / path.replace("/", "_")
         try:
             _write(staged, content, recipe)
         except GsmapError as error:
@@ -199,11 +199,10 @@ def _remove_doomed(out: Path, manifest: Manifest) -> None:
         manifest.save(out)
 
 
-def _remove_leftovers(out: Path) -> None:
-    """Delete what an export that was killed had begun to write."""
-    for path in [out / STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
-        with suppress(OSError, CorruptError):
-            remove_tree(out, *path.relative_to(out).parts)
+def leftovers(out: Path) -> list[tuple[str, ...]]:
+    """Where in its folder an export that was killed had begun to write."""
+    found = [*out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]
+    return [(_STAGING,), *(path.relative_to(out).parts for path in found)]
 
 
 def _told(news: dict[_At, Tile]) -> tuple[str, ...]:

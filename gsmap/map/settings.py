@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import describe, engine, export, merge, optimize, register, retrieve
+from gsmap import compare, describe, engine, export, merge, optimize, register, retrieve, thin
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.settings import FILE_NAME, changed, load, save
@@ -48,6 +48,8 @@ class Settings:
         retrieve: which pairs are tried.
         register: how a pair is registered and judged.
         optimize: how poses are solved.
+        compare: what counts as evidence that captures disagree.
+        thin: when a capture is kept compact.
         merge: how captures become one.
         export: how tiles are planned and kept.
         evaluate: when an edge counts as wrong.
@@ -58,6 +60,8 @@ class Settings:
     retrieve: retrieve.Params = field(default_factory=retrieve.Params)
     register: register.Params = field(default_factory=register.Params)
     optimize: optimize.Params = field(default_factory=optimize.Params)
+    compare: compare.Params = field(default_factory=compare.Params)
+    thin: thin.Params = field(default_factory=thin.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)

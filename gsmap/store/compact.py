@@ -7,6 +7,7 @@ of a scene are read as before.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -83,6 +84,16 @@ def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
     value = {name: low + arrays[f"compact.{name}"] * step for name, (low, step) in ranges.items()}
     sh = np.concatenate([value["sh0"], value["sh_rest"]], axis=1).reshape(len(rows), -1, 3)
     return Gaussians(means, quats, value["log_scales"], logits_of_bytes(arrays["compact.opacities"]), sh)
+
+
+def rounded(gaussians: Gaussians) -> Gaussians:
+    """What would be read of Gaussians that are kept compact."""
+    return unpack(pack(gaussians), np.arange(len(gaussians)))
+
+
+def num_bytes(gaussians: Gaussians) -> int:
+    """About what Gaussians take on the disk where they are kept compact: their arrays, packed as in a map."""
+    return sum(len(zlib.compress(array.tobytes(), 1)) for array in pack(gaussians).values())
 
 
 def shapes(n: int, sh_degree: int) -> dict[str, Shape]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from gsmap.store.boxes import chunk_boxes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
-from gsmap.store.groups import has_group, manifest, publish, unname
+from gsmap.store.groups import has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.layout import CHUNK_ROWS, Shape
 from gsmap.store.schema import CHUNK_BOXES, graphs, scenes
 from gsmap.types import Cameras, Gaussians, Scene, Thinning
@@ -234,7 +234,7 @@ class Scenes:
             files = _manifest(connection, row)
             chunks = None if bounds is None else _touching(connection, row.number, np.asarray(bounds, np.float64))
         rows = None if chunks is None else _ranges(chunks, row.num_gaussians)
-        with self._unless_pruned(row):
+        with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
             out = self._read(row, files, rows)
         if bounds is None:
             return out
@@ -295,6 +295,11 @@ class Scenes:
                     unname(connection, group)
             return _with_tags(connection, _find(connection, row.id))
 
+    def num_bytes(self, ref: str) -> int:
+        """Of a scene's arrays, as they were written."""
+        with self._catalog.read() as connection:
+            return num_bytes(connection, _find(connection, ref).group_id)
+
     def cameras(self, ref: str) -> Cameras:
         """Read a scene's cameras.
 
@@ -305,7 +310,7 @@ class Scenes:
             row = _find(connection, ref)
             files = _manifest(connection, row)
         names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
-        with self._unless_pruned(row):
+        with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
             arrays = self._arrays.read(KIND, row.group_id, files, only=names, shapes=_shapes(row))
         pose, intrinsics, sizes, text_bytes = arrays.values()
         try:
@@ -313,20 +318,6 @@ class Scenes:
         except UnicodeDecodeError as error:
             raise CorruptError(f"scene {row.name}: the names of its cameras are no text: ingest it again") from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
-
-    @contextlib.contextmanager
-    def _unless_pruned(self, row: Row[Any]) -> Iterator[None]:
-        """Tell arrays that others reclaimed while they were read from damaged ones."""
-        try:
-            yield
-        except CorruptError:
-            with self._catalog.read() as connection:
-                found = _by_id(connection, row.id)
-            if found is None or found.group_id is None:
-                raise NotFoundError(
-                    f"scene {row.name!r} was removed and its arrays were pruned while they were read"
-                ) from None
-            raise
 
     def remove(self, ref: str) -> Scene:
         """Leave a tombstone: gone from lists and from the next revision, its bytes kept until they are pruned."""
@@ -357,9 +348,7 @@ class Scenes:
             problems = self._arrays.problems(KIND, row.group_id, files)
             if problems:
                 raise CorruptError(f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}")
-            name, number = row.name, 2
-            while name_taken(connection, name):
-                name, number = f"{row.name}-{number}", number + 1
+            name = free_name(connection, row.name)
             back = {"removed_at": None, "ingested_at": now(), "name": name}
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(**back))
             if name != row.name:
@@ -388,19 +377,16 @@ class Scenes:
 
     def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str) -> Scene:
         """The row of a new or returning scene, under a name that is free."""
-        name, number = fields["name"], 2
-        while name_taken(connection, fields["name"]):
-            if not rename:
-                raise InputError(f"another scene is called {name!r}: choose another name, or remove that one first")
-            fields = fields | {"name": f"{name}-{number}"}
-            number += 1
-        fields = fields | {"ingested_at": now(), "removed_at": None}
+        wanted, name = fields["name"], free_name(connection, fields["name"])
+        if name != wanted and not rename:
+            raise InputError(f"another scene is called {wanted!r}: choose another name, or remove that one first")
+        fields = fields | {"name": name, "ingested_at": now(), "removed_at": None}
         before = _by_id(connection, new_id)
         if before is None:
             connection.execute(insert(scenes), fields | {"id": new_id})
         else:
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(**fields))
-        facts.say(connection, new_id, [("name", fields["name"])])
+        facts.say(connection, new_id, [("name", name)])
         if fields["captured_at"] or (before is not None and before.captured_at):
             facts.say(connection, new_id, [("captured_at", fields["captured_at"] or "")], dated_by)
         return _with_tags(connection, _find(connection, new_id))
@@ -440,6 +426,14 @@ def name_taken(connection: Connection, name: str) -> bool:
     """Whether a living scene is called so."""
     same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
     return connection.execute(same).first() is not None
+
+
+def free_name(connection: Connection, wanted: str) -> str:
+    """The name, or ``name-2`` and so on where living scenes have it."""
+    name, number = wanted, 2
+    while name_taken(connection, name):
+        name, number = f"{wanted}-{number}", number + 1
+    return name
 
 
 def _alive(connection: Connection, ref: str) -> Row[Any]:

@@ -205,10 +205,7 @@ class Transfer:
             self.ours.execute(update(scenes).where(scenes.c.id == scene).values(**values))
 
     def _free_name(self, wanted: str) -> str:
-        free, number = wanted, 2
-        while scene_rows.name_taken(self.ours, free):
-            free = f"{wanted}-{number}"
-            number += 1
+        free = scene_rows.free_name(self.ours, wanted)
         if free != wanted:
             self.renamed.append((wanted, free))
         return free

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tiny_encoder import image_encoder
 
 from gsmap import formats
 from gsmap.cli import app
@@ -165,7 +166,7 @@ def write_samples(folder: Path) -> None:
         np.savetxt(folder / f"{name}.txt", pose)
     if importlib.util.find_spec("onnx") is not None:
         for name, window in (("encoder", 16), ("encoder2", 8)):
-            (folder / f"{name}.onnx").write_bytes(_encoder(window))
+            (folder / f"{name}.onnx").write_bytes(image_encoder(window))
 
 
 def capture(seed: int, count: int = 400) -> Gaussians:
@@ -185,23 +186,6 @@ def _frames(name: str) -> list[dict[str, object]]:
         | {"rotation": [[0, 0, way], [-way, 0, 0], [0, -1, 0]], "fx": 20.0, "fy": 20.0}
         for i, way in enumerate((1, -1))
     ]
-
-
-def _encoder(window: int) -> bytes:
-    from onnx import TensorProto, helper
-
-    across = 32 // window
-    pool = helper.make_node(
-        "AveragePool", ["image"], ["pooled"], kernel_shape=[window, window], strides=[window, window]
-    )
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 3 * across * across])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
 FUNCTIONS = {"*litter": litter, "*older": older}

@@ -15,7 +15,7 @@ from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.tileset import FILE_NAME as TILESET
 from gsmap.export.tileset import LEVELS_FOLDER, is_stale
-from gsmap.export.write import STAGING
+from gsmap.export.write import leftovers
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
 
@@ -109,8 +109,8 @@ def _clean(store: Store, out: Path, scene: str, found: _Tiles) -> None:
     kept = {at: tile for at, tile in manifest.tiles.items() if at not in made_with_it}
     paths = {tile.path for tile in made_with_it.values() if tile.path}
     paths |= manifest.doomed - {tile.path for tile in kept.values()} - {""}
-    for leftover in [out / STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
-        remove_tree(out, *leftover.relative_to(out).parts)  # what an interrupted export left may be such a tile
+    for leftover in leftovers(out):
+        remove_tree(out, *leftover)  # what an interrupted export left may be such a tile
     gone = len(paths)
     touched = {path.split("/")[0] for path in paths}
     for folder in _component_folders(out):

@@ -82,7 +82,9 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             newer = [
                 other
                 for other in dated
-                if other.id in whole and _when(other) > _when(scene) and graph.poses[other.id].component == mine.component
+                if other.id in whole
+                and _when(other) > _when(scene)
+                and graph.poses[other.id].component == mine.component
             ]
             share = seen_again(placed(scene), [looked(other) for other in newer], settings.compare) if newer else 0.0
             if share < settings.thin.min_seen_again:
@@ -116,9 +118,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     )
 
 
-def _row(
-    scene: Scene, before: int, after: int, seen: float, reason: str, fidelity: float | None = None
-) -> ThinRow:
+def _row(scene: Scene, before: int, after: int, seen: float, reason: str, fidelity: float | None = None) -> ThinRow:
     return ThinRow(
         scene=scene.id,
         name=scene.name,

@@ -12,6 +12,7 @@ from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, S
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.leases import AtWorkRow
+from gsmap.types.rows.life import ThinReport, ThinRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -99,6 +100,8 @@ __all__ = [
     "SnapshotRow",
     "SplitReport",
     "TileRow",
+    "ThinReport",
+    "ThinRow",
     "TodoRow",
     "TrustReport",
     "UpdateReport",
