@@ -123,4 +123,5 @@ def _bytes_apart(values: np.ndarray) -> np.ndarray:
 
 
 def _bytes_together(values: np.ndarray) -> np.ndarray:
-    return (values[:, :3].astype(np.uint16) << 8) | values[:, 3:]
+    out: np.ndarray = (values[:, :3].astype(np.uint16) << 8) | values[:, 3:]
+    return out

@@ -242,7 +242,9 @@ class Scenes:
         reach = _SIGMAS * np.exp(out.log_scales.max(1, initial=-np.inf, keepdims=True))
         return out[((out.means >= low - reach) & (out.means <= high + reach)).all(1)]
 
-    def _read(self, row: Row[Any], files: tuple[StoredFile, ...], ranges: list[tuple[int, int]] | None) -> Gaussians:
+    def _read(
+        self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None
+    ) -> Gaussians:
         """The Gaussians in ranges of rows, all where None."""
         shapes = _shapes(row)
         if row.thinned is None:
@@ -272,9 +274,8 @@ class Scenes:
         if before.thinning is not None:
             return before
         if len(shown) != before.num_gaussians or not shown.any():
-            raise InputError(
-                f"of the {before.num_gaussians} Gaussians of {before.name}, {int(shown.sum())} are to stay"
-            )
+            counts = f"{int(shown.sum())} of {len(shown)} Gaussians"
+            raise InputError(f"cannot keep {counts} of scene {before.name}, which has {before.num_gaussians}")
         own = self.gaussians(before.id)[shown]
         content = compact.pack(own) | _camera_arrays(self.cameras(before.id))
         boxes = chunk_boxes(own, CHUNK_ROWS, sigmas=_SIGMAS)

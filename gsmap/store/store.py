@@ -289,7 +289,7 @@ class Store:
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
     def reclaim(self) -> integrity.Reclaimed:
-        """Delete the arrays and models that no row names, and what crashes left; no scene or revision loses anything."""
+        """Delete arrays and models that no row names, and what crashes left."""
         return integrity.reclaim(self.catalog, self.arrays)
 
     def close(self) -> None:

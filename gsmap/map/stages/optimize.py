@@ -67,7 +67,7 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
 
 
 def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dict[str, np.ndarray]:
-    """What each scene's present graph (by key) says is up; where it has none yet, its newest graph, or what that said."""
+    """What each scene's present graph (by key) says is up; where it has none yet, its newest one, or what that said."""
     # Graphs come oldest first; the present one of a scene goes last.
     chosen = {graph.scene: graph.up for graph in sorted(store.graphs.list(), key=lambda graph: graph.key in present)}
     of_thinned = {scene.id: scene.thinning.up for scene in living if scene.thinning is not None}

@@ -78,17 +78,13 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             if request.budget_bytes is not None and sum(sizes.values()) <= request.budget_bytes:
                 break
             progress("thin", done / len(old), scene.name)
-            mine = graph.poses[scene.id]
-            newer = [
-                other
-                for other in dated
-                if other.id in whole
-                and _when(other) > _when(scene)
-                and graph.poses[other.id].component == mine.component
-            ]
+            component = graph.poses[scene.id].component
+            beside = [other for other in dated if other.id in whole and graph.poses[other.id].component == component]
+            newer = [other for other in beside if _when(other) > _when(scene)]
             share = seen_again(placed(scene), [looked(other) for other in newer], settings.compare) if newer else 0.0
             if share < settings.thin.min_seen_again:
-                rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, f"newer ones saw {share:.0%} of it"))
+                why = f"newer captures saw {share:.0%} of it" if newer else "no newer capture lies beside it"
+                rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why))
                 continue
             own = PlacedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
             stays = shown(own, settings.thin)
