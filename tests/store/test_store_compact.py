@@ -58,7 +58,7 @@ def test_a_thinned_scene_reads_whole_and_in_pieces(store):
     after = store.scenes.gaussians("a")
     np.testing.assert_allclose(after.means, before.means[shown], atol=2e-4)
     np.testing.assert_array_equal(store.scenes.cameras("a").T_frame_camera, make_cameras().T_frame_camera)
-    box = np.array([[-1.0, -2, -5], [1, 2, 5]])
+    box = np.array([[3.0, 3, 3], [5, 5, 5]])  # in the last chunk
     reach = 3 * after.scales.max(1, keepdims=True)
     wanted = ((after.means >= box[0] - reach) & (after.means <= box[1] + reach)).all(1)
     np.testing.assert_array_equal(store.scenes.gaussians("a", box).means, after.means[wanted])
