@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.compare.params import Params
-from gsmap.geometry.voxels import voxel_labels
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
@@ -49,7 +48,9 @@ class Tally:
         self.through = np.zeros(count, dtype=np.int32)
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
-        self.grazed = np.zeros(count, dtype=np.int32)  # views in which it is before the surface, though perhaps at an edge
+        self.grazed = np.zeros(
+            count, dtype=np.int32
+        )  # views in which it is before the surface, though perhaps at an edge
         self.sure = np.zeros(count, dtype=np.int32)
         self.sharpness = np.zeros(count, dtype=np.float32)
         self.colour_seen = np.zeros(count, dtype=np.int32)
@@ -114,9 +115,7 @@ class _Neighbours:
         return out
 
 
-def _painted(
-    own: np.ndarray, seen: np.ndarray, views: np.ndarray, near: _Neighbours, params: Params
-) -> np.ndarray:
+def _painted(own: np.ndarray, seen: np.ndarray, views: np.ndarray, near: _Neighbours, params: Params) -> np.ndarray:
     """(N,) whether the colours of a Gaussian differ by more than light and noise explain.
 
     Args:

@@ -15,7 +15,7 @@ from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish, unless_pruned, unname
+from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.matrices import from_array, to_array
 from gsmap.store.scenes import resolve
 from gsmap.store.schema import graphs, scenes
@@ -129,6 +129,12 @@ class Graphs:
             }
             layers[name] = NodeLayer(**own, **layer["rest"])
         return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
+
+    def num_bytes(self, ref: str) -> int:
+        """Of the arrays of all graphs of a scene, as they were written."""
+        with self._catalog.read() as connection:
+            made = select(graphs.c.group_id).where(graphs.c.scene == resolve(connection, ref)).distinct()
+            return sum(num_bytes(connection, group) for group in connection.execute(made).scalars())
 
     def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
         """Those of the keys (as digests) that a graph is kept under."""

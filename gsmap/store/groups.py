@@ -65,6 +65,11 @@ def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
         raise NotFoundError(f"{gone}, and its arrays were pruned while they were read: try again") from None
 
 
+def num_bytes(connection: Connection, group_id: str) -> int:
+    """Of a group's files, as they were written."""
+    return sum(file.size_bytes for file in manifest(connection, group_id))
+
+
 def manifest(connection: Connection, group_id: str) -> tuple[StoredFile, ...]:
     """The files a group must have, with their digests."""
     rows = connection.execute(select(files).where(files.c.group_id == group_id).order_by(files.c.path))

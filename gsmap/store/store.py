@@ -290,6 +290,10 @@ class Store:
         """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
 
+    def reclaim(self) -> integrity.Reclaimed:
+        """Delete arrays and models that no row names, and what crashes left."""
+        return integrity.reclaim(self.catalog, self.arrays)
+
     def close(self) -> None:
         self.leases.close()
         self.catalog.close()

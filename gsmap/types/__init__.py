@@ -10,6 +10,7 @@ from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph
 from gsmap.types.sim3 import Sim3
+from gsmap.types.thinning import Thinning
 from gsmap.types.tile import Tile
 
 __all__ = [
@@ -35,5 +36,6 @@ __all__ = [
     "SceneGraph",
     "ScenePose",
     "Sim3",
+    "Thinning",
     "Tile",
 ]

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.voxels import merge_groups, voxel_labels
-from gsmap import compare
 from gsmap.merge import exposure, references
 from gsmap.merge.changes import Prefer, settle
 from gsmap.merge.exposure import balance_exposure
