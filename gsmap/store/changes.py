@@ -31,7 +31,7 @@ from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import manifest, publish, unless_pruned
 from gsmap.store.layout import Shape
 from gsmap.store.matrices import from_array, from_pose
-from gsmap.store.scenes import living_ids, resolve, scene_name
+from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
 from gsmap.types import Sim3
 from gsmap.types.change import Change, ChangeReport

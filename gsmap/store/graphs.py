@@ -17,7 +17,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.matrices import from_array, to_array
-from gsmap.store.scenes import resolve
+from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import graphs, scenes
 from gsmap.types import NodeLayer, SceneGraph
 from gsmap.types.plain import plain

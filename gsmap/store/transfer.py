@@ -16,10 +16,12 @@ from gsmap.errors import ConfigError, StoreError
 from gsmap.store import facts
 from gsmap.store import scenes as scene_rows
 from gsmap.store.arrays import Staged, StoredFile, link_or_copy
+from gsmap.store.boxes import get_boxes, put_boxes
 from gsmap.store.change_rows import named_groups
 from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.groups import has_group, manifest, name, publish
 from gsmap.store.models import model_path
+from gsmap.store.scene_refs import free_name
 from gsmap.store.schema import (
     graphs,
     groups,
@@ -206,15 +208,15 @@ class Transfer:
             self.ours.execute(update(scenes).where(scenes.c.id == scene).values(**values))
 
     def _free_name(self, wanted: str) -> str:
-        free = scene_rows.free_name(self.ours, wanted)
+        free = free_name(self.ours, wanted)
         if free != wanted:
             self.renamed.append((wanted, free))
         return free
 
     def _copy_boxes(self, row: Row[Any], number: int) -> None:
-        boxes = scene_rows.get_boxes(self.theirs, row.number)
+        boxes = get_boxes(self.theirs, row.number)
         if len(boxes):
-            scene_rows.put_boxes(self.ours, number, boxes)
+            put_boxes(self.ours, number, boxes)
 
     def bring_group(self, kind: str, group: str | None) -> None:
         staged = None if self._staged is None or group is None else self._staged.pop((kind, group), None)
