@@ -11,11 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
-<<<<<<< HEAD
-from tiny_encoder import image_encoder
-=======
 from cli_rooms import save_changes
->>>>>>> t/verbs
+from tiny_encoder import image_encoder
 
 import gsmap
 import gsmap.map
