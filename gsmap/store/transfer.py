@@ -14,7 +14,6 @@ from sqlalchemy import Connection, Row, delete, insert, select, update
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import ConfigError, StoreError
 from gsmap.store import facts
-from gsmap.store import scenes as scene_rows
 from gsmap.store.arrays import Staged, StoredFile, link_or_copy
 from gsmap.store.boxes import get_boxes, put_boxes
 from gsmap.store.change_rows import named_groups
@@ -22,6 +21,7 @@ from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.groups import has_group, manifest, name, publish
 from gsmap.store.models import model_path
 from gsmap.store.scene_refs import free_name
+from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import (
     graphs,
     groups,
@@ -115,7 +115,7 @@ class Transfer:
                 continue
             mine = self.ours.execute(select(scenes).where(scenes.c.id == row.id)).first()
             if mine is None or mine.group_id in (None, row.group_id) or mine.thinned is not None:
-                self.bring_group(scene_rows.KIND, row.group_id)
+                self.bring_group(SCENES, row.group_id)
             if mine is None:
                 self._add_scene(row)
                 self._join_facts(row.id, arrives=True)
@@ -351,7 +351,7 @@ def _missing_groups(
     into: Store, ours: Connection, theirs: Connection, only: Collection[str] | None, mend: bool
 ) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
     """Manifests of the groups that wanted scenes need and this map lacks (or has damaged), by (kind, id)."""
-    named = [(scene_rows.KIND, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
+    named = [(SCENES, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
     known = {row.key: row.group_id for row in ours.execute(select(graphs.c.key, graphs.c.group_id))}
     made = theirs.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id))
     named += [(GRAPHS, row.scene, row.group_id) for row in made if known.get(row.key, row.group_id) == row.group_id]
