@@ -107,8 +107,7 @@ def export_tiles(
         make_folder(out)
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
-        remove_tree(out, STAGING)  # it may not be ours, and hold links
-        (out / STAGING).mkdir()
+        (out / STAGING).mkdir()  # one that was there may not be ours, and hold links: it is gone
         work = _finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers, report.give_up)
         with closing(work) as finished:
             for at, tile, num_bytes in finished:
