@@ -19,6 +19,7 @@ from gsmap.types import Gaussians
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
+EXPORT_3DTILES = f"{EXPORT} --format 3dtiles"
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Verb:
         also: lines that are run first, undisturbed and unwatched.
         needs: a package without which there is no such verb.
         then: lines that must work once it has come to its end, the first time and the second.
+        forgets: a text that no file below the folder holds once it has come to its end.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Verb:
     also: tuple[str, ...] = ()
     needs: str = ""
     then: tuple[str, ...] = ()
+    forgets: str = ""
 
     @property
     def possible(self) -> bool:
@@ -63,6 +66,8 @@ BASES = {
         ("ingest MAP IN/c.ply", "edge MAP a:b --pose IN/pose2.txt --sigma 0.1,0.01", "optimize MAP"),
     ),
     "shrunk": ("exported", ("remove MAP b", "optimize MAP")),
+    "removed": ("placed", ("remove MAP b",)),
+    "levelled": ("placed", (EXPORT_3DTILES,)),
     "modelled": ("placed", ("models add MAP clip IN/encoder.onnx --preset unit",)),
     # Everything that prune takes: a removed scene with its graph, revisions, an orphan, what a dead writer left.
     "littered": ("placed", ("remove MAP b", "optimize MAP", "*litter")),
@@ -101,9 +106,15 @@ VERBS = {
         Verb("export", "placed", EXPORT),
         Verb("export-moved", "moved", EXPORT),
         Verb("export-shrunk", "shrunk", EXPORT),
-        Verb("export-3dtiles", "placed", "export MAP OUT --merge union --tile-size 3 --format 3dtiles"),
+        Verb("export-3dtiles", "placed", EXPORT_3DTILES),
         Verb("prune", "littered", "prune MAP --keep-revisions 1"),
         Verb("remove", "placed", "remove MAP b", done_says="no scene is called"),
+        Verb("purge", "exported", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"),
+        Verb(
+            "purge-3dtiles", "levelled", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"
+        ),
+        Verb("restore-scene", "removed", "restore-scene MAP b", done_says="was not removed"),
+        Verb("restore-from", "two", "restore-scene MAP c --from HERE/other.gsmap"),
         Verb("models-add", "placed", "models add MAP clip IN/encoder.onnx --preset unit", needs="onnx"),
         Verb("models-again", "modelled", "models add MAP clip IN/encoder2.onnx --preset unit", needs="onnx"),
         Verb("migrate", "older", "migrate MAP"),
