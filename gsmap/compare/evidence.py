@@ -50,6 +50,7 @@ class Tally:
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
         self.grazed = np.zeros(count, dtype=np.int32)  # views in which it is before the surface, though perhaps at an edge
+        self.covered = np.zeros(count, dtype=np.int32)  # on the surface, but its own capture shows something before it
         self.sure = np.zeros(count, dtype=np.int32)
         self.sharpness = np.zeros(count, dtype=np.float32)
         self.colour_seen = np.zeros(count, dtype=np.int32)
@@ -62,11 +63,14 @@ class Tally:
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
         near = _Neighbours(points, shows, params)
         state = self._geometry(near, params)
+        # What is near the other's surface, yet part of a thing that stood before it, is no part of that surface.
+        beside = near.sums((state == GONE).astype(np.int32)) >= 2
+        state[(state == SAME) & (self.covered > self.colour_seen) & (beside | (self.through >= 1))] = GONE
         same = state == SAME
         seen = same & (self.colour_seen >= 1) & shows
         paint = _painted(np.column_stack([chroma, lightness]), seen, self.colour_seen, near, params)
         state[same & paint] = REPAINTED
-        _follow(state, near, self.grazed > 0)
+        _follow(state, near, self.grazed > 0, self.colour_seen < params.min_views)
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
 
@@ -137,13 +141,12 @@ def _painted(
     return out
 
 
-def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray) -> None:
+def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray, doubtful: np.ndarray) -> None:
     """What nobody judged goes with those around it that were, where most of these are gone or repainted."""
     votes = np.stack([near.sums((state == s).astype(np.int32)) for s in (SAME, REPAINTED, GONE)])
-    open_ = state < SAME
+    open_ = (state < SAME) | ((state == SAME) & doubtful)
     most = votes.argmax(0)
     sure = (votes.max(0) >= 3) & (2 * votes.max(0) > votes.sum(0))
-    state[open_ & grazed & ~(sure & (most == 0))] = GONE
-    open_ = state < SAME
+    state[(state < SAME) & grazed & ~(sure & (most == 0))] = GONE
     sure &= most > 0
     state[open_ & sure] = np.array([SAME, REPAINTED, GONE], dtype=np.int8)[most[open_ & sure]]
