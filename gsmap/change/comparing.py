@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 from gsmap import compare as comparison
 from gsmap import render
 from gsmap.change.kinds import kind_of_paint
+from gsmap.change.moving import find_moves
 from gsmap.change.params import Params
 from gsmap.change.sides import Side, sides
-from gsmap.change.things import Cells, Paint, Thing, behind, judge, paints, things_of, with_behind
+from gsmap.change.things import Cells, Paint, Thing, behind, is_paint, judge, paints, things_of, with_behind
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.methods import RecipeKey
 from gsmap.types import PlacedScene, Sim3
@@ -66,7 +67,7 @@ def compare(
     report(0.7, "finding what changed")
     both = sides(looks_older, looks_newer, found, params)
     cells = judge(both, params)
-    changes = [_change(one, both, cells, params) for one in _find(both, cells, params)]
+    changes = [_change(one, both, cells, params) for one in _find(both, cells, found.balance, (looks_older, looks_newer), params)]
     changes = [c for c in changes if c.confidence >= params.min_confidence]
     changes.sort(key=lambda c: (-c.confidence, c.box.tolist()))
     report(1.0, "changes found")
@@ -74,8 +75,14 @@ def compare(
     return ChangeReport(tuple(changes), seen, found.balance.gains())
 
 
-def _find(both: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params) -> list[_Found]:
-    tints = [p for p in paints(both, cells, params) if p.strength >= params.min_paint and p.leak <= params.most_leak]
+def _find(
+    both: tuple[Side, Side],
+    cells: tuple[Cells, Cells],
+    line: comparison.Balance,
+    looks: tuple[comparison.Looks, comparison.Looks],
+    params: Params,
+) -> list[_Found]:
+    tints = [p for p in paints(both, cells, params) if is_paint(p, line, params)]
     clear = [np.zeros(len(side), dtype=bool) for side in both]
     for paint in tints:
         if not paint.is_shell:
@@ -94,6 +101,12 @@ def _find(both: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params) -
             older[k] = with_behind(older[k], paint.cells[0])
         else:
             newer[k - len(older)] = with_behind(newer[k - len(older)], paint.cells[1])
+    for move in find_moves(older, newer, both, looks, params):
+        evidence = {"fit": move.score, "next_fit": move.runner_up}
+        things = (older[move.older], newer[move.newer])
+        found.append(_Found("moved", things, None, move.S_after_before, move.symmetry, evidence))
+    taken = [{id(t) for one in found for t in one.things if t is not None}]
+    older, newer = ([t for t in things if id(t) not in taken[0]] for things in (older, newer))
     return found + _in_place(older, newer, both)
 
 
