@@ -13,7 +13,19 @@ from gsmap.change.kinds import kind_of_paint
 from gsmap.change.moving import find_moves
 from gsmap.change.params import Params
 from gsmap.change.sides import Side, sides
-from gsmap.change.things import Cells, Paint, Thing, behind, is_paint, judge, paints, things_of, with_behind
+from gsmap.change.things import (
+    Cells,
+    Paint,
+    Thing,
+    behind,
+    gathered,
+    is_paint,
+    judge,
+    paints,
+    parts,
+    things_of,
+    with_behind,
+)
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.methods import RecipeKey
 from gsmap.types import PlacedScene, Sim3
@@ -26,7 +38,10 @@ VERSION = 1
 
 _IN_PLACE_M = 0.1  # cells of two captures so close to each other are of one place ...
 _IN_PLACE = 0.3  # ... and so are two things, if this share of the smaller one is
-_REPAINTED = 0.15  # where less of it was looked through a thing was painted, not replaced
+_REPAINTED = 0.03  # where less of it was looked through, a thing was painted and not replaced, ...
+_FEWEST_MOVED = 8  # ... or fewer cells
+_SPLIT = (0.15, 0.85)  # share of a thing that stands where another does, for it to be two side by side
+_FEWEST_OF_PART = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +116,41 @@ def _find(
             older[k] = with_behind(older[k], paint.cells[0])
         else:
             newer[k - len(older)] = with_behind(newer[k - len(older)], paint.cells[1])
-    for move in find_moves(older, newer, both, looks, params):
-        evidence = {"fit": move.score, "next_fit": move.runner_up}
-        things = (older[move.older], newer[move.newer])
-        found.append(_Found("moved", things, None, move.S_after_before, move.symmetry, evidence))
-    taken = [{id(t) for one in found for t in one.things if t is not None}]
-    older, newer = ([t for t in things if id(t) not in taken[0]] for things in (older, newer))
+    older, newer = gathered(older, both[0]), gathered(newer, both[1])
+    for _ in range(2):
+        moves = find_moves(older, newer, both, cells, looks, params)
+        for move in moves:
+            evidence = {"fit": move.score, "next_fit": move.runner_up}
+            things = (older[move.older], newer[move.newer])
+            found.append(_Found("moved", things, None, move.S_after_before, move.symmetry, evidence))
+        older = [t for k, t in enumerate(older) if all(k != m.older for m in moves)]
+        newer = [t for k, t in enumerate(newer) if all(k != m.newer for m in moves)]
+        # What did not move as it is may be two things side by side, of which one did.
+        split = [_split(mine, theirs, both, k) for k, mine, theirs in ((0, older, newer), (1, newer, older))]
+        if len(split[0]) == len(older) and len(split[1]) == len(newer):
+            break
+        older, newer = split
     return found + _in_place(older, newer, both)
+
+
+def _split(things: list[Thing], others: list[Thing], both: tuple[Side, Side], which: int) -> list[Thing]:
+    """Things, of which those that another takes the place of in part become two."""
+    out = []
+    for thing in things:
+        points = both[which].points[thing.cells]
+        for other in others:
+            at = both[1 - which].points[other.cells]
+            low, high = np.quantile(at, 0.02, axis=0) - 0.08, np.quantile(at, 0.98, axis=0) + 0.08
+            inside = ((points > low) & (points < high)).all(1)
+            if _SPLIT[0] < inside.mean() < _SPLIT[1]:
+                here, rest = parts(thing, thing.cells[inside])
+                gone = len(rest.moved) / max(len(rest.changed), 1)
+                if len(rest.cells) >= _FEWEST_OF_PART and gone > 0.5 > len(here.moved) / max(len(here.changed), 1):
+                    out += [here, rest]
+                    break
+        else:
+            out.append(thing)
+    return out
 
 
 def _in_place(older: list[Thing], newer: list[Thing], both: tuple[Side, Side]) -> list[_Found]:
@@ -122,11 +165,31 @@ def _in_place(older: list[Thing], newer: list[Thing], both: tuple[Side, Side]) -
         k = int(np.argmax(shares)) if shares else -1
         if k < 0 or shares[k] < _IN_PLACE:
             found.append(_Found("disappeared", (thing, None)))
-            continue
-        other = left.pop(k)
-        moved, total = len(thing.moved) + len(other.moved), len(thing.changed) + len(other.changed)
-        found.append(_Found("recoloured" if moved < _REPAINTED * total else "replaced", (thing, other)))
+        else:
+            other = left.pop(k)
+            found.append(_Found(_kind_in_place(thing, other, both), (thing, other)))
     return found + [_Found("appeared", (None, other)) for other in left]
+
+
+def _kind_in_place(older: Thing, newer: Thing, both: tuple[Side, Side]) -> ChangeKind:
+    """What happened where both captures show something that changed."""
+    moved = len(older.moved), len(newer.moved)
+    if sum(moved) < max(_FEWEST_MOVED, _REPAINTED * (len(older.changed) + len(newer.changed))):
+        return "recoloured"
+    # What a thing stood on or before changed its colour too, and is no thing in its place.
+    slight = [_is_slight(a, b) for a, b in (((both[0], older), (both[1], newer)), ((both[1], newer), (both[0], older)))]
+    if moved[1] > moved[0] and slight[0]:
+        return "appeared"
+    if moved[0] > moved[1] and slight[1]:
+        return "disappeared"
+    return "replaced"
+
+
+def _is_slight(a: tuple[Side, Thing], b: tuple[Side, Thing]) -> bool:
+    """Whether a thing is much less than another, or much flatter."""
+    (side_a, thing_a), (side_b, thing_b) = a, b
+    flat = np.ptp(side_a.points[thing_a.cells, 2]) < 0.3 * np.ptp(side_b.points[thing_b.cells, 2])
+    return bool(flat or len(thing_a.cells) < 0.35 * len(thing_b.cells))
 
 
 def _change(one: _Found, both: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params) -> Change:
@@ -167,4 +230,8 @@ def _change(one: _Found, both: tuple[Side, Side], cells: tuple[Cells, Cells], pa
 
 
 def _confidence(one: _Found, evidence: dict[str, float]) -> float:
-    return 1 - float(np.exp(-evidence["cells"] / 20))
+    """In [0, 1]: how much was looked through, how clear a change of colour is, and how well a moved thing fits."""
+    through = evidence["looked_through"] * min(evidence["views_through"], 6) / 6
+    paint = max(evidence["cells"] - evidence["looked_through"], 0) * np.clip(evidence["strength"] / 2 - 0.4, 0, 2)
+    sure = 1 - float(np.exp(-through / 10 - paint / 50))
+    return sure * float(np.clip(evidence["fit"] / 0.8, 0, 1)) if one.kind == "moved" else sure

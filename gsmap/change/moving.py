@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.change.params import Params
 from gsmap.change.sides import Side
-from gsmap.change.things import Thing
+from gsmap.change.things import Cells, Thing
 from gsmap.compare import Looks
 from gsmap.compare.looks import place
 from gsmap.types import Sim3
@@ -22,6 +23,9 @@ _FEWEST = 30  # cells with which a thing can be told from others
 _COARSE, _FINE = 120, 500  # cells that are laid on others
 _KEPT = 4  # starts that are followed to the end
 _AS_GOOD = 0.92  # a pose that scores this share of the best is not told from it
+_ABOUT_M = 0.4  # how far around a thing its unchanged parts are looked for
+_RISE_M = 0.3  # a thing that stands less higher or lower stands on the same floor
+_LEAST_M = 0.08  # a thing that was moved by less, and not turned, was not moved
 _APART_M = 0.15  # the middle of a symmetric thing stays this near
 
 
@@ -52,24 +56,34 @@ class _Body:
     points: np.ndarray
     colours: np.ndarray
     side: Side
+    cells: Cells
     looks: Looks
 
     @property
     def features(self) -> np.ndarray:
         return np.concatenate([self.points, self.colours * _TINT_M], axis=1)
 
+    @cached_property
+    def tree(self) -> Any:
+        """Of the features of the thing and of what stands about it, the shell of the room left out."""
+        low, high = self.points.min(0) - _ABOUT_M, self.points.max(0) + _ABOUT_M
+        points = self.side.points
+        rows = np.flatnonzero((self.cells.plane < 0) & ((points > low) & (points < high)).all(1))
+        return cKDTree(np.concatenate([points[rows], self.side.colours[rows] * _TINT_M], axis=1))
+
 
 def find_moves(
     older: Sequence[Thing],
     newer: Sequence[Thing],
     sides: tuple[Side, Side],
+    cells: tuple[Cells, Cells],
     looks: tuple[Looks, Looks],
     params: Params,
 ) -> list[Move]:
     """The things of the older capture that stand elsewhere in the newer one, surest first, none taken twice."""
     bodies = [
-        [_Body(side.points[t.cells], side.colours[t.cells], side, look) for t in things]
-        for things, side, look in zip((older, newer), sides, looks, strict=True)
+        [_Body(side.points[t.cells], side.colours[t.cells], side, known, look) for t in things]
+        for things, side, known, look in zip((older, newer), sides, cells, looks, strict=True)
     ]
     found = []
     for i, a in enumerate(bodies[0]):
@@ -91,7 +105,7 @@ def _could_be(a: _Body, b: _Body) -> bool:
         return False
     tall = [float(np.ptp(np.quantile(body.points[:, 2], (0.02, 0.98)))) for body in (a, b)]
     wide = [_width(body.points[:, :2]) for body in (a, b)]
-    if abs(tall[0] - tall[1]) > 0.1 + 0.3 * max(tall) or abs(wide[0] - wide[1]) > 0.2 + 0.35 * max(wide):
+    if abs(tall[0] - tall[1]) > 0.15 + 0.4 * max(tall) or abs(wide[0] - wide[1]) > 0.2 + 0.4 * max(wide):
         return False
     return _common_colours(a.colours, b.colours) > 0.35
 
@@ -129,12 +143,12 @@ def _moved(i: int, j: int, a: _Body, b: _Body, params: Params) -> Move | None:
         if len(kept) < _KEPT and all(_differ(tried[k], other, a) for other in kept):
             kept.append(tried[k])
     fine = a.features[:: max(1, len(a.points) // _FINE)]
-    poses = [_laid(fine, target, pose, (0.15, 0.12, 0.1, 0.1, 0.08, 0.08, 0.06, 0.06, 0.05, 0.05)) for pose in kept]
+    poses = [_laid(fine, b.tree, pose, (0.15, 0.12, 0.1, 0.1, 0.08, 0.08, 0.06, 0.06, 0.05, 0.05)) for pose in kept]
     scores = [_score(a, b, pose, params) for pose in poses]
     best = int(np.argmax(scores))
-    if scores[best] < params.min_moved:
-        return None
     pose, score = poses[best], scores[best]
+    if score < params.min_moved or np.linalg.norm(pose.apply(a.points) - a.points, axis=1).mean() < _LEAST_M:
+        return None
     others = [s for s, p in zip(scores, poses, strict=True) if _differ(p, pose, a)]
     symmetry = _symmetry(a, b, pose, score, params)
     return Move(i, j, pose, score, max(others, default=0.0), symmetry)
@@ -148,7 +162,9 @@ def _start(a: _Body, b: _Body, yaw: float) -> Sim3:
     for axis in range(2):
         low, high = ((np.quantile(p[:, axis], q) for p in (turned, b.points)) for q in (0.03, 0.97))
         shift[axis] = 0.5 * sum(-(x[0] - x[1]) for x in (list(low), list(high)))
-    shift[2] = np.quantile(b.points[:, 2], 0.03) - np.quantile(turned[:, 2], 0.03)
+    rise = np.quantile(b.points[:, 2], 0.03) - np.quantile(turned[:, 2], 0.03)
+    # Most things stay on the floor, of which less may be seen in one of the captures.
+    shift[2] = rise if abs(rise) > _RISE_M else 0.0
     return Sim3(rotation, shift)
 
 
@@ -157,7 +173,7 @@ def _about_up(yaw: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _laid(features: np.ndarray, target: cKDTree, start: Sim3, radii_m: Sequence[float]) -> Sim3:
+def _laid(features: np.ndarray, target: Any, start: Sim3, radii_m: Sequence[float]) -> Sim3:
     """ICP over yaw and translation; neighbours are near in place and colour."""
     pose = start
     for radius in radii_m:
@@ -178,7 +194,7 @@ def _laid(features: np.ndarray, target: cKDTree, start: Sim3, radii_m: Sequence[
     return pose
 
 
-def _fit(features: np.ndarray, target: cKDTree, pose: Sim3) -> float:
+def _fit(features: np.ndarray, target: Any, pose: Sim3) -> float:
     moved = np.concatenate([pose.apply(features[:, :3]), features[:, 3:]], axis=1)
     distance, _ = target.query(moved, distance_upper_bound=0.15)
     return float((1 - np.minimum(distance, 0.15) / 0.15).mean())
@@ -221,7 +237,7 @@ def _looked_through(points: np.ndarray, looks: Looks) -> np.ndarray:
 
 def _symmetry(a: _Body, b: _Body, pose: Sim3, score: float, params: Params) -> Literal["none", "half", "any"]:
     """Whether the thing, turned about its own middle, fits as well."""
-    target, fine = cKDTree(b.features), a.features[:: max(1, len(a.points) // _FINE)]
+    target, fine = b.tree, a.features[:: max(1, len(a.points) // _FINE)]
     middle = 0.5 * (np.quantile(a.points, 0.02, axis=0) + np.quantile(a.points, 0.98, axis=0))
     fits = []
     for turn in (np.pi, np.pi / 3, -np.pi / 2):

@@ -16,7 +16,7 @@ from gsmap.compare import Balance
 _SMOOTH_M = 0.08  # neighbours that a cell asks
 _FEWEST_LOOKS = 3  # views through a neighbourhood, and pixels that compared its colour
 _FAINT = 0.6  # strength from which a cell may belong to something that changed its colour
-_WHOLE = 0.4  # of a thing of which this share of what was judged has changed, all has
+_WHOLE = 0.33  # of a thing of which this share of what was judged has changed, all has
 _BOX_M = 0.1  # ... but not what lies farther than this beyond all that has
 _LINK_M = 0.08  # cells of one thing, where nothing but the room's shell is between things
 _RING_M = (0.04, 0.12)  # how far from a change of colour its surroundings begin and end
@@ -24,8 +24,9 @@ _MUCH, _MANY = 0.25, 100  # of a thing, and cells: so much of it does not change
 _LIT_OTHERWISE = 0.035  # spread of what agrees, beyond which the whole place is lit otherwise
 _DARK = 0.8  # a change that is lightness to this share may be a shadow, a lamp, or a window at night
 _COHERENT = 0.4  # one that agrees with itself less may be a texture that two trainings show differently
-_BEHIND_M = 0.15  # a change of colour on a wall, so close to a thing that came or went, is its back or its shadow
+_BEHIND_M = 0.2  # a change of colour on a wall, so close to a thing that came or went, is its back or its shadow
 _BEHIND = 0.5  # ... if this share of it is
+_SPLINTER, _SPLINTER_M = 60, 0.15  # a thing of fewer cells, so close to a larger one, is a part of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +222,7 @@ def behind(things: list[Thing], sides: tuple[Side, Side], paint: Paint, which: l
     owners = [k for k, t in enumerate(things) if len(t.moved)]
     if not owners:
         return None
-    points = [sides[which[k]].points[things[k].moved] for k in owners]
+    points = [sides[which[k]].points[things[k].cells] for k in owners]
     owner = np.repeat(owners, [len(p) for p in points])
     at = np.concatenate([side.points[p] for side, p in zip(sides, paint.cells, strict=True)])
     distance, row = cKDTree(np.concatenate(points)).query(at, distance_upper_bound=_BEHIND_M)
@@ -234,3 +235,45 @@ def behind(things: list[Thing], sides: tuple[Side, Side], paint: Paint, which: l
 def with_behind(thing: Thing, cells: np.ndarray) -> Thing:
     """The thing, and what changed its colour on the wall behind it."""
     return replace(thing, behind=np.union1d(thing.behind, cells))
+
+
+def gathered(things: list[Thing], side: Side) -> list[Thing]:
+    """Things, largest first; what is small and close to a larger one is a part of it that little was seen of."""
+    left = sorted(things, key=lambda t: (-len(t.cells), int(t.cells[0])))
+    kept: list[Thing] = []
+    for thing in left:
+        near = _nearest(thing, kept, side) if len(thing.cells) < _SPLINTER else None
+        if near is None:
+            kept.append(thing)
+        else:
+            kept[near] = joined(kept[near], thing)
+    return kept
+
+
+def _nearest(thing: Thing, others: list[Thing], side: Side) -> int | None:
+    for k, other in enumerate(others):
+        distance, _ = cKDTree(side.points[other.cells]).query(
+            side.points[thing.cells], distance_upper_bound=_SPLINTER_M
+        )
+        if np.isfinite(distance).mean() >= 0.5:
+            return k
+    return None
+
+
+def joined(a: Thing, b: Thing) -> Thing:
+    """Two things of one capture as one."""
+    return Thing(
+        np.union1d(a.cells, b.cells),
+        np.union1d(a.moved, b.moved),
+        np.union1d(a.painted, b.painted),
+        np.union1d(a.behind, b.behind),
+    )
+
+
+def parts(thing: Thing, rows: np.ndarray) -> tuple[Thing, Thing]:
+    """The part of a thing that is made of some of its cells, and the rest."""
+    inside = np.isin(thing.cells, rows)
+    both = []
+    for cells in (thing.cells[inside], thing.cells[~inside]):
+        both.append(Thing(cells, np.intersect1d(thing.moved, cells), np.intersect1d(thing.painted, cells)))
+    return both[0], replace(both[1], behind=thing.behind)
