@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import reduce
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gsmap import compare as comparison
@@ -20,6 +22,7 @@ from gsmap.change.things import (
     behind,
     gathered,
     is_paint,
+    joined,
     judge,
     paints,
     parts,
@@ -155,27 +158,32 @@ def _split(things: list[Thing], others: list[Thing], both: tuple[Side, Side], wh
 
 def _in_place(older: list[Thing], newer: list[Thing], both: tuple[Side, Side]) -> list[_Found]:
     """What went, what came, and what went where another thing came."""
-    found, left = [], list(newer)
-    for thing in older:
+    same = np.zeros((len(older), len(newer)), dtype=bool)
+    for i, thing in enumerate(older):
         tree = cKDTree(both[0].points[thing.cells])
-        shares = []
-        for other in left:
+        for j, other in enumerate(newer):
             near = np.isfinite(tree.query(both[1].points[other.cells], distance_upper_bound=_IN_PLACE_M)[0]).sum()
-            shares.append(near / min(len(thing.cells), len(other.cells)))
-        k = int(np.argmax(shares)) if shares else -1
-        if k < 0 or shares[k] < _IN_PLACE:
-            found.append(_Found("disappeared", (thing, None)))
-        else:
-            other = left.pop(k)
-            found.append(_Found(_kind_in_place(thing, other, both), (thing, other)))
-    return found + [_Found("appeared", (None, other)) for other in left]
+            same[i, j] = near >= _IN_PLACE * min(len(thing.cells), len(other.cells))
+    graph = np.zeros((len(older) + len(newer),) * 2, dtype=bool)
+    graph[: len(older), len(older) :] = same
+    labels = connected_components(graph, directed=False)[1]
+    found = []
+    for k in range(int(labels.max(initial=-1)) + 1):
+        mine = [older[i] for i in np.flatnonzero(labels[: len(older)] == k)]
+        theirs = [newer[j] for j in np.flatnonzero(labels[len(older) :] == k)]
+        a, b = (reduce(joined, things) if things else None for things in (mine, theirs))
+        found.append(_Found(_kind_in_place(a, b, both), (a, b)))
+    return found
 
 
-def _kind_in_place(older: Thing, newer: Thing, both: tuple[Side, Side]) -> ChangeKind:
-    """What happened where both captures show something that changed."""
-    moved = len(older.moved), len(newer.moved)
-    if sum(moved) < max(_FEWEST_MOVED, _REPAINTED * (len(older.changed) + len(newer.changed))):
+def _kind_in_place(older: Thing | None, newer: Thing | None, both: tuple[Side, Side]) -> ChangeKind:
+    """What happened where one capture or both show something that changed."""
+    moved = tuple(len(t.moved) if t is not None else 0 for t in (older, newer))
+    changed = sum(len(t.changed) for t in (older, newer) if t is not None)
+    if sum(moved) < min(_FEWEST_MOVED, changed / 2) or sum(moved) < _REPAINTED * changed:
         return "recoloured"
+    if older is None or newer is None:
+        return "appeared" if older is None else "disappeared"
     # What a thing stood on or before changed its colour too, and is no thing in its place.
     slight = [_is_slight(a, b) for a, b in (((both[0], older), (both[1], newer)), ((both[1], newer), (both[0], older)))]
     if moved[1] > moved[0] and slight[0]:

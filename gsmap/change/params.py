@@ -42,7 +42,7 @@ class Params:
     colour_spreads: float = 3.0
     yaw_starts: int = 24
     moved_within_m: float = 0.05
-    min_moved: float = 0.6
+    min_moved: float = 0.68
     min_confidence: float = 0.3
 
     def __post_init__(self) -> None:

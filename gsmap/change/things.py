@@ -18,6 +18,7 @@ _FEWEST_LOOKS = 3  # views through a neighbourhood, and pixels that compared its
 _FAINT = 0.6  # strength from which a cell may belong to something that changed its colour
 _WHOLE = 0.33  # of a thing of which this share of what was judged has changed, all has
 _BOX_M = 0.1  # ... but not what lies farther than this beyond all that has
+_SAME_M = 0.15  # ... nor what is the same as ever and lies farther from what changed
 _LINK_M = 0.08  # cells of one thing, where nothing but the room's shell is between things
 _RING_M = (0.04, 0.12)  # how far from a change of colour its surroundings begin and end
 _MUCH, _MANY = 0.25, 100  # of a thing, and cells: so much of it does not change its colour by a shadow
@@ -136,7 +137,8 @@ def things_of(side: Side, cells: Cells, painted: np.ndarray, params: Params) -> 
         rows = np.flatnonzero(kind == thing)
         box = side.points[rows[changed[rows]]]
         outside = ((side.points[rows] < box.min(0) - _BOX_M) | (side.points[rows] > box.max(0) + _BOX_M)).any(1)
-        whole[rows[outside]] = False
+        apart = cKDTree(box).query(side.points[rows], distance_upper_bound=_SAME_M)[0]
+        whole[rows[outside | (np.isinf(apart) & cells.judged[rows])]] = False
     found = []
     for group in groups(side.points, np.flatnonzero(changed | whole), params.reach_m, fewest, kind):
         moved, tinted = group[cells.moved[group]], group[painted[group] & ~cells.moved[group]]
