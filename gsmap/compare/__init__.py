@@ -14,7 +14,9 @@ from gsmap.compare.comparing import (
     compare,
 )
 from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, Evidence
+from gsmap.compare.joining import joined, outdated
 from gsmap.compare.looks import Looks, View, look
+from gsmap.compare.neighbourhoods import grown
 from gsmap.compare.params import Params
 
 VERSION = 1
@@ -40,5 +42,8 @@ __all__ = [
     "Pictured",
     "View",
     "compare",
+    "grown",
+    "joined",
     "look",
+    "outdated",
 ]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.compare.neighbourhoods import over_3x3
 from gsmap.compare.params import Params
 
 _FLOOR = 0.03  # added before logarithms: what is darker is noise
@@ -37,17 +38,55 @@ class Balance:
         out: np.ndarray = np.exp((self.slope - 1) * grey + self.offset)
         return out
 
-    def differences(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far colours (..., 3) of both differ in chroma (..., 2) and lightness (...), as seen in [0, 1].
+    def applied(self, colour: np.ndarray) -> np.ndarray:
+        """Colours (..., 3) of the first as the second would show them."""
+        logs = np.log(np.clip(colour, 0, 1) + np.float32(_FLOOR))
+        out = np.exp(logs * self.slope.astype(np.float32) + self.offset.astype(np.float32)) - np.float32(_FLOOR)
+        return np.clip(out, 0, 1).astype(np.float32)
+
+    def differences(self, a: np.ndarray, b: np.ndarray, both: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far two pictures (H, W, 3) of one view differ in chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
 
         Ratios, so that shading cancels in the chroma, times the brightness, for nobody sees the hue of what is black.
+        Only what no pixel nearby explains counts: texture that lies half a pixel off is no paint.
+
+        Args:
+            both: (H, W) bool, pixels that show one surface; others explain nothing.
         """
-        log_a = np.log(np.clip(a, 0, 1) + np.float32(_FLOOR))
-        expected = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
-        ratio = np.log(np.clip(b, 0, 1) + np.float32(_FLOOR)) - expected
-        bright = np.minimum(np.maximum(b.max(-1), np.exp(expected).max(-1)), 1)
-        chroma = np.stack([ratio[..., 0] - ratio[..., 1], ratio[..., 2] - ratio[..., 1]], axis=-1)
-        return chroma * bright[..., None], ratio.mean(-1) * bright
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
+        log_a = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
+        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
+        apart = [_apart(x, y, both) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True)]
+        return np.stack(apart[:2], axis=-1), apart[2]
+
+    def left_over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Differences of single colours (K, 3): chroma (K, 2) and lightness (K,)."""
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
+        log_a = log_a * self.slope + self.offset
+        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
+        red, blue, light = ((y - x) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True))
+        return np.stack([red, blue], axis=-1), light
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    """(...,) largest of three channels (..., 3)."""
+    out: np.ndarray = np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
+    return out
+
+
+def _tones(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Red over green, blue over green, and lightness, of logarithms of colours (..., 3)."""
+    red, green, blue = logs[..., 0], logs[..., 1], logs[..., 2]
+    return red - green, blue - green, (red + green + blue) / 3
+
+
+def _apart(a: np.ndarray, b: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """(H, W) by how much b lies above a (below: negative), beyond the ranges of both over 3 x 3 pixels."""
+    infinite = np.float32(1e3)  # beyond all logarithms of colours
+    low_a, low_b = (over_3x3(np.where(both, v, infinite), np.minimum) for v in (a, b))
+    high_a, high_b = (over_3x3(np.where(both, v, -infinite), np.maximum) for v in (a, b))
+    out: np.ndarray = np.where(both, np.maximum(low_b - high_a, 0) + np.minimum(high_b - low_a, 0), 0)
+    return out
 
 
 IDENTITY = Balance(np.ones(3), np.zeros(3), 0.0, 0.0)
@@ -74,13 +113,13 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
             slope[channel] = np.clip(covariance / ((weight * centred**2).sum() + prior), 0.4, 2.5)
             offset[channel] = mean_y - slope[channel] * mean_x
     line = Balance(slope, offset, 0.0, 0.0)
-    chroma, lightness = line.differences(a[::step], b[::step])
-    spread = 1.4826 * float(np.median(np.abs(chroma).max(-1)))
+    chroma, lightness = line.left_over(a[::step], b[::step])
+    spread = 1.4826 * float(np.median(np.maximum(*np.abs(chroma).T)))
     return Balance(slope, offset, spread, 1.4826 * float(np.median(np.abs(lightness))))
 
 
 def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray, params: Params) -> np.ndarray:
     """Where colours differ by more than light and noise explain."""
-    return (np.abs(chroma).max(-1) > max(params.min_chroma, params.colour_spreads * line.chroma_spread)) | (
+    return (np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1])) > max(params.min_chroma, params.colour_spreads * line.chroma_spread)) | (
         np.abs(lightness) > max(params.min_lightness, params.colour_spreads * line.lightness_spread)
     )

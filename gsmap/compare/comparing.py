@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.compare.colours import Balance, balance, differ
 from gsmap.compare.evidence import Evidence, Tally
-from gsmap.compare.looks import Looks, View, place, view_of
+from gsmap.compare.looks import Looks, Placed, View, place, view_of
 from gsmap.compare.params import Params
 from gsmap.render import render
 from gsmap.types import Gaussians
@@ -29,12 +29,16 @@ class Pictured:
         own: the capture's own view.
         other: the other's surfaces from the same camera.
         outcome: (H, W) uint8, one of the five outcomes.
-        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour where the outcome is AGREE or COLOUR.
+        one: (H, W) bool, both show one surface, well seen or not.
+        covered: (H, W) bool, the other has a thing before what this one shows, though perhaps at an edge.
+        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour there, newer less older.
     """
 
     own: View
     other: View
     outcome: np.ndarray
+    one: np.ndarray
+    covered: np.ndarray
     chroma: np.ndarray
     lightness: np.ndarray
 
@@ -73,17 +77,15 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
     tolerance = _tolerance([pair for pairs in crossed for pair in pairs], params)
     line = _line(crossed, tolerance)
     pictured = [
-        [_outcomes(own, sure, other, line if flip else _reversed(line), tolerance, params) for own, sure, other in pairs]
-        for pairs, flip in zip(crossed, (False, True), strict=True)
+        [_outcomes(own, sure, other, line, sign, tolerance, params) for own, sure, other in pairs]
+        for pairs, sign in zip(crossed, (-1, 1), strict=True)
     ]
     tallies = Tally(len(older.gaussians)), Tally(len(newer.gaussians))
-    for mine, theirs, pictures, looks in (
-        (tallies[0], tallies[1], pictured[1], (older, newer)),
-        (tallies[1], tallies[0], pictured[0], (newer, older)),
-    ):
-        for sure, picture in zip(looks[1].sure, pictures, strict=True):
-            _count(mine, looks[0].gaussians, picture, sure, tolerance, params)
-            _count_colour(theirs, looks[1].gaussians, picture, tolerance, params)
+    for judged, judge, by, of in ((tallies[0], tallies[1], newer, older), (tallies[1], tallies[0], older, newer)):
+        for picture, sure, own in zip(pictured[by is newer], by.sure, by.placed, strict=True):
+            at = place(of.gaussians.means, picture.own, params.nearest_m)
+            _count(judged, at, picture, sure, tolerance)
+            _count_colour(judge, own, picture, tolerance)
     evidence = [
         tally.evidence(one.gaussians.means, one.surface, params)
         for tally, one in zip(tallies, (older, newer), strict=True)
@@ -129,10 +131,6 @@ def _line(crossed: list[list[tuple[View, np.ndarray, View]]], tolerance: tuple[f
     return balance(np.concatenate(older), np.concatenate(newer)) if older else balance(*np.zeros((2, 0, 3)))
 
 
-def _reversed(line: Balance) -> Balance:
-    return Balance(1 / line.slope, -line.offset / line.slope, line.chroma_spread, line.lightness_spread)
-
-
 def _one_surface(own: View, other: View, tolerance: tuple[float, float]) -> np.ndarray:
     base, share = tolerance
     out: np.ndarray = np.abs(own.depth - other.depth) <= base + share * own.depth
@@ -140,65 +138,66 @@ def _one_surface(own: View, other: View, tolerance: tuple[float, float]) -> np.n
 
 
 def _outcomes(
-    own: View, sure: np.ndarray, other: View, line: Balance, tolerance: tuple[float, float], params: Params
+    own: View,
+    sure: np.ndarray,
+    other: View,
+    line: Balance,
+    sign: int,
+    tolerance: tuple[float, float],
+    params: Params,
 ) -> Pictured:
-    """``line`` takes the other's colours to the own."""
+    """``line`` takes the older's colours to the newer's."""
     base, share = tolerance
     gap = base + share * own.depth
+    one = own.solid & other.solid & _one_surface(own, other, tolerance)
     both = sure & other.solid
-    one = both & _one_surface(own, other, tolerance)
-    chroma, lightness = line.differences(other.colour, own.colour)
-    # Noise of single pixels is not paint.
-    chroma, lightness = _smooth(chroma), _smooth(lightness[..., None])[..., 0]
+    covered = own.opaque & other.opaque & (other.depth < own.depth - gap)
+    older, newer = (other, own) if sign > 0 else (own, other)
+    chroma, lightness = line.differences(older.colour, newer.colour, one)
     outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
-    outcome[one] = AGREE
-    outcome[one & differ(line, chroma, lightness, params)] = COLOUR
+    outcome[one & sure] = AGREE
+    outcome[one & sure & differ(line, chroma, lightness, params)] = COLOUR
     # Beyond both neighbourhoods' extremes: a pixel off at an edge proves nothing.
     outcome[both & (other.far < own.near - gap)] = OTHER_BEFORE
     outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND
-    return Pictured(own, other, outcome, chroma, lightness)
+    return Pictured(own, other, outcome, one, covered, chroma, lightness)
 
 
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """(H, W, K) means over 3 x 3 pixels."""
-    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    out: np.ndarray = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
-    return out
-
-
-def _count(
-    tally: Tally, gaussians: Gaussians, picture: Pictured, sure: np.ndarray, tolerance: tuple[float, float], params: Params
-) -> None:
+def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolerance: tuple[float, float]) -> None:
     """Where the Gaussians of one capture lie in a view of the other."""
     view, (base, share) = picture.own, tolerance
-    at = place(gaussians.means.astype(np.float64), view, params.nearest_m)
     near, far = view.near[at.row, at.column], view.far[at.row, at.column]
     gap = base + share * at.z
-    known = sure[at.row, at.column]
+    known = view.solid[at.row, at.column]
     through = known & (at.z < near - gap)
     hidden = known & (at.z > far + gap)
     # Where depths jump within a few pixels, lying somewhere between proves nothing.
     on = known & ~through & ~hidden & (far - near < 4 * gap)
     tally.through[at.index[through]] += 1
     tally.hidden[at.index[hidden]] += 1
+    grazed = view.opaque[at.row, at.column] & (at.z < view.depth[at.row, at.column] - gap)
+    tally.grazed[at.index[grazed]] += 1
     tally.on_surface[at.index[on]] += 1
-    _add_colour(tally, at.index[on], picture.outcome[at.row[on], at.column[on]])
+    tally.covered[at.index[on & picture.covered[at.row, at.column]]] += 1
+    looked = through | on
+    tally.sure[at.index[looked & sure[at.row, at.column]]] += 1
+    tally.sharpness[at.index[looked]] += view.pixels_a_metre(at.z[looked]) ** 2
+    _add_colour(tally, at, on, picture)
 
 
-def _count_colour(
-    tally: Tally, gaussians: Gaussians, picture: Pictured, tolerance: tuple[float, float], params: Params
-) -> None:
+def _count_colour(tally: Tally, at: Placed, picture: Pictured, tolerance: tuple[float, float]) -> None:
     """What a capture's own view says of the colours of its own Gaussians."""
-    view, (base, share) = picture.own, tolerance
-    at = place(gaussians.means.astype(np.float64), view, params.nearest_m)
-    on = np.abs(at.z - view.depth[at.row, at.column]) <= base + share * at.z
-    _add_colour(tally, at.index[on], picture.outcome[at.row[on], at.column[on]])
+    base, share = tolerance
+    _add_colour(tally, at, np.abs(at.z - picture.own.depth[at.row, at.column]) <= base + share * at.z, picture)
 
 
-def _add_colour(tally: Tally, index: np.ndarray, outcome: np.ndarray) -> None:
-    tally.colour_seen[index] += (outcome == AGREE) | (outcome == COLOUR)
-    tally.colour_differs[index] += outcome == COLOUR
+def _add_colour(tally: Tally, at: Placed, on: np.ndarray, picture: Pictured) -> None:
+    row, column, index = at.row[on], at.column[on], at.index[on]
+    one = picture.one[row, column]
+    row, column, index = row[one], column[one], index[one]
+    tally.colour_seen[index] += 1
+    tally.chroma[index] += picture.chroma[row, column]
+    tally.lightness[index] += picture.lightness[row, column]
 
 
 def pictures(comparison: Comparison) -> Iterator[Pictured]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.compare.neighbourhoods import extremes, shrunk
 from gsmap.compare.params import Params
 from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.voxels import voxel_labels
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
@@ -23,7 +24,8 @@ class View:
         depth: (H, W) float32 camera-space z, metres.
         near, far: (H, W) float32 lowest and highest depth over 3 x 3 pixels: at an edge a depth is a mixture of what
             lies before and behind it, and proves nothing between the two.
-        solid: (H, W) bool, opaque, and so are the eight neighbours.
+        opaque: (H, W) bool, shows a surface.
+        solid: (H, W) bool, so it does, and so do the eight neighbours.
         dominant_id: (H, W) int32 Gaussian of the capture that shows most, -1 for none.
     """
 
@@ -32,8 +34,24 @@ class View:
     depth: np.ndarray
     near: np.ndarray
     far: np.ndarray
+    opaque: np.ndarray
     solid: np.ndarray
     dominant_id: np.ndarray
+
+    def pixels_a_metre(self, z: np.ndarray) -> np.ndarray:
+        """How finely the picture shows what lies at depths z."""
+        out: np.ndarray = (self.camera.intrinsics_px[0, 0] / z).astype(np.float32)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Which points fall in a picture (``index``), on which pixels, at which depth ``z``."""
+
+    index: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    z: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +63,18 @@ class Looks:
         views: V pictures of it.
         surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen.
         times_seen: (N,) int32 pictures in which a Gaussian lies on the surface that is shown.
+        sharpness: (N,) float32 sum over these of (pixels a metre)^2: more looks and nearer ones see better.
         sure: per view (H, W) bool, solid, and a surface that enough of the capture's views saw.
+        placed: per view, where its own Gaussians fall in it.
     """
 
     scene: PlacedScene
     views: tuple[View, ...]
     surface: np.ndarray
     times_seen: np.ndarray
+    sharpness: np.ndarray
     sure: tuple[np.ndarray, ...]
+    placed: tuple[Placed, ...]
 
     @property
     def gaussians(self) -> Gaussians:
@@ -69,15 +91,27 @@ def look(scene: PlacedScene, params: Params | None = None) -> Looks:
         view, weight = _view(scene.gaussians, camera, params)
         views.append(view)
         np.maximum(largest, weight, out=largest)
-    times_seen = np.zeros(count, dtype=np.int32)
-    points = scene.gaussians.means.astype(np.float64)
-    for view in views:
-        at = place(points, view, params.nearest_m)
+    times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
+    placed = tuple(place(scene.gaussians.means, view, params.nearest_m) for view in views)
+    for view, at in zip(views, placed, strict=True):
         margin = params.least_tolerance_m
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
         times_seen[at.index[on]] += 1
-    sure = tuple(v.solid & (times_seen[v.dominant_id] >= params.min_views) & (v.dominant_id >= 0) for v in views)
-    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sure)
+        sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
+    well = _best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
+    sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
+    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sharpness, sure, placed)
+
+
+def _best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
+    """(N,) the largest count in each point's cell: a place was seen as often as what shows it best."""
+    if not len(points):
+        return counts
+    cell = voxel_labels(points, cell_m)
+    best = np.zeros(int(cell.max()) + 1, dtype=counts.dtype)
+    np.maximum.at(best, cell, counts)
+    out: np.ndarray = best[cell]
+    return out
 
 
 def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
@@ -89,22 +123,12 @@ def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
     return [small[i] for i in range(len(small))]
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """Which points fall in a picture (``index``), on which pixels, at which depth ``z``."""
-
-    index: np.ndarray
-    row: np.ndarray
-    column: np.ndarray
-    z: np.ndarray
-
-
 def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
     """Points (N, 3) in a view, those alone that lie in the picture and beyond ``nearest_m``."""
     pixels, z = project(points, view.camera.T_camera_frame[0], view.camera.intrinsics_px[0])
     index = np.flatnonzero(in_image(pixels, z, view.camera.sizes_px[0], near=nearest_m))
-    column, row = pixels[index].astype(np.int64).T
-    return Placed(index, row, column, z[index])
+    column, row = pixels[index].astype(np.int32).T
+    return Placed(index.astype(np.int32), row, column, z[index])
 
 
 def _view(gaussians: Gaussians, camera: Cameras, params: Params) -> tuple[View, np.ndarray]:
@@ -123,36 +147,5 @@ def view_of(
     """A picture with what its neighbourhoods say."""
     opaque = alpha > params.min_alpha
     near, far = extremes(depth, opaque)
-    solid = opaque & _shrunk(opaque)
-    return View(camera, np.clip(colour, 0, 1), depth, near, far, solid, dominant_id)
-
-
-def extremes(depth: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) lowest and highest opaque depth over 3 x 3 pixels; inf and -inf where nothing is opaque."""
-    low = np.where(opaque, depth, np.float32(np.inf))
-    high = np.where(opaque, depth, np.float32(-np.inf))
-    return _over_3x3(low, np.minimum), _over_3x3(high, np.maximum)
-
-
-def _shrunk(mask: np.ndarray) -> np.ndarray:
-    return _over_3x3(mask, np.logical_and)
-
-
-def grown(mask: np.ndarray, times: int = 1) -> np.ndarray:
-    """A mask (H, W) with every pixel beside it, ``times`` times."""
-    for _ in range(times):
-        mask = _over_3x3(mask, np.logical_or)
-    return mask
-
-
-def _over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
-    """The ufunc over each pixel's 3 x 3 neighbourhood; the border repeats."""
-    padded = np.pad(values, 1, mode="edge")
-    rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
-    out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
-    return out
-
-
-def surfaces_of(looks: Sequence[Looks]) -> list[Gaussians]:
-    """Of each capture what its own pictures show."""
-    return [one.gaussians if one.surface.all() else one.gaussians[one.surface] for one in looks]
+    solid = opaque & shrunk(opaque)
+    return View(camera, np.clip(colour, 0, 1), depth, near, far, opaque, solid, dominant_id)

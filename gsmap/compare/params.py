@@ -25,7 +25,8 @@ class Params:
         min_share: of the views that could judge, these must agree.
         min_chroma, min_lightness: colours, in [0, 1], that differ by less after exposure is balanced are one;
         colour_spreads: nor do those within that many robust standard deviations of what agrees.
-        cell_m: Gaussians of one cell vote together.
+        cell_m: Gaussians that near vote together,
+        neighbours: at most so many of them.
     """
 
     longest_side_px: int = 240
@@ -35,14 +36,15 @@ class Params:
     nearest_m: float = 0.2
     least_tolerance_m: float = 0.03
     most_tolerance_m: float = 0.1
-    tolerance_spreads: float = 5.0
+    tolerance_spreads: float = 3.5
     tolerance_share: float = 0.01
-    min_views: int = 3
+    min_views: int = 2
     min_share: float = 0.6
     min_chroma: float = 0.06
-    min_lightness: float = 0.15
+    min_lightness: float = 0.2
     colour_spreads: float = 4.0
-    cell_m: float = 0.06
+    cell_m: float = 0.12
+    neighbours: int = 16
 
     def __post_init__(self) -> None:
         for name in ("longest_side_px", "max_views", "min_views", "cell_m", "least_tolerance_m"):

@@ -33,7 +33,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "merge.mergers.tto.ssim_weight": 0.0,
         "merge.mergers.tto.min_weight": 0.0,
         "merge.mergers.tto.keep": 1.0,
-        "merge.mergers.tto.newer_wins": False,
+        "merge.mergers.tto.prefer": "both",
     },
 }
 """Settings by the name of a preset; what a preset does not name has its default."""
