@@ -14,7 +14,6 @@ from gsmap.register import SceneView
 from gsmap.store import Store, branches, sqlite
 from gsmap.types import ChangeReport, PlacedScene, Registration, SceneGraph, Sim3
 from gsmap.types.model import ModelSpec
-from gsmap.types.registration import Proposal
 
 
 def _store(path: str) -> Store:
@@ -61,13 +60,6 @@ def register_scenes(
 ) -> Registration:
     """The registration of one pair of the map at ``path``; target and source are (scene id, key of its graph)."""
     return registering.register_pair(_view(path, *target), _view(path, *source), params)
-
-
-def check_scenes(
-    path: str, target: tuple[str, str], source: tuple[str, str], proposal: Proposal, params: registering.Params
-) -> Registration:
-    """What a pose that is known of one pair is worth; target and source as for `register_scenes`."""
-    return registering.check_pose(_view(path, *target), _view(path, *source), proposal, params)
 
 
 def compare_scenes(

@@ -55,7 +55,7 @@ def test_it_takes_the_place_with_all_that_is_known(site: Path, cli: Run, tmp_pat
     assert done.code == 0, done.stderr
     (row,) = done.json["ingested"]
     assert (row["scene_name"], row["new"], row["captured_at"][:10]) == ("left", True, "2026-05-30")
-    assert "1 of 1 edges hold" in done.stderr
+    assert "1 of 1 edges hold: gsmap optimize" in done.stderr
     after = scenes(cli, site)
     assert after.keys() == before.keys()
     left = after["left"]

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmap import describe as describing
 from gsmap import register as registering
-from gsmap.engine import run_jobs
-from gsmap.errors import GsmapError, InputError
+from gsmap.errors import InputError
 from gsmap.ingest import Capture
 from gsmap.map import models
-from gsmap.map.jobs import check_scenes
 from gsmap.map.settings import Settings
-from gsmap.map.sharing import SharedJobs
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView, recipe_key
@@ -43,10 +40,25 @@ class Superseded:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _Carried:
+    """An edge of the scene that goes, as one of the scene that comes.
+
+    Args:
+        edge: as it is to be kept, under a key; None where a person measured it.
+        review, note: the word that stands on it.
+    """
+
+    edge: Registration
+    key: RecipeKey | None
+    review: str | None
+    note: str
+
+
 def supersede(
     store: Store, capture: Capture, ref: str, settings: Settings, progress: StageProgress, *, named: bool
 ) -> Superseded:
-    """Put a capture in the place of a scene; see `gsmap.map.Map.ingest`.
+    """Put a capture in the place of a scene, whole or not at all; see `gsmap.map.Map.ingest`.
 
     Args:
         ref: the scene that goes.
@@ -58,18 +70,17 @@ def supersede(
     old = store.scenes.get(ref)
     if capture.scale_policy == "auto":
         capture = replace(capture, scale_policy=old.scale_policy)
-    new_id = scene_id(capture.gaussians, capture.cameras)
-    if any(new_id == scene.id for scene in store.scenes.list()):
+    coming = replace(old, id=scene_id(capture.gaussians, capture.cameras), scale_policy=capture.scale_policy)
+    if any(coming.id == scene.id for scene in store.scenes.list()):
         raise InputError(f"the capture to supersede {old.name} is in the map already: there is nothing to put in place")
     progress("ingest", 0.0, f"comparing with {old.name}")
-    graph = _describe(store, new_id, capture, settings)
-    old_view = _view(store, old, settings)
-    new_view = SceneView(new_id, capture.gaussians, capture.cameras, graph, capture.scale_policy)
-    _check_frame(old, old_view, new_view, settings)
-    known = [stored for stored in store.registrations.current() if old.id in _ends(stored)]
-    # A date that was read beside the capture does not overrule what people said of the same frames.
-    said = capture.captured_at is not None and (not capture.dated_by or old.captured_at is None)
-    dated_by = [fact.author for fact in store.scenes.facts(old.id) if fact.kind == "captured_at"]
+    graph = _describe(store, coming.id, capture, settings)
+    view = SceneView(coming.id, capture.gaussians, capture.cameras, graph, capture.scale_policy)
+    _check_frame(old, _view(store, old, settings), view, settings)
+    carried = list(_carried(store, old, coming, view, settings, progress))
+    # A date that was read beside the capture does not overrule what was said of the same frames.
+    dated = capture.captured_at is not None and (not capture.dated_by or old.captured_at is None)
+    dated_by = ["", *(fact.author for fact in store.scenes.facts(old.id) if fact.kind == "captured_at")][-1]
     with store.transaction():
         store.scenes.remove(old.id)
         scene, _ = store.scenes.add(
@@ -77,22 +88,24 @@ def supersede(
             capture.cameras,
             name=capture.name if named else old.name,
             scale_policy=capture.scale_policy,
-            captured_at=capture.captured_at if said else old.captured_at,
+            captured_at=capture.captured_at if dated else old.captured_at,
             source=capture.source,
             antialiased=capture.antialiased,
             notes=capture.notes,
-            dated_by=capture.dated_by if said else (dated_by or [""])[-1],
+            dated_by=capture.dated_by if dated else dated_by,
         )
         inherit(store, old.id, scene.id)
-        key = graph_keys(store, [scene], settings)[scene.id]
-        store.graphs.save(graph, key)
+        store.graphs.save(graph, graph_keys(store, [scene], settings)[scene.id])
+        for one in carried:
+            store.registrations.save(one.edge, one.key)
+            if one.review is not None:
+                store.registrations.review(one.edge.target, one.edge.source, one.review, one.note)
     progress("ingest", 1.0, f"{scene.name} in the place of {old.id[:12]}")
-    notes = _carry_edges(store, old, scene, known, settings, progress)
-    return Superseded(scene, (f"it took the place of scene {old.id[:12]} ({old.name})", *notes))
-
-
-def _ends(stored: StoredRegistration) -> tuple[str, str]:
-    return stored.registration.target, stored.registration.source
+    held = [one.edge.status for one in carried if one.edge.S_target_source is not None]
+    notes = [f"it took the place of scene {old.id[:12]} ({old.name})"]
+    if held:
+        notes.append(f"{held.count('accepted')} of {len(held)} edges hold: gsmap optimize {store.location} uses them")
+    return Superseded(scene, tuple(notes))
 
 
 def _describe(store: Store, new_id: str, capture: Capture, settings: Settings) -> SceneGraph:
@@ -121,60 +134,51 @@ def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings:
     advice = "ingest it without --supersedes, and registration finds where it lies"
     if found.status != "accepted" or found.S_target_source is None:
         raise InputError(f"the capture does not lie where scene {old.name} lies ({found.reason}): {advice}")
-    low, high = old.bounds
-    corners = np.array(np.meshgrid(*np.array([low, high]).T)).reshape(3, -1).T
+    corners = np.array(np.meshgrid(*np.asarray(old.bounds).T)).reshape(3, -1).T
     off = np.linalg.norm(found.S_target_source.apply(corners) - corners, axis=1).max() * old_view.graph.unit_m
     if off > _SAME_FRAME_M:
         raise InputError(f"the capture lies {off:.2f} m off where scene {old.name} lies: {advice}")
 
 
-def _carry_edges(
-    store: Store,
-    old: Scene,
-    new: Scene,
-    known: list[StoredRegistration],
-    settings: Settings,
-    progress: StageProgress,
-) -> list[str]:
-    """Give the new scene the edges of the old one: poses are checked, and nothing is searched.
-
-    Returns:
-        What a person should know.
-    """
+def _carried(
+    store: Store, old: Scene, coming: Scene, view: SceneView, settings: Settings, progress: StageProgress
+) -> Iterator[_Carried]:
+    """The edges of the scene that goes, for the one that comes: poses are checked, and none is searched."""
     living = {scene.id: scene for scene in store.scenes.list()}
-    known = [stored for stored in known if set(_ends(stored)) - {old.id} <= set(living)]
-    graphs = graph_keys(store, list(living.values()), settings)
+    known = [stored for stored in store.registrations.current() if old.id in _ends(stored)]
     recipe = recipe_key(settings.register)
-    keys: dict[str, RecipeKey] = {}
-    jobs: dict[str, tuple[object, ...]] = {}
-    for stored in known:
-        edge = stored.registration
+    for i, stored in enumerate(known):
+        (other,) = (living[scene] for scene in _ends(stored) if scene != old.id)
+        said = [word for word in store.registrations.reviews(old.id, other.id) if word.review == stored.review]
+        word = (stored.review, said[-1].note if said else "")
+        keys = graph_keys(store, [coming, other], settings)
+        progress("ingest", (i + 1) / (len(known) + 2), f"checking the edge to {other.name}")
+        edge, S = stored.registration, stored.registration.S_target_source
+        ends = [coming.id if scene == old.id else scene for scene in _ends(stored)]
+        alike = replace(edge, target=ends[0], source=ends[1])
         if stored.manual:
-            target, source = (new.id if scene == old.id else scene for scene in _ends(stored))
-            store.registrations.save(replace(edge, target=target, source=source))
+            yield _Carried(alike, None, *word)
             continue
-        (other,) = set(_ends(stored)) - {old.id}
-        if store.graphs.find(graphs[other]) is None:
-            continue  # the other scene has no graph under these settings: it is registered by the next update
-        target, source = sorted((new.id, other))
-        key = recipe.of(graphs[target].digest, graphs[source].digest)
-        S = edge.S_target_source
         if S is None:
-            note = f"known of scene {old.id[:12]}, which it superseded"
-            alike = replace(edge, target=target, source=source, notes=(*edge.notes, note))
-            store.registrations.save(alike, key)
+            alike = replace(alike, notes=(*edge.notes, f"known of scene {old.id[:12]}, which it superseded"))
+            yield _Carried(alike, recipe.of(*(keys[end].digest for end in ends)), *word)
             continue
-        S = S if (edge.target == old.id) == (target == new.id) else S.inverse()
-        keys[key.digest] = key
-        ends = (target, graphs[target].digest), (source, graphs[source].digest)
-        jobs[key.digest] = (store.location, *ends, _proposal(edge, S), settings.register)
-    held = _check_edges(store, keys, jobs, settings, progress)
-    notes = [f"{held} of {len(jobs)} edges hold as they were; the others say why"] if jobs else []
-    return [*notes, *_carry_words(store, old, new, known, living)]
+        target, source = sorted(ends)
+        views = {coming.id: view, other.id: _view(store, other, settings)}
+        known_pose = _proposal(edge, S if target == ends[0] else S.inverse())
+        found = registering.check_pose(views[target], views[source], known_pose, settings.register)
+        if stored.review == "confirm" and found.S_target_source is None:  # a person vouches for the pose as it was
+            found = replace(alike, notes=(*edge.notes, f"confirmed of scene {old.id[:12]}; of this: {found.reason}"))
+        key = recipe.of(keys[found.target].digest, keys[found.source].digest)
+        yield _Carried(found, key, *word)
+
+
+def _ends(stored: StoredRegistration) -> Sequence[str]:
+    return stored.registration.target, stored.registration.source
 
 
 def _proposal(edge: Registration, S_target_source: Sim3) -> Proposal:
-    """An edge of the superseded scene as a proposal for the new one."""
+    """An edge as a proposal, with what its correspondences said of it."""
     return Proposal(
         edge.proposer,
         S_target_source,
@@ -185,38 +189,3 @@ def _proposal(edge: Registration, S_target_source: Sim3) -> Proposal:
         log_nfa=edge.evidence.get("log_nfa", float("nan")),
         runner_up=edge.evidence.get("runner_up", float("nan")),
     )
-
-
-def _check_edges(
-    store: Store,
-    keys: dict[str, RecipeKey],
-    jobs: dict[str, tuple[object, ...]],
-    settings: Settings,
-    progress: StageProgress,
-) -> int:
-    """Check the poses of the edges, shared with whoever is at work; returns how many are accepted."""
-    shared = SharedJobs(store, "register", "edge", jobs, store.registrations.kept, progress)
-    results = shared.results(lambda arguments: run_jobs(check_scenes, arguments, settings.engine))
-    with closing(results):
-        for key, edge in results:
-            store.registrations.save(edge, keys[key])
-            shared.saved(key, f"{edge.target[:12]}-{edge.source[:12]}: {edge.status}")
-    found = [store.registrations.find(key) for key in keys]
-    return sum(stored is not None and stored.registration.status == "accepted" for stored in found)
-
-
-def _carry_words(
-    store: Store, old: Scene, new: Scene, known: list[StoredRegistration], living: dict[str, Scene]
-) -> list[str]:
-    """What people said of the old scene's pairs stands for those of the new one; what cannot is told."""
-    notes = []
-    for stored in known:
-        if stored.review is None:
-            continue
-        (other,) = set(_ends(stored)) - {old.id}
-        word = [review for review in store.registrations.reviews(old.id, other) if review.review == stored.review][-1]
-        try:
-            store.registrations.review(new.id, other, stored.review, word.note)
-        except GsmapError as error:
-            notes.append(f"the word on the pair with {living[other].name} ({stored.review}) was not carried: {error}")
-    return notes
