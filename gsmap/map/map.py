@@ -347,6 +347,7 @@ class Map(AbstractContextManager["Map"]):
         between: Sequence[str] | None = None,
         as_of: str | None = None,
         min_confidence: float = 0.0,
+        pictures: str | os.PathLike[str] | None = None,
     ) -> ChangesReport:
         """What changed from each capture to those that were taken of the same places just before it.
 
@@ -359,6 +360,7 @@ class Map(AbstractContextManager["Map"]):
             between: two dates: only where the newer capture is dated after the first, at or before the second.
             as_of: only where it is dated at or before this.
             min_confidence: only changes that are at least as sure.
+            pictures: a folder to draw each change in, before and after; an empty or new one, or one of this map.
 
         Raises:
             NotFoundError: the map has no poses yet, or no such scene.
@@ -372,7 +374,13 @@ class Map(AbstractContextManager["Map"]):
         if self.store.catalog.writable:
             with at_work(self.store, "changes"):
                 compare(self.store, asked, self.settings, self._progress, verify=pair is not None)
-        return changes_report(self.store, self.settings, asked, min_confidence=min_confidence)
+        report = changes_report(self.store, self.settings, asked, min_confidence=min_confidence)
+        if pictures is None:
+            return report
+        from gsmap.map.pictures import draw
+
+        files = draw(self.store, Path(pictures), report.changes, self._progress)
+        return replace(report, changes=tuple(replace(row, picture=files.get(row.id)) for row in report.changes))
 
     def show_change(self, name: str) -> ChangeDetail:
         """``gsmap show MAP c12``: everything known of one change.

@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+import gsmap.map
 from gsmap import formats
+from gsmap.change import recipe_key
 from gsmap.cli import app
-from gsmap.types import Gaussians
+from gsmap.types import Change, ChangeReport, Gaussians
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
@@ -79,7 +81,7 @@ BASES = {
             "optimize MAP",
         ),
     ),
-    "compared": ("visited", ("changes MAP",)),
+    "compared": ("visited", ("*compared",)),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
@@ -161,6 +163,18 @@ def older(site: Path) -> None:
     with tarfile.open(OLDER) as archive:
         archive.extractall(site.parent, filter="data")
     os.rename(site.parent / "old.gsmap", site)
+
+
+def compared(site: Path) -> None:
+    """A change, whatever finds changes finds."""
+    box, rows = np.array([[2.0, 1.2, 0], [2.6, 1.8, 1]]), np.arange(9, dtype=np.int32)
+    gone = Change("disappeared", box, box.astype(np.float32), rows, rows[:0], confidence=0.75)
+    with gsmap.map.open(site) as m:
+        older, newer = (m.pose_graph().poses[scene.id] for scene in m.scenes())
+        key = recipe_key(m.settings.change).of(older.scene, newer.scene)
+        where = {"S_newer_older": newer.S_map_scene.inverse() @ older.S_map_scene, "S_frame_newer": newer.S_map_scene}
+        report = ChangeReport((gone,), 0.75, np.ones(3))
+        m.store.changes.save(report, key, older=older.scene, newer=newer.scene, **where)
 
 
 # --- captures --------------------------------------------------------------------------------------------------------
@@ -259,7 +273,7 @@ def _encoder(window: int) -> bytes:
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
-FUNCTIONS = {"*litter": litter, "*older": older}
+FUNCTIONS = {"*litter": litter, "*older": older, "*compared": compared}
 
 
 def copy_map(source: Path, target: Path) -> None:

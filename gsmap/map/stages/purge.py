@@ -16,6 +16,8 @@ from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.tileset import FILE_NAME as TILESET
 from gsmap.export.tileset import LEVELS_FOLDER, is_stale
 from gsmap.export.write import STAGING
+from gsmap.map.pictures import FILE_NAME as PICTURES
+from gsmap.map.pictures import Pictures
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
 
@@ -89,8 +91,12 @@ def _finish(store: Store, begun: Purge) -> Purge:
             if os.path.lexists(out / FILE_NAME):
                 with folder_lock(out):
                     _clean(store, out, begun.scene, tiles)
+            elif os.path.lexists(out / PICTURES):
+                gone = Pictures.load(out, store.id).forget(out, begun.scene)
+                tiles.tile_files += gone
+                tiles.cleaned += [str(out)] if gone else []
             else:
-                tiles.unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME}")
+                tiles.unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
             tiles.unreachable.append(f"{target}: {error}")
     gone = {"tile_files": tiles.tile_files, "cleaned": tiles.cleaned, "unreachable": tiles.unreachable}
