@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 from tiny_encoder import image_encoder
 
+import gsmap.map
 from gsmap import formats
+from gsmap.change import recipe_key
 from gsmap.cli import app
-from gsmap.types import Gaussians
+from gsmap.types import Change, ChangeReport, Gaussians
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
@@ -85,7 +87,7 @@ BASES = {
             "optimize MAP",
         ),
     ),
-    "compared": ("visited", ("changes MAP",)),
+    "compared": ("visited", ("*compared",)),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
@@ -175,6 +177,18 @@ def older(site: Path) -> None:
     os.rename(site.parent / "old.gsmap", site)
 
 
+def compared(site: Path) -> None:
+    """A change, whatever finds changes finds."""
+    box, rows = np.array([[2.0, 1.2, 0], [2.6, 1.8, 1]]), np.arange(9, dtype=np.int32)
+    gone = Change("disappeared", box, box.astype(np.float32), rows, rows[:0], confidence=0.75)
+    with gsmap.map.open(site) as m:
+        older, newer = (m.pose_graph().poses[scene.id] for scene in m.scenes())
+        key = recipe_key(m.settings.change).of(older.scene, newer.scene)
+        where = {"S_newer_older": newer.S_map_scene.inverse() @ older.S_map_scene, "S_frame_newer": newer.S_map_scene}
+        report = ChangeReport((gone,), 0.75, np.ones(3))
+        m.store.changes.save(report, key, older=older.scene, newer=newer.scene, **where)
+
+
 # --- captures --------------------------------------------------------------------------------------------------------
 
 
@@ -254,7 +268,7 @@ def _frames(name: str) -> list[dict[str, object]]:
     ]
 
 
-FUNCTIONS = {"*litter": litter, "*older": older}
+FUNCTIONS = {"*litter": litter, "*older": older, "*compared": compared}
 
 
 def copy_map(source: Path, target: Path) -> None:

@@ -23,6 +23,8 @@ from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.tileset import FILE_NAME as TILESET
 from gsmap.export.tileset import LEVELS_FOLDER, is_stale
 from gsmap.export.write import leftovers
+from gsmap.map.pictures import FILE_NAME as PICTURES
+from gsmap.map.pictures import Pictures
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
 
@@ -87,8 +89,11 @@ def _finish(store: Store, begun: Purge) -> Purge:
             if os.path.lexists(out / FILE_NAME):
                 with folder_lock(out):
                     begun = _clean(store, out, begun)
+            elif os.path.lexists(out / PICTURES):
+                if gone := Pictures.load(out, store.id).forget(out, begun.scene):
+                    begun = purging.note(store, begun, str(out), gone)
             else:
-                unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME}")
+                unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
             unreachable.append(f"{target}: {error}")
     return purging.finish(store, begun, unreachable)
