@@ -26,6 +26,9 @@ def command(
     min_confidence: Annotated[
         float, typer.Option("--min-confidence", min=0, max=1, help="Only changes that are at least as sure.")
     ] = 0.0,
+    pictures: Annotated[
+        str | None, typer.Option("--pictures", metavar="DIR", help="Also draw each change before and after, to here.")
+    ] = None,
     sets: Sets = None,
     preset: Preset = None,
     json: AsJson = False,
@@ -35,7 +38,9 @@ def command(
     Example: `gsmap changes site.gsmap --since 2024-05-31`
     """
     with opened(map, bars=True, sets=sets, preset=preset) as m:
-        report = m.changes(pair, since=since, between=between, as_of=as_of, min_confidence=min_confidence)
+        report = m.changes(
+            pair, since=since, between=between, as_of=as_of, min_confidence=min_confidence, pictures=pictures
+        )
     for note in report.notes:
         say(note)
     for one in report.pairs:

@@ -14,7 +14,15 @@ from threading import Lock
 import numpy as np
 
 from gsmap import formats
-from gsmap.durable import make_folder, refuse_links, remove_empty_folder, remove_file, remove_tree, sync_folder
+from gsmap.durable import (
+    is_folder,
+    make_folder,
+    refuse_links,
+    remove_empty_folder,
+    remove_file,
+    remove_tree,
+    sync_folder,
+)
 from gsmap.errors import CorruptError, GsmapError, of_system
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.plan import Params, PlannedTile
@@ -194,6 +202,9 @@ def _remove_doomed(out: Path, manifest: Manifest) -> None:
     for path in doomed:
         remove_file(out, *path.split("/"))
         remove_empty_folder(out, path.split("/")[0])
+    for folder in {path.split("/")[0] for path in doomed}:
+        if is_folder(out / folder):
+            sync_folder(out / folder)  # or they are back when the power was gone, and named by nothing
     if manifest.doomed:
         manifest.doomed = set()
         manifest.save(out)

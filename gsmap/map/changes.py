@@ -56,13 +56,8 @@ def changes_report(
     asked: Wanted,
     *,
     min_confidence: float,
-    pictures: dict[str, str] | None = None,
 ) -> ChangesReport:
-    """What is known of the pairs asked for.
-
-    Args:
-        pictures: files by id of change.
-    """
+    """What is known of the pairs asked for."""
     known, placed = scenes_by_id(store), store.revisions.get()
     missing = set(lacking(store, asked, settings))
     pairs = set(asked.pairs)
@@ -78,9 +73,8 @@ def changes_report(
     if chosen and not any(scene.scale_policy == "known" for scene in known.values()):
         notes.append("no scene's scale is known, so lengths are in the map's own unit")
     rows = [_row(one, change, known, placed) for one in chosen for change in one.changes]
-    rows = [row | {"picture": (pictures or {}).get(row["id"])} for row in rows if row["confidence"] >= min_confidence]
     return ChangesReport(
-        changes=tuple(ChangeRow(**row) for row in rows),
+        changes=tuple(ChangeRow(**row) for row in rows if row["confidence"] >= min_confidence),
         pairs=tuple(_comparison_row(one, known) for one in chosen),
         notes=tuple(notes),
     )

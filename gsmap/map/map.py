@@ -194,6 +194,7 @@ class Map(AbstractContextManager["Map"]):
         name: str | None = None,
         captured_at: str | None = None,
         scale: str = "auto",
+        supersedes: str | None = None,
     ) -> list[IngestRow]:
         """Add captures: those found at files and folders, or one in memory. Each is checked whole before it is written.
 
@@ -203,21 +204,28 @@ class Map(AbstractContextManager["Map"]):
             captured_at: of every capture given, ISO 8601; UTC where it has no zone. Else each is dated by what lies
                 beside it: a sidecar, the EXIF of its frames, or its name (`gsmap.ingest.find_date`).
             scale: ``known`` (metres), ``unknown`` (any unit) or ``auto`` (registration finds out).
+            supersedes: the one capture given was trained again of the frames of this scene, in its frame of
+                coordinates: it takes the scene's place, with its pose, what was said of it, and its edges, which are
+                checked and not searched again.
 
         Raises:
             NotFoundError, InputError, ConfigError: see `gsmap.ingest`; captures before the bad one are in the map.
+            InputError: a capture that does not lie where the scene that it supersedes lies; nothing is changed.
         """
-        from gsmap.map.stages.ingest import ingest
+        from gsmap.map.stages.ingest import ingest, readers
+        from gsmap.map.stages.supersede import supersede
 
-        added = ingest(
-            self.store,
-            captures,
-            cameras=cameras,
-            name=name,
-            captured_at=captured_at,
-            scale=scale,
-            progress=self._progress,
-        )
+        options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale": scale}
+        if supersedes is not None:
+            found = readers(captures, **options)
+            if len(found) != 1:
+                raise ConfigError(f"one capture takes the place of {supersedes}, {len(found)} were found: name one")
+            with at_work(self.store, "ingest"):
+                capture = found[0][1]()
+                done = supersede(self.store, capture, supersedes, self.settings, self._progress, named=name is not None)
+            return [reports.ingest_row(done.scene, new=True, dated=False, notes=(*capture.notes, *done.notes))]
+
+        added = ingest(self.store, captures, progress=self._progress, **options)
         return [reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added]
 
     def describe(self, *scenes: str) -> list[GraphRow]:
@@ -340,6 +348,7 @@ class Map(AbstractContextManager["Map"]):
         between: Sequence[str] | None = None,
         as_of: str | None = None,
         min_confidence: float = 0.0,
+        pictures: str | os.PathLike[str] | None = None,
     ) -> ChangesReport:
         """What changed from each capture to those that were taken of the same places just before it.
 
@@ -352,6 +361,7 @@ class Map(AbstractContextManager["Map"]):
             between: two dates: only where the newer capture is dated after the first, at or before the second.
             as_of: only where it is dated at or before this.
             min_confidence: only changes that are at least as sure.
+            pictures: a folder to draw each change in, before and after; an empty or new one, or one of this map.
 
         Raises:
             NotFoundError: the map has no poses yet, or no such scene.
@@ -365,7 +375,13 @@ class Map(AbstractContextManager["Map"]):
         if self.store.catalog.writable:
             with at_work(self.store, "changes"):
                 compare(self.store, asked, self.settings, self._progress, verify=pair is not None)
-        return changes_report(self.store, self.settings, asked, min_confidence=min_confidence)
+        report = changes_report(self.store, self.settings, asked, min_confidence=min_confidence)
+        if pictures is None:
+            return report
+        from gsmap.map.pictures import draw
+
+        files = draw(self.store, Path(pictures), report.changes, self._progress)
+        return replace(report, changes=tuple(replace(row, picture=files.get(row.id)) for row in report.changes))
 
     def show_change(self, name: str) -> ChangeDetail:
         """``gsmap show MAP c12``: everything known of one change.

@@ -8,7 +8,7 @@ from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
-from gsmap.types.scene_graph import NodeLayer, SceneGraph
+from gsmap.types.scene_graph import NodeLayer, SceneGraph, Things
 from gsmap.types.sim3 import Sim3
 from gsmap.types.thinning import Thinning
 from gsmap.types.tile import Tile
@@ -37,5 +37,6 @@ __all__ = [
     "ScenePose",
     "Sim3",
     "Thinning",
+    "Things",
     "Tile",
 ]

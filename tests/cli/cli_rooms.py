@@ -23,25 +23,29 @@ def write_captures(folder: Path) -> None:
     (folder / "truth").mkdir(parents=True)
     rooms = {"left": (7, 0.0, 4.2), "right": (7, 1.8, 6.0), "odd:one": (8, 0.0, 6.0)}
     for k, (name, (room, low, high)) in enumerate(rooms.items()):
-        rng = np.random.default_rng(k)
         S = Sim3(exp_so3(np.array([0.0, 0.0, 0.7 * k])), np.array([2.0, -1.0, 0.3]) * k)
-        gaussians = transform_gaussians(_surfaces(rng, room, low, high, 9_000), S)
-        formats.write(folder / f"{name}.ply", gaussians)
-        frames = [
-            {
-                "id": i,
-                "img_name": f"{name}_{i}",
-                "width": 96,
-                "height": 72,
-                "position": (pose[:3, 3]).tolist(),
-                "rotation": pose[:3, :3].tolist(),
-                "fx": 60.0,
-                "fy": 60.0,
-            }
-            for i, pose in enumerate(S.matrix() @ view for view in _views(low, high))
-        ]
-        (folder / f"{name}.cameras.json").write_text(json.dumps(frames))
+        write_capture(folder, name, S, room, low, high, k)
         (folder / "truth" / f"{name}.json").write_text(json.dumps({"T_scene_world": S.matrix().tolist()}))
+
+
+def write_capture(folder: Path, name: str, S: Sim3, room: int, low: float, high: float, seed: int) -> None:
+    """Part of a room between two values of x, in a frame of its own, with the cameras that look around in it."""
+    gaussians = transform_gaussians(_surfaces(np.random.default_rng(seed), room, low, high, 9_000), S)
+    formats.write(folder / f"{name}.ply", gaussians)
+    frames = [
+        {
+            "id": i,
+            "img_name": f"{name}_{i}",
+            "width": 96,
+            "height": 72,
+            "position": (pose[:3, 3]).tolist(),
+            "rotation": pose[:3, :3].tolist(),
+            "fx": 60.0,
+            "fy": 60.0,
+        }
+        for i, pose in enumerate(S.matrix() @ view for view in _views(low, high))
+    ]
+    (folder / f"{name}.cameras.json").write_text(json.dumps(frames))
 
 
 def _surfaces(rng: np.random.Generator, room: int, low: float, high: float, count: int) -> Gaussians:

@@ -13,12 +13,15 @@ from pathlib import Path
 import numpy as np
 from tiny_encoder import image_encoder
 
+import gsmap.map
 from gsmap import formats
+from gsmap.change import recipe_key
 from gsmap.cli import app
-from gsmap.types import Gaussians
+from gsmap.types import Change, ChangeReport, Gaussians
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
+EXPORT_3DTILES = f"{EXPORT} --format 3dtiles"
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class Verb:
         also: lines that are run first, undisturbed and unwatched.
         needs: a package without which there is no such verb.
         then: lines that must work once it has come to its end, the first time and the second.
+        forgets: a text that no file below the folder holds once it has come to its end.
     """
 
     name: str
@@ -42,6 +46,7 @@ class Verb:
     also: tuple[str, ...] = ()
     needs: str = ""
     then: tuple[str, ...] = ()
+    forgets: str = ""
 
     @property
     def possible(self) -> bool:
@@ -63,6 +68,8 @@ BASES = {
         ("ingest MAP IN/c.ply", "edge MAP a:b --pose IN/pose2.txt --sigma 0.1,0.01", "optimize MAP"),
     ),
     "shrunk": ("exported", ("remove MAP b", "optimize MAP")),
+    "removed": ("placed", ("remove MAP b",)),
+    "levelled": ("placed", (EXPORT_3DTILES,)),
     "modelled": ("placed", ("models add MAP clip IN/encoder.onnx --preset unit",)),
     # Everything that prune takes: a removed scene with its graph, revisions, an orphan, what a dead writer left.
     "littered": ("placed", ("remove MAP b", "optimize MAP", "*litter")),
@@ -80,7 +87,7 @@ BASES = {
             "optimize MAP",
         ),
     ),
-    "compared": ("visited", ("changes MAP",)),
+    "compared": ("visited", ("*compared",)),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
@@ -101,9 +108,15 @@ VERBS = {
         Verb("export", "placed", EXPORT),
         Verb("export-moved", "moved", EXPORT),
         Verb("export-shrunk", "shrunk", EXPORT),
-        Verb("export-3dtiles", "placed", "export MAP OUT --merge union --tile-size 3 --format 3dtiles"),
+        Verb("export-3dtiles", "placed", EXPORT_3DTILES),
         Verb("prune", "littered", "prune MAP --keep-revisions 1"),
         Verb("remove", "placed", "remove MAP b", done_says="no scene is called"),
+        Verb("purge", "exported", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"),
+        Verb(
+            "purge-3dtiles", "levelled", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"
+        ),
+        Verb("restore-scene", "removed", "restore-scene MAP b", done_says="was not removed"),
+        Verb("restore-from", "two", "restore-scene MAP c --from HERE/other.gsmap"),
         Verb("models-add", "placed", "models add MAP clip IN/encoder.onnx --preset unit", needs="onnx"),
         Verb("models-again", "modelled", "models add MAP clip IN/encoder2.onnx --preset unit", needs="onnx"),
         Verb("migrate", "older", "migrate MAP"),
@@ -162,6 +175,18 @@ def older(site: Path) -> None:
     with tarfile.open(OLDER) as archive:
         archive.extractall(site.parent, filter="data")
     os.rename(site.parent / "old.gsmap", site)
+
+
+def compared(site: Path) -> None:
+    """A change, whatever finds changes finds."""
+    box, rows = np.array([[2.0, 1.2, 0], [2.6, 1.8, 1]]), np.arange(9, dtype=np.int32)
+    gone = Change("disappeared", box, box.astype(np.float32), rows, rows[:0], confidence=0.75)
+    with gsmap.map.open(site) as m:
+        older, newer = (m.pose_graph().poses[scene.id] for scene in m.scenes())
+        key = recipe_key(m.settings.change).of(older.scene, newer.scene)
+        where = {"S_newer_older": newer.S_map_scene.inverse() @ older.S_map_scene, "S_frame_newer": newer.S_map_scene}
+        report = ChangeReport((gone,), 0.75, np.ones(3))
+        m.store.changes.save(report, key, older=older.scene, newer=newer.scene, **where)
 
 
 # --- captures --------------------------------------------------------------------------------------------------------
@@ -243,7 +268,7 @@ def _frames(name: str) -> list[dict[str, object]]:
     ]
 
 
-FUNCTIONS = {"*litter": litter, "*older": older}
+FUNCTIONS = {"*litter": litter, "*older": older, "*compared": compared}
 
 
 def copy_map(source: Path, target: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import gsmap.change
 import gsmap.map
@@ -237,6 +238,28 @@ def test_a_map_that_cannot_be_written_tells_what_it_knows(
         assert [pair.pair for pair in report.pairs] == ["may:june"]
         assert report.notes == ("1 pairs are not compared yet: gsmap changes does where the map can be written",)
     assert seen.pairs == names_before
+
+
+def test_pictures_of_changes_go_with_a_scene_that_is_purged(site: Map, seen: Seen, tmp_path: Path) -> None:
+    out = tmp_path / "pictures"
+    report = site.changes(pictures=out)
+    assert {Path(row.picture).name for row in report.changes} == {"c1.png", "c2.png", "c3.png", "c4.png"}
+    assert all(Image.open(row.picture).size[0] > 300 for row in report.changes)
+    assert site.changes(pictures=out).changes[0].picture == report.changes[0].picture
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("")
+    with pytest.raises(ConfigError, match="holds other things"):
+        site.changes(pictures=tmp_path / "mine")
+    with gsmap.map.create(tmp_path / "other.gsmap") as other:
+        other.ingest(_cloud(0), cameras=_cameras(), name="a", captured_at="2026-01-01")
+        place(other)
+        with pytest.raises(ConfigError, match="pictures of another map"):
+            other.changes(pictures=out)
+    gone = next(scene.id for scene in site.scenes() if scene.name == "may")
+    receipt = site.purge("may")
+    assert (receipt.num_tiles, receipt.exports, receipt.unreachable) == (2, (str(out),), ())
+    assert sorted(path.name for path in out.iterdir()) == ["c3.png", "c4.png", "changes.json"]
+    assert gone not in (out / "changes.json").read_text()
 
 
 def test_without_poses_there_is_nothing_to_compare(tmp_path: Path, seen: Seen) -> None:

@@ -200,11 +200,17 @@ def test_dropping_what_went_is_right_and_dropping_all_is_not(truth):
     assert everything["gone"] == everything["painted"] == everything["false"] == 1.0
 
 
-def test_what_a_map_kept_is_told_by_place(truth):
-    older = truth.gaussians("t0")
-    kept = scores.kept_of(older, older.means[::2] + np.array([0.01, 0, 0]))
-    assert kept[::2].all()
-    assert kept.mean() < 0.95
+def test_ghosts_stand_where_things_went_and_the_newest_has_none(truth):
+    old, new = truth.gaussians("t0").means, truth.gaussians("t1").means
+    assert scores.score_ghosts(truth, "t1", "t0", new)["left"] == 0
+    both = scores.score_ghosts(truth, "t1", "t0", np.concatenate([old, new]))
+    assert both["left"] == 1
+    assert both["n"] > 20
+
+
+def test_rows_that_are_still_there_are_told(truth):
+    means = truth.gaussians("t0").means
+    np.testing.assert_array_equal(scores.kept_rows(means[:9], means[::2]), [True, False] * 4 + [True])
 
 
 def test_the_sets_never_share_a_place_and_say_what_is_false():
