@@ -126,7 +126,7 @@ def make(out: Path, seed: int, visits: tuple[Visit, ...], args: argparse.Namespa
         gaussians = fit_frames(frames[shown], steps=args.steps, num_gaussians=args.gaussians, seed=k)
         capture = put_in_own_frame(gaussians, frames, visit.name, np.random.default_rng([seed, k, 8]))
         synthetic.write_captures(out, [capture], images=True)
-        dated = f"{2022 + k}-05-14T10:00:00+00:00"
+        dated = f"{min(2022, 2026 - len(visits)) + k}-05-14T10:00:00+00:00"
         (out / f"{visit.name}.json").write_text(json.dumps({"captured_at": dated}))
         truth = {
             "T_scene_world": capture.T_scene_world.tolist(),

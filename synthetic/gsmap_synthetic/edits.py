@@ -179,4 +179,4 @@ def _by_night(surfaces: Surfaces) -> Surfaces:
 
 def _dark(material: Material) -> Material:
     """What a window shows by night."""
-    return lambda u, v, size: material(u, v, size) * np.float32([0.02, 0.025, 0.04])
+    return lambda u, v, size: material(u, v, size) * np.array([0.02, 0.025, 0.04], np.float32)

@@ -90,7 +90,7 @@ class Surfaces:
 
     def copy(self) -> Surfaces:
         """A collection of its own with the same content."""
-        lists = {f.name: list(v) for f in fields(self) if isinstance(v := getattr(self, f.name), list)}
+        lists: dict[str, Any] = {f.name: list(v) for f in fields(self) if isinstance(v := getattr(self, f.name), list)}
         return replace(self, **lists)
 
     def of(self, owner: int) -> np.ndarray:
@@ -99,11 +99,11 @@ class Surfaces:
 
     def keep(self, quads: Iterable[int], lamps: Iterable[int]) -> None:
         """Leave only these quads and lamps, in this order."""
-        quads, lamps = list(quads), list(lamps)
-        for held in (self.corners, self.sizes_m, self.origins_m, self.materials, self.glows, self.leaves, self.owners):
-            held[:] = [held[i] for i in quads]
-        for held in (self.lamps, self.lamp_owners):
-            held[:] = [held[i] for i in lamps]
+        of_quads: tuple[list[Any], ...] = (self.corners, self.sizes_m, self.origins_m, self.materials, self.glows)
+        of_lamps: tuple[list[Any], ...] = (self.lamps, self.lamp_owners)
+        for rows, lists in ((list(quads), (*of_quads, self.leaves, self.owners)), (list(lamps), of_lamps)):
+            for held in lists:
+                held[:] = [held[i] for i in rows]
 
     def quad(self, corners, material: Material, origin_m=(0.0, 0.0), glow: float = 0.0, size_m=None) -> None:
         """Add one quad of local corners p00, p10, p11, p01."""

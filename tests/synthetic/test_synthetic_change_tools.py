@@ -19,10 +19,14 @@ import make_change
 TINY = ["--steps", "0", "--frames", "16", "--gaussians", "6000", "--size", "96", "--texel", "0.05"]
 
 
+TRAINED_ON = []
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    out = tmp_path_factory.mktemp("change")
+    out, fit = tmp_path_factory.mktemp("change"), make_change.fit_frames
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(make_change, "fit_frames", lambda f, **o: (TRAINED_ON.append(f.cameras.names), fit(f, **o))[1])
         patch.setattr(sys, "argv", ["make_change.py", str(out), "--seed", "3", "--exposure", *TINY])
         assert make_change.main() == 0
     return out
@@ -52,7 +56,9 @@ def test_captures_are_read_as_any_others_and_are_a_year_apart(folder, truth):
     assert [c.name for c in captures] == truth.times == ["t0", "t1"]
     assert [c.captured_at[:4] for c in captures] == ["2022", "2023"]
     assert all(len(c.cameras) == 16 for c in captures)
-    assert truth.held_out("t0").tolist() == [i % 6 == 3 for i in range(16)]
+    for time, names in zip(truth.times, TRAINED_ON, strict=True):
+        assert truth.held_out(time).tolist() == [i % 6 == 3 for i in range(16)]
+        assert set(names) == set(np.array(truth.cameras(time).names)[~truth.held_out(time)])
     poses = [truth.T_place_scene(t).rotation for t in truth.times]
     assert np.abs(poses[0] - poses[1]).max() > 0.1
 
@@ -82,8 +88,17 @@ def test_voxels_of_changes_lie_on_their_things_and_were_seen_by_both(truth, voxe
         boxes = [np.array(b) for k in ("box_before_m", "box_after_m") if (b := change[k]) is not None]
         inside = [((v > low - 0.06) & (v < high + 0.06)).all(1) for low, high in boxes]
         assert np.any(inside, axis=0).all()
-    behind = np.array([[50.0, 50, 1]])
-    assert not scores.observed(truth, "t0", behind)[0]
+
+
+def test_what_lies_behind_walls_is_not_observed(truth):
+    y, z = np.meshgrid(np.linspace(0.5, 5, 12), np.linspace(0.3, 2.2, 6))
+    outside = np.stack([np.full(y.size, -0.5), y.ravel(), z.ravel()], axis=1)
+    assert not scores.observed(truth, "t0", outside).any()
+    assert not scores.looked_through(truth, "t0", outside).any()
+    centres = truth.cameras("t0").centers
+    ahead = centres + 0.3 * truth.cameras("t0").T_frame_camera[:, :3, 2]
+    assert scores.observed(truth, "t0", ahead).mean() > 0.9
+    assert scores.looked_through(truth, "t0", ahead).mean() > 0.8
 
 
 def test_the_truth_scores_full_marks(truth, claims):
@@ -181,6 +196,15 @@ def test_masks_tell_the_newest_from_the_union_of_all(truth):
     moved = Sim3(np.eye(3), np.array([1.0, 2, 3]), 1.0)
     again = scores.score_merge(truth, "t1", ["t0"], transform_gaussians(newest, moved), moved.inverse())
     assert again["psnr"]["all"] == pytest.approx(alone["psnr"]["all"], abs=0.05)
+
+
+def test_psnr_is_of_the_pixels_of_a_kind():
+    kinds = np.array([[[0, 1, 2, 3]]])
+    shown = np.array([0.1, 0.01, 0.1, 1.0])[None, None, :, None] * np.ones(3)
+    got = scores.psnr_by_kind(shown, np.zeros((1, 1, 4, 3)), kinds)
+    assert [got[k] for k in ("same", "new", "recoloured", "vacated")] == pytest.approx([20, 40, 20, 0])
+    assert got["changed"] == pytest.approx(-10 * np.log10((1e-4 + 1e-2 + 1) / 3))
+    assert np.isnan(scores.psnr_by_kind(shown, shown, np.zeros((1, 1, 4), int))["new"])
 
 
 def test_old_mix_and_new_are_told_by_colour():
