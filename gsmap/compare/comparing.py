@@ -90,7 +90,7 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             _count(judged, at, picture, sure, tolerance)
             _count_colour(judge, own, picture, tolerance)
     evidence = [
-        tally.evidence(one.gaussians.means, one.surface, params)
+        tally.evidence(one.gaussians.means, one.surface, line, params)
         for tally, one in zip(tallies, (older, newer), strict=True)
     ]
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.compare.colours import Balance, limits
 from gsmap.compare.params import Params
 from gsmap.geometry.voxels import voxel_labels
 
@@ -59,7 +60,7 @@ class Tally:
         self.chroma = np.zeros((count, 2), dtype=np.float32)
         self.lightness = np.zeros(count, dtype=np.float32)
 
-    def evidence(self, points: np.ndarray, shows: np.ndarray, params: Params) -> Evidence:
+    def evidence(self, points: np.ndarray, shows: np.ndarray, line: Balance, params: Params) -> Evidence:
         """The counts and what they come to; ``shows`` (N,) says which Gaussians are part of a surface and vote."""
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
@@ -70,7 +71,8 @@ class Tally:
         state[(state == SAME) & (self.covered > self.colour_seen) & (beside | (self.through >= 1))] = GONE
         same = state == SAME
         seen = same & (self.colour_seen >= 1) & shows
-        differs = _differs(np.column_stack([chroma, lightness]), seen, near, params)
+        limit = limits(line, params)
+        differs = np.maximum(np.abs(chroma).max(1) / limit[0], np.abs(lightness) / limit[1])
         state[same & (near.mean(np.where(seen, differs, 0), seen) >= 1) & (differs >= _PART)] = REPAINTED
         # What differs less, and alone, is noise; beside what is sure it is its border.
         for _ in range(_ROUNDS):
@@ -128,21 +130,6 @@ class _Neighbours:
         padded = np.concatenate([values[self.rows], np.zeros_like(values[:1])])
         out: np.ndarray = padded[self.index].sum(1, dtype=np.float64)
         return out
-
-
-def _differs(own: np.ndarray, seen: np.ndarray, near: _Neighbours, params: Params) -> np.ndarray:
-    """(N,) by how much colours differ, where 1 is more than light and noise explain.
-
-    Args:
-        own: (N, 3) mean differences, two of chroma and one of lightness.
-        seen: (N,) which have one.
-    """
-    if not seen.any():
-        return np.zeros(len(own))
-    spread = 1.4826 * np.median(np.abs(own[seen]), axis=0)
-    limit = np.maximum([params.min_chroma, params.min_chroma, params.min_lightness], params.colour_spreads * spread)
-    out: np.ndarray = (np.abs(own) / limit).max(1)
-    return out
 
 
 def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray, doubtful: np.ndarray) -> None:

@@ -30,3 +30,10 @@ def over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
     rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
     out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
     return out
+
+
+def ranges(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, K) lowest and highest value of each channel over 3 x 3 pixels."""
+    channels = [picture[..., c] for c in range(picture.shape[-1])]
+    low, high = (np.stack([over_3x3(c, pick) for c in channels], axis=-1) for pick in (np.minimum, np.maximum))
+    return low, high

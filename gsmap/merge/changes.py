@@ -177,8 +177,9 @@ def _intruders(
         seen = render(together, view.camera, depth=False)
         shown = seen.dominant_id[0]
         theirs = view.opaque & (shown >= count)
-        off = np.abs(np.clip(seen.colour[0][theirs], 0, 1) - view.colour[theirs]).max(1)
-        worse = off > _INTRUDES
+        low, high = compare.ranges(view.colour)
+        colour = np.clip(seen.colour[0][theirs], 0, 1)
+        worse = (np.maximum(low[theirs] - colour, colour - high[theirs]) > _INTRUDES).any(1)
         shown = shown[theirs] - count
         bad += np.bincount(shown[worse], minlength=len(rows))
         good += np.bincount(shown[~worse], minlength=len(rows))
