@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +10,11 @@ import numpy as np
 from sqlalchemy import Connection, Row, select
 
 from gsmap.store.matrices import to_array, to_pose
-from gsmap.store.schema import change_reviews, changes, comparisons
+from gsmap.store.schema import change_reviews, changes, comparisons, scenes
 from gsmap.types import Sim3
 from gsmap.types.change import ChangeKind, Symmetry
 
+KIND = "changes"
 OPEN = "open"
 _STATUS = {None: OPEN, "confirm": "confirmed", "reject": "rejected"}
 
@@ -111,6 +112,22 @@ def newest_of_all(connection: Connection) -> list[Row[Any]]:
     """The comparison of every pair that counts, in the order they were made; scenes may be gone."""
     query = select(comparisons).order_by(comparisons.c.created_at, comparisons.c.number)
     return list({row.pair: row for row in connection.execute(query)}.values())
+
+
+def named_groups(
+    ours: Connection, theirs: Connection, only: Collection[str] | None
+) -> Iterator[tuple[str, str, str | None]]:
+    """(kind, scene, group) of the arrays that go from one map into another: those of the newest comparisons of scenes
+    that are there or come along.
+
+    Args:
+        only: ids of the scenes that come; None for all.
+    """
+    here = set(ours.execute(select(scenes.c.id)).scalars())
+    for row in newest_of_all(theirs):
+        ends = {row.older, row.newer}
+        if only is None or ends <= here | set(only):
+            yield from ((KIND, end, row.group_id) for end in ends)
 
 
 def same_changes(

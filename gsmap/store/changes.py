@@ -14,6 +14,7 @@ from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.change_rows import (
+    KIND,
     OPEN,
     ChangeReview,
     Comparison,
@@ -36,7 +37,6 @@ from gsmap.types import Sim3
 from gsmap.types.change import Change, ChangeReport
 from gsmap.types.plain import plain
 
-KIND = "changes"
 REVIEWS = ("confirm", "reject", "withdraw")
 
 

@@ -18,8 +18,8 @@ from gsmap.store import sqlite, staging
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.change_rows import KIND as CHANGES
 from gsmap.store.change_rows import newest_of_all
-from gsmap.store.changes import KIND as CHANGES
 from gsmap.store.explained import PRUNE_MAY, explained
 from gsmap.store.groups import manifest
 from gsmap.store.layout import CHUNK_ROWS

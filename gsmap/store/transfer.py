@@ -16,6 +16,7 @@ from gsmap.errors import ConfigError, StoreError
 from gsmap.store import facts
 from gsmap.store import scenes as scene_rows
 from gsmap.store.arrays import Staged, StoredFile, link_or_copy
+from gsmap.store.change_rows import named_groups
 from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.groups import has_group, manifest, name, publish
 from gsmap.store.models import model_path
@@ -32,7 +33,6 @@ from gsmap.store.schema import (
     scenes,
 )
 from gsmap.store.store import Store
-from gsmap.store.transfer_changes import named_groups
 from gsmap.types.plain import canonical
 
 Content = dict[str, Any]

@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 
-from gsmap.store.change_rows import newest_of_all, same_changes
+from gsmap.store.change_rows import KIND, newest_of_all, same_changes
 from gsmap.store.matrices import to_array, to_pose
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
-
-if TYPE_CHECKING:
-    from gsmap.store.transfer import Transfer
-
-KIND = "changes"
-
-
-def named_groups(
-    ours: Connection, theirs: Connection, only: Collection[str] | None
-) -> Iterator[tuple[str, str, str | None]]:
-    """(kind, scene, group) of the arrays of their newest comparisons whose scenes are here or come along."""
-    here = set(ours.execute(select(scenes.c.id)).scalars())
-    for row in newest_of_all(theirs):
-        ends = {row.older, row.newer}
-        if only is None or ends <= here | set(only):
-            yield from ((KIND, end, row.group_id) for end in ends)
+from gsmap.store.transfer import Transfer
 
 
 def comparisons_of(transfer: Transfer) -> None:

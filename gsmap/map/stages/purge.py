@@ -92,9 +92,9 @@ def _finish(store: Store, begun: Purge) -> Purge:
                 with folder_lock(out):
                     _clean(store, out, begun.scene, tiles)
             elif os.path.lexists(out / PICTURES):
-                gone = Pictures.load(out, store.id).forget(out, begun.scene)
-                tiles.tile_files += gone
-                tiles.cleaned += [str(out)] if gone else []
+                drawn = Pictures.load(out, store.id).forget(out, begun.scene)
+                tiles.tile_files += drawn
+                tiles.cleaned += [str(out)] if drawn else []
             else:
                 tiles.unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
