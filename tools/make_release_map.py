@@ -20,6 +20,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from tiny_encoder import image_encoder
 
 import gsmap.map
 from gsmap.map import Map
@@ -157,21 +158,6 @@ def compare(m: Map) -> None:
             key = recipe.of(a, b)
         m.store.changes.save(report, key, older=a, newer=b, **where)
     m.confirm("c1", "I moved it")
-
-
-def image_encoder() -> bytes:
-    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
-    from onnx import TensorProto, helper
-
-    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
 def pack(path: Path, out: Path) -> None:

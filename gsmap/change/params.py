@@ -25,6 +25,7 @@ class Params:
         colour_spreads: nor do those within that many robust standard deviations of what agrees.
         yaw_starts: turns about the vertical from which a moved thing is looked for.
         moved_within_m: a moved thing lies this close to where it is said to stand.
+        min_moved: share of a thing that fits where it is said to stand, there and back.
         min_confidence: changes less sure than this are not reported.
     """
 
@@ -41,6 +42,7 @@ class Params:
     colour_spreads: float = 3.0
     yaw_starts: int = 24
     moved_within_m: float = 0.05
+    min_moved: float = 0.68
     min_confidence: float = 0.3
 
     def __post_init__(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -123,7 +122,9 @@ def _limits(line: Balance, params: Params) -> tuple[float, float]:
     )
 
 
-def _add(older: _Sums, newer: _Sums, a: Any, b: Any, picture: Pictured, comparison: Comparison, limits, own: int) -> None:
+def _add(
+    older: _Sums, newer: _Sums, a: Any, b: Any, picture: Pictured, comparison: Comparison, limits, own: int
+) -> None:
     """Add one camera's pair of pictures: ``a`` shows the older, ``b`` the newer; ``own`` is whose camera it is."""
     both = a.solid & b.solid & (a.dominant_id >= 0) & (b.dominant_id >= 0)
     base, share = comparison.tolerance_m
@@ -145,7 +146,9 @@ def _add(older: _Sums, newer: _Sums, a: Any, b: Any, picture: Pictured, comparis
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
     """Differences of colour (H, W, 3), two of chroma and one of lightness, and how far they go beyond what a shift by
     a pixel explains (H, W), as multiples of the limits."""
-    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
+    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(
+        np.float32
+    )
     log_b = np.log(np.clip(b, 0, 1) + np.float32(FLOOR))
     bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
     plain = _opponent(log_b - log_a, bright)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsmap.change.components import components
 
 _BIN_M = 0.03
 _THICK_M = 0.045  # skirting boards, picture frames and the noise of a plane belong to it
-_LEVEL_M2, _WALL_M2 = 4.0, 1.5  # a smaller plane is a table or a cupboard
+_LEVEL_M2, _WALL_M2 = 4.0, 0.8  # a smaller plane is a table or a cupboard
 _REACH_M = 0.16  # cells of one plane are linked over such gaps
 _WALL_M = 1.8  # a wall is at least this high, and ...
 _TO_CEILING_M = 0.2  # ... comes this close to the ceiling, where there is one
+_PIECE_M2 = 0.1  # of a wall that furniture hides, pieces at least so large are looked at
+_BESIDE_M = 0.3  # what lies so close to a wall, in its plane, is wall
 _MOST_PLANES = 24
 
 
@@ -39,16 +42,28 @@ def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray
         along = np.abs(normals[upright] @ way) > 0.94
         for offset in _peaks(points[upright[along]] @ way, _WALL_M2 / cell_m**2):
             on = (np.abs(points @ way - offset) < _THICK_M) & (np.abs(normals @ way) > 0.8) & (label < 0)
-            for piece in _pieces(points, np.flatnonzero(on), _WALL_M2 / cell_m**2):
-                height = np.ptp(points[piece, 2])
-                top = points[piece, 2].max()
-                if height < _WALL_M or (np.isfinite(ceiling) and top < ceiling - _TO_CEILING_M):
-                    continue
-                label[piece] = found
+            rows = _wall(points, np.flatnonzero(on), ceiling, cell_m)
+            if len(rows):
+                label[rows] = found
                 found += 1
-                if found >= _MOST_PLANES:
-                    return label
+            if found >= _MOST_PLANES:
+                return label
     return label
+
+
+def _wall(points: np.ndarray, rows: np.ndarray, ceiling: float, cell_m: float) -> np.ndarray:
+    """Those cells of an upright plane that are wall: large pieces up to the ceiling, and what little lies by them."""
+    pieces = _pieces(points, rows, _PIECE_M2 / cell_m**2)
+    tall = [p for p in pieces if np.ptp(points[p, 2]) > _WALL_M or points[p, 2].max() > ceiling - _TO_CEILING_M]
+    if not tall:
+        return rows[:0]
+    core = np.concatenate(tall)
+    if len(core) < _WALL_M2 / cell_m**2 or np.ptp(points[core, 2]) < _WALL_M:
+        return rows[:0]
+    if np.isfinite(ceiling) and points[core, 2].max() < ceiling - _TO_CEILING_M:
+        return rows[:0]
+    near = cKDTree(points[core]).query(points[rows], distance_upper_bound=_BESIDE_M)[0]
+    return rows[np.isfinite(near)]
 
 
 def _peaks(values: np.ndarray, fewest: float) -> list[float]:

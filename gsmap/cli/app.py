@@ -47,6 +47,7 @@ VERBS = (
     "restore-scene",
     "check",
     "prune",
+    "thin",
     "migrate",
     "backup",
     "restore",

@@ -73,6 +73,7 @@ OBJECTS: dict[str, Object] = {
     "restore-scene": One(rows.SceneRow),
     "check": One(rows.CheckReport),
     "prune": One(rows.PruneReport),
+    "thin": One(rows.ThinReport),
     "migrate": One(rows.MigrateReport),
     "backup": One(rows.BackupReport),
     "backup --list": Many("snapshots", rows.SnapshotRow),

@@ -120,6 +120,7 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
 
 def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray, params: Params) -> np.ndarray:
     """Where colours differ by more than light and noise explain."""
-    return (np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1])) > max(params.min_chroma, params.colour_spreads * line.chroma_spread)) | (
-        np.abs(lightness) > max(params.min_lightness, params.colour_spreads * line.lightness_spread)
-    )
+    return (
+        np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1]))
+        > max(params.min_chroma, params.colour_spreads * line.chroma_spread)
+    ) | (np.abs(lightness) > max(params.min_lightness, params.colour_spreads * line.lightness_spread))

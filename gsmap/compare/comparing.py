@@ -30,6 +30,7 @@ class Pictured:
         other: the other's surfaces from the same camera.
         outcome: (H, W) uint8, one of the five outcomes.
         one: (H, W) bool, both show one surface, well seen or not.
+        covered: (H, W) bool, the other has a thing before what this one shows, though perhaps at an edge.
         chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour there, newer less older.
     """
 
@@ -37,6 +38,7 @@ class Pictured:
     other: View
     outcome: np.ndarray
     one: np.ndarray
+    covered: np.ndarray
     chroma: np.ndarray
     lightness: np.ndarray
 
@@ -69,7 +71,10 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
     params = params or Params()
     surfaces = {id(one): _surface(one) for one in (older, newer)}
     crossed = [
-        [(own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)], params)) for i in range(len(own.views))]
+        [
+            (own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)], params))
+            for i in range(len(own.views))
+        ]
         for own, other in ((older, newer), (newer, older))
     ]
     tolerance = _tolerance([pair for pairs in crossed for pair in pairs], params)
@@ -149,6 +154,7 @@ def _outcomes(
     gap = base + share * own.depth
     one = own.solid & other.solid & _one_surface(own, other, tolerance)
     both = sure & other.solid
+    covered = own.opaque & other.opaque & (other.depth < own.depth - gap)
     older, newer = (other, own) if sign > 0 else (own, other)
     chroma, lightness = line.differences(older.colour, newer.colour, one)
     outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
@@ -157,7 +163,7 @@ def _outcomes(
     # Beyond both neighbourhoods' extremes: a pixel off at an edge proves nothing.
     outcome[both & (other.far < own.near - gap)] = OTHER_BEFORE
     outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND
-    return Pictured(own, other, outcome, one, chroma, lightness)
+    return Pictured(own, other, outcome, one, covered, chroma, lightness)
 
 
 def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolerance: tuple[float, float]) -> None:
@@ -175,6 +181,7 @@ def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolera
     grazed = view.opaque[at.row, at.column] & (at.z < view.depth[at.row, at.column] - gap)
     tally.grazed[at.index[grazed]] += 1
     tally.on_surface[at.index[on]] += 1
+    tally.covered[at.index[on & picture.covered[at.row, at.column]]] += 1
     looked = through | on
     tally.sure[at.index[looked & sure[at.row, at.column]]] += 1
     tally.sharpness[at.index[looked]] += view.pixels_a_metre(at.z[looked]) ** 2

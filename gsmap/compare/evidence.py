@@ -40,6 +40,8 @@ class Evidence:
 
 
 _PART = 0.3  # of a difference that a Gaussian must have itself, where its neighbours have it
+_BORDER = 0.4  # of its neighbours that changed, for a Gaussian to be at a change's border
+_ROUNDS = 2
 
 
 class Tally:
@@ -50,6 +52,7 @@ class Tally:
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
         self.grazed = np.zeros(count, dtype=np.int32)  # views in which it is before the surface, though perhaps at an edge
+        self.covered = np.zeros(count, dtype=np.int32)  # on the surface, but its own capture shows something before it
         self.sure = np.zeros(count, dtype=np.int32)
         self.sharpness = np.zeros(count, dtype=np.float32)
         self.colour_seen = np.zeros(count, dtype=np.int32)
@@ -62,11 +65,18 @@ class Tally:
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
         near = _Neighbours(points, shows, params)
         state = self._geometry(near, params)
+        # What is near the other's surface, yet part of a thing that stood before it, is no part of that surface.
+        beside = near.sums((state == GONE).astype(np.int32)) >= 2
+        state[(state == SAME) & (self.covered > self.colour_seen) & (beside | (self.through >= 1))] = GONE
         same = state == SAME
         seen = same & (self.colour_seen >= 1) & shows
-        paint = _painted(np.column_stack([chroma, lightness]), seen, self.colour_seen, near, params)
-        state[same & paint] = REPAINTED
-        _follow(state, near, self.grazed > 0)
+        differs = _differs(np.column_stack([chroma, lightness]), seen, near, params)
+        state[same & (near.mean(np.where(seen, differs, 0), seen) >= 1) & (differs >= _PART)] = REPAINTED
+        # What differs less, and alone, is noise; beside what is sure it is its border.
+        for _ in range(_ROUNDS):
+            beside = near.sums((state >= REPAINTED).astype(np.int32)) >= _BORDER * np.maximum(near.count, 1)
+            state[(state == SAME) & beside & (differs >= _PART)] = REPAINTED
+        _follow(state, near, self.grazed > 0, self.colour_seen < params.min_views)
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
 
@@ -107,6 +117,12 @@ class _Neighbours:
         out: np.ndarray = (self.index < len(self.rows)).sum(1)
         return out
 
+    def mean(self, values: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """(N,) means of values (N,) over those neighbours that are among ``of`` (N,), at least three; 0 for fewer."""
+        count = self.sums(of.astype(np.int32))
+        out: np.ndarray = np.where(count >= 3, self.sums(np.where(of, values, 0)) / np.maximum(count, 1), 0)
+        return out
+
     def sums(self, values: np.ndarray) -> np.ndarray:
         """(N, ...) sums of values (N, ...) over the neighbours within reach."""
         padded = np.concatenate([values[self.rows], np.zeros_like(values[:1])])
@@ -114,36 +130,27 @@ class _Neighbours:
         return out
 
 
-def _painted(
-    own: np.ndarray, seen: np.ndarray, views: np.ndarray, near: _Neighbours, params: Params
-) -> np.ndarray:
-    """(N,) whether the colours of a Gaussian differ by more than light and noise explain.
+def _differs(own: np.ndarray, seen: np.ndarray, near: _Neighbours, params: Params) -> np.ndarray:
+    """(N,) by how much colours differ, where 1 is more than light and noise explain.
 
     Args:
         own: (N, 3) mean differences, two of chroma and one of lightness.
         seen: (N,) which have one.
-        views: (N,) of how many views it is the mean.
     """
     if not seen.any():
-        return seen
-    count = near.sums(seen.astype(np.int32))
-    mean = near.sums(np.where(seen[:, None], own, 0)) / np.maximum(count, 1)[:, None]
-    spread = 1.4826 * np.median(np.abs(mean[seen]), axis=0)
+        return np.zeros(len(own))
+    spread = 1.4826 * np.median(np.abs(own[seen]), axis=0)
     limit = np.maximum([params.min_chroma, params.min_chroma, params.min_lightness], params.colour_spreads * spread)
-    alone = (np.abs(own) > limit).any(1) & (views >= params.min_views)
-    # With those around it: what has no part in the difference does not share it.
-    together = ((np.abs(mean) > limit) & (own * np.sign(mean) > _PART * limit)).any(1) & (count >= 3)
-    out: np.ndarray = alone | together
+    out: np.ndarray = (np.abs(own) / limit).max(1)
     return out
 
 
-def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray) -> None:
+def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray, doubtful: np.ndarray) -> None:
     """What nobody judged goes with those around it that were, where most of these are gone or repainted."""
     votes = np.stack([near.sums((state == s).astype(np.int32)) for s in (SAME, REPAINTED, GONE)])
-    open_ = state < SAME
+    open_ = (state < SAME) | ((state == SAME) & doubtful)
     most = votes.argmax(0)
     sure = (votes.max(0) >= 3) & (2 * votes.max(0) > votes.sum(0))
-    state[open_ & grazed & ~(sure & (most == 0))] = GONE
-    open_ = state < SAME
+    state[(state < SAME) & grazed & ~(sure & (most == 0))] = GONE
     sure &= most > 0
     state[open_ & sure] = np.array([SAME, REPAINTED, GONE], dtype=np.int8)[most[open_ & sure]]

@@ -40,11 +40,11 @@ class Params:
     tolerance_share: float = 0.01
     min_views: int = 2
     min_share: float = 0.6
-    min_chroma: float = 0.05
-    min_lightness: float = 0.15
+    min_chroma: float = 0.06
+    min_lightness: float = 0.2
     colour_spreads: float = 4.0
     cell_m: float = 0.12
-    neighbours: int = 8
+    neighbours: int = 16
 
     def __post_init__(self) -> None:
         for name in ("longest_side_px", "max_views", "min_views", "cell_m", "least_tolerance_m"):

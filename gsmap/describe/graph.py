@@ -12,8 +12,11 @@ from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
 from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
+from gsmap.describe.objects import things
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import object_layer, resolved
+from gsmap.describe.objects.things import Params as ThingParams
+from gsmap.describe.objects.things import find_things
 from gsmap.describe.unit import Params as UnitParams
 from gsmap.describe.unit import estimate_unit_m, landmark_units
 from gsmap.errors import ConfigError
@@ -35,21 +38,25 @@ class Params:
     Args:
         landmarks: whether to make the layers of landmarks.
         objects: whether to make the layer of objects.
+        things: whether to tell which Gaussians are one thing.
         surface: which Gaussians make up the surface.
         gravity: how the vertical is found.
         unit: what the metre is guessed from.
         landmark: how landmarks are found.
         object: how objects are found.
+        thing: how things are told apart.
         few_nodes: a scene none of whose layers has as many nodes gets a note.
     """
 
     landmarks: bool = True
     objects: bool = True
+    things: bool = True
     surface: SurfaceParams = field(default_factory=SurfaceParams)
     gravity: GravityParams = field(default_factory=GravityParams)
     unit: UnitParams = field(default_factory=UnitParams)
     landmark: LandmarkParams = field(default_factory=LandmarkParams)
     object: ObjectParams = field(default_factory=ObjectParams)
+    thing: ThingParams = field(default_factory=ThingParams)
     few_nodes: int = 20
 
 
@@ -62,7 +69,7 @@ def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | N
     params, models = params or Params(), models or {}
     version = {"describe": VERSION}
     settings: dict[str, object] = {
-        "layers": [name for name in ("landmarks", "objects") if getattr(params, name)],
+        "layers": [name for name in ("landmarks", "objects", "things") if getattr(params, name)],
         **{name: plain(getattr(params, name)) for name in ("surface", "gravity", "unit", "few_nodes")},
     }
     backend = ""
@@ -74,6 +81,9 @@ def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | N
         version |= chosen.versions
         settings["object"] = chosen.settings(models)
         backend = chosen.params.render_backend
+    if params.things:
+        version["things"] = things.VERSION
+        settings["thing"] = plain(params.thing)
     return RecipeKey("describe", "graph", version, settings, backend)
 
 
@@ -127,10 +137,15 @@ def describe(
     if params.objects:
         context = SceneContext(cloud, len(gaussians), up, unit_m, models or {})
         layers["objects"], remarks = object_layer(
-            gaussians, cameras, context, params.object, lambda fraction, text: progress(0.6 + 0.4 * fraction, text)
+            gaussians, cameras, context, params.object, lambda fraction, text: progress(0.6 + 0.35 * fraction, text)
         )
         notes += remarks
     if len(cloud) and not any(len(layer) >= params.few_nodes for layer in layers.values()):
         notes.append(f"fewer than {params.few_nodes} nodes in every layer: little colour or shape to hold on to")
+    found = None
+    if params.things:
+        progress(0.95, "things")
+        own_unit = "landmarks" in landmark_units(unit_m, scale_policy, params.unit)
+        found = find_things(gaussians, cloud, up, 1.0 if own_unit else unit_m, params.thing)
     progress(1.0, "described")
-    return SceneGraph(scene_id, layers, up, unit_m, tuple(notes))
+    return SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found)

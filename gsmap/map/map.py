@@ -50,6 +50,7 @@ from gsmap.types.rows import (
     SettingRow,
     SnapshotRow,
     SplitReport,
+    ThinReport,
     TileRow,
     UpdateReport,
 )
@@ -233,9 +234,9 @@ class Map(AbstractContextManager["Map"]):
         Args:
             scenes: only these; and where their graph is damaged it is made again.
         """
-        from gsmap.map.stages.describe import describe
+        from gsmap.map.stages.describe import describe, unthinned
 
-        wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
+        wanted = [self.store.scenes.get(ref) for ref in scenes] or unthinned(self.scenes())
         with at_work(self.store, "describe"):
             keys = describe(self.store, wanted, self.settings, self._progress, verify=bool(scenes))
         return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
@@ -306,7 +307,7 @@ class Map(AbstractContextManager["Map"]):
         Args:
             captured_at: as in `ingest`.
         """
-        from gsmap.map.stages.describe import describe
+        from gsmap.map.stages.describe import describe, unthinned
         from gsmap.map.stages.optimize import solve
         from gsmap.map.stages.register import register
 
@@ -314,7 +315,7 @@ class Map(AbstractContextManager["Map"]):
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
         with at_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-            describe(self.store, self.scenes(), self.settings, self._progress)
+            describe(self.store, unthinned(self.scenes()), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
             while solve(self.store, self.settings, self._progress):
                 # Scenes that now turn out to be neighbours.
@@ -715,7 +716,7 @@ class Map(AbstractContextManager["Map"]):
 
         Args:
             island: those of this component.
-            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of the island, else of component 0.
+            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of that component, else of component 0.
             scenes: those of these names.
         """
         return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))
@@ -744,6 +745,26 @@ class Map(AbstractContextManager["Map"]):
     def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
         """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
         return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
+
+    def thin(
+        self,
+        *,
+        keep_days: float | None = None,
+        budget_bytes: int | None = None,
+        dry_run: bool = False,
+        now: str | None = None,
+    ) -> ThinReport:
+        """``gsmap thin MAP``: keep captures compact that newer ones supersede, the oldest first, and free the rest.
+
+        Args:
+            keep_days: what was captured in so many days before ``now`` stays as it is.
+            budget_bytes: thin no more than it takes for the arrays of living scenes to fit.
+            now: ISO 8601; None for the present.
+        """
+        from gsmap.map.stages.thin import Request, thin
+
+        with at_work(self.store, "thin"):
+            return thin(self.store, Request(keep_days, budget_bytes, dry_run, now), self.settings, self._progress)
 
     def backup(self, target: str | os.PathLike[str], *, verify: bool = False, keep: int | None = None) -> BackupReport:
         """``gsmap backup MAP DEST``: save the map as it is now, while others go on; only what is new is sent.

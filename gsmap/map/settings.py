@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, merge, optimize, register, retrieve
+from gsmap import change, describe, engine, export, merge, optimize, register, retrieve, thin
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.map import visits
@@ -49,6 +49,7 @@ class Settings:
         retrieve: which pairs are tried.
         register: how a pair is registered and judged.
         optimize: how poses are solved.
+        thin: when a capture is kept compact.
         merge: how captures become one.
         export: how tiles are planned and kept.
         visits: which captures are compared for changes.
@@ -61,6 +62,7 @@ class Settings:
     retrieve: retrieve.Params = field(default_factory=retrieve.Params)
     register: register.Params = field(default_factory=register.Params)
     optimize: optimize.Params = field(default_factory=optimize.Params)
+    thin: thin.Params = field(default_factory=thin.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)
     visits: visits.Params = field(default_factory=visits.Params)

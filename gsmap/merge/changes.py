@@ -20,7 +20,9 @@ Prefer = Literal["newest", "best", "both"]
 """Who wins where captures disagree: the ``newest``, whoever saw it ``best``, or nobody, so that ``both`` show."""
 
 _SHOWS = 0.1  # share of a pixel from which on what is disputed shows in it
+_NEAR_M = 0.25  # of what changed, within which shards of it are looked for
 _NEGLIGIBLE_GAIN = 0.01
+_INTRUDES = 0.15  # difference of colour, of [0, 1], by which a picture has become another
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,8 @@ class Settled:
             if len(others):
                 disputed |= _share_of_pixels(others, own, small) > _SHOWS
         # A Gaussian's skirts reach beyond the pixels in which it shows.
-        disputed = compare.grown(disputed, 1)
+        disputed = compare.grown(disputed, int(__import__('os').environ.get('GROW','1')))
+        if __import__('os').environ.get('NOMASK'): disputed[:]=False
         rows = ((np.arange(height) + 0.5) * disputed.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * disputed.shape[1] / width).astype(int)
         out: np.ndarray = disputed[np.ix_(rows, columns)]
@@ -94,6 +97,8 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
             found = compare.compare(looks, joined, params)
             verdict = _verdict(looks, joined, found, prefer)
             keeps[i] &= ~verdict.lost
+            if prefer == "newest":
+                keeps[i] &= ~_intruders(scenes[i].gaussians, keeps[i], joined, found, verdict)
             first = 0
             for one in parts:
                 rows = np.flatnonzero(one.shows)
@@ -154,6 +159,38 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
         bare = (picture.outcome == OTHER_BEFORE) & (dominant >= 0)
         bared += np.bincount(dominant[bare], minlength=count)
     out: np.ndarray = (bared >= 2) & (bared >= 0.2 * shown)
+    return out
+
+
+def _intruders(
+    older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict
+) -> np.ndarray:
+    """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
+
+    A last look at what evidence of single Gaussians leaves: shards at edges, what is smaller than a tolerance.
+    """
+    rows = np.flatnonzero(stays)
+    count = len(newer.gaussians)
+    together = Gaussians.concatenate([newer.gaussians, older[rows]])
+    good, bad = np.zeros(len(rows)), np.zeros(len(rows))
+    for view in newer.views:
+        seen = render(together, view.camera, depth=False)
+        shown = seen.dominant_id[0]
+        theirs = view.opaque & (shown >= count)
+        off = np.abs(np.clip(seen.colour[0][theirs], 0, 1) - view.colour[theirs]).max(1)
+        worse = off > _INTRUDES
+        shown = shown[theirs] - count
+        bad += np.bincount(shown[worse], minlength=len(rows))
+        good += np.bincount(shown[~worse], minlength=len(rows))
+    out = np.zeros(len(older), dtype=bool)
+    out[rows[bad > good]] = True
+    from scipy.spatial import cKDTree
+
+    disputed = np.concatenate([older.means[verdict.lost], newer.gaussians.means[verdict.changed]])
+    at = np.flatnonzero(out)
+    if len(at):
+        reach = cKDTree(disputed).query(older.means[at], distance_upper_bound=_NEAR_M)[0] if len(disputed) else np.full(len(at), np.inf)
+        out[at[np.isinf(reach)]] = False
     return out
 
 

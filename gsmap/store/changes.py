@@ -151,7 +151,11 @@ class Changes:
             group = select(comparisons.c.group_id).where(comparisons.c.number == comparison)
             group_id = connection.execute(group).scalar_one() or ""
             files = manifest(connection, group_id)
-            sizes = {row.id: row.num_gaussians for row in connection.execute(select(scenes))}
+            # Rows of a scene that was thinned since count what it had then.
+            sizes = {
+                row.id: row.num_gaussians if row.thinned is None else row.thinned["num_gaussians"]
+                for row in connection.execute(select(scenes))
+            }
         if not found.whole:
             raise NotFoundError(
                 f"the arrays of comparison {comparison} were pruned: gsmap changes MAP makes those of today's again"

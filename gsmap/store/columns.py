@@ -231,15 +231,28 @@ def poses_by_scene(value: Any) -> bool:
     return isinstance(value, dict) and all(is_digest(scene) and a_pose(pose) for scene, pose in value.items())
 
 
+def a_thinning(value: Any) -> bool:
+    """How a thinned scene is kept beside its arrays."""
+    return (
+        isinstance(value, dict)
+        and isinstance(value.get("at"), str)
+        and isinstance(value.get("num_gaussians"), int)
+        and (value.get("up") is None or a_direction(value["up"]))
+    )
+
+
 def a_graph(value: Any) -> bool:
     """What a graph is beside its arrays."""
     if not isinstance(value, dict) or not isinstance(value.get("layers"), dict):
         return False
-    layers = value["layers"].values()
+    layers, things = value["layers"].values(), value.get("things", {"count": 0, "unit_m": 1.0})
     return (
         (value.get("up") is None or a_direction(value["up"]))
         and _numbers(value.get("unit_m"))
         and texts(value.get("notes"))
+        and isinstance(things, dict)
+        and isinstance(things.get("count"), int)
+        and _numbers(things.get("unit_m"))
         and all(isinstance(x, dict) and isinstance(x.get("count"), int) and an_object(x.get("rest")) for x in layers)
     )
 

@@ -15,14 +15,16 @@ from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish, unname
+from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.matrices import from_array, to_array
 from gsmap.store.scenes import resolve
 from gsmap.store.schema import graphs, scenes
-from gsmap.types import NodeLayer, SceneGraph
+from gsmap.types import NodeLayer, SceneGraph, Things
 from gsmap.types.plain import plain
 
 KIND = "graphs"
+
+_THINGS = ("members", "positions", "extents", "colours")
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,15 @@ class Graphs:
             arrays |= {f"{i}.{part}": value for part, value in parts.items() if isinstance(value, np.ndarray)}
             rest = {part: value for part, value in parts.items() if not isinstance(value, np.ndarray)}
             layers[name] = {"count": len(nodes), "rest": plain(rest)}
-        about = {
+        about: dict[str, Any] = {
             "up": from_array(graph.up),
             "unit_m": float(graph.unit_m),
             "notes": list(graph.notes),
             "layers": layers,
         }
+        if graph.things is not None:
+            arrays |= {f"things.{name}": getattr(graph.things, name) for name in _THINGS}
+            about["things"] = {"count": len(graph.things), "unit_m": float(graph.things.unit_m)}
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
@@ -110,6 +115,7 @@ class Graphs:
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
+            NotFoundError: no such scene, or others dropped and pruned the graph meanwhile.
         """
         with self._catalog.read() as connection:
             query = select(graphs).where(graphs.c.scene == resolve(connection, ref))
@@ -119,14 +125,26 @@ class Graphs:
             if row is None:
                 return None
             files = manifest(connection, row.group_id)
-        arrays = self._arrays.read(KIND, row.group_id, files)
+        with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
+            arrays = self._arrays.read(KIND, row.group_id, files)
         layers = {}
         for i, (name, layer) in enumerate(row.about["layers"].items()):
             own: dict[str, Any] = {
                 part.split(".", 1)[1]: array for part, array in arrays.items() if part.startswith(f"{i}.")
             }
             layers[name] = NodeLayer(**own, **layer["rest"])
-        return SceneGraph(row.scene, layers, to_array(row.about["up"]), row.about["unit_m"], tuple(row.about["notes"]))
+        things = None
+        if (about := row.about.get("things")) is not None:
+            members, positions, extents, colours = (arrays[f"things.{name}"] for name in _THINGS)
+            things = Things(members, positions, extents, colours, about["unit_m"])
+        up = to_array(row.about["up"])
+        return SceneGraph(row.scene, layers, up, row.about["unit_m"], tuple(row.about["notes"]), things)
+
+    def num_bytes(self, ref: str) -> int:
+        """Of the arrays of all graphs of a scene, as they were written."""
+        with self._catalog.read() as connection:
+            made = select(graphs.c.group_id).where(graphs.c.scene == resolve(connection, ref)).distinct()
+            return sum(num_bytes(connection, group) for group in connection.execute(made).scalars())
 
     def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
         """Those of the keys (as digests) that a graph is kept under."""

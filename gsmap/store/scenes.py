@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, insert, select, text, update
+from sqlalchemy import Connection, Row, delete, insert, select, text, update
 
 from gsmap.errors import CorruptError, InputError, NotFoundError, StoreError
 from gsmap.geometry.morton import morton_order
-from gsmap.store import facts
+from gsmap.store import compact, facts
 from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
-from gsmap.store.groups import has_group, manifest, publish
+from gsmap.store.groups import has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.layout import CHUNK_ROWS, Shape
-from gsmap.store.schema import CHUNK_BOXES, scenes
-from gsmap.types import Cameras, Gaussians, Scene
+from gsmap.store.schema import CHUNK_BOXES, graphs, scenes
+from gsmap.types import Cameras, Gaussians, Scene, Thinning
 from gsmap.types.progress import Progress
 
 KIND = "scenes"
@@ -126,7 +126,9 @@ class Scenes:
             publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
             put_boxes(connection, number, boxes)
-            connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))
+            whole = {"group_id": new_id, "num_gaussians": len(gaussians), "thinned": None}
+            connection.execute(update(scenes).where(scenes.c.id == new_id).values(**whole))
+            scene = _with_tags(connection, _find(connection, new_id))
         return scene, True
 
     def list(self, *, removed: bool = False) -> list[Scene]:
@@ -232,14 +234,72 @@ class Scenes:
             files = _manifest(connection, row)
             chunks = None if bounds is None else _touching(connection, row.number, np.asarray(bounds, np.float64))
         rows = None if chunks is None else _ranges(chunks, row.num_gaussians)
-        with self._unless_pruned(row):
-            arrays = self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows, shapes=_shapes(row))
-        out = Gaussians(**arrays)
+        with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+            out = self._read(row, files, rows)
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)
         reach = _SIGMAS * np.exp(out.log_scales.max(1, initial=-np.inf, keepdims=True))
         return out[((out.means >= low - reach) & (out.means <= high + reach)).all(1)]
+
+    def _read(
+        self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None
+    ) -> Gaussians:
+        """The Gaussians in ranges of rows, all where None."""
+        shapes = _shapes(row)
+        if row.thinned is None:
+            read = self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=ranges, shapes=shapes)
+            return Gaussians(**read)
+        by_row = [name for name in compact.shapes(0, 0) if name not in compact.WHOLE]
+        read = self._arrays.read(KIND, row.group_id, files, only=by_row, rows=ranges, shapes=shapes)
+        read |= self._arrays.read(KIND, row.group_id, files, only=compact.WHOLE, shapes=shapes)
+        spans = [(0, row.num_gaussians)] if ranges is None else ranges
+        rows = np.concatenate([np.arange(*span) for span in spans]) if spans else np.zeros(0, dtype=np.int64)
+        return compact.unpack(read, rows)
+
+    def thin(self, ref: str, shown: np.ndarray, *, up: Sequence[float] | None = None) -> Scene:
+        """Keep a living scene compact, and its graphs no longer; durable when it returns.
+
+        What it had before goes with the next prune, unless a branch names it. A scene that is compact already stays.
+
+        Args:
+            shown: (N,) bool, which of its Gaussians to keep, in the order they are read.
+            up: (3,) against gravity in its frame, as its graph said.
+
+        Raises:
+            InputError: another number of Gaussians, or none to keep.
+            NotFoundError: no such scene.
+        """
+        before = self.get(ref)
+        if before.thinning is not None:
+            return before
+        if len(shown) != before.num_gaussians or not shown.any():
+            counts = f"{int(shown.sum())} of {len(shown)} Gaussians"
+            raise InputError(f"cannot keep {counts} of scene {before.name}, which has {before.num_gaussians}")
+        own = self.gaussians(before.id)[shown]
+        content = compact.pack(own) | _camera_arrays(self.cameras(before.id))
+        boxes = chunk_boxes(own, CHUNK_ROWS, sigmas=_SIGMAS)
+        group_id = digest(*content.values(), text=f"compact {before.id}")
+        staging = self._arrays.stage(content)
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+            row = _alive(connection, before.id)
+            if row.thinned is None:
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
+                about = {"at": now(), "num_gaussians": row.num_gaussians, "up": None if up is None else list(up)}
+                values = {"group_id": group_id, "num_gaussians": len(own), "thinned": about}
+                connection.execute(update(scenes).where(scenes.c.id == row.id).values(**values))
+                put_boxes(connection, row.number, boxes)
+                made = graphs.c.scene == row.id
+                old = [row.group_id, *connection.execute(select(graphs.c.group_id).where(made)).scalars()]
+                connection.execute(delete(graphs).where(made))
+                for group in old:
+                    unname(connection, group)
+            return _with_tags(connection, _find(connection, row.id))
+
+    def num_bytes(self, ref: str) -> int:
+        """Of a scene's arrays, as they were written."""
+        with self._catalog.read() as connection:
+            return num_bytes(connection, _find(connection, ref).group_id)
 
     def cameras(self, ref: str) -> Cameras:
         """Read a scene's cameras.
@@ -251,7 +311,7 @@ class Scenes:
             row = _find(connection, ref)
             files = _manifest(connection, row)
         names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
-        with self._unless_pruned(row):
+        with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
             arrays = self._arrays.read(KIND, row.group_id, files, only=names, shapes=_shapes(row))
         pose, intrinsics, sizes, text_bytes = arrays.values()
         try:
@@ -259,20 +319,6 @@ class Scenes:
         except UnicodeDecodeError as error:
             raise CorruptError(f"scene {row.name}: the names of its cameras are no text: ingest it again") from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
-
-    @contextlib.contextmanager
-    def _unless_pruned(self, row: Row[Any]) -> Iterator[None]:
-        """Tell arrays that others reclaimed while they were read from damaged ones."""
-        try:
-            yield
-        except CorruptError:
-            with self._catalog.read() as connection:
-                found = _by_id(connection, row.id)
-            if found is None or found.group_id is None:
-                raise NotFoundError(
-                    f"scene {row.name!r} was removed and its arrays were pruned while they were read"
-                ) from None
-            raise
 
     def remove(self, ref: str) -> Scene:
         """Leave a tombstone: gone from lists and from the next revision, its bytes kept until they are pruned."""
@@ -303,9 +349,7 @@ class Scenes:
             problems = self._arrays.problems(KIND, row.group_id, files)
             if problems:
                 raise CorruptError(f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}")
-            name, number = row.name, 2
-            while name_taken(connection, name):
-                name, number = f"{row.name}-{number}", number + 1
+            name = free_name(connection, row.name)
             back = {"removed_at": None, "ingested_at": now(), "name": name}
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(**back))
             if name != row.name:
@@ -334,19 +378,16 @@ class Scenes:
 
     def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str) -> Scene:
         """The row of a new or returning scene, under a name that is free."""
-        name, number = fields["name"], 2
-        while name_taken(connection, fields["name"]):
-            if not rename:
-                raise InputError(f"another scene is called {name!r}: choose another name, or remove that one first")
-            fields = fields | {"name": f"{name}-{number}"}
-            number += 1
-        fields = fields | {"ingested_at": now(), "removed_at": None}
+        wanted, name = fields["name"], free_name(connection, fields["name"])
+        if name != wanted and not rename:
+            raise InputError(f"another scene is called {wanted!r}: choose another name, or remove that one first")
+        fields = fields | {"name": name, "ingested_at": now(), "removed_at": None}
         before = _by_id(connection, new_id)
         if before is None:
             connection.execute(insert(scenes), fields | {"id": new_id})
         else:
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(**fields))
-        facts.say(connection, new_id, [("name", fields["name"])])
+        facts.say(connection, new_id, [("name", name)])
         if fields["captured_at"] or (before is not None and before.captured_at):
             facts.say(connection, new_id, [("captured_at", fields["captured_at"] or "")], dated_by)
         return _with_tags(connection, _find(connection, new_id))
@@ -386,6 +427,14 @@ def name_taken(connection: Connection, name: str) -> bool:
     """Whether a living scene is called so."""
     same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
     return connection.execute(same).first() is not None
+
+
+def free_name(connection: Connection, wanted: str) -> str:
+    """The name, or ``name-2`` and so on where living scenes have it."""
+    name, number = wanted, 2
+    while name_taken(connection, name):
+        name, number = f"{wanted}-{number}", number + 1
+    return name
 
 
 def _alive(connection: Connection, ref: str) -> Row[Any]:
@@ -440,7 +489,15 @@ def _scene(row: Row[Any], tags: tuple[str, ...]) -> Scene:
         cameras_synthesised=bool(row.cameras_synthesised),
         antialiased=bool(row.antialiased),
         tags=tags,
+        thinning=_thinning(row),
     )
+
+
+def _thinning(row: Row[Any]) -> Thinning | None:
+    if row.thinned is None:
+        return None
+    up = row.thinned["up"]
+    return Thinning(row.thinned["at"], row.thinned["num_gaussians"], None if up is None else tuple(up))
 
 
 def _shapes(row: Row[Any]) -> dict[str, Shape]:
@@ -452,6 +509,10 @@ def _shapes(row: Row[Any]) -> dict[str, Shape]:
         "log_scales": (n, 3),
         "logit_opacities": (n,),
         "sh": (n, (row.sh_degree + 1) ** 2, 3),
+    }
+    if row.thinned is not None:
+        shapes = compact.shapes(n, row.sh_degree)
+    shapes |= {
         "cameras.T_frame_camera": (c, 4, 4),
         "cameras.intrinsics_px": (c, 4),
         "cameras.sizes_px": (c, 2),
@@ -461,10 +522,14 @@ def _shapes(row: Row[Any]) -> dict[str, Shape]:
 
 
 def _to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:
+    return {name: getattr(gaussians, name) for name in _GAUSSIANS} | _camera_arrays(cameras)
+
+
+def _camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
     for name in cameras.names:
         if "\n" in name:
             raise InputError(f"camera name {name!r} has a line break")
-    return {name: getattr(gaussians, name) for name in _GAUSSIANS} | {
+    return {
         "cameras.T_frame_camera": cameras.T_frame_camera,
         "cameras.intrinsics_px": cameras.intrinsics_px,
         "cameras.sizes_px": cameras.sizes_px,

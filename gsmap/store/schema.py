@@ -35,6 +35,7 @@ from gsmap.store.columns import (
     a_graph,
     a_matrix,
     a_pose,
+    a_thinning,
     an_object,
     numbers,
     poses_by_scene,
@@ -43,7 +44,7 @@ from gsmap.store.columns import (
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 
-HEAD = "0004"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0005"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
@@ -117,6 +118,7 @@ scenes = _table(
     Column("notes", Json(texts), nullable=False),
     Column("group_id", Digest, ForeignKey("groups.id")),  # null once pruned
     Column("removed_at", Text),  # the tombstone
+    Column("thinned", Json(a_thinning)),  # of a scene that is kept compact (`gsmap.store.compact`)
     CheckConstraint("scale_policy in ('auto', 'known', 'unknown')", name="scale_policy"),
 )
 Index(

@@ -164,8 +164,7 @@ class Store:
 
     def others(self) -> list[Place]:
         """Where the other catalogs over the same arrays lie: the map, its branches, its tags."""
-        every = (Place(self.home, self.home), *branches.places(self.home))
-        return [place for place in every if place.folder != self.folder]
+        return branches.other_places(self.home, self.folder)
 
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
@@ -290,6 +289,10 @@ class Store:
     def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
         """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
+
+    def reclaim(self) -> integrity.Reclaimed:
+        """Delete arrays and models that no row names, and what crashes left."""
+        return integrity.reclaim(self.catalog, self.arrays)
 
     def close(self) -> None:
         self.leases.close()

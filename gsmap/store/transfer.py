@@ -111,8 +111,9 @@ class Transfer:
         for row in self._rows:
             if row.id in self._forgotten:
                 continue
-            self.bring_group(scene_rows.KIND, row.group_id)
             mine = self.ours.execute(select(scenes).where(scenes.c.id == row.id)).first()
+            if mine is None or mine.group_id in (None, row.group_id) or mine.thinned is not None:
+                self.bring_group(scene_rows.KIND, row.group_id)
             if mine is None:
                 self._add_scene(row)
                 self._join_facts(row.id, arrives=True)
@@ -135,8 +136,12 @@ class Transfer:
         self.counts["known"] += 1
         values: Content = {}
         if mine.group_id is None and row.group_id is not None:
-            values["group_id"] = row.group_id
+            values |= _kept(row)
             self._copy_boxes(row, mine.number)
+        elif mine.thinned is not None and row.group_id is not None and row.thinned is None:
+            values |= _kept(row)
+            self._copy_boxes(row, mine.number)
+            self.notes.append(f"scene {mine.name} is whole again: it was thinned here, and not there")
         returns = mine.removed_at is not None and row.removed_at is None and row.ingested_at > mine.removed_at
         leaves = mine.removed_at is None and row.removed_at is not None and row.removed_at > mine.ingested_at
         if returns:
@@ -201,10 +206,7 @@ class Transfer:
             self.ours.execute(update(scenes).where(scenes.c.id == scene).values(**values))
 
     def _free_name(self, wanted: str) -> str:
-        free, number = wanted, 2
-        while scene_rows.name_taken(self.ours, free):
-            free = f"{wanted}-{number}"
-            number += 1
+        free = scene_rows.free_name(self.ours, wanted)
         if free != wanted:
             self.renamed.append((wanted, free))
         return free
@@ -373,6 +375,11 @@ def _forgotten(connection: Connection) -> set[str]:
 def _content(row: Row[Any]) -> Content:
     """A row without its number, which is each map's own."""
     return {column: value for column, value in row._mapping.items() if column != "number"}
+
+
+def _kept(row: Row[Any]) -> Content:
+    """How a scene's arrays are kept."""
+    return {name: getattr(row, name) for name in ("group_id", "num_gaussians", "thinned")}
 
 
 def _identity(row: Row[Any], *besides: str) -> str:

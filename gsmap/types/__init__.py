@@ -8,8 +8,9 @@ from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
-from gsmap.types.scene_graph import NodeLayer, SceneGraph
+from gsmap.types.scene_graph import NodeLayer, SceneGraph, Things
 from gsmap.types.sim3 import Sim3
+from gsmap.types.thinning import Thinning
 from gsmap.types.tile import Tile
 
 __all__ = [
@@ -35,5 +36,7 @@ __all__ = [
     "SceneGraph",
     "ScenePose",
     "Sim3",
+    "Thinning",
+    "Things",
     "Tile",
 ]

@@ -68,6 +68,48 @@ class NodeLayer:
 
 
 @dataclass(frozen=True, eq=False)
+class Things:
+    """Which Gaussians of a capture are one thing: furniture, lamps, pictures.
+
+    Args:
+        members: (N,) int32 thing of each Gaussian, in the capture's order; -1 for the building and for dust.
+        positions: (M, 3) float64 mean of the members, scene frame and unit.
+        extents: (M, 2, 3) float64 lowest and highest corner around the members, scene frame and unit.
+        colours: (M, 3) float32 median colour, CIE L*a*b* (D65).
+        unit_m: metres per scene unit that they were found under.
+
+    Raises:
+        InputError: arrays that do not fit together.
+    """
+
+    members: np.ndarray
+    positions: np.ndarray
+    extents: np.ndarray
+    colours: np.ndarray
+    unit_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        kinds = {"members": np.int32, "positions": np.float64, "extents": np.float64, "colours": np.float32}
+        for name, dtype in kinds.items():
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=dtype))
+        m = len(self.positions)
+        shapes = {"positions": (m, 3), "extents": (m, 2, 3), "colours": (m, 3), "members": (self.members.size,)}
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise InputError(f"Things.{name} must have shape {shape}, got {array.shape}")
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise InputError(f"Things.{name} holds NaN or infinity")
+        if self.members.size and not (self.members.min() >= -1 and self.members.max() < m):
+            raise InputError(f"Things.members names things outside -1 to {m - 1}")
+        if not (np.isfinite(self.unit_m) and self.unit_m > 0):
+            raise InputError(f"Things.unit_m must be positive, got {self.unit_m}")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True, eq=False)
 class SceneGraph:
     """The nodes of one scene, by layer; edges are implied (fully connected, length = distance of positions).
 
@@ -81,6 +123,7 @@ class SceneGraph:
         up: (3,) unit vector against gravity in the scene frame, or None where it could not be told.
         unit_m: guess of metres per scene unit (good to a factor of about 2); 1 where the scale is known.
         notes: what a person should know (few nodes, no gravity, ...).
+        things: which Gaussians are one thing; None where it was not asked, as in graphs of older releases.
     """
 
     scene_id: str
@@ -88,6 +131,7 @@ class SceneGraph:
     up: np.ndarray | None = None
     unit_m: float = 1.0
     notes: tuple[str, ...] = ()
+    things: Things | None = None
 
     @property
     def num_nodes(self) -> int:

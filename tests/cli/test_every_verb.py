@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer.main
 from cli_rooms import save_changes
+from tiny_encoder import image_encoder
 
 import gsmap
 import gsmap.map
@@ -100,7 +101,7 @@ def gsmap_run(
 ) -> Callable[[str], Any]:
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
-    (tmp_path / "encoder.onnx").write_bytes(_image_encoder())
+    (tmp_path / "encoder.onnx").write_bytes(image_encoder())
     (tmp_path / "remote.gsmap" / "arrays").mkdir(parents=True)
     trust.write(tmp_path / "remote.gsmap", "postgresql+psycopg://me@example.org/site", "0" * 32)
     monkeypatch.setattr("gsmap.view.ViewServer.serve_forever", lambda self: None)
@@ -128,21 +129,6 @@ def _link_captures(captures: Path, folder: Path) -> None:
     (folder / "truth").mkdir(parents=True)
     for path in [*captures.glob("left*"), *captures.glob("truth/left*")]:
         (folder / path.relative_to(captures)).symlink_to(path)
-
-
-def _image_encoder() -> bytes:
-    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
-    from onnx import TensorProto, helper
-
-    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
 def test_no_verb_is_forgotten() -> None:

@@ -35,6 +35,7 @@ LAYERS = [
         "optimize",
         "merge",
         "change",
+        "thin",
         "export",
         "evaluate",
         "view",

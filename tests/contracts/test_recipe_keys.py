@@ -32,6 +32,7 @@ ALTERNATIVES: dict[str, Any] = {
     "describe.object.segmenter": "builtin",
     "describe.object.embedder": "builtin",
     "merge.method": "voxel",
+    "merge.mergers.tto.prefer": "both",
     "describe.object.render_backend": "gsplat",
     "register.proposer": "kiss_matcher",
     "register.fallback_proposer": "graph",
@@ -41,11 +42,19 @@ ALTERNATIVES: dict[str, Any] = {
     "register.polisher": "photometric",
     "register.proposers.graph.kinds": ("landmarks",),
     "register.proposers.graph.consistency.test": "ratio",
-    "merge.mergers.tto.prefer": "both",
 }
 """Another value of a setting that takes only certain words."""
 
-NAMES_NOTHING = ("retrieve.", "visits.", "export.", "evaluate.", "engine.", "merge.method", "describe.object.model_")
+NAMES_NOTHING = (
+    "retrieve.",
+    "visits.",
+    "thin.",
+    "export.",
+    "evaluate.",
+    "engine.",
+    "merge.method",
+    "describe.object.model_",
+)
 """Settings that choose work (which pairs, which tiles, where it runs, when it is given up), and change no result."""
 
 
@@ -209,7 +218,7 @@ def test_a_version_changes_a_key(module: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(found, "VERSION", found.VERSION + 1)
     after = all_keys()
     assert before != after, f"{module} states a VERSION that no key knows"
-    room = {"describe": GRAPH, "register": EDGE, "optimize": POSES}.get(module.split(".")[1], "tile")
+    room = {"describe": GRAPH, "register": EDGE, "optimize": POSES, "change": CHANGES}.get(module.split(".")[1], "tile")
     for old, new in zip(before, after, strict=True):
         changed_kinds = {kind for kind in old if old[kind] != new[kind]}
         upstream = {EDGE: {GRAPH}, POSES: {GRAPH, EDGE}, "tile": {GRAPH, EDGE, POSES}}.get(room, set())

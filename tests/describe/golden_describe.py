@@ -16,6 +16,7 @@ from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import object_layer
 from gsmap.describe.objects.lift import visible
+from gsmap.describe.objects.things import find_things
 from gsmap.describe.objects.views import render_views
 from gsmap.describe.segmenters import builtin as segmenter
 from gsmap.describe.unit import estimate_unit_m
@@ -66,6 +67,12 @@ def _objects() -> dict[str, np.ndarray]:
     return _arrays(object_layer(*room(n=4000), _context(), _FEW)[0])
 
 
+def _things() -> dict[str, np.ndarray]:
+    gaussians, _ = room(n=4000)
+    found = find_things(gaussians, surface_cloud(gaussians), _UP, 1.0)
+    return {name: getattr(found, name) for name in ("members", "positions", "extents", "colours")}
+
+
 def _segmenter() -> dict[str, np.ndarray]:
     gaussians, cameras = room(n=4000)
     cut = segmenter.make(_context(), segmenter.Params())
@@ -95,6 +102,7 @@ CASES: dict[str, Callable[[], dict[str, np.ndarray]]] = {
     "describe": _describe,
     "landmarks": _landmarks,
     "objects": _objects,
+    "things": _things,
     "segmenter.builtin": _segmenter,
     "embedder.builtin": _embedder,
 }

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tiny_encoder import image_encoder
 
 import gsmap.map
 from gsmap import formats
@@ -20,6 +21,7 @@ from gsmap.types import Change, ChangeReport, Gaussians
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
+EXPORT_3DTILES = f"{EXPORT} --format 3dtiles"
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Verb:
         also: lines that are run first, undisturbed and unwatched.
         needs: a package without which there is no such verb.
         then: lines that must work once it has come to its end, the first time and the second.
+        forgets: a text that no file below the folder holds once it has come to its end.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Verb:
     also: tuple[str, ...] = ()
     needs: str = ""
     then: tuple[str, ...] = ()
+    forgets: str = ""
 
     @property
     def possible(self) -> bool:
@@ -64,6 +68,8 @@ BASES = {
         ("ingest MAP IN/c.ply", "edge MAP a:b --pose IN/pose2.txt --sigma 0.1,0.01", "optimize MAP"),
     ),
     "shrunk": ("exported", ("remove MAP b", "optimize MAP")),
+    "removed": ("placed", ("remove MAP b",)),
+    "levelled": ("placed", (EXPORT_3DTILES,)),
     "modelled": ("placed", ("models add MAP clip IN/encoder.onnx --preset unit",)),
     # Everything that prune takes: a removed scene with its graph, revisions, an orphan, what a dead writer left.
     "littered": ("placed", ("remove MAP b", "optimize MAP", "*litter")),
@@ -102,9 +108,15 @@ VERBS = {
         Verb("export", "placed", EXPORT),
         Verb("export-moved", "moved", EXPORT),
         Verb("export-shrunk", "shrunk", EXPORT),
-        Verb("export-3dtiles", "placed", "export MAP OUT --merge union --tile-size 3 --format 3dtiles"),
+        Verb("export-3dtiles", "placed", EXPORT_3DTILES),
         Verb("prune", "littered", "prune MAP --keep-revisions 1"),
         Verb("remove", "placed", "remove MAP b", done_says="no scene is called"),
+        Verb("purge", "exported", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"),
+        Verb(
+            "purge-3dtiles", "levelled", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"
+        ),
+        Verb("restore-scene", "removed", "restore-scene MAP b", done_says="was not removed"),
+        Verb("restore-from", "two", "restore-scene MAP c --from HERE/other.gsmap"),
         Verb("models-add", "placed", "models add MAP clip IN/encoder.onnx --preset unit", needs="onnx"),
         Verb("models-again", "modelled", "models add MAP clip IN/encoder2.onnx --preset unit", needs="onnx"),
         Verb("migrate", "older", "migrate MAP"),
@@ -195,7 +207,7 @@ def write_samples(folder: Path) -> None:
         np.savetxt(folder / f"{name}.txt", pose)
     if importlib.util.find_spec("onnx") is not None:
         for name, window in (("encoder", 16), ("encoder2", 8)):
-            (folder / f"{name}.onnx").write_bytes(_encoder(window))
+            (folder / f"{name}.onnx").write_bytes(image_encoder(window))
 
 
 def capture(seed: int, count: int = 400) -> Gaussians:
@@ -254,23 +266,6 @@ def _frames(name: str) -> list[dict[str, object]]:
         | {"rotation": [[0, 0, way], [-way, 0, 0], [0, -1, 0]], "fx": 20.0, "fy": 20.0}
         for i, way in enumerate((1, -1))
     ]
-
-
-def _encoder(window: int) -> bytes:
-    from onnx import TensorProto, helper
-
-    across = 32 // window
-    pool = helper.make_node(
-        "AveragePool", ["image"], ["pooled"], kernel_shape=[window, window], strides=[window, window]
-    )
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 3 * across * across])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
 FUNCTIONS = {"*litter": litter, "*older": older, "*compared": compared}

@@ -304,6 +304,7 @@ def test_migrating_a_map_migrates_its_branches(store, tmp_path):
             for table in ("change_reviews", "changes", "comparisons", "leases", "backups", "purges"):
                 connection.execute(f"DROP TABLE {table}")
             connection.execute("ALTER TABLE revisions DROP COLUMN origin")
+            connection.execute("ALTER TABLE scenes DROP COLUMN thinned")
             connection.execute("UPDATE alembic_version SET version_num = '0002'")
         connection.close()
         digests.note(place / "map.sqlite")

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.voxels import merge_groups, voxel_labels
-from gsmap import compare
 from gsmap.merge import exposure, references
 from gsmap.merge.changes import Prefer, settle
 from gsmap.merge.exposure import balance_exposure
@@ -192,7 +192,7 @@ def merge(
         return MergeResult(start, origin, notes=tuple(notes))
     # The near half of the halo is fitted along, then dropped: were it frozen, what is at the border would make up for
     # neighbours that are going to be refined too.
-    frozen = ~inside(start.means, bounds, params.halo_m / 2) | changed
+    frozen = ~inside(start.means, bounds, params.halo_m / 2)
     fitted, steps, truncated = _fit(start, frozen, wanted, params, deadline, progress)
     # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
     mine = inside(start.means, bounds)

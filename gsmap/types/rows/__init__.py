@@ -13,6 +13,7 @@ from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.leases import AtWorkRow
+from gsmap.types.rows.life import ThinReport, ThinRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -104,6 +105,8 @@ __all__ = [
     "SnapshotRow",
     "SplitReport",
     "TileRow",
+    "ThinReport",
+    "ThinRow",
     "TodoRow",
     "TrustReport",
     "UpdateReport",

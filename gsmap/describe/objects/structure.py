@@ -1,0 +1,184 @@
+"""The building itself: floor, ceiling and walls, told from what stands in them by geometry alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+_BIN_M = 0.02  # of a histogram of heights: finer than a floor is flat, coarser than a surface is noisy
+_STEP_M = 0.1  # of a histogram along a wall
+_CEILING_M = 1.9  # a horizontal plane lower than this above the floor is a table
+_PATCH_M2 = 0.3  # smaller upright patches say nothing of a wall
+_REACH_M = 0.3  # a wall ends nearer to the ceiling than this
+_HIDDEN_M = 2.5  # what a bookshelf hides of a wall: a plane that goes on behind so much is the same wall
+_FLAT_M = 0.02  # neighbours on one plane lie no farther off it
+_PARALLEL = 0.96  # cosine of neighbours' normals on one plane
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """A stretch of a vertical plane, level frame.
+
+    Args:
+        normal: (2,) horizontal unit normal; which side it points to says nothing.
+        offset_m: of the plane along it.
+        span_m: (low, high) along `along`.
+    """
+
+    normal: np.ndarray
+    offset_m: float
+    span_m: tuple[float, float]
+
+    @property
+    def along(self) -> np.ndarray:
+        """(2,) unit vector along the wall."""
+        return np.array([-self.normal[1], self.normal[0]])
+
+    def inside(self, points: np.ndarray, margin_m: float = _STEP_M) -> np.ndarray:
+        """(N,) which points lie before or behind the stretch."""
+        along = points[:, :2] @ self.along
+        return np.asarray((along > self.span_m[0] - margin_m) & (along < self.span_m[1] + margin_m))
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What was found of the building.
+
+    Args:
+        heights_m: (N,) of the points above the floor.
+        ceiling_m: height of the ceiling, or of the highest points where there is none.
+        has_ceiling: whether a ceiling was seen.
+        walls: stretches of planes that reach up to the ceiling.
+    """
+
+    heights_m: np.ndarray
+    ceiling_m: float
+    has_ceiling: bool
+    walls: tuple[Wall, ...]
+
+
+def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(count,) which nodes edges a-b join."""
+    joined = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(count, count))
+    labels: np.ndarray = connected_components(joined, directed=False)[1]
+    return labels
+
+
+def find_structure(
+    points: np.ndarray, normals: np.ndarray, planarity: np.ndarray, areas: np.ndarray, neighbours: np.ndarray
+) -> Structure:
+    """Floor, ceiling and walls of a place.
+
+    The floor is the lowest large horizontal plane (fitted, for what is up is known to a fraction of a degree only), the
+    ceiling the highest. A wall is an upright patch, grown over neighbours on one plane, that reaches up to the ceiling;
+    its plane is followed along as far as it goes on.
+
+    Args:
+        points: (N, 3) metres, z up.
+        normals: (N, 3) of the surface, sign arbitrary.
+        planarity: (N,) in [0, 1], how flat the neighbourhood is.
+        areas: (N,) square metres that each stands for.
+        neighbours: (N, K) rows of the nearest points, each point itself first.
+    """
+    heights, ceiling, has_ceiling = _heights(points, np.abs(normals[:, 2]) > 0.95, areas)
+    upright = (np.abs(normals[:, 2]) < 0.2) & (planarity > 0.3) & (heights > _FLAT_M) & (heights < ceiling + _REACH_M)
+    a = np.repeat(np.arange(len(points)), neighbours.shape[1] - 1)
+    b = neighbours[:, 1:].ravel()
+    both = upright[a] & upright[b]
+    a, b = a[both], b[both]
+    step = points[a] - points[b]
+    flat = np.abs((normals[a] * normals[b]).sum(1)) > _PARALLEL
+    flat &= (np.abs((step * normals[a]).sum(1)) < _FLAT_M) & (np.abs((step * normals[b]).sum(1)) < _FLAT_M)
+    patch = components(len(points), a[flat], b[flat])
+    size = np.bincount(patch, areas * upright)
+    by_patch = np.argsort(patch, kind="stable")
+    ends = np.cumsum(np.bincount(patch))
+    walls: list[Wall] = []
+    for label in np.argsort(-size, kind="stable"):
+        if size[label] < _PATCH_M2:
+            break
+        rows = by_patch[ends[label] - np.count_nonzero(patch == label) : ends[label]]
+        rows = rows[upright[rows]]
+        if np.quantile(heights[rows], 0.98) < ceiling - _REACH_M:
+            continue
+        if not any(_is_of(wall, points[rows]) for wall in walls):
+            wall = _wall(points, normals, areas, rows)
+            if wall is not None:
+                walls.append(wall)
+    return Structure(heights, ceiling, has_ceiling, tuple(walls))
+
+
+def _heights(points: np.ndarray, flat: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    """Heights above the fitted floor (N,), the ceiling's, and whether there is one."""
+    z = points[:, 2]
+    low = float(z.min())
+    if not flat.any():
+        return z - np.quantile(z, 0.01), float(np.ptp(np.quantile(z, [0.01, 0.99]))), False
+    lying = np.convolve(np.bincount(((z[flat] - low) / _BIN_M).astype(int), areas[flat]), np.ones(3), "same")
+    large = np.flatnonzero(lying > 0.25 * lying.max())
+    first, last = large[0], large[-1]
+    floor = low + _BIN_M * (first + int(np.argmax(lying[first : first + 6])) + 0.5)
+    ceiling = low + _BIN_M * (last - int(np.argmax(lying[max(last - 5, 0) : last + 1][::-1])) + 0.5) - floor
+    heights = z - floor
+    plan = np.column_stack([points[:, :2], np.ones(len(points))])
+    for within in (0.08, 0.03, 0.03):
+        on = flat & (np.abs(heights) < within)
+        if np.count_nonzero(on) < 10:
+            break
+        heights = heights - plan @ np.linalg.lstsq(plan[on], heights[on], rcond=None)[0]
+    if ceiling < _CEILING_M:
+        return heights, float(np.quantile(heights, 0.99)), False
+    return heights, float(ceiling), True
+
+
+def _is_of(wall: Wall, points: np.ndarray) -> bool:
+    off = np.abs(points[:, :2] @ wall.normal - wall.offset_m) < 2 * _FLAT_M
+    return bool((off & wall.inside(points)).mean() > 0.8)
+
+
+def _wall(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, rows: np.ndarray) -> Wall | None:
+    """The plane of a patch, fitted to all that lies on it, and how far it goes on; None where it is a pillar."""
+    patch = points[rows, :2]
+    middle = patch.mean(0)
+    normal = np.linalg.eigh((patch - middle).T @ (patch - middle))[1][:, 0]
+    offset, span = middle @ normal, np.zeros(2)
+    for _ in range(3):
+        along = np.array([-normal[1], normal[0]])
+        span = np.quantile(patch @ along, [0.02, 0.98])
+        at = points[:, :2] @ along
+        near = np.abs(points[:, :2] @ normal - offset) < 1.5 * _FLAT_M
+        on = near & (np.abs(normals[:, :2] @ normal) > 0.9) & (at > span[0] - 0.2) & (at < span[1] + 0.2)
+        if np.count_nonzero(on) < 10:
+            break
+        weight = areas[on]
+        middle = np.average(points[on, :2], axis=0, weights=weight)
+        centred = points[on, :2] - middle
+        fitted = np.linalg.eigh((centred * weight[:, None]).T @ centred)[1][:, 0]
+        normal = fitted * (np.sign(fitted @ normal) or 1.0)
+        offset = middle @ normal
+    if np.ptp(span) < 0.5:
+        return None
+    along = np.array([-normal[1], normal[0]])
+    facing = np.abs(normals[:, :2] @ normal) > 0.8
+    off = points[:, :2] @ normal - offset
+    on = facing & (np.abs(off) < 2 * _FLAT_M)
+    # The wall, not the mean of the wall and what hangs on it.
+    bins, edges = np.histogram(off[on], bins=40, range=(-2 * _FLAT_M, 2 * _FLAT_M), weights=areas[on])
+    peak = int(np.argmax(np.convolve(bins, np.ones(5), "same")))
+    offset += 0.5 * (edges[peak] + edges[peak + 1])
+    steps = np.floor(points[on, :2] @ along / _STEP_M).astype(int)
+    low = steps.min()
+    there = np.flatnonzero(np.bincount(steps - low, areas[on]) > 0.02) + low
+    first, last = np.floor(span / _STEP_M).astype(int)
+    for step in there[there > last]:
+        if step - last > _HIDDEN_M / _STEP_M:
+            break
+        last = step
+    for step in there[there < first][::-1]:
+        if first - step > _HIDDEN_M / _STEP_M:
+            break
+        first = step
+    return Wall(normal, float(offset), (first * _STEP_M, (last + 1) * _STEP_M))
