@@ -107,7 +107,8 @@ class _Drawer:
         assert graph is not None
         self._store = store
         self._S_map_newer = graph.poses[newer].S_map_scene
-        self._scenes = [_placed(store, scene, graph.poses[scene].S_map_scene) for scene in (older, newer)]
+        self._older = _placed(store, older, graph.poses[older].S_map_scene)
+        self._newer = _placed(store, newer, self._S_map_newer)
 
     def draw(self, row: ChangeRow, path: Path) -> None:
         from PIL import Image
@@ -119,7 +120,7 @@ class _Drawer:
         voxels = self._store.changes.load(change.comparison).changes[change.place].voxels
         points = (self._S_map_newer @ comparison.S_frame_newer.inverse()).apply(voxels)
         assert row.box_m is not None
-        Image.fromarray(draw_change(*self._scenes, row.box_m, points)).save(path, format="PNG")
+        Image.fromarray(draw_change(self._older, self._newer, row.box_m, points)).save(path, format="PNG")
 
 
 def _placed(store: Store, scene: str, S: Sim3) -> PlacedScene:
