@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.describe.colour import srgb_to_lab
 from gsmap.describe.objects.structure import Structure, components, find_structure
+from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.directions import level_frame
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import rgb_of_sh0
@@ -236,7 +236,7 @@ class _Surface:
         return foreign
 
     def _hanging(self, free: np.ndarray, distinct: np.ndarray, wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Patches on walls, label (N,) of each point, -1 for none: those that hang there, and all that are of a wall."""
+        """Patches on walls, label (N,) of each point, -1 for none: those that hang, and all that are of a wall."""
         # A trim is thin: by its core a patch is told from it, then the core is given its rim back.
         same = self.near & (wall[self.a] == wall[self.b]) & (wall[self.a] >= 0)
         others = np.bincount(self.a[same], distinct[self.b[same]], minlength=self.count)
