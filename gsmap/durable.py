@@ -7,14 +7,16 @@ without ever following a link that lies in it: such a folder may come from a str
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import shutil
 import stat
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from gsmap.errors import CorruptError
+from gsmap.errors import BusyError, CorruptError
 
 
 def sync_folder(folder: Path) -> None:
@@ -63,6 +65,23 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     finally:
         staged.unlink(missing_ok=True)
     sync_folder(path.parent)
+
+
+def lock_within(handle: int, how: int, patience_s: float, busy: str) -> None:
+    """Lock an open file or folder (``how``: `fcntl.LOCK_EX`, `fcntl.LOCK_SH`); the kernel frees it with the process.
+
+    Raises:
+        BusyError: others kept it for so long; ``busy`` says what they have been doing.
+    """
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(handle, how | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                raise BusyError(f"{busy} for {patience_s:g} s; try again later") from None
+            time.sleep(0.01)
 
 
 # --- below a folder that may come from a stranger ---------------------------------------------------------------------

@@ -5,7 +5,8 @@
 The installed gsmap writes it, through its doors and its store alone, so that an older checkout can run this file, too.
 In it: four tiny scenes, one of them removed; a graph of each; edges that were accepted, refused, measured by hand,
 confirmed, rejected, and adopted again; a prior and an up direction; facts with their history; a model; settings;
-revisions, one of them dropped; an export; and, where this gsmap knows them, a tag and a branch.
+revisions, one of them dropped; an export; and, where this gsmap knows them, changes with a word on one, one comparison
+of a pair superseded by another, a tag and a branch.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from tiny_encoder import image_encoder
 
 import gsmap.map
 from gsmap.map import Map
@@ -70,6 +72,8 @@ def write(path: Path) -> None:
         m.reject("hall:attic", withdraw=True)
         m.add_edge("hall:shed", Sim3(np.eye(3), np.array([4.0, 0, 0])), np.full(7, 0.05), "tape measure")
         m.optimize()
+        if hasattr(m.store, "changes"):  # younger than this script
+            compare(m)
         m.remove("shed")
         m.optimize()
         m.prune(keep_revisions=3)
@@ -133,19 +137,27 @@ def register(m: Map) -> None:
         m.store.registrations.adopt(first)
 
 
-def image_encoder() -> bytes:
-    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
-    from onnx import TensorProto, helper
+def compare(m: Map) -> None:
+    """Changes as a comparison might have found them; the hall and the stairwell are compared twice."""
+    from gsmap.change import recipe_key as change_recipe
+    from gsmap.types import Change, ChangeReport
 
-    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
+    box, rows = np.array([[0.0, 0, 0], [0.5, 0.5, 1]]), np.arange(5, dtype=np.int32)
+    moved = Sim3(np.eye(3), np.array([1.0, 0, 0]))
+    chair = Change("moved", box, box.astype(np.float32), rows, rows[:3], moved, "half", 0.875, {"through": 6.0})
+    wall = Change("recoloured", box + 2, box.astype(np.float32) + 2, rows, rows, confidence=0.5)
+    recipe, placed = change_recipe(m.settings.change), m.pose_graph().poses
+    for older, newer, found in (("hall", "stairwell", (chair, wall)), ("stairwell", "attic", ())) * 2:
+        a, b = (m.store.scenes.get(name).id for name in (older, newer))
+        S_newer_older = placed[b].S_map_scene.inverse() @ placed[a].S_map_scene
+        where = {"S_newer_older": S_newer_older, "S_frame_newer": placed[b].S_map_scene}
+        report = ChangeReport(found, 0.75, np.array([1.0, 1.125, 0.875]), ("it was dark",))
+        if not m.store.changes.current():  # the first one is of another recipe
+            key = change_recipe(type(m.settings.change)(min_confidence=0.125)).of(a, b)
+        else:
+            key = recipe.of(a, b)
+        m.store.changes.save(report, key, older=a, newer=b, **where)
+    m.confirm("c1", "I moved it")
 
 
 def pack(path: Path, out: Path) -> None:

@@ -1,1 +1,13 @@
-"""What changed between two captures of one place."""
+"""What changed between two captures of one place.
+
+``compare(older, newer)`` is pure: two captures in one metric frame in, a report out. What is no change of a thing, other
+light or exposure or what one capture did not see, is not reported as one.
+"""
+
+from __future__ import annotations
+
+from gsmap.change.comparing import VERSION, compare, recipe_key
+from gsmap.change.crops import crops
+from gsmap.change.params import Params
+
+__all__ = ["VERSION", "Params", "compare", "crops", "recipe_key"]

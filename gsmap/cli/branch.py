@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -23,18 +23,25 @@ def command(
 
     Example: `gsmap branch site.gsmap what-if`
     """
+    make_or_list("branch", "branches", map, name, delete, list_all, json)
+
+
+def make_or_list(
+    kind: Literal["branch", "tag"], title: str, map: str, name: str | None, delete: bool, list_all: bool, json: bool
+) -> None:
+    """What `gsmap branch` and `gsmap tag` do; ``title`` heads the table."""
     from gsmap.errors import ConfigError
 
     if (name is None and delete) or (name is not None and list_all):
-        raise ConfigError("name the branch to make or to delete, or give --list alone")
+        raise ConfigError(f"name the {kind} to make or to delete, or give --list alone")
     with opened(map) as m:
         if name is None:
-            rows = m.branches("branch")
+            rows = m.branches(kind)
         elif delete:
-            rows = [m.delete_branch(name, "branch")]
-            say(f"deleted branch {name}; gsmap prune {map} reclaims what only it named")
+            rows = [m.delete_branch(name, kind)]
+            say(f"deleted {kind} {name}; gsmap prune {map} reclaims what only it named")
         else:
-            rows = [m.branch(name)]
-            say(f"made branch {name}: open it as {rows[0].map}")
+            rows = [m.tag(name) if kind == "tag" else m.branch(name)]
+            say(f"made {kind} {name}: open it as {rows[0].map}")
     if name is None or json:
-        print_rows("branch", rows, json, "branches")
+        print_rows(kind, rows, json, title)

@@ -35,6 +35,10 @@ Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="A.B=VALUE", help="Change a setting for this run; `gsmap settings MAP` lists them."),
 ]
+AsOf = Annotated[
+    str | None,
+    typer.Option("--as-of", metavar="DATE", help="Only captures dated at or before this, ISO 8601; of a day, its end."),
+]
 Preset = Annotated[
     str | None, typer.Option("--preset", help="Start from this preset, for this run: `default` or `paper`.")
 ]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import AsJson, AsOf, MapPath, Preset, Sets, opened, print_rows, print_table, say
 
 
 def command(
@@ -34,6 +34,11 @@ def command(
         bool,
         typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
     ] = False,
+    prefer: Annotated[
+        str | None,
+        typer.Option("--prefer", help="Where captures disagree: newest, best (who saw it best) or both; newest else."),
+    ] = None,
+    as_of: AsOf = None,
     wait: Annotated[
         bool, typer.Option("--wait", help="If another export is at work in OUT, wait for it; refused else.")
     ] = False,
@@ -43,7 +48,7 @@ def command(
 ) -> None:
     """Write merged tiles; only what changed since the last export to OUT is computed.
 
-    Example: `gsmap export site.gsmap tiles --format spz --tile-size 5`
+    Example: `gsmap export site.gsmap tiles --format spz --as-of 2024-05-31`
     """
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.export(
@@ -57,8 +62,12 @@ def command(
             steps=steps,
             budget_s=budget,
             provenance=provenance,
+            prefer=prefer,
+            as_of=as_of,
             wait=wait,
         )
+    for note in report.notes:
+        say(note)
     about: dict[str, list[str]] = {}
     for tile in report.tiles:
         for note in tile.notes:

@@ -26,6 +26,14 @@ def command(
     name: Name = None,
     captured_at: CapturedAt = None,
     scale: Scale = "auto",
+    supersedes: Annotated[
+        str | None,
+        typer.Option(
+            "--supersedes",
+            metavar="SCENE",
+            help="The one capture given was trained again of this scene's frames: it takes its place.",
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Add scenes: Gaussians with the cameras found beside them. The same content twice is a no-op that says so.
@@ -33,7 +41,7 @@ def command(
     Example: `gsmap ingest site.gsmap monday.ply tuesday/`
     """
     with opened(map, bars=True) as m:
-        rows = m.ingest(*paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale)
+        rows = m.ingest(*paths, cameras=cameras, name=name, captured_at=captured_at, scale=scale, supersedes=supersedes)
     for row in rows:
         for note in row.notes:
             say(f"{row.scene_name}: {note}")

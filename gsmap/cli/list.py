@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows
+from gsmap.cli.console import AsJson, AsOf, MapPath, opened, print_rows, say
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -41,31 +41,43 @@ def command(
     tag: Annotated[
         str | None, typer.Option("--tag", help="Only scenes with this tag, and edges between such scenes.")
     ] = None,
+    as_of: AsOf = None,
     json: AsJson = False,
 ) -> None:
     """List scenes, edges, revisions or tiles.
 
     Example: `gsmap list site.gsmap edges --status accepted --json`
     """
+    from gsmap.map.dates import undated_note
+
     with opened(map) as m:
-        rows = _rows(m, what, component, status, after, tag)
+        rows = _rows(m, what, component, status, after, tag, as_of)
+        left_out = undated_note(m.scenes(), as_of) if as_of is not None else ""
+    if left_out:
+        say(left_out)
     print_rows(f"list {what}", rows, json, what)
 
 
 def _rows(
-    m: Map, what: What, component: int | None, status: str | None, after: str | None, tag: str | None
+    m: Map,
+    what: What,
+    component: int | None,
+    status: str | None,
+    after: str | None,
+    tag: str | None,
+    as_of: str | None,
 ) -> Sequence[Row]:
     from gsmap.errors import ConfigError
 
     if what is What.scenes:
-        return m.scene_rows(component=component, status=status, after=after, tag=tag)
+        return m.scene_rows(component=component, status=status, after=after, tag=tag, as_of=as_of)
     if what is What.edges:
-        return m.edge_rows(component=component, status=status, after=after, tag=tag)
+        return m.edge_rows(component=component, status=status, after=after, tag=tag, as_of=as_of)
     useless: dict[str, object]
     if what is What.tiles:
-        useless = {"--status": status, "--after": after, "--tag": tag}
+        useless = {"--status": status, "--after": after, "--tag": tag, "--as-of": as_of}
     else:
-        useless = {"--status": status, "--component": component, "--tag": tag}
+        useless = {"--status": status, "--component": component, "--tag": tag, "--as-of": as_of}
     for option, value in useless.items():
         if value is not None:
             raise ConfigError(f"{what} are not chosen by {option}: leave it out")

@@ -1,4 +1,4 @@
-"""gsmap reject: a person's review of an edge."""
+"""gsmap reject: a person's review of an edge or a change."""
 
 from __future__ import annotations
 
@@ -11,18 +11,23 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 def command(
     map: MapPath,
-    pair: Annotated[str, typer.Argument(metavar="A:B", help="The pair, by names or ids.")],
+    what: Annotated[
+        str, typer.Argument(metavar="A:B|CHANGE", help="The pair, by names or ids; or a change, such as c12.")
+    ],
     note: Annotated[str, typer.Option("--note", help="Why, for whoever asks later.")] = "",
     withdraw: Annotated[
-        bool, typer.Option("--withdraw", help="Take back the last review of the pair, or else its own measurement.")
+        bool, typer.Option("--withdraw", help="Take back the last review, or else the pair's own measurement.")
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Rule out an edge, so that it is never used. Kept in history.
+    """Rule out an edge, so that it is never used; or a change that is none. Kept in history.
 
     Example: `gsmap reject site.gsmap monday:tuesday`
     """
+    from gsmap.types.rows import ChangeRow
+
     with opened(map) as m:
-        row = m.reject(pair, note=note, withdraw=withdraw)
-    say(f"noted; run: gsmap optimize {map}")
-    print_rows("reject", row, json)
+        row = m.reject(what, note=note, withdraw=withdraw)
+    is_change = isinstance(row, ChangeRow)
+    say("noted" if is_change else f"noted; run: gsmap optimize {map}")
+    print_rows("reject CHANGE" if is_change else "reject", row, json)

@@ -11,7 +11,7 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, 
 if TYPE_CHECKING:
     from gsmap.map import Map
     from gsmap.types import Sim3
-    from gsmap.types.rows import PairReport, SceneReport
+    from gsmap.types.rows import ChangeDetail, PairReport, SceneReport
 
 _SHOWN = 8  # edges, notes and events shown of many, so that everything fits a screen
 
@@ -20,7 +20,10 @@ def command(
     map: MapPath,
     thing: Annotated[
         str,
-        typer.Argument(metavar="SCENE|A:B", help="A scene, or a pair of scenes; a scene whose name has a colon first."),
+        typer.Argument(
+            metavar="SCENE|A:B|CHANGE",
+            help="A scene, a pair of scenes, or a change such as c12; a scene of that name first.",
+        ),
     ],
     nodes: Annotated[bool, typer.Option("--nodes", help="Also list the nodes of the scene's graph.")] = False,
     picture: Annotated[
@@ -28,35 +31,40 @@ def command(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Show everything known about one scene or one pair.
+    """Show everything known about one scene, one pair or one change.
 
     Example: `gsmap show site.gsmap monday --picture monday.png`
     """
-    from gsmap.types.rows import SceneReport
+    from gsmap.types.rows import ChangeDetail, PairReport, SceneReport
 
     with opened(map) as m:
         report = _report(m, thing)
         if picture:
             m.draw_graph(thing, picture)
             say(f"wrote {picture}")
-    is_scene = isinstance(report, SceneReport)
     if json:
-        print_rows("show SCENE" if is_scene else "show A:B", report, json)
+        kinds = {SceneReport: "show SCENE", PairReport: "show A:B", ChangeDetail: "show CHANGE"}
+        print_rows(kinds[type(report)], report, json)
     elif isinstance(report, SceneReport):
         _print_scene(report, nodes)
+    elif isinstance(report, ChangeDetail):
+        _print_change(report)
     else:
         _print_pair(report)
 
 
-def _report(m: Map, thing: str) -> SceneReport | PairReport:
+def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail:
     from gsmap.errors import NotFoundError
+    from gsmap.map.changes import number_of
 
-    if ":" not in thing:
-        return m.show_scene(thing)
     try:
-        return m.show_scene(thing)  # a name may hold a colon
+        return m.show_scene(thing)  # whose name may hold a colon, or look like that of a change
     except NotFoundError:
-        return m.show_pair(thing)
+        if number_of(thing) is not None:
+            return m.show_change(thing)
+        if ":" in thing:
+            return m.show_pair(thing)
+        raise
 
 
 def _print_scene(scene: SceneReport, nodes: bool) -> None:
@@ -114,6 +122,29 @@ def _print_pair(pair: PairReport) -> None:
     print_facts(pair.pair, facts)
     if pair.history:
         print_table("history", pair.history[0].columns, pair.history[-_SHOWN:])
+
+
+def _print_change(change: ChangeDetail) -> None:
+    facts = {
+        "kind": change.kind,
+        "from": f"{change.older_name}, {change.older_at}",
+        "to": f"{change.newer_name}, {change.newer_at}",
+        "status": change.status,
+        "confidence": change.confidence,
+        "middle": change.at_m,
+        "size": change.size_m,
+        "component": change.component,
+        "moved": _pose(change.S_after_before),
+        "symmetry": change.symmetry if change.S_after_before is not None else None,
+        "Gaussians": f"{change.before} before, {change.after} after",
+        "voxels": change.num_voxels,
+        "evidence": change.evidence,
+        "found": change.compared_at,
+        **{f"note {i}": note for i, note in enumerate(change.notes[:_SHOWN], 1)},
+    }
+    print_facts(change.id, facts)
+    if change.history:
+        print_table("history", change.history[0].columns, change.history[-_SHOWN:])
 
 
 def _pose(pose: Sim3 | None) -> str | None:

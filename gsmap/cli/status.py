@@ -18,7 +18,9 @@ def command(map: MapPath, json: AsJson = False) -> None:
     if report.todo:
         print_table("to do", report.todo[0].columns, report.todo)
     components = f"{report.components} component{'s' * (report.components != 1)}"
-    whole = [row for row in report.at_work if row.what.split(" ")[0] not in ("graph", "edge")]  # and not each job
+    whole = [
+        row for row in report.at_work if row.what.split(" ")[0] not in ("graph", "edge", "comparison")
+    ]  # and not each job
     if whole:
         print_table("at work", whole[0].columns, whole)
     print(

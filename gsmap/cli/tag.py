@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.cli.branch import make_or_list
+from gsmap.cli.console import AsJson, MapPath
 
 
 def command(
@@ -22,18 +23,4 @@ def command(
 
     Example: `gsmap tag site.gsmap handover-2024`
     """
-    from gsmap.errors import ConfigError
-
-    if (name is None and delete) or (name is not None and list_all):
-        raise ConfigError("name the tag to make or to delete, or give --list alone")
-    with opened(map) as m:
-        if name is None:
-            rows = m.branches("tag")
-        elif delete:
-            rows = [m.delete_branch(name, "tag")]
-            say(f"deleted tag {name}; gsmap prune {map} reclaims what only it named")
-        else:
-            rows = [m.tag(name)]
-            say(f"made tag {name}: open it as {rows[0].map}")
-    if name is None or json:
-        print_rows("tag", rows, json, "tags")
+    make_or_list("tag", "tags", map, name, delete, list_all, json)

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from gsmap.durable import make_folder
+from gsmap.durable import make_folder, sync_folder
 from gsmap.errors import BusyError, StoreError
 from gsmap.types.holder import Holder, this_process
 
@@ -51,6 +51,7 @@ def folder_lock(out: Path, *, wait: bool = False, waiting: Callable[[str], None]
         if handle is not None:
             with suppress(OSError):
                 (out / LOCK_FILE).unlink()
+                sync_folder(out)
             os.close(handle)
         if fresh:
             with suppress(OSError):

@@ -11,6 +11,7 @@ import numpy as np
 from gsmap import formats
 from gsmap.errors import ConfigError
 from gsmap.export.plan import Params, PlannedTile
+from gsmap.geometry.boxes import box_corners
 from gsmap.methods import RecipeKey
 from gsmap.types import Tile
 
@@ -91,8 +92,7 @@ def dirty_reason(planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, mo
         return "an older gsmap made it"
     if tile.key != recipe.key(planned):
         return _what_changed(planned, tile, recipe)
-    low, high = planned.bounds
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    corners = box_corners(planned.bounds)
     for scene, pose in planned.poses.items():
         # How far the scene's content at the tile's corners has moved.
         then = tile.poses[scene] @ pose.inverse()

@@ -14,7 +14,15 @@ from threading import Lock
 import numpy as np
 
 from gsmap import formats
-from gsmap.durable import make_folder, refuse_links, remove_empty_folder, remove_file, remove_tree, sync_folder
+from gsmap.durable import (
+    is_folder,
+    make_folder,
+    refuse_links,
+    remove_empty_folder,
+    remove_file,
+    remove_tree,
+    sync_folder,
+)
 from gsmap.errors import CorruptError, GsmapError, of_system
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.plan import Params, PlannedTile
@@ -23,7 +31,7 @@ from gsmap.formats import tiles3d
 from gsmap.types import MergeResult, Tile
 from gsmap.types.progress import Progress, silent
 
-STAGING = ".partial"
+_STAGING = ".partial"
 Make = Callable[[PlannedTile, Progress], MergeResult]
 _At = tuple[int, str]  # component and name of a tile
 
@@ -89,18 +97,16 @@ def export_tiles(
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
-    _remove_leftovers(out)
-    if not todo and not gone and not manifest.doomed and out.exists():
-        return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
-
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     try:
+        if not todo and not gone and not manifest.doomed and out.exists():
+            return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
         make_folder(out)
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
-        remove_tree(out, STAGING)  # it may not be ours, and hold links
-        (out / STAGING).mkdir()
+        remove_tree(out, _STAGING)  # it may not be ours, and hold links
+        (out / _STAGING).mkdir()
         work = _finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers, report.give_up)
         with closing(work) as finished:
             for at, tile, num_bytes in finished:
@@ -126,7 +132,9 @@ def export_tiles(
             ) from error
         raise
     finally:
-        _remove_leftovers(out)
+        for left in leftovers(out):
+            with suppress(OSError, CorruptError):
+                remove_tree(out, *left)
     tiles = [manifest.tiles[at] for at in sorted(planned)]
     return ExportResult(tiles, len(todo), reused, len(gone), manifest.notes + _told(news))
 
@@ -145,7 +153,7 @@ def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, repor
     path, digest, num_bytes = "", "", 0
     if len(content.gaussians):
         path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
-        staged = out / STAGING / path.replace("/", "_")
+        staged = out / _STAGING / path.replace("/", "_")
         try:
             _write(staged, content, recipe)
         except GsmapError as error:
@@ -194,16 +202,18 @@ def _remove_doomed(out: Path, manifest: Manifest) -> None:
     for path in doomed:
         remove_file(out, *path.split("/"))
         remove_empty_folder(out, path.split("/")[0])
+    for folder in {path.split("/")[0] for path in doomed}:
+        if is_folder(out / folder):
+            sync_folder(out / folder)  # or they are back when the power was gone, and named by nothing
     if manifest.doomed:
         manifest.doomed = set()
         manifest.save(out)
 
 
-def _remove_leftovers(out: Path) -> None:
-    """Delete what an export that was killed had begun to write."""
-    for path in [out / STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
-        with suppress(OSError, CorruptError):
-            remove_tree(out, *path.relative_to(out).parts)
+def leftovers(out: Path) -> list[tuple[str, ...]]:
+    """Where in its folder an export that was killed had begun to write."""
+    found = [*out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]
+    return [(_STAGING,), *(path.relative_to(out).parts for path in found)]
 
 
 def _told(news: dict[_At, Tile]) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from gsmap.evaluate.renders import compare_renders, find_images
 from gsmap.export import manifest, tileset
 from gsmap.export.manifest import Manifest
 from gsmap.formats import tiles3d
+from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.store import Store
@@ -168,7 +169,7 @@ def _union_of(store: Store, scenes: list[Scene]) -> Callable[[Scene], tuple[Gaus
 
 def _map_box(bounds: np.ndarray, pose: ScenePose) -> np.ndarray:
     """(2, 3) box of a scene in the map."""
-    corners = pose.S_map_scene.apply(np.stack(np.meshgrid(*bounds.T), axis=-1).reshape(-1, 3))
+    corners = pose.S_map_scene.apply(box_corners(bounds))
     return np.stack([corners.min(0), corners.max(0)])
 
 

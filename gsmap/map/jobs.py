@@ -1,4 +1,4 @@
-"""What a worker runs: one scene described, one pair registered. Each opens the map for reading and returns types."""
+"""What a worker runs: a scene described, a pair registered or compared. Each opens the map to read, returns types."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import os
 from collections.abc import Mapping
 from functools import lru_cache
 
+from gsmap import change as changing
 from gsmap import describe as describing
 from gsmap import register as registering
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.register import SceneView
 from gsmap.store import Store, branches, sqlite
-from gsmap.types import Registration, SceneGraph
+from gsmap.types import ChangeReport, PlacedScene, Registration, SceneGraph, Sim3
 from gsmap.types.model import ModelSpec
 
 
@@ -58,3 +60,18 @@ def register_scenes(
 ) -> Registration:
     """The registration of one pair of the map at ``path``; target and source are (scene id, key of its graph)."""
     return registering.register_pair(_view(path, *target), _view(path, *source), params)
+
+
+def compare_scenes(
+    path: str, older: tuple[str, Sim3, str], newer: tuple[str, Sim3, str], params: changing.Params
+) -> ChangeReport:
+    """What changed between two scenes of the map at ``path``; each is (scene id, S_map_scene, captured at)."""
+    return changing.compare(_placed(path, *older), _placed(path, *newer), params)
+
+
+def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> PlacedScene:
+    scenes = _store(path).scenes
+    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    return PlacedScene(
+        transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene), scene_id, captured_at
+    )

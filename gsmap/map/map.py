@@ -24,6 +24,9 @@ from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
     BackupReport,
     BranchRow,
+    ChangeDetail,
+    ChangeRow,
+    ChangesReport,
     CheckReport,
     CloneReport,
     EdgeRow,
@@ -47,6 +50,7 @@ from gsmap.types.rows import (
     SettingRow,
     SnapshotRow,
     SplitReport,
+    ThinReport,
     TileRow,
     UpdateReport,
 )
@@ -190,6 +194,7 @@ class Map(AbstractContextManager["Map"]):
         name: str | None = None,
         captured_at: str | None = None,
         scale: str = "auto",
+        supersedes: str | None = None,
     ) -> list[IngestRow]:
         """Add captures: those found at files and folders, or one in memory. Each is checked whole before it is written.
 
@@ -199,21 +204,28 @@ class Map(AbstractContextManager["Map"]):
             captured_at: of every capture given, ISO 8601; UTC where it has no zone. Else each is dated by what lies
                 beside it: a sidecar, the EXIF of its frames, or its name (`gsmap.ingest.find_date`).
             scale: ``known`` (metres), ``unknown`` (any unit) or ``auto`` (registration finds out).
+            supersedes: the one capture given was trained again of the frames of this scene, in its frame of
+                coordinates: it takes the scene's place, with its pose, what was said of it, and its edges, which are
+                checked and not searched again.
 
         Raises:
             NotFoundError, InputError, ConfigError: see `gsmap.ingest`; captures before the bad one are in the map.
+            InputError: a capture that does not lie where the scene that it supersedes lies; nothing is changed.
         """
-        from gsmap.map.stages.ingest import ingest
+        from gsmap.map.stages.ingest import ingest, readers
+        from gsmap.map.stages.supersede import supersede
 
-        added = ingest(
-            self.store,
-            captures,
-            cameras=cameras,
-            name=name,
-            captured_at=captured_at,
-            scale=scale,
-            progress=self._progress,
-        )
+        options: dict[str, Any] = {"cameras": cameras, "name": name, "captured_at": captured_at, "scale": scale}
+        if supersedes is not None:
+            found = readers(captures, **options)
+            if len(found) != 1:
+                raise ConfigError(f"one capture takes the place of {supersedes}, {len(found)} were found: name one")
+            with at_work(self.store, "ingest"):
+                capture = found[0][1]()
+                done = supersede(self.store, capture, supersedes, self.settings, self._progress, named=name is not None)
+            return [reports.ingest_row(done.scene, new=True, dated=False, notes=(*capture.notes, *done.notes))]
+
+        added = ingest(self.store, captures, progress=self._progress, **options)
         return [reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added]
 
     def describe(self, *scenes: str) -> list[GraphRow]:
@@ -222,9 +234,9 @@ class Map(AbstractContextManager["Map"]):
         Args:
             scenes: only these; and where their graph is damaged it is made again.
         """
-        from gsmap.map.stages.describe import describe
+        from gsmap.map.stages.describe import describe, unthinned
 
-        wanted = [self.store.scenes.get(ref) for ref in scenes] or self.scenes()
+        wanted = [self.store.scenes.get(ref) for ref in scenes] or unthinned(self.scenes())
         with at_work(self.store, "describe"):
             keys = describe(self.store, wanted, self.settings, self._progress, verify=bool(scenes))
         return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
@@ -254,16 +266,25 @@ class Map(AbstractContextManager["Map"]):
         add_edge(self.store, a, b, S_target_source, sigmas, note)
         return reports.edge_row(self.store, a, b)
 
-    def confirm(self, pair: str, note: str = "", *, withdraw: bool = False) -> EdgeRow:
-        """Vouch for the edge of a pair ``A:B``: it is used whatever the votes say. ``withdraw`` takes a review back."""
-        return self._review(pair, "withdraw" if withdraw else "confirm", note)
+    def confirm(self, what: str, note: str = "", *, withdraw: bool = False) -> EdgeRow | ChangeRow:
+        """Vouch for the edge of a pair ``A:B``: it is used whatever the votes say; or for a change (``c12``).
 
-    def reject(self, pair: str, note: str = "", *, withdraw: bool = False) -> EdgeRow:
-        """Rule out the edge of a pair ``A:B``. ``withdraw`` takes a review back."""
-        return self._review(pair, "withdraw" if withdraw else "reject", note)
+        Args:
+            withdraw: take the last review back.
+        """
+        return self._review(what, "withdraw" if withdraw else "confirm", note)
 
-    def _review(self, pair: str, review: str, note: str) -> EdgeRow:
-        a, b = self._pair(pair)
+    def reject(self, what: str, note: str = "", *, withdraw: bool = False) -> EdgeRow | ChangeRow:
+        """Rule out the edge of a pair ``A:B``, or a change (``c12``) that is none; see `confirm`."""
+        return self._review(what, "withdraw" if withdraw else "reject", note)
+
+    def _review(self, what: str, review: str, note: str) -> EdgeRow | ChangeRow:
+        from gsmap.map import changes
+
+        if (number := changes.number_of(what)) is not None:
+            self.store.changes.review(number, review, note)
+            return changes.change_row(self.store, number)
+        a, b = self._pair(what)
         self.store.registrations.review(a.id, b.id, review, note)
         return reports.edge_row(self.store, a, b)
 
@@ -286,7 +307,7 @@ class Map(AbstractContextManager["Map"]):
         Args:
             captured_at: as in `ingest`.
         """
-        from gsmap.map.stages.describe import describe
+        from gsmap.map.stages.describe import describe, unthinned
         from gsmap.map.stages.optimize import solve
         from gsmap.map.stages.register import register
 
@@ -294,7 +315,7 @@ class Map(AbstractContextManager["Map"]):
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
         with at_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-            describe(self.store, self.scenes(), self.settings, self._progress)
+            describe(self.store, unthinned(self.scenes()), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
             while solve(self.store, self.settings, self._progress):
                 # Scenes that now turn out to be neighbours.
@@ -317,6 +338,64 @@ class Map(AbstractContextManager["Map"]):
         """Take back what was told of where a scene lies."""
         self.store.priors.remove(scene)
 
+    # --- changes -----------------------------------------------------------------------------------------------------
+
+    def changes(
+        self,
+        pair: str | None = None,
+        *,
+        since: str | None = None,
+        between: Sequence[str] | None = None,
+        as_of: str | None = None,
+        min_confidence: float = 0.0,
+        pictures: str | os.PathLike[str] | None = None,
+    ) -> ChangesReport:
+        """What changed from each capture to those that were taken of the same places just before it.
+
+        What has not been compared under these settings and at these poses is compared first, unless the map is open for
+        reading only.
+
+        Args:
+            pair: only the two captures of ``A:B``; damaged arrays of theirs are made again.
+            since: only where the newer capture is dated after this, ISO 8601.
+            between: two dates: only where the newer capture is dated after the first, at or before the second.
+            as_of: only where it is dated at or before this.
+            min_confidence: only changes that are at least as sure.
+            pictures: a folder to draw each change in, before and after; an empty or new one, or one of this map.
+
+        Raises:
+            NotFoundError: the map has no poses yet, or no such scene.
+            InputError: of the two captures that are named, nobody knows which is newer.
+        """
+        from gsmap.map.changes import changes_report, within
+        from gsmap.map.stages.change import compare, wanted
+
+        asked = wanted(self.store, self.settings, None if pair is None else self._pair(pair))
+        asked = within(asked, since, between, as_of)
+        if self.store.catalog.writable:
+            with at_work(self.store, "changes"):
+                compare(self.store, asked, self.settings, self._progress, verify=pair is not None)
+        report = changes_report(self.store, self.settings, asked, min_confidence=min_confidence)
+        if pictures is None:
+            return report
+        from gsmap.map.pictures import draw
+
+        files = draw(self.store, Path(pictures), report.changes, self._progress)
+        return replace(report, changes=tuple(replace(row, picture=files.get(row.id)) for row in report.changes))
+
+    def show_change(self, name: str) -> ChangeDetail:
+        """``gsmap show MAP c12``: everything known of one change.
+
+        Raises:
+            NotFoundError: no change is called so, or it is no longer found.
+        """
+        from gsmap.map import changes
+
+        number = changes.number_of(name)
+        if number is None:
+            raise NotFoundError(f"no change is called {name!r}: they are called c1, c2, ... (gsmap changes MAP)")
+        return changes.change_detail(self.store, number)
+
     # --- export ------------------------------------------------------------------------------------------------------
 
     def export(
@@ -332,6 +411,8 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        prefer: str | None = None,
+        as_of: str | None = None,
         wait: bool = False,
     ) -> ExportReport:
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
@@ -347,6 +428,10 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            prefer: whom to believe where captures disagree: ``newest``, ``best`` (whoever saw it best) or ``both``; by
+                default what the merger's settings say.
+            as_of: only captures dated at or before this (ISO 8601; of a day, its end) take part, those without a date
+                left out; poses are those of the revision all the same.
             wait: where another export is at work in the folder, until it has ended.
 
         Raises:
@@ -365,13 +450,15 @@ class Map(AbstractContextManager["Map"]):
             steps=steps,
             budget_s=budget_s,
             provenance=provenance,
+            prefer=prefer,
+            as_of=as_of,
         )
 
         def progress(fraction: float, text: str) -> None:
             self._progress("export", fraction, text)
 
-        made = export(self.store, Path(out), request, self.settings, progress, wait=wait)
-        return reports.export_report(self.store, Path(out), made)
+        made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait)
+        return reports.export_report(self.store, Path(out), made, notes)
 
     # --- look --------------------------------------------------------------------------------------------------------
 
@@ -409,9 +496,11 @@ class Map(AbstractContextManager["Map"]):
         status: str | None = None,
         after: str | None = None,
         tag: str | None = None,
+        as_of: str | None = None,
     ) -> list[SceneRow]:
-        """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date, or with a tag."""
-        return reports.scene_rows(self.store, component=component, status=status, after=after, tag=tag)
+        """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date or at or before
+        one, or with a tag."""
+        return reports.scene_rows(self.store, component=component, status=status, after=after, tag=tag, as_of=as_of)
 
     def edge_rows(
         self,
@@ -420,9 +509,10 @@ class Map(AbstractContextManager["Map"]):
         status: str | None = None,
         after: str | None = None,
         tag: str | None = None,
+        as_of: str | None = None,
     ) -> list[EdgeRow]:
         """``gsmap list MAP edges``: all, or those of one status, registered after a date, between scenes as asked."""
-        return reports.edge_rows(self.store, component=component, status=status, after=after, tag=tag)
+        return reports.edge_rows(self.store, component=component, status=status, after=after, tag=tag, as_of=as_of)
 
     def revision_rows(self) -> list[RevisionRow]:
         """``gsmap list MAP revisions``."""
@@ -626,7 +716,7 @@ class Map(AbstractContextManager["Map"]):
 
         Args:
             island: those of this component.
-            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of the island, else of component 0.
+            box: ``x0 y0 z0 x1 y1 z1``, those that reach into it, in the frame of that component, else of component 0.
             scenes: those of these names.
         """
         return as_values.split(self.store, out, as_values.chosen(self.store, island, box, scenes))
@@ -655,6 +745,26 @@ class Map(AbstractContextManager["Map"]):
     def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
         """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
         return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
+
+    def thin(
+        self,
+        *,
+        keep_days: float | None = None,
+        budget_bytes: int | None = None,
+        dry_run: bool = False,
+        now: str | None = None,
+    ) -> ThinReport:
+        """``gsmap thin MAP``: keep captures compact that newer ones supersede, the oldest first, and free the rest.
+
+        Args:
+            keep_days: what was captured in so many days before ``now`` stays as it is.
+            budget_bytes: thin no more than it takes for the arrays of living scenes to fit.
+            now: ISO 8601; None for the present.
+        """
+        from gsmap.map.stages.thin import Request, thin
+
+        with at_work(self.store, "thin"):
+            return thin(self.store, Request(keep_days, budget_bytes, dry_run, now), self.settings, self._progress)
 
     def backup(self, target: str | os.PathLike[str], *, verify: bool = False, keep: int | None = None) -> BackupReport:
         """``gsmap backup MAP DEST``: save the map as it is now, while others go on; only what is new is sent.

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import describe, engine, export, merge, optimize, register, retrieve
+from gsmap import change, describe, engine, export, merge, optimize, register, retrieve, thin
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
+from gsmap.map import visits
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
 
@@ -33,7 +34,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "merge.mergers.tto.ssim_weight": 0.0,
         "merge.mergers.tto.min_weight": 0.0,
         "merge.mergers.tto.keep": 1.0,
-        "merge.mergers.tto.newer_wins": False,
+        "merge.mergers.tto.prefer": "both",
     },
 }
 """Settings by the name of a preset; what a preset does not name has its default."""
@@ -48,8 +49,11 @@ class Settings:
         retrieve: which pairs are tried.
         register: how a pair is registered and judged.
         optimize: how poses are solved.
+        thin: when a capture is kept compact.
         merge: how captures become one.
         export: how tiles are planned and kept.
+        visits: which captures are compared for changes.
+        change: how changes between two captures are found.
         evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
@@ -58,8 +62,11 @@ class Settings:
     retrieve: retrieve.Params = field(default_factory=retrieve.Params)
     register: register.Params = field(default_factory=register.Params)
     optimize: optimize.Params = field(default_factory=optimize.Params)
+    thin: thin.Params = field(default_factory=thin.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)
+    visits: visits.Params = field(default_factory=visits.Params)
+    change: change.Params = field(default_factory=change.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 

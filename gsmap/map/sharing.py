@@ -29,7 +29,7 @@ class SharedJobs:
     Args:
         store: of the map.
         stage: the verb, for others to read, and for the progress.
-        kind: ``graph`` or ``edge``; a job is leased as ``KIND KEY``.
+        kind: ``graph``, ``edge`` or ``comparison``; a job is leased as ``KIND KEY``.
         jobs: the arguments of each by the key (digest) of its result, the most wanted first.
         done: tells from the catalog of which keys the results are there, whoever made them.
         progress: told what is done, and, once for each, whose work is waited for.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Sequence
 
+from gsmap.map.changes import num_open
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
-from gsmap.map.stages.describe import graph_keys, without_graph
+from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
 from gsmap.map.stages.export import dirty_tiles
 from gsmap.map.stages.optimize import pose_inputs
 from gsmap.map.stages.register import stale
@@ -29,7 +30,8 @@ def status(store: Store, settings: Settings) -> MapStatus:
         if count:
             todo.append(TodoRow(what=what, count=count, verb=verb, meaning=meaning))
 
-    keys = graph_keys(store, scenes, settings)
+    keys = graph_keys(store, unthinned(scenes), settings)
+    living = {scene.id for scene in scenes}
     current = store.registrations.current()
     lacking = without_graph(store, keys)
     bare = set(lacking) - {stored.scene for stored in store.graphs.list()}
@@ -54,12 +56,13 @@ def status(store: Store, settings: Settings) -> MapStatus:
     for target, (count, request) in dirty_tiles(store, settings).items():
         verb = " ".join(["gsmap export", at, shlex.quote(target), *request.options()])
         add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
-    poses = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in keys]
+    poses = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in living]
     tentative = [pose for pose in poses if pose.status == "tentative"]
     add("tentative", len(tentative), f"gsmap list {at} scenes --status tentative", "scenes on edges no cycle confirms")
-    undecided = [pair for pair in (graph.undecided if graph else ()) if set(pair) <= set(keys)]
+    undecided = [pair for pair in (graph.undecided if graph else ()) if set(pair) <= living]
     add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
-    outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in keys]
+    add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
+    outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes that nothing ties to others")

@@ -11,6 +11,7 @@ import numpy as np
 
 from gsmap.durable import sync_folder, write_text_whole
 from gsmap.errors import ConfigError, NotFoundError, StoreError
+from gsmap.geometry.boxes import box_corners
 from gsmap.settings import FILE_NAME
 from gsmap.store import Store, merging, staging
 from gsmap.store.branches import Branch
@@ -49,6 +50,8 @@ def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
         num_facts=merged.facts,
         num_priors=merged.priors,
         num_models=merged.models,
+        num_comparisons=merged.comparisons,
+        num_change_reviews=merged.change_reviews,
         num_revisions=merged.revisions,
         renamed=dict(merged.renamed),
         revision=merged.revision,
@@ -90,7 +93,7 @@ def chosen(store: Store, island: int | None, box: Sequence[float] | None, scenes
         NotFoundError: there are none.
     """
     if (scenes is None) == (island is None and box is None) or (scenes is not None and not scenes):
-        raise ConfigError("say which scenes: those of an island, those in a box, or their names")
+        raise ConfigError("say which scenes: those of a component, those in a box, or their names")
     if scenes is not None:
         return list(dict.fromkeys(store.scenes.get(ref).id for ref in scenes))
     graph, living = store.revisions.get(), {scene.id: scene for scene in store.scenes.list()}
@@ -98,12 +101,12 @@ def chosen(store: Store, island: int | None, box: Sequence[float] | None, scenes
     inside = [pose for pose in placed if pose.component == (0 if island is None else island)]
     if box is not None:
         low, high = np.reshape(np.asarray(box, dtype=np.float64), (2, 3))
-        corners = {pose.scene: pose.S_map_scene.apply(_corners(living[pose.scene])) for pose in inside}
+        corners = {pose.scene: pose.S_map_scene.apply(box_corners(living[pose.scene].bounds)) for pose in inside}
         touching = {s for s, at in corners.items() if (at.min(0) <= high).all() and (at.max(0) >= low).all()}
         inside = [pose for pose in inside if pose.scene in touching]
     if not inside:
         known = sorted({pose.component for pose in placed})
-        raise NotFoundError(f"no placed scene of {store.location} lies there: its islands are {known}")
+        raise NotFoundError(f"no placed scene of {store.location} lies there: its components are {known}")
     return [pose.scene for pose in inside]
 
 
@@ -145,7 +148,3 @@ def purge_report(purged: Sequence[tuple[str, Purge]]) -> PurgeReport:
         linked_files=max(one.receipt["linked_files"] for _, one in purged),
         mentions=every("mentions"),
     )
-
-
-def _corners(scene: Scene) -> np.ndarray:
-    return np.array(np.meshgrid(*np.asarray(scene.bounds).T)).reshape(3, -1).T

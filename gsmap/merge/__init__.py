@@ -37,6 +37,7 @@ __all__ = [
     "reach_m",
     "recipe_key",
     "uses_dates",
+    "with_prefer",
     "with_steps",
 ]
 
@@ -121,6 +122,24 @@ def with_steps(method: str, params: Any, steps: int) -> Any:
     if steps < 0:
         raise ConfigError(f"steps must not be negative, got {steps}")
     return replace(params, **{name: steps})
+
+
+PREFERENCES = ("newest", "best", "both")
+
+
+def with_prefer(method: str, params: Any, prefer: str) -> Any:
+    """The params with whom to believe where captures disagree: the newest, whoever saw it best, or both.
+
+    Raises:
+        ConfigError: another word, or a method that weighs no dates.
+    """
+    params = checked_params(method, params)
+    if prefer not in PREFERENCES:
+        raise ConfigError(f"prefer is one of {', '.join(PREFERENCES)}, got {prefer!r}")
+    if hasattr(params, "prefer"):
+        return replace(params, prefer=prefer)
+    takes = [other for other in methods() if hasattr(merger(other).Params(), "prefer")]
+    raise ConfigError(f"merge method {method!r} prefers nobody: leave --prefer out, or use {' or '.join(takes)}")
 
 
 def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:

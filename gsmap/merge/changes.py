@@ -1,120 +1,226 @@
-"""Where captures disagree because the place changed, the newer one wins."""
+"""Where captures disagree because the place changed: who is right, and whose pictures count there."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from typing import Literal
 
 import numpy as np
 
-from gsmap.geometry.projection import in_image, project
+from gsmap import compare
+from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, UNSEEN, Comparison, Looks
+from gsmap.merge.exposure import apply_gain
 from gsmap.merge.placed import overlapping
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
+Prefer = Literal["newest", "best", "both"]
+"""Who wins where captures disagree: the ``newest``, whoever saw it ``best``, or nobody, so that ``both`` show."""
 
-@dataclass(frozen=True)
-class Params:
-    """What counts as evidence that a later capture looked through a place.
+_SHOWS = 0.1  # share of a pixel from which on what is disputed shows in it
+_NEAR_M = 0.25  # of what changed, within which shards of it are looked for
+_NEGLIGIBLE_GAIN = 0.01
+_INTRUDES = 0.15  # difference of colour, of [0, 1], by which a picture has become another
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """Captures after those that disagree have been told apart.
 
     Args:
-        longest_side_px: size of the later capture's views that are rendered.
-        gap_m: a thing must be this far in front of the surface that the later capture shows to be gone, and
-        gap_share: this share of the surface's depth more.
-        min_opacity: alpha from which on a pixel shows a surface.
-        min_views: views of the later capture that must agree.
-        min_share: of the views that could see it, these must look through it.
-        nearest_m: what is nearer to a camera than this is not judged by it.
+        scenes: without the Gaussians that are overruled, in the order they were given.
+        lost: how many Gaussians each lost.
+        changed: per scene (N,) bool, the Gaussians that stand where another capture was overruled: nothing of an older
+            capture is left there to share the work with, so they stay as they are.
+        rivals: per scene, what stands now where it is overruled; empty where it is not.
+        losers: per scene, the Gaussians it lost.
     """
 
-    longest_side_px: int = 240
-    gap_m: float = 0.1
-    gap_share: float = 0.03
-    min_opacity: float = 0.9
-    min_views: int = 3
-    min_share: float = 0.6
-    nearest_m: float = 0.2
+    scenes: list[PlacedScene]
+    lost: list[int]
+    changed: list[np.ndarray]
+    rivals: list[Gaussians]
+    losers: list[Gaussians]
 
+    def overruled_pixels(self, scene: int, camera: Cameras, longest_side_px: int = 240) -> np.ndarray:
+        """(H, W) bool, where a picture of a scene from a camera (1) shows what is not so, or does not show what is."""
+        own, losers, rivals = self.scenes[scene].gaussians, self.losers[scene], self.rivals[scene]
+        width, height = (int(v) for v in camera.sizes_px[0])
+        if not len(losers) and not len(rivals):
+            return np.zeros((height, width), dtype=bool)
+        small = camera.resized(longest_side_px)
+        disputed = np.zeros((int(small.sizes_px[0, 1]), int(small.sizes_px[0, 0])), dtype=bool)
+        for others in (losers, rivals):
+            if len(others):
+                disputed |= _share_of_pixels(others, own, small) > _SHOWS
+        # A Gaussian's skirts reach beyond the pixels in which it shows.
+        disputed = compare.grown(disputed, int(__import__('os').environ.get('GROW','1')))
+        if __import__('os').environ.get('NOMASK'): disputed[:]=False
+        rows = ((np.arange(height) + 0.5) * disputed.shape[0] / height).astype(int)
+        columns = ((np.arange(width) + 0.5) * disputed.shape[1] / width).astype(int)
+        out: np.ndarray = disputed[np.ix_(rows, columns)]
+        return out
 
-def remove_disappeared(
-    scenes: Sequence[PlacedScene], params: Params | None = None
-) -> tuple[list[PlacedScene], list[int]]:
-    """The scenes without the Gaussians that a later capture looked straight through, and how many each lost.
-
-    A Gaussian is gone when, in most of the later capture's own views that have it in frame and unoccluded, and in at
-    least a few of them, the later capture shows an opaque surface clearly behind it. What the later capture never saw
-    stays. Captures without a time, or of the same time, overrule nothing.
-    """
-    params = params or Params()
-    kept, lost = [], []
-    for scene, newer in zip(scenes, _newer(scenes), strict=True):
-        gone = np.zeros(len(scene.gaussians), dtype=bool)
-        for other in newer:
-            through, on_surface = _evidence(scene.gaussians.means, other, params)
-            gone |= (through >= params.min_views) & (through >= params.min_share * (through + on_surface))
-        kept.append(replace(scene, gaussians=scene.gaussians[~gone]) if gone.any() else scene)
-        lost.append(int(gone.sum()))
-    return kept, lost
-
-
-def newer_surfaces(scenes: Sequence[PlacedScene], params: Params | None = None) -> list[list[Gaussians]]:
-    """For each scene, what its later captures are sure of: the Gaussians their own views show as a surface."""
-    params = params or Params()
-    newer = _newer(scenes)
-    sure: dict[int, Gaussians] = {}
-    for other in {id(s): s for others in newer for s in others}.values():
-        _, on_surface = _evidence(other.gaussians.means, other, params)
-        sure[id(other)] = other.gaussians[on_surface >= params.min_views]
-    return [[sure[id(s)] for s in others] for others in newer]
-
-
-def overruled_pixels(
-    camera: Cameras, depth: np.ndarray, newer: Sequence[Gaussians], params: Params | None = None
-) -> np.ndarray:
-    """(H, W) bool, where a later capture is sure of a surface clearly in front of the depth map of one camera."""
-    params = params or Params()
-    overruled = np.zeros(depth.shape, dtype=bool)
-    for gaussians in newer:
-        seen = render(gaussians, camera)
-        clearly = seen.depth[0] < depth - (params.gap_m + params.gap_share * depth)
-        overruled |= (seen.alpha[0] > params.min_opacity) & clearly
-    return overruled
-
-
-def _newer(scenes: Sequence[PlacedScene]) -> list[list[PlacedScene]]:
-    """For each scene, the scenes of the same place that were captured after it and have cameras."""
-    times = [_time(scene.captured_at) for scene in scenes]
-    return [
-        [
-            other
-            for other, then in zip(scenes, times, strict=True)
-            if time and then and then > time and other.cameras is not None and overlapping(scene, other)
+    def notes(self) -> list[str]:
+        """Remarks on what was dropped."""
+        return [
+            f"{n} Gaussians of scene {s.scene_id[:12]} are overruled where the place changed"
+            for s, n in zip(self.scenes, self.lost, strict=True)
+            if n
         ]
-        for scene, time in zip(scenes, times, strict=True)
-    ]
 
 
-def _evidence(means: np.ndarray, newer: PlacedScene, params: Params) -> tuple[np.ndarray, np.ndarray]:
-    """How many views of a capture show an opaque surface (N,) clearly behind each point, and (N,) at it."""
-    points = means.astype(np.float64)
-    through, on_surface = np.zeros(len(points), dtype=np.int32), np.zeros(len(points), dtype=np.int32)
-    if newer.cameras is None:
-        return through, on_surface
-    cameras = newer.cameras.resized(params.longest_side_px)
-    for c in range(len(cameras)):
-        pixels, z = project(points, cameras.T_camera_frame[c], cameras.intrinsics_px[c])
-        rows = np.flatnonzero(in_image(pixels, z, cameras.sizes_px[c], near=params.nearest_m))
-        if len(rows) == 0:
-            continue
-        seen = render(newer.gaussians, cameras[c])
-        column, row = pixels[rows].astype(int).T
-        surface, opaque = seen.depth[0][row, column], seen.alpha[0][row, column] > params.min_opacity
-        behind = surface - z[rows]
-        gap = params.gap_m + params.gap_share * surface
-        through[rows] += opaque & (behind > gap)
-        on_surface[rows] += opaque & (np.abs(behind) <= gap)
-    return through, on_surface
+def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: compare.Params | None = None) -> Settled:
+    """Drop what captures of other dates disprove.
+
+    From the newest capture back, each older one is compared once with what all newer ones are sure of together: N
+    captures cost N comparisons. A Gaussian leaves where that looked through it, or shows its surface in another colour
+    (exposure apart); with ``best`` only if it also saw the place better, and otherwise the newer's Gaussians leave.
+    What no newer capture saw stays. Captures without a date, or of one date, overrule nothing.
+    """
+    params = params or compare.Params()
+    keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
+    changed = [np.zeros(len(s.gaussians), dtype=bool) for s in scenes]
+    rivals = [_none(s) for s in scenes]
+    truth: list[_Standing] = []
+    for group in _newest_first(scenes) if prefer != "both" else []:
+        added = []
+        for i in group:
+            looks = compare.look(scenes[i], params)
+            parts = [one for one in truth if overlapping(one.looks.scene, scenes[i])]
+            if not parts:
+                added.append(_Standing(i, looks, np.ones(len(looks.gaussians), dtype=bool)))
+                continue
+            joined = compare.joined([(one.looks, one.shows) for one in parts], scenes[i], params)
+            found = compare.compare(looks, joined, params)
+            verdict = _verdict(looks, joined, found, prefer)
+            keeps[i] &= ~verdict.lost
+            if prefer == "newest":
+                keeps[i] &= ~_intruders(scenes[i].gaussians, keeps[i], joined, found, verdict)
+            first = 0
+            for one in parts:
+                rows = np.flatnonzero(one.shows)
+                mine = slice(first, first + len(rows))
+                changed[one.scene][rows[verdict.changed[mine]]] = True
+                keeps[one.scene][rows[verdict.beaten[mine]]] = False
+                first += len(rows)
+            rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
+            # Truth grows by what is new to it alone, so that it stays as large as the place.
+            shows = keeps[i] & np.isin(found.older.state, (UNSEEN, HIDDEN))
+            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), found), shows))
+        truth += added
+    return Settled(
+        [replace(s, gaussians=s.gaussians[k]) if not k.all() else s for s, k in zip(scenes, keeps, strict=True)],
+        [int((~k).sum()) for k in keeps],
+        [c[k] for c, k in zip(changed, keeps, strict=True)],
+        rivals,
+        [s.gaussians[~k] for s, k in zip(scenes, keeps, strict=True)],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Standing:
+    """A capture among the newer ones: which, its looks, and (N,) which of its Gaussians add to what is shown."""
+
+    scene: int
+    looks: Looks
+    shows: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Verdict:
+    """(N,) which Gaussians of the older leave, (M,) which of the newer stand where it changed, (M,) which leave."""
+
+    lost: np.ndarray
+    changed: np.ndarray
+    beaten: np.ndarray
+
+
+def _verdict(older: Looks, newer: Looks, found: Comparison, prefer: Prefer) -> _Verdict:
+    lost = np.isin(found.older.state, (GONE, REPAINTED))
+    changed = np.isin(found.newer.state, (GONE, REPAINTED)) | _revealed(newer, found)
+    beaten = np.zeros(len(changed), dtype=bool)
+    if prefer == "best":
+        stays = lost & (older.sharpness > found.older.sharpness)
+        beaten = np.isin(found.newer.state, (GONE, REPAINTED)) & (newer.sharpness < found.newer.sharpness)
+        lost, changed = lost & ~stays, changed & ~beaten
+    return _Verdict(lost, changed, beaten)
+
+
+def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
+    """(M,) which Gaussians of the newer show where the older had a thing before them."""
+    count = len(newer.gaussians)
+    shown, bared = np.zeros(count), np.zeros(count)
+    for picture in found.newer_views:
+        dominant = picture.own.dominant_id
+        shown += np.bincount(dominant[dominant >= 0], minlength=count)
+        bare = (picture.outcome == OTHER_BEFORE) & (dominant >= 0)
+        bared += np.bincount(dominant[bare], minlength=count)
+    out: np.ndarray = (bared >= 2) & (bared >= 0.2 * shown)
+    return out
+
+
+def _intruders(
+    older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict
+) -> np.ndarray:
+    """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
+
+    A last look at what evidence of single Gaussians leaves: shards at edges, what is smaller than a tolerance.
+    """
+    rows = np.flatnonzero(stays)
+    count = len(newer.gaussians)
+    together = Gaussians.concatenate([newer.gaussians, older[rows]])
+    good, bad = np.zeros(len(rows)), np.zeros(len(rows))
+    for view in newer.views:
+        seen = render(together, view.camera, depth=False)
+        shown = seen.dominant_id[0]
+        theirs = view.opaque & (shown >= count)
+        low, high = compare.ranges(view.colour)
+        colour = np.clip(seen.colour[0][theirs], 0, 1)
+        worse = (np.maximum(low[theirs] - colour, colour - high[theirs]) > _INTRUDES).any(1)
+        shown = shown[theirs] - count
+        bad += np.bincount(shown[worse], minlength=len(rows))
+        good += np.bincount(shown[~worse], minlength=len(rows))
+    out = np.zeros(len(older), dtype=bool)
+    out[rows[bad > good]] = True
+    from scipy.spatial import cKDTree
+
+    disputed = np.concatenate([older.means[verdict.lost], newer.gaussians.means[verdict.changed]])
+    at = np.flatnonzero(out)
+    if len(at):
+        reach = cKDTree(disputed).query(older.means[at], distance_upper_bound=_NEAR_M)[0] if len(disputed) else np.full(len(at), np.inf)
+        out[at[np.isinf(reach)]] = False
+    return out
+
+
+def _in_one_exposure(looks: Looks, found: Comparison) -> Looks:
+    gains = found.balance.gains()
+    if np.abs(np.log(gains)).max() < _NEGLIGIBLE_GAIN:
+        return looks
+    return replace(looks, scene=replace(looks.scene, gaussians=apply_gain(looks.gaussians, gains)))
+
+
+def _share_of_pixels(these: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
+    """(H, W) share of each pixel's light that comes from some Gaussians, seen among others."""
+    flag = np.full((len(these), 1, 3), 0.5 / 0.28209479177387814, dtype=np.float32)
+    dark = np.full((len(others), 1, 3), -0.5 / 0.28209479177387814, dtype=np.float32)
+    together = Gaussians.concatenate([replace(these, sh=flag), replace(others, sh=dark)])
+    out: np.ndarray = render(together, camera, depth=False, dominant_id=False).colour[0, ..., 0]
+    return out
+
+
+def _none(scene: PlacedScene) -> Gaussians:
+    return scene.gaussians[np.zeros(0, dtype=np.int64)]
+
+
+def _newest_first(scenes: Sequence[PlacedScene]) -> list[list[int]]:
+    """Indices of the scenes that have a date and meet another, by date, newest first; those of one date together."""
+    times = {i: _time(scene.captured_at) for i, scene in enumerate(scenes)}
+    dated = {i: time for i, time in times.items() if time is not None}
+    groups = [[i for i, then in dated.items() if then == time] for time in sorted(set(dated.values()), reverse=True)]
+    return groups if len(groups) > 1 else []
 
 
 def _time(text: str | None) -> datetime | None:

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.merge.changes import Params as ChangeParams
-from gsmap.merge.changes import overruled_pixels
+from gsmap.merge.changes import Settled
 from gsmap.merge.placed import inside, share_in_view
 from gsmap.render import Rendered, render
-from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types import Cameras, PlacedScene
 from gsmap.types.progress import Progress
 
 WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for what dominates no pixel: always less than one pixel
@@ -64,18 +63,17 @@ def render_references(
     bounds: np.ndarray | None,
     halo_m: float,
     longest_side_px: int,
-    newer: list[list[Gaussians]] | None,
+    settled: Settled | None,
     progress: Progress,
     params: Params | None = None,
-    changes: ChangeParams | None = None,
 ) -> References:
     """Render each scene from its own cameras; keep the views that show enough of the tile.
 
     A camera of one capture says nothing about what that capture never saw: pixels count as far as the capture itself
     covers them. For a tile they count where the surface seen lies inside it or within half the halo, so that what is
     at the border is held from both sides, and they show what lies within the halo alone: what glimmers through from
-    beyond is not there when the tile is fitted, and must not be made up for. ``newer`` (`gsmap.merge.changes`) holds
-    for each scene what stands there by now.
+    beyond is not there when the tile is fitted, and must not be made up for. ``settled`` (`gsmap.merge.changes`) knows
+    where the pictures of a scene are overruled.
     """
     params = params or Params()
     near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
@@ -96,8 +94,8 @@ def render_references(
         whole = pieces[i] is scenes[i].gaussians
         local = seen if whole else render(pieces[i], camera, depth=False, dominant_id=False)
         weight = local.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, halo_m / 2)
-        if newer is not None and newer[i]:
-            weight = weight * ~overruled_pixels(camera, seen.depth[0], newer[i], changes)
+        if settled is not None:
+            weight = weight * ~settled.overruled_pixels(i, camera)
         share = float(weight.mean())
         if share < params.min_share:
             continue

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -18,8 +17,6 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
 VERSION = 1
-
-_PER_THING = 400  # points of a thing that are kept: enough for its cells and for looking for it
 
 
 @dataclass(frozen=True)
@@ -44,16 +41,12 @@ class Capture:
     Args:
         scene: id.
         S_map_scene: where it lies.
-        things: which of its Gaussians are one thing.
-        points: (N, 3) centres of its Gaussians, scene frame.
-        lab: (N, 3) their colours, L*a*b*.
+        things: of its graph.
     """
 
     scene: str
     S_map_scene: Sim3
     things: Things
-    points: np.ndarray
-    lab: np.ndarray
 
 
 def recipe_key(params: Params | None = None) -> RecipeKey:
@@ -135,16 +128,9 @@ def make_objects(
 
 def _placed(capture: Capture, metres: float) -> Placed:
     """Some points of every thing, in metres of the map."""
-    rows = np.flatnonzero(capture.things.members >= 0)
-    order = rows[np.argsort(capture.things.members[rows], kind="stable")]
-    counts = np.bincount(capture.things.members[rows], minlength=len(capture.things))
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    chosen = [
-        order[a:b][np.linspace(0, b - a - 1, min(b - a, _PER_THING)).astype(int)] for a, b in pairwise(starts) if b > a
-    ]
-    index = np.concatenate(chosen) if chosen else np.zeros(0, np.int64)
-    points = capture.S_map_scene.apply(capture.points[index].astype(np.float64)) * metres
-    return Placed(points, capture.things.members[index], capture.lab[index].astype(np.float64), len(capture.things))
+    known = capture.things
+    points = capture.S_map_scene.apply(known.samples) * metres
+    return Placed(points, np.repeat(np.arange(len(known)), known.sample_counts), known.sample_colours, len(known))
 
 
 def _distinct(objects: list[MapObject]) -> list[MapObject]:

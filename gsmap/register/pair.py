@@ -47,6 +47,17 @@ def register_pair(
     return conclude(target, source, judged, params, seconds=watch.seconds, notes=proposing.notes)
 
 
+def check_pose(target: SceneView, source: SceneView, proposal: Proposal, params: Params | None = None) -> Registration:
+    """Refine and judge a pose that is known from elsewhere, and look for no other.
+
+    Returns:
+        `Registration`: ``accepted`` with the refined pose, or what speaks against it, as `register_pair` answers.
+    """
+    params, watch = params or Params(), Stopwatch()
+    judged = _judge(proposal, target, source, params, watch)
+    return conclude(target, source, [judged], params, seconds=watch.seconds)
+
+
 def _is_worth_judging(
     proposal: Proposal, judged: list[Judged], target: SceneView, source: SceneView, params: Params
 ) -> bool:

@@ -8,7 +8,7 @@ from gsmap.store.integrity import Check, Pruned
 from gsmap.store.models import Model
 from gsmap.store.registrations import MANUAL, Review, StoredRegistration
 from gsmap.store.revisions import Revision
-from gsmap.store.scenes import scene_id
+from gsmap.store.scene_content import scene_id
 from gsmap.store.store import Store
 
 __all__ = [

@@ -17,7 +17,6 @@ import os
 import shutil
 import stat
 import threading
-import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,8 +25,17 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.durable import files_below, is_folder, open_file, refuse_links, remove_tree, sync_file, sync_folder
-from gsmap.errors import BusyError, CorruptError
+from gsmap.durable import (
+    files_below,
+    is_folder,
+    lock_within,
+    open_file,
+    refuse_links,
+    remove_tree,
+    sync_file,
+    sync_folder,
+)
+from gsmap.errors import CorruptError
 from gsmap.store import layout
 from gsmap.store.columns import KINDS, is_digest
 from gsmap.store.explained import explained
@@ -121,17 +129,7 @@ class Arrays:
             return
         handle = os.open(self.root, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            deadline = time.monotonic() + patience_s
-            while True:
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                except BlockingIOError:
-                    if time.monotonic() > deadline:
-                        raise BusyError(
-                            f"{self.root}: others have been writing arrays for {patience_s:g} s; try again later"
-                        ) from None
-                    time.sleep(0.01)
+            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.root}: others have been writing arrays")
             self._held.depth = 1
             yield
         finally:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from sqlalchemy import Connection, text
 
+from gsmap.errors import InputError, StoreError
 from gsmap.geometry.rotations import quats_to_matrices
+from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.schema import CHUNK_BOXES
 from gsmap.types import Gaussians
 
 
@@ -18,3 +22,53 @@ def chunk_boxes(gaussians: Gaussians, rows: int, *, sigmas: float = 3.0) -> np.n
         reach = sigmas * np.sqrt(variance)
         out.append(np.stack([(part.means - reach).min(0), (part.means + reach).max(0)]))
     return np.array(out).reshape(-1, 2, 3)
+
+
+def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
+    """Keep the boxes (C, 2, 3) of a scene's chunks, in place of those that there are."""
+    if number >= 1 << 24:
+        raise StoreError("a map holds at most 16 million scenes")  # the R*Tree's floats count no further
+    connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
+    rows = [
+        {"s": number, "chunk": i}
+        | {f"{axis}{side}": float(box[side, k]) for side in (0, 1) for k, axis in enumerate("xyz")}
+        for i, box in enumerate(boxes)
+    ]
+    connection.execute(
+        text(
+            f"INSERT INTO {CHUNK_BOXES} (s0, s1, x0, x1, y0, y1, z0, z1, chunk) "
+            "VALUES (:s, :s, :x0, :x1, :y0, :y1, :z0, :z1, :chunk)"
+        ),
+        rows,
+    )
+
+
+def get_boxes(connection: Connection, number: int) -> np.ndarray:
+    """The boxes (C, 2, 3) of a scene's chunks."""
+    query = text(f"SELECT x0, y0, z0, x1, y1, z1 FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s ORDER BY chunk")
+    rows = [list(row) for row in connection.execute(query, {"s": number})]
+    return np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
+
+
+def touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:
+    """The chunks of a scene whose boxes meet one (2, 3) in its frame."""
+    if bounds.shape != (2, 3):
+        raise InputError(f"bounds must be (2, 3): lowest and highest corner, got shape {bounds.shape}")
+    query = text(
+        f"SELECT chunk FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s AND x1 >= :x0 AND x0 <= :x1 "
+        "AND y1 >= :y0 AND y0 <= :y1 AND z1 >= :z0 AND z0 <= :z1 ORDER BY chunk"
+    )
+    box = {f"{axis}{side}": float(bounds[side, k]) for side in (0, 1) for k, axis in enumerate("xyz")}
+    return list(connection.execute(query, {"s": number, **box}).scalars())
+
+
+def row_ranges(chunks: list[int], count: int) -> list[tuple[int, int]]:
+    """Row ranges of chunks, neighbours joined."""
+    out: list[tuple[int, int]] = []
+    for chunk in chunks:
+        start, stop = chunk * CHUNK_ROWS, min(count, (chunk + 1) * CHUNK_ROWS)
+        if out and out[-1][1] == start:
+            out[-1] = (out[-1][0], stop)
+        else:
+            out.append((start, stop))
+    return out

@@ -17,20 +17,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sqlalchemy import Connection, delete, func, select, update
+from sqlalchemy import Connection, func, select
 
-from gsmap.durable import is_file, is_folder, sync_file, sync_folder
+from gsmap.durable import is_file, is_folder, make_folder, remove_tree, sync_file, sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
+from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.catalog import Catalog, now, open_engine
+from gsmap.store.copying import copy_catalog, empty_catalog, make_own
 from gsmap.store.explained import explained
-from gsmap.store.schema import about, exports, files, groups, leases, models, revisions, scenes, tiles
+from gsmap.store.schema import exports, files, groups, leases, models, revisions, scenes, tiles
 
 FOLDER = "branches"
-_MARKER = "branch.json"
+MARKER = "branch.json"
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")  # it becomes a folder's name
-_SETTINGS = "settings.toml"
 _log = logging.getLogger("gsmap.store")
 
 
@@ -106,11 +107,16 @@ def places(home: Path) -> list[Place]:
     """The branches and tags of a map, by name."""
     root = home / FOLDER
     found = []
-    for folder in sorted(root.iterdir()) if root.is_dir() and not root.is_symlink() else ():
+    for folder in sorted(root.iterdir()) if is_folder(root) else ():
         ours = _NAME.fullmatch(folder.name) and is_folder(folder) and is_file(folder / sqlite.FILE)
-        if ours and is_file(folder / _MARKER):
+        if ours and is_file(folder / MARKER):
             found.append(Place(home, folder, folder.name, _told(folder)["kind"] == "tag"))
     return found
+
+
+def other_places(home: Path, folder: Path) -> list[Place]:
+    """Where the catalogs over a map's arrays lie, but the one in ``folder``: the map, its branches, its tags."""
+    return [place for place in (Place(home, home), *places(home)) if place.folder != folder]
 
 
 def checked_name(name: str) -> str:
@@ -172,16 +178,17 @@ class Branches:
         # Nobody reclaims arrays between the copy and the moment at which it counts.
         with explained(home), self._arrays.lock():
             try:
-                _make_folder(staged.parent)
+                make_folder(staged.parent)
                 staged.mkdir()
                 self._copy_catalog(staged)
-                if (self._place.folder / _SETTINGS).is_file():
-                    shutil.copyfile(self._place.folder / _SETTINGS, staged / _SETTINGS)
-                    sync_file(staged / _SETTINGS)
+                if (self._place.folder / SETTINGS).is_file():
+                    shutil.copyfile(self._place.folder / SETTINGS, staged / SETTINGS)
+                    sync_file(staged / SETTINGS)
                 told = {"kind": "tag" if tag else "branch", "parent": self._place.branch, "created_at": now()}
-                (staged / _MARKER).write_text(json.dumps(told))
-                sync_file(staged / _MARKER)
-                _make_own(staged)
+                (staged / MARKER).write_text(json.dumps(told))
+                sync_file(staged / MARKER)
+                # Who is at work on it and where it was exported to is of the map.
+                make_own(staged, (leases, tiles, exports), id=uuid.uuid4().hex)
                 sync_folder(staged)
                 os.rename(staged, folder)
                 sync_folder(folder.parent)
@@ -224,8 +231,6 @@ class Branches:
         if self._catalog.is_sqlite:
             sqlite.backup(self._catalog.engine, folder / sqlite.FILE)
             return
-        from gsmap.store.copying import copy_catalog, empty_catalog
-
         made = empty_catalog(folder)
         copy_catalog(self._catalog, made)
         made.close()
@@ -272,18 +277,18 @@ class Others:
         return [manifest for manifest in found if manifest]
 
     def _connections(self) -> Iterator[Connection]:
-        for place in (Place(self._home, self._home), *places(self._home)):
-            if place.folder != self._folder:
-                with _read(place) as connection:
-                    yield connection
+        for place in other_places(self._home, self._folder):
+            with _read(place) as connection:
+                yield connection
 
 
 def bury_leftovers(home: Path) -> None:
     """Delete what a crash left of making or deleting branches; only under the lock of the arrays."""
     root = home / FOLDER
-    for folder in root.glob(".*") if root.is_dir() and not root.is_symlink() else ():
-        if folder.is_dir() and not folder.is_symlink():
-            shutil.rmtree(folder, ignore_errors=True)
+    for folder in root.glob(".*") if is_folder(root) else ():
+        if is_folder(folder):
+            with contextlib.suppress(OSError):
+                remove_tree(home, FOLDER, folder.name)
 
 
 @contextlib.contextmanager
@@ -297,35 +302,9 @@ def _read(place: Place) -> Iterator[Connection]:
             engine.dispose()
 
 
-def _make_folder(folder: Path) -> None:
-    if not folder.exists():
-        folder.mkdir()
-        sync_folder(folder.parent)
-
-
-def _make_own(folder: Path) -> None:
-    """Let a copied catalog be another map: its revisions are those of the map that it was copied from."""
-    catalog = Catalog(folder, sqlite.engine(folder / sqlite.FILE, writable=True), writable=True)
-    with catalog.write() as connection:
-        parent = connection.execute(select(about.c.id)).scalar_one()
-        for number in (
-            connection.execute(select(revisions.c.number).where(revisions.c.origin.is_(None))).scalars().all()
-        ):
-            origin = {"map": parent, "number": number}
-            connection.execute(update(revisions).where(revisions.c.number == number).values(origin=origin))
-        connection.execute(update(about).values(id=uuid.uuid4().hex))
-        for table in (
-            leases,
-            tiles,
-            exports,
-        ):  # these are of the map: who is at work on it, and where it was exported to
-            connection.execute(delete(table))
-    catalog.close()
-
-
 def _told(folder: Path) -> dict[str, str]:
     try:
-        told = json.loads((folder / _MARKER).read_text())
+        told = json.loads((folder / MARKER).read_text())
         return {
             "kind": "tag" if told["kind"] == "tag" else "branch",
             **{k: str(told[k]) for k in ("parent", "created_at")},

@@ -8,7 +8,6 @@ import logging
 import os
 import sqlite3
 import threading
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +17,7 @@ from sqlalchemy import Connection, Engine, RootTransaction, create_engine
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
+from gsmap.durable import lock_within
 from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
 from gsmap.store import digests, sqlite, trust
 from gsmap.store.explained import NOT_KEPT, explained, is_full, summary
@@ -139,7 +139,8 @@ class Catalog:
             with explained(self.folder, NOT_KEPT):
                 raise error
         try:
-            _wait_for(self.folder, handle, fcntl.LOCK_EX, self.patience_s if patience_s is None else patience_s)
+            patience_s = self.patience_s if patience_s is None else patience_s
+            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.folder}: others have been writing")
             self._held.depth = 1
             yield
         finally:
@@ -271,27 +272,15 @@ class Catalog:
 def still(folder: Path, patience_s: float) -> Iterator[None]:
     """See `Catalog.still`; of the catalog in a folder."""
     try:
-        handle = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
+        handle = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:  # then nobody has ever written here, or nobody can
         yield
         return
     try:
-        _wait_for(folder, handle, fcntl.LOCK_SH, patience_s)
+        lock_within(handle, fcntl.LOCK_SH, patience_s, f"{folder}: others have been writing")
         yield
     finally:
         os.close(handle)
-
-
-def _wait_for(folder: Path, handle: int, how: int, patience_s: float) -> None:
-    deadline = time.monotonic() + patience_s
-    while True:
-        try:
-            fcntl.flock(handle, how | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
-            if time.monotonic() > deadline:
-                raise BusyError(f"{folder}: others have been writing for {patience_s:g} s; try again later") from None
-            time.sleep(0.01)
 
 
 def commit(connection: Connection, transaction: RootTransaction) -> None:

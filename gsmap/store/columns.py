@@ -19,7 +19,7 @@ from gsmap.errors import CorruptError, InputError
 from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
-KINDS = ("scenes", "graphs")
+KINDS = ("scenes", "graphs", "changes")
 """Of groups of arrays: the folders below ``arrays``."""
 
 
@@ -108,6 +108,20 @@ class Kind(_Checked):
         return value in KINDS
 
 
+class Word(_Checked):
+    """One of a few words."""
+
+    cache_ok = True
+
+    def __init__(self, words: tuple[str, ...], where: str = "") -> None:
+        super().__init__(where)
+        self.words = words
+        self.what = f"one of {', '.join(words)}"
+
+    def fits(self, value: str) -> bool:
+        return value in self.words
+
+
 class RelativePath(_Checked):
     """A path that leads downwards only; empty where there is no file."""
 
@@ -187,6 +201,11 @@ def a_direction(value: Any) -> bool:
     return _numbers(value, 3)
 
 
+def numbers(value: Any) -> bool:
+    """Numbers by name."""
+    return isinstance(value, dict) and all(_numbers(item) for item in value.values())
+
+
 def sigmas(value: Any) -> bool:
     return _numbers(value, 7)
 
@@ -210,6 +229,16 @@ def a_pose(value: Any) -> bool:
 
 def poses_by_scene(value: Any) -> bool:
     return isinstance(value, dict) and all(is_digest(scene) and a_pose(pose) for scene, pose in value.items())
+
+
+def a_thinning(value: Any) -> bool:
+    """How a thinned scene is kept beside its arrays."""
+    return (
+        isinstance(value, dict)
+        and isinstance(value.get("at"), str)
+        and isinstance(value.get("num_gaussians"), int)
+        and (value.get("up") is None or a_direction(value["up"]))
+    )
 
 
 def a_graph(value: Any) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Column, Connection, Double, Integer, MetaData, Table, select, text
+from sqlalchemy import Column, Connection, Double, Integer, MetaData, Table, delete, select, text, update
 from sqlalchemy.types import TypeDecorator
 
 from gsmap.errors import StoreError
@@ -40,15 +41,39 @@ def empty_catalog(folder: Path, url: str | None = None, map_id: str = "") -> Cat
     """
     if url is None:
         sqlite.create_file(folder / sqlite.FILE)
-        engine = sqlite.engine(folder / sqlite.FILE, writable=True)
+        made = own_catalog(folder)
     else:
         engine = _catalog.url_engine(url)
         if migrate.version(engine, folder) is not None:
             raise StoreError(f"the database {engine.url!r} holds a map already: give each map a database of its own")
         trust.write(folder, _catalog.url_without_password(url), map_id)
-    made = Catalog(folder, engine, writable=True)
+        made = Catalog(folder, engine, writable=True)
     migrate.upgrade(made)
     return made
+
+
+def own_catalog(folder: Path) -> Catalog:
+    """The ``map.sqlite`` in a folder that is being made, to change it."""
+    return Catalog(folder, sqlite.engine(folder / sqlite.FILE, writable=True), writable=True)
+
+
+def make_own(folder: Path, empty: Collection[Table], **about: Any) -> None:
+    """Let a copied ``map.sqlite`` be of another map: its revisions are those of the map that it was copied from.
+
+    Args:
+        empty: tables that are of that map alone.
+        about: what is other in the row about the map: its ``id``.
+    """
+    revisions = schema.revisions
+    with contextlib.closing(own_catalog(folder)) as catalog, catalog.write() as connection:
+        before = connection.execute(select(schema.about.c.id)).scalar_one()
+        connection.execute(update(schema.about).values(**about))
+        solved = select(revisions.c.number).where(revisions.c.origin.is_(None))
+        for number in connection.execute(solved).scalars().all():
+            origin = {"map": before, "number": number}
+            connection.execute(update(revisions).where(revisions.c.number == number).values(origin=origin))
+        for table in empty:
+            connection.execute(delete(table))
 
 
 def copy_catalog(source: Catalog, target: Catalog, *, leave_out: Collection[str] = ()) -> dict[str, int]:

@@ -15,16 +15,16 @@ from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
-from gsmap.store.groups import manifest, publish, unname
+from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.matrices import from_array, to_array
-from gsmap.store.scenes import resolve
+from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import graphs, scenes
 from gsmap.types import NodeLayer, SceneGraph, Things
 from gsmap.types.plain import plain
 
 KIND = "graphs"
 
-_THINGS = ("members", "positions", "extents", "colours")
+_THINGS = ("members", "positions", "extents", "colours", "samples", "sample_colours", "sample_counts")
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,7 @@ class Graphs:
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
+            NotFoundError: no such scene, or others dropped and pruned the graph meanwhile.
         """
         with self._catalog.read() as connection:
             query = select(graphs).where(graphs.c.scene == resolve(connection, ref))
@@ -124,7 +125,8 @@ class Graphs:
             if row is None:
                 return None
             files = manifest(connection, row.group_id)
-        arrays = self._arrays.read(KIND, row.group_id, files)
+        with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
+            arrays = self._arrays.read(KIND, row.group_id, files)
         layers = {}
         for i, (name, layer) in enumerate(row.about["layers"].items()):
             own: dict[str, Any] = {
@@ -133,10 +135,16 @@ class Graphs:
             layers[name] = NodeLayer(**own, **layer["rest"])
         things = None
         if (about := row.about.get("things")) is not None:
-            members, positions, extents, colours = (arrays[f"things.{name}"] for name in _THINGS)
-            things = Things(members, positions, extents, colours, about["unit_m"])
+            parts: dict[str, Any] = {name: arrays[f"things.{name}"] for name in _THINGS}
+            things = Things(**parts, unit_m=about["unit_m"])
         up = to_array(row.about["up"])
         return SceneGraph(row.scene, layers, up, row.about["unit_m"], tuple(row.about["notes"]), things)
+
+    def num_bytes(self, ref: str) -> int:
+        """Of the arrays of all graphs of a scene, as they were written."""
+        with self._catalog.read() as connection:
+            made = select(graphs.c.group_id).where(graphs.c.scene == resolve(connection, ref)).distinct()
+            return sum(num_bytes(connection, group) for group in connection.execute(made).scalars())
 
     def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
         """Those of the keys (as digests) that a graph is kept under."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 
 from sqlalchemy import Connection, delete, insert, select
 
+from gsmap.errors import CorruptError, NotFoundError
 from gsmap.store.arrays import Arrays, Staged, StoredFile
 from gsmap.store.branches import Others
 from gsmap.store.catalog import Catalog, now
@@ -42,6 +44,30 @@ def unname(connection: Connection, group_id: str) -> None:
     """Let a group count no longer; whoever claimed it is changed in the same transaction."""
     connection.execute(delete(files).where(files.c.group_id == group_id))
     connection.execute(delete(groups).where(groups.c.id == group_id))
+
+
+@contextlib.contextmanager
+def unless_pruned(catalog: Catalog, group_id: str, gone: str) -> Iterator[None]:
+    """Tell a group that others reclaimed while it was read from a damaged one.
+
+    Args:
+        gone: what it was of, and what became of that.
+
+    Raises:
+        NotFoundError: it could not be read, and no row names it any more.
+    """
+    try:
+        yield
+    except CorruptError:
+        with catalog.read() as connection:
+            if has_group(connection, group_id):
+                raise
+        raise NotFoundError(f"{gone}, and its arrays were pruned while they were read: try again") from None
+
+
+def num_bytes(connection: Connection, group_id: str) -> int:
+    """Of a group's files, as they were written."""
+    return sum(file.size_bytes for file in manifest(connection, group_id))
 
 
 def manifest(connection: Connection, group_id: str) -> tuple[StoredFile, ...]:

@@ -18,11 +18,13 @@ from gsmap.store import sqlite, staging
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.branches import Others, bury_leftovers
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.change_rows import KIND as CHANGES
+from gsmap.store.change_rows import newest_of_all
 from gsmap.store.explained import PRUNE_MAY, explained
 from gsmap.store.groups import manifest
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
-from gsmap.store.schema import CHUNK_BOXES, files, graphs, groups, models, poses, revisions, scenes
+from gsmap.store.schema import CHUNK_BOXES, comparisons, files, graphs, groups, models, poses, revisions, scenes
 from gsmap.types.progress import Progress
 
 _AGAIN = "what was to be reclaimed and is still there goes with the next prune"
@@ -111,7 +113,7 @@ def check(
         if found:  # unless it was pruned or mended meanwhile
             with catalog.read() as connection:
                 if manifest(connection, group) == manifests[group]:
-                    helps = _graph_advice(connection, group, location) if kind == "graphs" else ""
+                    helps = _advice(connection, kind, group, location)
                     problems += [problem + helps for problem in found]
     try:
         named_by_any = named.items() | {(group, kind) for kind, group in Others(home, catalog.folder).groups()}
@@ -244,6 +246,9 @@ def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
     keys = connection.execute(select(graphs.c.key).select_from(of_scene).where(gone)).scalars()
     claimed = set(connection.execute(select(scenes.c.group_id).where(not_(gone))).scalars())
     claimed |= set(connection.execute(select(graphs.c.group_id).select_from(of_scene).where(not_(gone))).scalars())
+    # Of a pair the newest comparison counts, as long as both of its scenes can be read.
+    lost = set(connection.execute(select(scenes.c.id).where(gone)).scalars())
+    claimed |= {row.group_id for row in newest_of_all(connection) if not {row.older, row.newer} & lost}
     known = {(g.kind, g.id) for g in connection.execute(select(groups))}
     return _Waste(
         dropped,
@@ -258,7 +263,8 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
     with catalog.write() as connection:
         connection.execute(update(revisions).where(revisions.c.number.in_(waste.revisions)).values(dropped_at=now()))
         connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
-        connection.execute(update(scenes).where(scenes.c.group_id.in_(ids)).values(group_id=None))
+        for table in (scenes, comparisons):
+            connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))
         for _, number in waste.scenes:
             boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
             connection.execute(boxes, {"s": number})
@@ -266,8 +272,12 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
         connection.execute(delete(groups).where(groups.c.id.in_(ids)))
 
 
-def _graph_advice(connection: Connection, group: str, location: str | None) -> str:
-    """Which scene a damaged graph is of, and what makes it whole."""
+def _advice(connection: Connection, kind: str, group: str, location: str | None) -> str:
+    """What a damaged group is of, and what makes it whole; empty where the message says so already."""
+    if kind == CHANGES:
+        return _comparison_advice(connection, group, location)
+    if kind != "graphs":
+        return ""
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
     found = connection.execute(select(scenes).select_from(of_scene).where(graphs.c.group_id == group)).first()
     if found is None:
@@ -278,6 +288,18 @@ def _graph_advice(connection: Connection, group: str, location: str | None) -> s
     if found.removed_at is not None:
         again = f"gsmap restore-scene {quote(location)} {found.id[:12]}, then {again}"
     return f" (the graph of scene {found.name}: {again} makes it again)"
+
+
+def _comparison_advice(connection: Connection, group: str, location: str | None) -> str:
+    rows = [row for row in newest_of_all(connection) if row.group_id == group]
+    name_of = {scene.id: scene.name for scene in connection.execute(select(scenes))}
+    for row in rows:
+        pair = f"{name_of[row.older]}:{name_of[row.newer]}"
+        again = "restore the file from a backup"
+        if location is not None:
+            again = f"gsmap changes {quote(location)} {quote(pair)} finds them again"
+        return f" (the changes of {pair}: {again})"
+    return f" (changes of an earlier comparison: gsmap prune {quote(location)})" if location else ""
 
 
 def _row_problems(connection: Connection, home: Path) -> list[str]:

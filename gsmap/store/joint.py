@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
+from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
 from gsmap.types import PoseGraph, ScenePose, Sim3
@@ -77,7 +78,7 @@ def _between(common: list[tuple[ScenePose, ScenePose]], bounds: Mapping[str, np.
     if len(common) == 1:
         mine, other = common[0]
         return mine.S_map_scene @ other.S_map_scene.inverse()
-    corners = [np.array(np.meshgrid(*np.asarray(bounds[mine.scene]).T)).reshape(3, -1).T for mine, _ in common]
+    corners = [box_corners(bounds[mine.scene]) for mine, _ in common]
     here = np.concatenate([mine.S_map_scene.apply(points) for (mine, _), points in zip(common, corners, strict=True)])
     there = np.concatenate(
         [other.S_map_scene.apply(points) for (_, other), points in zip(common, corners, strict=True)]

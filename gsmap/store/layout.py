@@ -69,8 +69,11 @@ def check(
 
 def mend(kind: str) -> str:
     """What to do about a damaged group of this kind."""
-    again = "make the graph again (gsmap describe MAP SCENE)" if kind == "graphs" else "ingest the scene again"
-    return f"run gsmap check, and {again}"
+    again = {
+        "graphs": "make the graph again (gsmap describe MAP SCENE)",
+        "changes": "compare its two scenes again (gsmap changes MAP A:B)",
+    }
+    return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"
 
 
 def _check_array(place: Path, name: str, sizes: Mapping[str, int], known: Shape | None) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import about, edges, poses, revisions, scenes
 from gsmap.store.store import Store
 from gsmap.store.transfer import Transfer, between
+from gsmap.store.transfer_changes import comparisons_of
 
 Identity = tuple[str, int, str | None]
 
@@ -28,7 +29,8 @@ class Merged:
 
     Args:
         scenes, removed, known: scenes that are new here and live, that are new or now removed, and that both maps had.
-        graphs, registrations, reviews, facts, priors, models, recipes, revisions: rows that are new here.
+        graphs, registrations, reviews, facts, priors, models, recipes, revisions, comparisons, change_reviews: rows
+            that are new here.
         renamed: (old, new) names of scenes whose name was taken.
         revision: number of the joint revision; None where none was needed.
         num_bytes: of the arrays that are new here, linked or copied.
@@ -46,6 +48,8 @@ class Merged:
     models: int = 0
     recipes: int = 0
     revisions: int = 0
+    comparisons: int = 0
+    change_reviews: int = 0
     renamed: tuple[tuple[str, str], ...] = ()
     revision: int | None = None
     num_bytes: int = 0
@@ -67,6 +71,7 @@ def merge(into: Store, source: Store) -> Merged:
         transfer.scenes()
         transfer.graphs()
         transfer.pairs()
+        comparisons_of(transfer)
         transfer.priors()
         transfer.models()
         number = _revisions(transfer)
@@ -86,6 +91,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
         transfer.scenes()
         transfer.graphs()
         transfer.pairs()
+        comparisons_of(transfer)
         transfer.priors()
         transfer.models()
         number = None
@@ -120,6 +126,7 @@ def bring_scene(into: Store, source: Store, scene: str) -> Merged:
             into.scenes.restore(scene)
         transfer.graphs()
         transfer.pairs()
+        comparisons_of(transfer)
         transfer.priors()
         return replace(_merged(transfer, None), notes=())
 
@@ -138,10 +145,9 @@ def _check_shared(transfer: Transfer, scene: str) -> None:
 
 
 def _merged(transfer: Transfer, revision: int | None) -> Merged:
-    nouns = ("scenes", "removed", "known", "graphs", "registrations", "reviews", "facts", "priors", "models", "recipes")
-    counts = {noun: transfer.counts[noun] for noun in (*nouns, "revisions")}
+    counted = {field.name for field in fields(Merged) if field.type == "int"} - {"num_bytes"}
     return Merged(
-        **counts,
+        **{noun: transfer.counts[noun] for noun in counted},
         renamed=tuple(transfer.renamed),
         revision=revision,
         num_bytes=transfer.counts["bytes"],

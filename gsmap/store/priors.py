@@ -8,7 +8,7 @@ from sqlalchemy import Connection, insert, select, update
 from gsmap.errors import InputError, NotFoundError
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
-from gsmap.store.scenes import living_ids, resolve
+from gsmap.store.scene_refs import living_ids, resolve
 from gsmap.store.schema import priors
 from gsmap.types import Prior
 

@@ -10,20 +10,24 @@ from __future__ import annotations
 import contextlib
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import Connection, Row, Table, delete, func, insert, select, text, update
 
-from gsmap.durable import files_below, is_file, remove_file
+from gsmap.durable import files_below, is_file, is_folder, remove_file, sync_folder
 from gsmap.errors import BusyError
 from gsmap.store import integrity, sqlite
 from gsmap.store.branches import Others, Place
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.columns import KINDS
 from gsmap.store.explained import explained
 from gsmap.store.schema import (
     CHUNK_BOXES,
+    change_reviews,
+    changes,
+    comparisons,
     edges,
     exports,
     files,
@@ -41,7 +45,6 @@ from gsmap.store.schema import (
     tiles,
 )
 from gsmap.store.store import Store
-from gsmap.types.plain import plain
 
 _GONE = "a scene that was purged"
 # Texts that gsmap wrote itself: where one names the scene it says instead that it was purged. What people wrote of
@@ -51,11 +54,13 @@ _REMARKS: tuple[tuple[Table, tuple[str, ...]], ...] = (
     (registrations, ("reason", "notes")),
     (revisions, ("notes", "provenance")),
     (edges, ("reason",)),
+    (comparisons, ("notes",)),
     (tiles, ("notes",)),
 )
 _WORDS: tuple[tuple[Table, str, str], ...] = (
     (scene_facts, "value", "scene"),
     (reviews, "note", "pair"),
+    (change_reviews, "note", "change"),
     (revisions, "note", "number"),
 )
 
@@ -67,7 +72,8 @@ class Purge:
     Args:
         number: of its row.
         scene: id.
-        receipt: counts of what went, what is still to be done (``pending``), and where else the scene may live.
+        receipt: counts of what went, what is still to be done (``pending``: the folders to look into, how many files go
+            in those that were, and the arrays and copies of the catalog to delete), and where else the scene may live.
         created_at: when its rows went.
     """
 
@@ -87,7 +93,9 @@ def begin(store: Store, scene: str) -> Purge:
     Args:
         scene: id of a scene that the catalog has, living or removed.
     """
-    Others(store.home, store.folder).groups()  # asked first: what of its arrays another branch names must be known
+    shared = {
+        group for _, group in Others(store.home, store.folder).groups()
+    }  # these stay, and another purge takes them
     of_map = _backups_of_map(store)
     with store.catalog.write() as connection:
         row = connection.execute(select(scenes).where(scenes.c.id == scene)).one()
@@ -95,12 +103,17 @@ def begin(store: Store, scene: str) -> Purge:
         linked = _linked_files(store, connection, scene)
         targets = sorted(connection.execute(select(exports.c.target).distinct()).scalars())
         elsewhere = _backups(connection, row, of_map)
-        counts = _delete_rows(connection, row)
+        counts, bodies = _delete_rows(connection, row)
         _scrub(connection, scene, names)
         mentions = _mentions(connection, scene, names)
         receipt: dict[str, Any] = {
             "rows": dict(counts),
-            "pending": {"targets": targets},
+            "pending": {
+                "targets": targets,
+                "tiles": {},
+                "groups": {group: size for group, size in bodies.items() if group not in shared},
+                "copies": _copies(store),
+            },
             "backups": elsewhere,
             "linked_files": linked,
             "mentions": mentions,
@@ -118,28 +131,49 @@ def listed(store: Store) -> list[Purge]:
     return [Purge(row.number, row.scene, dict(row.receipt), row.created_at) for row in rows]
 
 
-def finish(store: Store, purge: Purge, tiles_gone: Mapping[str, Any]) -> Purge:
+def note(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
+    """Write down how many files of tiles go in a folder, before they do: a crash may leave nothing to count."""
+    pending = purge.receipt["pending"]
+    noted = {**pending["tiles"], target: max(num_files, pending["tiles"].get(target, 0))}
+    return _save(store, purge, {**purge.receipt, "pending": {**pending, "tiles": noted}})
+
+
+def finish(store: Store, purge: Purge, unreachable: Sequence[str]) -> Purge:
     """Reclaim arrays, older copies and what deleted rows left in the catalog's file; the receipt is complete then.
 
     Args:
-        tiles_gone: what became of the folders that were exported to, for the receipt.
+        unreachable: the folders that were exported to and could not be looked into, and why, for the receipt.
 
     Raises:
         BusyError: somebody reads a state from before the purge, so that it cannot be taken out of the file yet.
     """
-    reclaimed = integrity.reclaim(store.catalog, store.arrays)
-    copies = _drop_copies(store)
+    pending = purge.receipt["pending"]
+    integrity.reclaim(store.catalog, store.arrays)
+    copies = sorted({*pending["copies"], *_copies(store)})
+    for name in copies:
+        remove_file(store.folder, name)
+    for folder in (store.folder, *(store.arrays.root / kind for kind in KINDS), store.arrays.staging):
+        if is_folder(folder):
+            sync_folder(folder)  # or they are back when the power was gone
+    left = {group for _, group in store.arrays.groups()}  # a branch has them, too
+    num_bytes = [size for group, size in pending["groups"].items() if group not in left]
     receipt = {key: value for key, value in purge.receipt.items() if key != "pending"} | {
-        "num_groups": len(reclaimed.groups),
-        "num_bytes": reclaimed.num_bytes,
+        "num_groups": len(num_bytes),
+        "num_bytes": sum(num_bytes),
         "catalog_copies": copies,
         "branches": [place.location for place in holders(store, purge.scene)],
-        **plain(dict(tiles_gone)),
+        "tile_files": sum(pending["tiles"].values()),
+        "cleaned": sorted(pending["tiles"]),
+        "unreachable": list(unreachable),
     }
     overwrite(store.catalog)
+    return _save(store, purge, receipt)
+
+
+def _save(store: Store, purge: Purge, receipt: dict[str, Any]) -> Purge:
     with store.catalog.write() as connection:
         connection.execute(update(purges).where(purges.c.number == purge.number).values(receipt=receipt))
-    return Purge(purge.number, purge.scene, receipt, purge.created_at)
+    return replace(purge, receipt=receipt)
 
 
 def recheck(store: Store) -> None:
@@ -149,9 +183,7 @@ def recheck(store: Store) -> None:
             continue
         still = [place.location for place in holders(store, one.scene)]
         if still != one.receipt["branches"]:
-            with store.catalog.write() as connection:
-                row = purges.c.number == one.number
-                connection.execute(update(purges).where(row).values(receipt={**one.receipt, "branches": still}))
+            _save(store, one, {**one.receipt, "branches": still})
 
 
 def holders(store: Store, scene: str) -> list[Place]:
@@ -196,7 +228,8 @@ def overwrite(catalog: Catalog) -> None:
 # --- rows ------------------------------------------------------------------------------------------------------------
 
 
-def _delete_rows(connection: Connection, row: Row[Any]) -> Counter[str]:
+def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], dict[str, int]]:
+    """How many rows went, and the groups of arrays that none claims any more with their bytes."""
     scene = row.id
     counts: Counter[str] = Counter()
 
@@ -207,19 +240,29 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> Counter[str]:
     affected = set(connection.execute(select(poses.c.revision).where(poses.c.scene == scene)).scalars())
     drop("reviews", reviews, reviews.c.pair.contains(scene))
     drop("registrations", registrations, pairs)
+    with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
+    of_changes = changes.c.comparison.in_(select(comparisons.c.number).where(with_it))
+    drop("change_reviews", change_reviews, change_reviews.c.change.in_(select(changes.c.number).where(of_changes)))
+    drop("changes", changes, of_changes)
+    drop("comparisons", comparisons, with_it)
     drop("edges", edges, (edges.c.target == scene) | (edges.c.source == scene))
     drop("poses", poses, poses.c.scene == scene)
     drop("priors", priors, priors.c.scene == scene)
     drop("facts", scene_facts, scene_facts.c.scene == scene)
     drop("leases", leases, leases.c.what.contains(scene))
-    with_it = [tile.number for tile in connection.execute(select(tiles.c.number, tiles.c.poses)) if scene in tile.poses]
-    drop("tiles", tiles, tiles.c.number.in_(with_it))
+    made_with_it = [
+        tile.number for tile in connection.execute(select(tiles.c.number, tiles.c.poses)) if scene in tile.poses
+    ]
+    drop("tiles", tiles, tiles.c.number.in_(made_with_it))
     drop("graphs", graphs, graphs.c.scene == scene)
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
     claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
     claimed |= set(connection.execute(select(graphs.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
+    sizes = select(files.c.group_id, func.sum(files.c.size_bytes)).where(files.c.group_id.in_(unclaimed))
+    bodies = {group: int(size) for group, size in connection.execute(sizes.group_by(files.c.group_id))}
     connection.execute(delete(files).where(files.c.group_id.in_(unclaimed)))
     connection.execute(delete(groups).where(groups.c.id.in_(unclaimed)))
     for number in sorted(affected):
@@ -228,7 +271,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> Counter[str]:
         said = f"the pose of {_GONE} is no longer part of this revision"
         connection.execute(update(revisions).where(mine).values(notes=[*notes, said]))
     counts["revisions"] = len(affected)
-    return counts
+    return counts, bodies
 
 
 def _names(connection: Connection, row: Row[Any]) -> set[str]:
@@ -319,21 +362,18 @@ def _backups(connection: Connection, scene: Row[Any], of_map: Iterable[tuple[str
 
 def _linked_files(store: Store, connection: Connection, scene: str) -> int:
     """How many of its files have other names on this disk: another map that it was merged or split into, a clone."""
-    ids = [
-        ("scenes", scene),
-        *(
-            ("graphs", g)
-            for g in connection.execute(select(graphs.c.group_id).where(graphs.c.scene == scene)).scalars()
-        ),
-    ]
+    with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
+    of_scene = {
+        "graphs": select(graphs.c.group_id).where(graphs.c.scene == scene),
+        "changes": select(comparisons.c.group_id).where(with_it, comparisons.c.group_id.is_not(None)),
+    }
+    ids = [("scenes", scene)]
+    ids += [(kind, group) for kind, query in of_scene.items() for group in connection.execute(query).scalars()]
     found = (files_below(store.arrays.root / kind / name) for kind, name in ids)
     return sum(entry.st_nlink > 1 for group in found for entry in group.values())
 
 
-def _drop_copies(store: Store) -> list[str]:
-    """Delete the copies of the catalog that migrations left: they hold what is to be forgotten. Their names."""
+def _copies(store: Store) -> list[str]:
+    """The copies of the catalog that migrations left: they hold what is to be forgotten."""
     pattern = re.compile(re.escape(sqlite.FILE) + r"\.[0-9A-Za-z]+\.bak[a-z0-9.-]*")
-    names = sorted(p.name for p in store.folder.iterdir() if pattern.fullmatch(p.name) and is_file(p))
-    for name in names:
-        remove_file(store.folder, name)
-    return names
+    return sorted(p.name for p in store.folder.iterdir() if pattern.fullmatch(p.name) and is_file(p))

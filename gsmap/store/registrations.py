@@ -14,7 +14,7 @@ from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
-from gsmap.store.scenes import living_ids, resolve, scene_name
+from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import registrations, reviews
 from gsmap.types import Registration
 from gsmap.types.plain import plain

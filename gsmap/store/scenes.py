@@ -1,39 +1,34 @@
-"""Scenes: their rows, their arrays, and where in space each chunk lies."""
+"""Scenes: who is in the map, what is said of them, and reading them."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, insert, select, text, update
+from sqlalchemy import Connection, Row, delete, insert, select, update
 
-from gsmap.errors import CorruptError, InputError, NotFoundError, StoreError
+from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.morton import morton_order
-from gsmap.store import facts
+from gsmap.store import compact, facts
 from gsmap.store.arrays import Arrays, StoredFile, digest
-from gsmap.store.boxes import chunk_boxes
+from gsmap.store.boxes import chunk_boxes, put_boxes, row_ranges, touching
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
-from gsmap.store.groups import has_group, manifest, publish
-from gsmap.store.layout import CHUNK_ROWS, Shape
-from gsmap.store.schema import CHUNK_BOXES, scenes
+from gsmap.store.groups import has_group, manifest, num_bytes, publish, unless_pruned, unname
+from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.scene_content import GAUSSIANS, camera_arrays, scene_id, scene_of, shapes_of, to_arrays
+from gsmap.store.scene_refs import alive, by_id, find, find_removed, free_name, name_taken
+from gsmap.store.schema import graphs, scenes
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import Progress
 
 KIND = "scenes"
 
-_GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
 _SIGMAS = 3.0
-
-
-def scene_id(gaussians: Gaussians, cameras: Cameras) -> str:
-    """32 hex digits of content: the same Gaussians and cameras have the same id in every map."""
-    arrays = [getattr(gaussians, name) for name in _GAUSSIANS]
-    views = [cameras.T_frame_camera, cameras.intrinsics_px, cameras.sizes_px]
-    return digest(*arrays, *views, text="\n".join(cameras.names))
 
 
 class Scenes:
@@ -85,7 +80,7 @@ class Scenes:
             raise InputError(f"scene {name!r} has no Gaussians")
         new_id = scene_id(gaussians, cameras)
         with self._catalog.read() as connection:
-            row = _by_id(connection, new_id)
+            row = by_id(connection, new_id)
             files = manifest(connection, new_id)
         stored = bool(files) and not self._arrays.problems(KIND, new_id, files)
         if row is not None and row.removed_at is None and stored:
@@ -113,9 +108,9 @@ class Scenes:
         boxes = chunk_boxes(ordered, CHUNK_ROWS, sigmas=_SIGMAS)
         if progress:
             progress(0.4, f"writing {name}")
-        staging = self._arrays.stage(_to_arrays(ordered, cameras))
+        staging = self._arrays.stage(to_arrays(ordered, cameras))
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
-            row = _by_id(connection, new_id)
+            row = by_id(connection, new_id)
             if row is not None and row.removed_at is None:
                 scene = self._dated(new_id, captured_at, dated_by)
                 if manifest(connection, new_id) != files:  # another process was faster
@@ -126,7 +121,9 @@ class Scenes:
             publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
             put_boxes(connection, number, boxes)
-            connection.execute(update(scenes).where(scenes.c.id == new_id).values(group_id=new_id))
+            whole = {"group_id": new_id, "num_gaussians": len(gaussians), "thinned": None}
+            connection.execute(update(scenes).where(scenes.c.id == new_id).values(**whole))
+            scene = _with_tags(connection, find(connection, new_id))
         return scene, True
 
     def list(self, *, removed: bool = False) -> list[Scene]:
@@ -135,7 +132,7 @@ class Scenes:
         with self._catalog.read() as connection:
             tags = facts.tags(connection)
             rows = connection.execute(select(scenes).where(condition).order_by(scenes.c.number))
-            return [_scene(row, tags.get(row.id, ())) for row in rows]
+            return [scene_of(row, tags.get(row.id, ())) for row in rows]
 
     def get(self, ref: str) -> Scene:
         """One scene by name, id or the beginning of its id; a removed one by its id only.
@@ -144,7 +141,7 @@ class Scenes:
             NotFoundError: none, or several begin so.
         """
         with self._catalog.read() as connection:
-            return _with_tags(connection, _find(connection, ref))
+            return _with_tags(connection, find(connection, ref))
 
     def edit(
         self,
@@ -180,7 +177,7 @@ class Scenes:
         if author:
             facts.checked_text("an author", author)
         with self._catalog.write() as connection:
-            row = _alive(connection, ref)
+            row = alive(connection, ref)
             tags = set(facts.tags(connection, row.id).get(row.id, ()))
             same = {("name", row.name), ("captured_at", row.captured_at or ""), *(("tag", tag) for tag in tags)}
             new = [fact for fact in dict.fromkeys(new) if fact not in same]
@@ -193,12 +190,12 @@ class Scenes:
             columns = {kind: value or None for kind, value in new if kind in ("name", "captured_at")}
             if columns:
                 connection.execute(update(scenes).where(scenes.c.id == row.id).values(**columns))
-            return _with_tags(connection, _find(connection, row.id))
+            return _with_tags(connection, find(connection, row.id))
 
     def facts(self, ref: str) -> Sequence[SceneFact]:
         """Everything people said of a scene since it was ingested, oldest first."""
         with self._catalog.read() as connection:
-            return facts.said(connection, _find(connection, ref).id)
+            return facts.said(connection, find(connection, ref).id)
 
     def latest_notes(self) -> dict[str, str]:
         """The last note that people made of each scene, by its id; scenes without one are left out."""
@@ -208,12 +205,12 @@ class Scenes:
     def notes(self, ref: str) -> tuple[str, ...]:
         """What a person should know about how it was ingested."""
         with self._catalog.read() as connection:
-            return tuple(_find(connection, ref).notes)
+            return tuple(find(connection, ref).notes)
 
     def removed_at(self, ref: str) -> str | None:
         """When it was removed; None while it lives."""
         with self._catalog.read() as connection:
-            when: str | None = _find(connection, ref).removed_at
+            when: str | None = find(connection, ref).removed_at
             return when
 
     def gaussians(self, ref: str, bounds: np.ndarray | None = None) -> Gaussians:
@@ -228,18 +225,76 @@ class Scenes:
             NotFoundError: no such scene, or its bytes were pruned.
         """
         with self._catalog.read() as connection:
-            row = _find(connection, ref)
+            row = find(connection, ref)
             files = _manifest(connection, row)
-            chunks = None if bounds is None else _touching(connection, row.number, np.asarray(bounds, np.float64))
-        rows = None if chunks is None else _ranges(chunks, row.num_gaussians)
-        with self._unless_pruned(row):
-            arrays = self._arrays.read(KIND, row.group_id, files, only=_GAUSSIANS, rows=rows, shapes=_shapes(row))
-        out = Gaussians(**arrays)
+            chunks = None if bounds is None else touching(connection, row.number, np.asarray(bounds, np.float64))
+        rows = None if chunks is None else row_ranges(chunks, row.num_gaussians)
+        with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+            out = self._read(row, files, rows)
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)
         reach = _SIGMAS * np.exp(out.log_scales.max(1, initial=-np.inf, keepdims=True))
         return out[((out.means >= low - reach) & (out.means <= high + reach)).all(1)]
+
+    def _read(
+        self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None
+    ) -> Gaussians:
+        """The Gaussians in ranges of rows, all where None."""
+        shapes = shapes_of(row)
+        if row.thinned is None:
+            read = self._arrays.read(KIND, row.group_id, files, only=GAUSSIANS, rows=ranges, shapes=shapes)
+            return Gaussians(**read)
+        by_row = [name for name in compact.shapes(0, 0) if name not in compact.WHOLE]
+        read = self._arrays.read(KIND, row.group_id, files, only=by_row, rows=ranges, shapes=shapes)
+        read |= self._arrays.read(KIND, row.group_id, files, only=compact.WHOLE, shapes=shapes)
+        spans = [(0, row.num_gaussians)] if ranges is None else ranges
+        rows = np.concatenate([np.arange(*span) for span in spans]) if spans else np.zeros(0, dtype=np.int64)
+        return compact.unpack(read, rows)
+
+    def thin(self, ref: str, shown: np.ndarray, *, up: Sequence[float] | None = None) -> Scene:
+        """Keep a living scene compact, and its graphs no longer; durable when it returns.
+
+        What it had before goes with the next prune, unless a branch names it. A scene that is compact already stays.
+
+        Args:
+            shown: (N,) bool, which of its Gaussians to keep, in the order they are read.
+            up: (3,) against gravity in its frame, as its graph said.
+
+        Raises:
+            InputError: another number of Gaussians, or none to keep.
+            NotFoundError: no such scene.
+        """
+        before = self.get(ref)
+        if before.thinning is not None:
+            return before
+        if len(shown) != before.num_gaussians or not shown.any():
+            counts = f"{int(shown.sum())} of {len(shown)} Gaussians"
+            raise InputError(f"cannot keep {counts} of scene {before.name}, which has {before.num_gaussians}")
+        own = self.gaussians(before.id)[shown]
+        content = compact.pack(own) | camera_arrays(self.cameras(before.id))
+        boxes = chunk_boxes(own, CHUNK_ROWS, sigmas=_SIGMAS)
+        group_id = digest(*content.values(), text=f"compact {before.id}")
+        staging = self._arrays.stage(content)
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+            row = alive(connection, before.id)
+            if row.thinned is None:
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
+                about = {"at": now(), "num_gaussians": row.num_gaussians, "up": None if up is None else list(up)}
+                values = {"group_id": group_id, "num_gaussians": len(own), "thinned": about}
+                connection.execute(update(scenes).where(scenes.c.id == row.id).values(**values))
+                put_boxes(connection, row.number, boxes)
+                made = graphs.c.scene == row.id
+                old = [row.group_id, *connection.execute(select(graphs.c.group_id).where(made)).scalars()]
+                connection.execute(delete(graphs).where(made))
+                for group in old:
+                    unname(connection, group)
+            return _with_tags(connection, find(connection, row.id))
+
+    def num_bytes(self, ref: str) -> int:
+        """Of a scene's arrays, as they were written."""
+        with self._catalog.read() as connection:
+            return num_bytes(connection, find(connection, ref).group_id)
 
     def cameras(self, ref: str) -> Cameras:
         """Read a scene's cameras.
@@ -248,11 +303,11 @@ class Scenes:
             CorruptError, NotFoundError: as `gaussians`.
         """
         with self._catalog.read() as connection:
-            row = _find(connection, ref)
+            row = find(connection, ref)
             files = _manifest(connection, row)
         names = ("cameras.T_frame_camera", "cameras.intrinsics_px", "cameras.sizes_px", "cameras.names")
-        with self._unless_pruned(row):
-            arrays = self._arrays.read(KIND, row.group_id, files, only=names, shapes=_shapes(row))
+        with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+            arrays = self._arrays.read(KIND, row.group_id, files, only=names, shapes=shapes_of(row))
         pose, intrinsics, sizes, text_bytes = arrays.values()
         try:
             image_names = tuple(text_bytes.tobytes().decode().split("\n")) if len(pose) else ()
@@ -260,24 +315,10 @@ class Scenes:
             raise CorruptError(f"scene {row.name}: the names of its cameras are no text: ingest it again") from error
         return Cameras(pose, intrinsics, sizes, image_names, bool(row.cameras_synthesised))
 
-    @contextlib.contextmanager
-    def _unless_pruned(self, row: Row[Any]) -> Iterator[None]:
-        """Tell arrays that others reclaimed while they were read from damaged ones."""
-        try:
-            yield
-        except CorruptError:
-            with self._catalog.read() as connection:
-                found = _by_id(connection, row.id)
-            if found is None or found.group_id is None:
-                raise NotFoundError(
-                    f"scene {row.name!r} was removed and its arrays were pruned while they were read"
-                ) from None
-            raise
-
     def remove(self, ref: str) -> Scene:
         """Leave a tombstone: gone from lists and from the next revision, its bytes kept until they are pruned."""
         with self._catalog.write() as connection:
-            row = _alive(connection, ref)
+            row = alive(connection, ref)
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(removed_at=now()))
             return _with_tags(connection, row)
 
@@ -293,7 +334,7 @@ class Scenes:
             CorruptError: its arrays are damaged.
         """
         with self._catalog.write() as connection:
-            row = _find_removed(connection, ref)
+            row = find_removed(connection, ref)
             files = manifest(connection, row.group_id or "")
             if not files:
                 raise NotFoundError(
@@ -303,14 +344,12 @@ class Scenes:
             problems = self._arrays.problems(KIND, row.group_id, files)
             if problems:
                 raise CorruptError(f"scene {row.name} stays removed, its arrays are damaged: {problems[0]}")
-            name, number = row.name, 2
-            while name_taken(connection, name):
-                name, number = f"{row.name}-{number}", number + 1
+            name = free_name(connection, row.name)
             back = {"removed_at": None, "ingested_at": now(), "name": name}
             connection.execute(update(scenes).where(scenes.c.id == row.id).values(**back))
             if name != row.name:
                 facts.say(connection, row.id, [("name", name)])
-            return _with_tags(connection, _find(connection, row.id))
+            return _with_tags(connection, find(connection, row.id))
 
     def find_any(self, ref: str) -> Scene:
         """A scene by name, id or the beginning of its id, living or else removed.
@@ -320,8 +359,8 @@ class Scenes:
         """
         with self._catalog.read() as connection:
             with contextlib.suppress(NotFoundError):
-                return _with_tags(connection, _find(connection, ref))
-            return _with_tags(connection, _find_removed(connection, ref))
+                return _with_tags(connection, find(connection, ref))
+            return _with_tags(connection, find_removed(connection, ref))
 
     def _dated(self, known_id: str, captured_at: str | None, dated_by: str) -> Scene:
         """A living scene that was ingested again, with the date that came this time.
@@ -334,85 +373,19 @@ class Scenes:
 
     def _enter(self, connection: Connection, new_id: str, fields: dict[str, Any], rename: bool, dated_by: str) -> Scene:
         """The row of a new or returning scene, under a name that is free."""
-        name, number = fields["name"], 2
-        while name_taken(connection, fields["name"]):
-            if not rename:
-                raise InputError(f"another scene is called {name!r}: choose another name, or remove that one first")
-            fields = fields | {"name": f"{name}-{number}"}
-            number += 1
-        fields = fields | {"ingested_at": now(), "removed_at": None}
-        before = _by_id(connection, new_id)
+        wanted, name = fields["name"], free_name(connection, fields["name"])
+        if name != wanted and not rename:
+            raise InputError(f"another scene is called {wanted!r}: choose another name, or remove that one first")
+        fields = fields | {"name": name, "ingested_at": now(), "removed_at": None}
+        before = by_id(connection, new_id)
         if before is None:
             connection.execute(insert(scenes), fields | {"id": new_id})
         else:
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(**fields))
-        facts.say(connection, new_id, [("name", fields["name"])])
+        facts.say(connection, new_id, [("name", name)])
         if fields["captured_at"] or (before is not None and before.captured_at):
             facts.say(connection, new_id, [("captured_at", fields["captured_at"] or "")], dated_by)
-        return _with_tags(connection, _find(connection, new_id))
-
-
-def _find_removed(connection: Connection, ref: str) -> Row[Any]:
-    """A removed scene by its id, the beginning of it, or its last name."""
-    gone = scenes.c.removed_at.is_not(None)
-    named = connection.execute(select(scenes).where(gone, (scenes.c.id == ref) | (scenes.c.name == ref))).all()
-    if not named and ref and all(c in "0123456789abcdef" for c in ref):
-        named = connection.execute(select(scenes).where(gone, scenes.c.id.startswith(ref))).all()
-    if len(named) == 1:
-        return named[0]
-    if named:
-        several = ", ".join(f"{row.name} {row.id[:12]}" for row in named)
-        raise NotFoundError(f"several removed scenes are called {ref!r} ({several}): give more of an id")
-    with contextlib.suppress(NotFoundError):
-        raise InputError(f"scene {_find(connection, ref).name} was not removed: there is nothing to bring back")
-    raise NotFoundError(f"no removed scene is called {ref!r}, and no id begins so")
-
-
-def living_ids(connection: Connection) -> set[str]:
-    return set(connection.execute(select(scenes.c.id).where(scenes.c.removed_at.is_(None))).scalars())
-
-
-def resolve(connection: Connection, ref: str) -> str:
-    """The id that a ref means; see `Scenes.get`."""
-    return str(_find(connection, ref).id)
-
-
-def scene_name(connection: Connection, ref: str) -> str:
-    """What people call the scene that a ref means."""
-    return str(_find(connection, ref).name)
-
-
-def name_taken(connection: Connection, name: str) -> bool:
-    """Whether a living scene is called so."""
-    same = select(scenes.c.id).where(scenes.c.name == name, scenes.c.removed_at.is_(None))
-    return connection.execute(same).first() is not None
-
-
-def _alive(connection: Connection, ref: str) -> Row[Any]:
-    row = _find(connection, ref)
-    if row.removed_at is not None:
-        raise NotFoundError(f"scene {ref} was removed on {row.removed_at}")
-    return row
-
-
-def _find(connection: Connection, ref: str) -> Row[Any]:
-    living = scenes.c.removed_at.is_(None)
-    row = connection.execute(select(scenes).where(scenes.c.name == ref, living)).first() or _by_id(connection, ref)
-    if row is not None:
-        return row
-    rows: Sequence[Row[Any]] = []
-    if ref and all(c in "0123456789abcdef" for c in ref):
-        rows = connection.execute(select(scenes).where(scenes.c.id.startswith(ref), living).limit(3)).all()
-    if len(rows) == 1:
-        return rows[0]
-    if rows:
-        several = ", ".join(r.name for r in rows)
-        raise NotFoundError(f"{ref!r} is the beginning of several scene ids ({several}): add digits")
-    raise NotFoundError(f"no scene is called {ref!r}, and no id begins so: gsmap list MAP scenes shows what there is")
-
-
-def _by_id(connection: Connection, wanted: str) -> Row[Any] | None:
-    return connection.execute(select(scenes).where(scenes.c.id == wanted)).first()
+        return _with_tags(connection, find(connection, new_id))
 
 
 def _manifest(connection: Connection, row: Row[Any]) -> tuple[StoredFile, ...]:
@@ -422,100 +395,4 @@ def _manifest(connection: Connection, row: Row[Any]) -> tuple[StoredFile, ...]:
 
 
 def _with_tags(connection: Connection, row: Row[Any]) -> Scene:
-    return _scene(row, facts.tags(connection, row.id).get(row.id, ()))
-
-
-def _scene(row: Row[Any], tags: tuple[str, ...]) -> Scene:
-    return Scene(
-        id=row.id,
-        name=row.name,
-        num_gaussians=row.num_gaussians,
-        sh_degree=row.sh_degree,
-        num_cameras=row.num_cameras,
-        bounds=np.array(row.bounds),
-        scale_policy=row.scale_policy,
-        captured_at=row.captured_at,
-        ingested_at=row.ingested_at,
-        source=row.source,
-        cameras_synthesised=bool(row.cameras_synthesised),
-        antialiased=bool(row.antialiased),
-        tags=tags,
-    )
-
-
-def _shapes(row: Row[Any]) -> dict[str, Shape]:
-    """What a scene's row says of its arrays."""
-    n, c = row.num_gaussians, row.num_cameras
-    shapes: dict[str, Shape] = {
-        "means": (n, 3),
-        "quats": (n, 4),
-        "log_scales": (n, 3),
-        "logit_opacities": (n,),
-        "sh": (n, (row.sh_degree + 1) ** 2, 3),
-        "cameras.T_frame_camera": (c, 4, 4),
-        "cameras.intrinsics_px": (c, 4),
-        "cameras.sizes_px": (c, 2),
-        "cameras.names": (None,),
-    }
-    return shapes
-
-
-def _to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:
-    for name in cameras.names:
-        if "\n" in name:
-            raise InputError(f"camera name {name!r} has a line break")
-    return {name: getattr(gaussians, name) for name in _GAUSSIANS} | {
-        "cameras.T_frame_camera": cameras.T_frame_camera,
-        "cameras.intrinsics_px": cameras.intrinsics_px,
-        "cameras.sizes_px": cameras.sizes_px,
-        "cameras.names": np.frombuffer("\n".join(cameras.names).encode(), np.uint8),
-    }
-
-
-def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:
-    """Keep the boxes (C, 2, 3) of a scene's chunks, in place of those that there are."""
-    if number >= 1 << 24:
-        raise StoreError("a map holds at most 16 million scenes")  # the R*Tree's floats count no further
-    connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": number})
-    rows = [
-        {"s": number, "chunk": i}
-        | {f"{axis}{side}": float(box[side, k]) for side in (0, 1) for k, axis in enumerate("xyz")}
-        for i, box in enumerate(boxes)
-    ]
-    connection.execute(
-        text(
-            f"INSERT INTO {CHUNK_BOXES} (s0, s1, x0, x1, y0, y1, z0, z1, chunk) "
-            "VALUES (:s, :s, :x0, :x1, :y0, :y1, :z0, :z1, :chunk)"
-        ),
-        rows,
-    )
-
-
-def get_boxes(connection: Connection, number: int) -> np.ndarray:
-    """The boxes (C, 2, 3) of a scene's chunks."""
-    query = text(f"SELECT x0, y0, z0, x1, y1, z1 FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s ORDER BY chunk")
-    rows = [list(row) for row in connection.execute(query, {"s": number})]
-    return np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
-
-
-def _touching(connection: Connection, number: int, bounds: np.ndarray) -> list[int]:
-    if bounds.shape != (2, 3):
-        raise InputError(f"bounds must be (2, 3): lowest and highest corner, got shape {bounds.shape}")
-    query = text(
-        f"SELECT chunk FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s AND x1 >= :x0 AND x0 <= :x1 "
-        "AND y1 >= :y0 AND y0 <= :y1 AND z1 >= :z0 AND z0 <= :z1 ORDER BY chunk"
-    )
-    box = {f"{axis}{side}": float(bounds[side, k]) for side in (0, 1) for k, axis in enumerate("xyz")}
-    return list(connection.execute(query, {"s": number, **box}).scalars())
-
-
-def _ranges(chunks: list[int], count: int) -> list[tuple[int, int]]:
-    """Row ranges of chunks, neighbours joined."""
-    out: list[tuple[int, int]] = []
-    for chunk in chunks:
-        start, stop = chunk * CHUNK_ROWS, min(count, (chunk + 1) * CHUNK_ROWS)
-        if out and out[-1][1] == start:
-            out[-1] = (out[-1][0], stop)
-        else:
-            out.append((start, stop))
-    return out
+    return scene_of(row, facts.tags(connection, row.id).get(row.id, ()))

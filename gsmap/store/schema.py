@@ -29,18 +29,22 @@ from gsmap.store.columns import (
     Lines,
     Pair,
     RelativePath,
+    Word,
     a_box,
     a_direction,
     a_graph,
     a_matrix,
     a_pose,
+    a_thinning,
     an_object,
+    numbers,
     poses_by_scene,
     sigmas,
     texts,
 )
+from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 
-HEAD = "0003"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0005"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
@@ -85,7 +89,7 @@ about = _table(
 groups = _table(
     "groups",
     Column("id", Digest, primary_key=True),  # digest of the content
-    Column("kind", Kind, nullable=False),  # scenes, graphs
+    Column("kind", Kind, nullable=False),  # scenes, graphs, changes
     Column("created_at", Text, nullable=False),
 )
 files = _table(
@@ -114,6 +118,7 @@ scenes = _table(
     Column("notes", Json(texts), nullable=False),
     Column("group_id", Digest, ForeignKey("groups.id")),  # null once pruned
     Column("removed_at", Text),  # the tombstone
+    Column("thinned", Json(a_thinning)),  # of a scene that is kept compact (`gsmap.store.compact`)
     CheckConstraint("scale_policy in ('auto', 'known', 'unknown')", name="scale_policy"),
 )
 Index(
@@ -193,6 +198,51 @@ reviews = _table(
     Column("pair", Pair, nullable=False, index=True),
     Column("review", Text, nullable=False),
     Column("registration", Integer, ForeignKey("registrations.number"), nullable=False),
+    Column("note", Lines, nullable=False),
+    Column("created_at", Text, nullable=False),
+    CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),
+)
+
+# Two captures of a place, looked at for what changed. Nothing is overwritten; of a pair the newest one counts.
+comparisons = _table(
+    "comparisons",
+    Column("number", Integer, primary_key=True),
+    _scene("older"),
+    _scene("newer"),
+    Column("pair", Pair, nullable=False, index=True),  # both ids, sorted
+    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest
+    _recipe(),
+    Column("S_newer_older", Json(a_pose), nullable=False),  # the relative pose that it was made with
+    Column("S_frame_newer", Json(a_pose), nullable=False),  # takes the newer scene to the frame of boxes and voxels
+    Column("seen_share", Real, nullable=False),
+    Column("gains", Json(a_direction), nullable=False),
+    Column("notes", Json(texts), nullable=False),
+    Column("group_id", Digest, ForeignKey("groups.id")),  # null where nothing changed, and once pruned
+    Column("created_at", Text, nullable=False),
+)
+changes = _table(
+    "changes",
+    Column("number", Integer, primary_key=True),
+    Column("comparison", Integer, ForeignKey("comparisons.number"), nullable=False, index=True),
+    Column("place", Integer, nullable=False),  # in its comparison, from 0, surest first
+    Column("same_as", Integer, ForeignKey("changes.number")),  # the first row of the change that this one is; or null
+    Column("kind", Word(CHANGE_KINDS), nullable=False),
+    Column("box", Json(a_box), nullable=False),
+    Column("S_after_before", Json(a_pose)),
+    Column("symmetry", Word(SYMMETRIES), nullable=False),
+    Column("confidence", Real, nullable=False),
+    Column("evidence", Json(numbers), nullable=False),
+    Column("num_voxels", Integer, nullable=False),  # so many of each array of its comparison are its own
+    Column("num_before", Integer, nullable=False),
+    Column("num_after", Integer, nullable=False),
+    CheckConstraint("kind in ('appeared', 'disappeared', 'moved', 'recoloured', 'replaced', 'lighting')", name="kind"),
+    CheckConstraint("symmetry in ('none', 'half', 'any')", name="symmetry"),
+)
+change_reviews = _table(
+    "change_reviews",
+    Column("number", Integer, primary_key=True),
+    Column("change", Integer, ForeignKey("changes.number"), nullable=False, index=True),  # its first row
+    Column("review", Text, nullable=False),
     Column("note", Lines, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),

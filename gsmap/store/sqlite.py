@@ -7,6 +7,7 @@ import errno
 import os
 import sqlite3
 import threading
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -252,22 +253,22 @@ def accept(engine: Engine, file: Path) -> None:
 
 def integrity_problems(connection: Connection) -> list[str]:
     """What SQLite itself finds wrong with its structure; it does not notice other bytes than those written."""
-    rows = [str(row[0]) for row in connection.exec_driver_sql("PRAGMA integrity_check")]
-    names = [
-        f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in connection.exec_driver_sql("PRAGMA foreign_key_check")
-    ]
-    return ([] if rows == ["ok"] else rows) + names
+    return _problems(connection.exec_driver_sql)
 
 
 def file_problems(file: Path) -> list[str]:
     """As `integrity_problems`, of a file that nobody has open; nothing is made beside it."""
     try:
         with contextlib.closing(_connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1")) as connection:
-            rows = [str(row[0]) for row in connection.execute("PRAGMA integrity_check")]
-            odd = connection.execute("PRAGMA foreign_key_check").fetchall()
+            return _problems(connection.execute)
     except sqlite3.DatabaseError as error:
         return [str(error)]
-    return ([] if rows == ["ok"] else rows) + [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in odd]
+
+
+def _problems(execute: Callable[[str], Iterable[Any]]) -> list[str]:
+    rows = [str(row[0]) for row in execute("PRAGMA integrity_check")]
+    missing = [f"row {r[1]} of {r[0]} names a missing {r[2]}" for r in execute("PRAGMA foreign_key_check")]
+    return ([] if rows == ["ok"] else rows) + missing
 
 
 def damage(file: Path) -> list[str]:

@@ -20,6 +20,7 @@ from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
 from gsmap.store.branches import Branches, Place
 from gsmap.store.catalog import Catalog
+from gsmap.store.changes import Changes
 from gsmap.store.copying import empty_catalog
 from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
@@ -39,10 +40,10 @@ from gsmap.version import __version__
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
-    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``revisions``, ``priors``,
-    ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that changes something is one
-    transaction, durable when it returns; `transaction` makes several of them one. Killed anywhere, the map opens whole.
-    Threads may share a store; processes open their own.
+    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``changes``,
+    ``revisions``, ``priors``, ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that
+    changes something is one transaction, durable when it returns; `transaction` makes several of them one. Killed
+    anywhere, the map opens whole. Threads may share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -69,6 +70,7 @@ class Store:
         self.recipes = Recipes(catalog)
         self.graphs = Graphs(catalog, self.arrays)
         self.registrations = Registrations(catalog)
+        self.changes = Changes(catalog, self.arrays)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
         self.models = Models(catalog, self.arrays)
@@ -162,8 +164,7 @@ class Store:
 
     def others(self) -> list[Place]:
         """Where the other catalogs over the same arrays lie: the map, its branches, its tags."""
-        every = (Place(self.home, self.home), *branches.places(self.home))
-        return [place for place in every if place.folder != self.folder]
+        return branches.other_places(self.home, self.folder)
 
     @classmethod
     def migrate(cls, path: str | os.PathLike[str]) -> tuple[str | None, str | None]:
@@ -288,6 +289,10 @@ class Store:
     def prune(self, *, keep_revisions: int | None = None, dry_run: bool = False) -> Pruned:
         """Reclaim what no kept revision names, and what crashes left; see `gsmap.store.integrity.prune`."""
         return integrity.prune(self.catalog, self.arrays, keep_revisions=keep_revisions, dry_run=dry_run)
+
+    def reclaim(self) -> integrity.Reclaimed:
+        """Delete arrays and models that no row names, and what crashes left."""
+        return integrity.reclaim(self.catalog, self.arrays)
 
     def close(self) -> None:
         self.leases.close()

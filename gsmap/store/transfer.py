@@ -14,11 +14,14 @@ from sqlalchemy import Connection, Row, delete, insert, select, update
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import ConfigError, StoreError
 from gsmap.store import facts
-from gsmap.store import scenes as scene_rows
 from gsmap.store.arrays import Staged, StoredFile, link_or_copy
+from gsmap.store.boxes import get_boxes, put_boxes
+from gsmap.store.change_rows import named_groups
 from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.groups import has_group, manifest, name, publish
 from gsmap.store.models import model_path
+from gsmap.store.scene_refs import free_name
+from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import (
     graphs,
     groups,
@@ -110,8 +113,9 @@ class Transfer:
         for row in self._rows:
             if row.id in self._forgotten:
                 continue
-            self._bring_group(scene_rows.KIND, row.group_id)
             mine = self.ours.execute(select(scenes).where(scenes.c.id == row.id)).first()
+            if mine is None or mine.group_id in (None, row.group_id) or mine.thinned is not None:
+                self.bring_group(SCENES, row.group_id)
             if mine is None:
                 self._add_scene(row)
                 self._join_facts(row.id, arrives=True)
@@ -134,8 +138,12 @@ class Transfer:
         self.counts["known"] += 1
         values: Content = {}
         if mine.group_id is None and row.group_id is not None:
-            values["group_id"] = row.group_id
+            values |= _kept(row)
             self._copy_boxes(row, mine.number)
+        elif mine.thinned is not None and row.group_id is not None and row.thinned is None:
+            values |= _kept(row)
+            self._copy_boxes(row, mine.number)
+            self.notes.append(f"scene {mine.name} is whole again: it was thinned here, and not there")
         returns = mine.removed_at is not None and row.removed_at is None and row.ingested_at > mine.removed_at
         leaves = mine.removed_at is None and row.removed_at is not None and row.removed_at > mine.ingested_at
         if returns:
@@ -200,20 +208,17 @@ class Transfer:
             self.ours.execute(update(scenes).where(scenes.c.id == scene).values(**values))
 
     def _free_name(self, wanted: str) -> str:
-        free, number = wanted, 2
-        while scene_rows.name_taken(self.ours, free):
-            free = f"{wanted}-{number}"
-            number += 1
+        free = free_name(self.ours, wanted)
         if free != wanted:
             self.renamed.append((wanted, free))
         return free
 
     def _copy_boxes(self, row: Row[Any], number: int) -> None:
-        boxes = scene_rows.get_boxes(self.theirs, row.number)
+        boxes = get_boxes(self.theirs, row.number)
         if len(boxes):
-            scene_rows.put_boxes(self.ours, number, boxes)
+            put_boxes(self.ours, number, boxes)
 
-    def _bring_group(self, kind: str, group: str | None) -> None:
+    def bring_group(self, kind: str, group: str | None) -> None:
         staged = None if self._staged is None or group is None else self._staged.pop((kind, group), None)
         if group is None or (staged is None and has_group(self.ours, group)):
             return
@@ -235,7 +240,7 @@ class Transfer:
             if row.scene not in self.wanted:
                 continue
             if row.key not in here or row.group_id == here[row.key]:
-                self._bring_group(GRAPHS, row.group_id)
+                self.bring_group(GRAPHS, row.group_id)
             if row.key not in here:
                 self.recipe(row.recipe)
                 self.ours.execute(insert(graphs), dict(row._mapping))
@@ -346,10 +351,11 @@ def _missing_groups(
     into: Store, ours: Connection, theirs: Connection, only: Collection[str] | None, mend: bool
 ) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
     """Manifests of the groups that wanted scenes need and this map lacks (or has damaged), by (kind, id)."""
-    named = [(scene_rows.KIND, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
+    named = [(SCENES, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
     known = {row.key: row.group_id for row in ours.execute(select(graphs.c.key, graphs.c.group_id))}
     made = theirs.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id))
     named += [(GRAPHS, row.scene, row.group_id) for row in made if known.get(row.key, row.group_id) == row.group_id]
+    named += named_groups(ours, theirs, only)
     here, forgotten = set(ours.execute(select(groups.c.id)).scalars()), _forgotten(ours)
 
     def is_lacking(kind: str, group: str) -> bool:
@@ -371,6 +377,11 @@ def _forgotten(connection: Connection) -> set[str]:
 def _content(row: Row[Any]) -> Content:
     """A row without its number, which is each map's own."""
     return {column: value for column, value in row._mapping.items() if column != "number"}
+
+
+def _kept(row: Row[Any]) -> Content:
+    """How a scene's arrays are kept."""
+    return {name: getattr(row, name) for name in ("group_id", "num_gaussians", "thinned")}
 
 
 def _identity(row: Row[Any], *besides: str) -> str:

@@ -15,6 +15,10 @@ ChangeKind = Literal["appeared", "disappeared", "moved", "recoloured", "replaced
 ``recoloured``: the same surface in another colour. ``replaced``: another thing where one stood. ``lighting``: the same
 surfaces, lit otherwise; of the place, never of a thing."""
 
+Symmetry = Literal["none", "half", "any"]
+"""The turn about the vertical that nothing tells apart: none, half a turn, any."""
+
+SYMMETRIES: tuple[Symmetry, ...] = ("none", "half", "any")
 CHANGE_KINDS: tuple[ChangeKind, ...] = ("appeared", "disappeared", "moved", "recoloured", "replaced", "lighting")
 
 
@@ -41,7 +45,7 @@ class Change:
     before: np.ndarray
     after: np.ndarray
     S_after_before: Sim3 | None = None
-    symmetry: Literal["none", "half", "any"] = "none"
+    symmetry: Symmetry = "none"
     confidence: float = 0.0
     evidence: Mapping[str, float] = field(default_factory=dict)
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.types.thinning import Thinning
+
 SCALE_POLICIES = ("auto", "known", "unknown")
 
 
@@ -25,6 +27,7 @@ class Scene:
         cameras_synthesised: true when the source had no cameras.
         antialiased: true when trained with the 2D Mip filter (noted, not yet rendered differently).
         tags: words that people gave it, sorted.
+        thinning: how it is kept where newer captures supersede it; None for one that is kept as it came.
     """
 
     id: str
@@ -40,3 +43,4 @@ class Scene:
     cameras_synthesised: bool = False
     antialiased: bool = False
     tags: tuple[str, ...] = ()
+    thinning: Thinning | None = None

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.formats.tiles3d import coarser
+from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.geometry.voxels import covariances
@@ -86,7 +87,7 @@ class ViewMap:
                     "component": pose.component if pose else components + index,
                     "status": pose.status if pose else "not placed",
                     "S_map_scene": _pose(entry).matrix().tolist(),
-                    "corners": _pose(entry).apply(_corners(entry.scene.bounds)).tolist(),
+                    "corners": _pose(entry).apply(box_corners(entry.scene.bounds)).tolist(),
                 }
             )
         at = {entry.scene.id: index for index, entry in enumerate(self.scenes)}
@@ -147,8 +148,3 @@ class ViewMap:
 
 def _pose(entry: ViewScene) -> Sim3:
     return entry.pose.S_map_scene if entry.pose is not None else Sim3.identity()
-
-
-def _corners(bounds: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of a box (2, 3)."""
-    return np.array([[bounds[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])

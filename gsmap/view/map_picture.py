@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -132,8 +133,7 @@ def _view(low: np.ndarray, high: np.ndarray, elevation_deg: float, size_px: tupl
         forward /= np.linalg.norm(forward)
     rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
     center = 0.5 * (low + high)
-    corners = np.stack(np.meshgrid(*np.stack([low, high], 1), indexing="ij"), -1).reshape(-1, 3)
-    local = (corners - center) @ rotation
+    local = (box_corners(np.stack([low, high])) - center) @ rotation
     distance = 6.0 * np.linalg.norm(high - low)
     spread = np.abs(local[:, :2]).max(0) / (distance - np.abs(local[:, 2]).max())
     focal = 0.48 * min(width / spread[0] / 1.0, height / spread[1] / 1.0)

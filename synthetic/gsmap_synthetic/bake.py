@@ -30,6 +30,7 @@ class Skin:
         offsets: per level, (Q,) where each quad's texels start.
         widths, heights: per level, (Q,) texels along u and v.
         texel_m: edge of a texel of the finest level.
+        owners: (Q,) the object a quad belongs to, -1 for none.
         leaves: (Q,) the door whose leaf a quad belongs to, -1 for all that stays.
         shut: the doors that are shut; the leaves of others are not there.
     """
@@ -41,6 +42,7 @@ class Skin:
     heights: tuple[np.ndarray, ...]
     texel_m: float
     leaves: np.ndarray
+    owners: np.ndarray
     shut: frozenset[int] = frozenset()
 
     def with_shut(self, doors: Iterable[int]) -> Skin:
@@ -58,11 +60,11 @@ class Skin:
 
     @cached_property
     def _rays(self):
-        return _ray_scene(self.corners[self.present])
+        return ray_scene(self.corners[self.present])
 
     def cast(self, origins: np.ndarray, directions: np.ndarray):
         """First hits of rays (n, 3): distance in units of the direction (inf for none), quad index, and its (s, t)."""
-        hit = self._rays.cast_rays(_rays_tensor(origins, directions))
+        hit = self._rays.cast_rays(rays_tensor(origins, directions))
         primitive = hit["primitive_ids"].numpy()
         found = primitive != 0xFFFFFFFF
         primitive = np.where(found, primitive, 0).astype(np.int64)
@@ -96,7 +98,7 @@ def _triangles(count: int) -> np.ndarray:
     return (base[:, :, None] + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
 
 
-def _ray_scene(corners: np.ndarray) -> Any:
+def ray_scene(corners: np.ndarray) -> Any:
     o3d = _open3d()
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -105,7 +107,7 @@ def _ray_scene(corners: np.ndarray) -> Any:
     return scene
 
 
-def _rays_tensor(origins: np.ndarray, directions: np.ndarray) -> Any:
+def rays_tensor(origins: np.ndarray, directions: np.ndarray) -> Any:
     o3d = _open3d()
     return o3d.core.Tensor(np.concatenate([origins, directions], axis=1).astype(np.float32))
 
@@ -134,7 +136,7 @@ def bake(
         glow = surfaces.glows[q]
         images.append(_display(paint * (lit * (1 - glow) + 1.1 * glow)))
     texels, offsets, widths, heights = _pack(images)
-    return Skin(corners, texels, offsets, widths, heights, texel_m, leaves)
+    return Skin(corners, texels, offsets, widths, heights, texel_m, leaves, np.array(surfaces.owners))
 
 
 def _paint(surfaces: Surfaces, q: int, texel_m: float) -> np.ndarray:
@@ -147,10 +149,16 @@ def _paint(surfaces: Surfaces, q: int, texel_m: float) -> np.ndarray:
     )
 
 
+def mean_albedo(surfaces: Surfaces, quads: Iterable[int]) -> np.ndarray:
+    """(3,) linear-light colour of some quads, averaged over their area."""
+    painted = [_paint(surfaces, q, 0.05).reshape(-1, 3) for q in quads]
+    return np.concatenate(painted).mean(0)
+
+
 def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
     """Irradiance on a coarse grid of every quad: the grids' (nu, nv) and all values (P, 3), normalised in exposure."""
     standing = np.flatnonzero(np.array(surfaces.leaves) < 0)  # Doors stand open while the lamps shine.
-    scene = _ray_scene(corners[standing])
+    scene = ray_scene(corners[standing])
     grids = np.clip(np.ceil(sizes / _LIGHT_STEP_M).astype(int) + 1, 2, 64)
     at, facing = [], []
     for q, (nu, nv) in enumerate(grids):
@@ -174,7 +182,7 @@ def _light(surfaces: Surfaces, corners, sizes, mean_albedo):
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     bitangent = np.cross(normals, tangent)
     for x, y, z in directions:
-        hit = scene.cast_rays(_rays_tensor(points, x * tangent + y * bitangent + z * normals))
+        hit = scene.cast_rays(rays_tensor(points, x * tangent + y * bitangent + z * normals))
         primitive = hit["primitive_ids"].numpy()
         found = primitive != 0xFFFFFFFF
         bounce[found] += radiosity[standing[primitive[found] // 2]] / rays
@@ -194,7 +202,7 @@ def _direct(scene, lamps, points, normals) -> np.ndarray:
             distance = np.linalg.norm(way, axis=1)
             cosine = (way * normals[near]).sum(1) / distance
             lit = np.flatnonzero(cosine > 0)
-            rays = _rays_tensor(points[near[lit]], way[lit])
+            rays = rays_tensor(points[near[lit]], way[lit])
             free = ~scene.test_occlusions(rays, tnear=0.0, tfar=0.98).numpy().astype(bool)
             lit = lit[free]
             light[near[lit]] += 0.25 * colour * (cosine[lit] / (distance[lit] ** 2 + 0.15))[:, None]

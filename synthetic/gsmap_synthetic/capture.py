@@ -153,15 +153,15 @@ def film(
     *,
     size_px: tuple[int, int] = (320, 240),
     shut: Iterable[int] = (),
-    gain: float = 1.0,
+    gain: float | np.ndarray = 1.0,
     gamma: float = 1.0,
     name: str = "frame",
     progress: Callable[[float, str], None] | None = None,
 ) -> Frames:
     """Render colour (2 x 2 supersampled) and depth frames of a place from camera-to-place poses (C, 4, 4).
 
-    ``shut`` names the doors (indices) that are closed meanwhile. ``gain`` and ``gamma`` imitate a camera's exposure:
-    colours become ``clip(gain * colour ** gamma)``.
+    ``shut`` names the doors (indices) that are closed meanwhile. ``gain`` (one, or one a channel: white balance) and
+    ``gamma`` imitate a camera's exposure: colours become ``clip(gain * colour ** gamma)``.
     """
     width, height = size_px
     focal = _FOCAL * width

@@ -347,32 +347,38 @@ def basin(s: Surfaces, rng, w, d) -> None:
 
 @dataclass(frozen=True)
 class Piece:
-    """A kind of furniture: how to build it and the footprints it comes in (width along the wall, depth)."""
+    """A kind of furniture: how to build it and the footprints it comes in (width along the wall, depth).
+
+    ``symmetry`` says which turns about its middle leave it nearly as it is, see `PlaceObject`.
+    """
 
     build: Callable[[Surfaces, np.random.Generator, float, float], None]
     width_m: tuple[float, float]
     depth_m: tuple[float, float]
     against_wall: bool = True
     tall: bool = False
+    covers_wall: bool = False  # Pictures keep clear of it.
+    symmetry: str = "none"
+    small: bool = False
 
 
 PIECES = {
     "armchair": Piece(armchair, (0.85, 0.95), (0.8, 0.9)),
-    "basin": Piece(basin, (0.6, 0.9), (0.45, 0.5), tall=True),
+    "basin": Piece(basin, (0.6, 0.9), (0.45, 0.5), tall=True, covers_wall=True),
     "bathtub": Piece(bathtub, (1.5, 1.7), (0.7, 0.8)),
     "bed": Piece(bed, (1.2, 1.7), (2.0, 2.1)),
-    "bookshelf": Piece(bookshelf, (0.8, 1.4), (0.3, 0.34), tall=True),
-    "coffee table": Piece(coffee_table, (0.8, 1.1), (0.5, 0.6), against_wall=False),
-    "desk": Piece(desk, (1.2, 1.5), (0.6, 0.7)),
-    "dining table": Piece(dining_table, (1.6, 2.1), (1.7, 1.8), against_wall=False),
-    "drawers": Piece(drawers, (0.8, 1.2), (0.42, 0.5)),
-    "floor lamp": Piece(floor_lamp, (0.42, 0.42), (0.42, 0.42), tall=True),
-    "fridge": Piece(fridge, (0.6, 0.7), (0.62, 0.68), tall=True),
-    "kitchen row": Piece(kitchen_row, (1.8, 2.7), (0.6, 0.62), tall=True),
-    "plant": Piece(plant, (0.5, 0.5), (0.5, 0.5), tall=True),
-    "sideboard": Piece(sideboard, (1.3, 1.8), (0.4, 0.45)),
+    "bookshelf": Piece(bookshelf, (0.8, 1.4), (0.3, 0.34), tall=True, covers_wall=True),
+    "coffee table": Piece(coffee_table, (0.8, 1.1), (0.5, 0.6), against_wall=False, symmetry="half"),
+    "desk": Piece(desk, (1.2, 1.5), (0.6, 0.7), covers_wall=True),
+    "dining table": Piece(dining_table, (1.6, 2.1), (1.7, 1.8), against_wall=False, symmetry="half"),
+    "drawers": Piece(drawers, (0.8, 1.2), (0.42, 0.5), covers_wall=True),
+    "floor lamp": Piece(floor_lamp, (0.42, 0.42), (0.42, 0.42), tall=True, covers_wall=True, symmetry="any"),
+    "fridge": Piece(fridge, (0.6, 0.7), (0.62, 0.68), tall=True, covers_wall=True),
+    "kitchen row": Piece(kitchen_row, (1.8, 2.7), (0.6, 0.62), tall=True, covers_wall=True),
+    "plant": Piece(plant, (0.5, 0.5), (0.5, 0.5), tall=True, covers_wall=True),
+    "sideboard": Piece(sideboard, (1.3, 1.8), (0.4, 0.45), covers_wall=True),
     "sofa": Piece(sofa, (1.5, 2.1), (0.8, 0.9)),
-    "wardrobe": Piece(wardrobe, (1.1, 1.8), (0.55, 0.62), tall=True),
+    "wardrobe": Piece(wardrobe, (1.1, 1.8), (0.55, 0.62), tall=True, covers_wall=True),
 }
 
 ROOMS = {

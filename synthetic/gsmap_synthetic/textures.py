@@ -273,3 +273,13 @@ def leaf(colour: np.ndarray, seed: int) -> Material:
         return _shade(colour, np.where(rib, 1.5, 1 + 0.5 * _fractal(u, v, 0.05, seed, 2)))
 
     return paint
+
+
+def repainted(material: Material, colour: np.ndarray, mean: float) -> Material:
+    """Another colour on the same thing: the pattern of ``material``, whose mean luminance is ``mean``, stays."""
+
+    def paint(u, v, size):
+        luminance = material(u, v, size) @ np.float32([0.2126, 0.7152, 0.0722])
+        return _shade(colour, np.clip(luminance / np.float32(max(mean, 0.02)), 0.35, 1.8))
+
+    return paint

@@ -1,4 +1,4 @@
-"""Captures for the tests of this room, made in a moment: parts of a textured room, as files with known truth."""
+"""What the tests of this room share: parts of a textured room as files with known truth, and changes of a map."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+import gsmap.map
 from gsmap import formats
+from gsmap.change import recipe_key
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.geometry.transforms import transform_gaussians
-from gsmap.types import Gaussians, Sim3
+from gsmap.types import Change, ChangeReport, Gaussians, Sim3
 
 SIZE = np.array([6.0, 4.0, 2.5])
 
@@ -21,25 +23,29 @@ def write_captures(folder: Path) -> None:
     (folder / "truth").mkdir(parents=True)
     rooms = {"left": (7, 0.0, 4.2), "right": (7, 1.8, 6.0), "odd:one": (8, 0.0, 6.0)}
     for k, (name, (room, low, high)) in enumerate(rooms.items()):
-        rng = np.random.default_rng(k)
         S = Sim3(exp_so3(np.array([0.0, 0.0, 0.7 * k])), np.array([2.0, -1.0, 0.3]) * k)
-        gaussians = transform_gaussians(_surfaces(rng, room, low, high, 9_000), S)
-        formats.write(folder / f"{name}.ply", gaussians)
-        frames = [
-            {
-                "id": i,
-                "img_name": f"{name}_{i}",
-                "width": 96,
-                "height": 72,
-                "position": (pose[:3, 3]).tolist(),
-                "rotation": pose[:3, :3].tolist(),
-                "fx": 60.0,
-                "fy": 60.0,
-            }
-            for i, pose in enumerate(S.matrix() @ view for view in _views(low, high))
-        ]
-        (folder / f"{name}.cameras.json").write_text(json.dumps(frames))
+        write_capture(folder, name, S, room, low, high, k)
         (folder / "truth" / f"{name}.json").write_text(json.dumps({"T_scene_world": S.matrix().tolist()}))
+
+
+def write_capture(folder: Path, name: str, S: Sim3, room: int, low: float, high: float, seed: int) -> None:
+    """Part of a room between two values of x, in a frame of its own, with the cameras that look around in it."""
+    gaussians = transform_gaussians(_surfaces(np.random.default_rng(seed), room, low, high, 9_000), S)
+    formats.write(folder / f"{name}.ply", gaussians)
+    frames = [
+        {
+            "id": i,
+            "img_name": f"{name}_{i}",
+            "width": 96,
+            "height": 72,
+            "position": (pose[:3, 3]).tolist(),
+            "rotation": pose[:3, :3].tolist(),
+            "fx": 60.0,
+            "fy": 60.0,
+        }
+        for i, pose in enumerate(S.matrix() @ view for view in _views(low, high))
+    ]
+    (folder / f"{name}.cameras.json").write_text(json.dumps(frames))
 
 
 def _surfaces(rng: np.random.Generator, room: int, low: float, high: float, count: int) -> Gaussians:
@@ -94,3 +100,18 @@ def _views(low: float, high: float) -> np.ndarray:
             pose[:3, 3] = [x, SIZE[1] / 2, 1.5]
             views.append(pose)
     return np.array(views)
+
+
+def save_changes(site: Path) -> None:
+    """What a comparison of left and right might have found, so that nothing is rendered here."""
+    box, rows = np.array([[0.0, 0, 0], [0.5, 0.5, 1]]), np.arange(5, dtype=np.int32)
+    moved = Sim3(np.eye(3), np.array([1.0, 0, 0]))
+    chair = Change("moved", box, box.astype(np.float32), rows, rows[:3], moved, "half", 0.875, {"through": 6.0})
+    report = ChangeReport((chair,), 0.75, np.array([1.0, 1.125, 0.875]), ("it was dark",))
+    with gsmap.map.open(site) as m:
+        m.edit("left", captured_at="2026-05-30")
+        m.edit("right", captured_at="2026-05-31")
+        left, right = (m.pose_graph().poses[m.store.scenes.get(name).id] for name in ("left", "right"))
+        where = {"older": left.scene, "newer": right.scene, "S_frame_newer": right.S_map_scene}
+        where |= {"S_newer_older": right.S_map_scene.inverse() @ left.S_map_scene}
+        m.store.changes.save(report, recipe_key(m.settings.change).of(left.scene, right.scene), **where)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-
-from conftest import Done
+from typing import Any
 
 from gsmap.export.lock import LOCK_FILE, folder_lock
 from gsmap.store import Store
 
 
-def test_a_second_export_to_a_folder_says_who_is_at_it(cli: Callable[..., Done], site: Path, tmp_path: Path) -> None:
+def test_a_second_export_to_a_folder_says_who_is_at_it(cli: Callable[..., Any], site: Path, tmp_path: Path) -> None:
     out = tmp_path / "tiles"
     with folder_lock(out):
         (out / ".partial").mkdir()
@@ -26,7 +25,7 @@ def test_a_second_export_to_a_folder_says_who_is_at_it(cli: Callable[..., Done],
     assert LOCK_FILE not in os.listdir(out)
 
 
-def test_status_says_who_is_at_work(cli: Callable[..., Done], site: Path) -> None:
+def test_status_says_who_is_at_work(cli: Callable[..., Any], site: Path) -> None:
     assert cli("status", site, "--json").json["at_work"] == []
     with Store.open(site) as store, store.leases.attend("update"):
         (row,) = cli("status", site, "--json").json["at_work"]

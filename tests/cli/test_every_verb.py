@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
+from cli_rooms import save_changes
+from tiny_encoder import image_encoder
 
 import gsmap
 import gsmap.map
@@ -47,8 +49,11 @@ RUNS = {
     "status": "status MAP",
     "confirm": "confirm MAP left:right --note seen",
     "reject": "reject MAP left:right --note mirrored",
+    "confirm CHANGE": "confirm MAP c1 --note seen",
+    "reject CHANGE": "reject MAP c1 --note shadow",
     "edge": "edge MAP left:right --pose TMP/pose.txt --sigma 0.5,0.02 --note tape",
     "prior": "prior MAP left --anchor",
+    "changes": "changes MAP",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",
     "list scenes": "list MAP scenes",
@@ -57,6 +62,7 @@ RUNS = {
     "list tiles": "list MAP tiles",
     "show SCENE": "show MAP left",
     "show A:B": "show MAP left:right",
+    "show CHANGE": "show MAP c1",
     "diff": "diff MAP 1 2",
     "poses": "poses MAP",
     "settings": "settings MAP",
@@ -95,7 +101,7 @@ def gsmap_run(
 ) -> Callable[[str], Any]:
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
-    (tmp_path / "encoder.onnx").write_bytes(_image_encoder())
+    (tmp_path / "encoder.onnx").write_bytes(image_encoder())
     (tmp_path / "remote.gsmap" / "arrays").mkdir(parents=True)
     trust.write(tmp_path / "remote.gsmap", "postgresql+psycopg://me@example.org/site", "0" * 32)
     monkeypatch.setattr("gsmap.view.ViewServer.serve_forever", lambda self: None)
@@ -104,6 +110,8 @@ def gsmap_run(
     monkeypatch.setattr(gsmap_synthetic, "write_captures", lambda folder, made: _link_captures(captures, folder))
 
     def call(line: str) -> Any:
+        if "c1" in line.split() or "changes" in line.split():
+            save_changes(site)
         if "TMP/saved" in line:
             with gsmap.map.open(site) as m:
                 m.backup(tmp_path / "saved")
@@ -121,21 +129,6 @@ def _link_captures(captures: Path, folder: Path) -> None:
     (folder / "truth").mkdir(parents=True)
     for path in [*captures.glob("left*"), *captures.glob("truth/left*")]:
         (folder / path.relative_to(captures)).symlink_to(path)
-
-
-def _image_encoder() -> bytes:
-    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
-    from onnx import TensorProto, helper
-
-    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
 def test_no_verb_is_forgotten() -> None:

@@ -36,6 +36,7 @@ LAYERS = [
         "merge",
         "change",
         "objects",
+        "thin",
         "export",
         "evaluate",
         "view",

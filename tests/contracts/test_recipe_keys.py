@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import gsmap
-from gsmap import describe, merge, optimize, register
+from gsmap import change, describe, merge, optimize, register
 from gsmap.errors import ConfigError
 from gsmap.export import PlannedTile, TileRecipe
 from gsmap.map.settings import PRESETS, Settings, settings_of
@@ -24,7 +24,7 @@ from gsmap.methods import families
 from gsmap.settings import changed, leaves, load, parse, save
 from gsmap.types import Sim3
 
-GRAPH, EDGE, POSES = "graph", "edge", "poses"
+GRAPH, EDGE, POSES, CHANGES = "graph", "edge", "poses", "changes"
 MERGERS = families()["merger"].names()
 TILE = PlannedTile(0, "map", np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), {"scene": Sim3.identity()}, "all")
 
@@ -32,6 +32,7 @@ ALTERNATIVES: dict[str, Any] = {
     "describe.object.segmenter": "builtin",
     "describe.object.embedder": "builtin",
     "merge.method": "voxel",
+    "merge.mergers.tto.prefer": "both",
     "describe.object.render_backend": "gsplat",
     "register.proposer": "kiss_matcher",
     "register.fallback_proposer": "graph",
@@ -44,7 +45,16 @@ ALTERNATIVES: dict[str, Any] = {
 }
 """Another value of a setting that takes only certain words."""
 
-NAMES_NOTHING = ("retrieve.", "export.", "evaluate.", "engine.", "merge.method", "describe.object.model_")
+NAMES_NOTHING = (
+    "retrieve.",
+    "visits.",
+    "thin.",
+    "export.",
+    "evaluate.",
+    "engine.",
+    "merge.method",
+    "describe.object.model_",
+)
 """Settings that choose work (which pairs, which tiles, where it runs, when it is given up), and change no result."""
 
 
@@ -83,7 +93,8 @@ def keys(settings: Settings) -> dict[str, str]:
     edge = register.recipe_key(settings.register).of(graph.digest, graph.digest)
     poses = optimize.recipe_key(settings.optimize).of("scene", edge.digest)
     tiles = {f"tile {m}": TileRecipe(merge.recipe_key(m, settings.merge.mergers[m])).key(TILE) for m in MERGERS}
-    return {GRAPH: graph.digest, EDGE: edge.digest, POSES: poses.digest, **tiles}
+    changes = change.recipe_key(settings.change).of("older", "newer")
+    return {GRAPH: graph.digest, EDGE: edge.digest, POSES: poses.digest, CHANGES: changes.digest, **tiles}
 
 
 def expected(name: str) -> set[str]:
@@ -94,7 +105,7 @@ def expected(name: str) -> set[str]:
     if room == "merge":
         return {f"tile {name.split('.')[2]}"}
     # An edge is made from graphs, and poses from edges: what changes the one changes the other.
-    return {"describe": {GRAPH, EDGE, POSES}, "register": {EDGE, POSES}, "optimize": {POSES}}[room]
+    return {"describe": {GRAPH, EDGE, POSES}, "register": {EDGE, POSES}, "optimize": {POSES}, "change": {CHANGES}}[room]
 
 
 def another(name: str, value: Any) -> Iterator[Any]:
@@ -207,7 +218,7 @@ def test_a_version_changes_a_key(module: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(found, "VERSION", found.VERSION + 1)
     after = all_keys()
     assert before != after, f"{module} states a VERSION that no key knows"
-    room = {"describe": GRAPH, "register": EDGE, "optimize": POSES}.get(module.split(".")[1], "tile")
+    room = {"describe": GRAPH, "register": EDGE, "optimize": POSES, "change": CHANGES}.get(module.split(".")[1], "tile")
     for old, new in zip(before, after, strict=True):
         changed_kinds = {kind for kind in old if old[kind] != new[kind]}
         upstream = {EDGE: {GRAPH}, POSES: {GRAPH, EDGE}, "tile": {GRAPH, EDGE, POSES}}.get(room, set())

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from stop_sweep import alive
 
 ROOT = Path(__file__).parents[2]
 ASKED = {signal.SIGINT: "", signal.SIGTERM: " by SIGTERM", signal.SIGHUP: " by SIGHUP"}
@@ -45,20 +46,6 @@ def start() -> Iterator[Start]:
         for pid in alive(process.pid):
             os.kill(pid, signal.SIGKILL)
         process.communicate()
-
-
-def alive(session: int) -> list[int]:
-    """The processes of a session."""
-    found = []
-    for path in Path("/proc").iterdir():
-        if path.name.isdecimal():
-            try:
-                fields = (path / "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue
-            if int(fields[3]) == session and fields[0] not in "ZX":
-                found.append(int(path.name))
-    return found
 
 
 def wait_for_workers(process: subprocess.Popen[str]) -> None:

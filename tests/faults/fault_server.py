@@ -226,7 +226,7 @@ class Server:
                 store.prune()
         except GsmapError as error:
             out.lost.append(f"does not open to be pruned: {error}")
-        out.left += fault_judge.leftovers(self.work)
+        out.left += fault_judge.leftovers(self.work, locks=again == 0)
         return out
 
     def _problems(self) -> list[str]:
@@ -243,7 +243,7 @@ class Server:
 
     def _then(self, verb: Verb) -> list[str]:
         """What does not work of what the verb was for."""
-        out = []
+        out = fault_judge.told(self.work, verb.forgets) if verb.forgets else []
         for line in verb.then:
             code, stderr = self._run(line)
             out += [f"gsmap {line} ended with {code}: {stderr[-300:]}"] if code else []

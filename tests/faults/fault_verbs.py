@@ -11,13 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tiny_encoder import image_encoder
 
+import gsmap.map
 from gsmap import formats
+from gsmap.change import recipe_key
 from gsmap.cli import app
-from gsmap.types import Gaussians
+from gsmap.types import Change, ChangeReport, Gaussians
 
 OLDER = Path(__file__).resolve().parents[1] / "store" / "releases" / "0.1.0.tar.xz"
 EXPORT = "export MAP OUT --merge union --tile-size 3"
+EXPORT_3DTILES = f"{EXPORT} --format 3dtiles"
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class Verb:
         also: lines that are run first, undisturbed and unwatched.
         needs: a package without which there is no such verb.
         then: lines that must work once it has come to its end, the first time and the second.
+        forgets: a text that no file below the folder holds once it has come to its end.
     """
 
     name: str
@@ -41,6 +46,7 @@ class Verb:
     also: tuple[str, ...] = ()
     needs: str = ""
     then: tuple[str, ...] = ()
+    forgets: str = ""
 
     @property
     def possible(self) -> bool:
@@ -62,6 +68,8 @@ BASES = {
         ("ingest MAP IN/c.ply", "edge MAP a:b --pose IN/pose2.txt --sigma 0.1,0.01", "optimize MAP"),
     ),
     "shrunk": ("exported", ("remove MAP b", "optimize MAP")),
+    "removed": ("placed", ("remove MAP b",)),
+    "levelled": ("placed", (EXPORT_3DTILES,)),
     "modelled": ("placed", ("models add MAP clip IN/encoder.onnx --preset unit",)),
     # Everything that prune takes: a removed scene with its graph, revisions, an orphan, what a dead writer left.
     "littered": ("placed", ("remove MAP b", "optimize MAP", "*litter")),
@@ -69,6 +77,17 @@ BASES = {
     "kept": ("placed", ("backup MAP HERE/kept",)),
     "grown": ("kept", ("ingest MAP IN/c.ply",)),
     "branched": ("placed", ("branch MAP what-if", "edit MAP@what-if a --note later")),
+    # One room on two days, and on the second a box is gone.
+    "visited": (
+        "empty",
+        (
+            "ingest MAP IN/then.ply --captured-at 2026-01-01 --scale known",
+            "ingest MAP IN/now.ply --captured-at 2026-02-01 --scale known",
+            "edge MAP then:now --pose IN/same.txt --sigma 0.1,0.001",
+            "optimize MAP",
+        ),
+    ),
+    "compared": ("visited", ("*compared",)),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
@@ -89,14 +108,22 @@ VERBS = {
         Verb("export", "placed", EXPORT),
         Verb("export-moved", "moved", EXPORT),
         Verb("export-shrunk", "shrunk", EXPORT),
-        Verb("export-3dtiles", "placed", "export MAP OUT --merge union --tile-size 3 --format 3dtiles"),
+        Verb("export-3dtiles", "placed", EXPORT_3DTILES),
         Verb("prune", "littered", "prune MAP --keep-revisions 1"),
         Verb("remove", "placed", "remove MAP b", done_says="no scene is called"),
+        Verb("purge", "exported", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"),
+        Verb(
+            "purge-3dtiles", "levelled", "remove MAP b --purge", done_says="no scene is called", forgets="samples/b.ply"
+        ),
+        Verb("restore-scene", "removed", "restore-scene MAP b", done_says="was not removed"),
+        Verb("restore-from", "two", "restore-scene MAP c --from HERE/other.gsmap"),
         Verb("models-add", "placed", "models add MAP clip IN/encoder.onnx --preset unit", needs="onnx"),
         Verb("models-again", "modelled", "models add MAP clip IN/encoder2.onnx --preset unit", needs="onnx"),
         Verb("migrate", "older", "migrate MAP"),
         Verb("confirm", "placed", "confirm MAP a:b"),
         Verb("reject", "placed", "reject MAP a:b"),
+        Verb("changes", "visited", "changes MAP"),
+        Verb("confirm-change", "compared", "confirm MAP c1 --note seen"),
         Verb("edge", "placed", "edge MAP a:b --pose IN/pose2.txt --sigma 1,0.1"),
         Verb("prior", "placed", "prior MAP a --anchor"),
         Verb("edit", "placed", "edit MAP a --captured-at 2024-05-31 --note wet --tag hall"),
@@ -150,6 +177,18 @@ def older(site: Path) -> None:
     os.rename(site.parent / "old.gsmap", site)
 
 
+def compared(site: Path) -> None:
+    """A change, whatever finds changes finds."""
+    box, rows = np.array([[2.0, 1.2, 0], [2.6, 1.8, 1]]), np.arange(9, dtype=np.int32)
+    gone = Change("disappeared", box, box.astype(np.float32), rows, rows[:0], confidence=0.75)
+    with gsmap.map.open(site) as m:
+        older, newer = (m.pose_graph().poses[scene.id] for scene in m.scenes())
+        key = recipe_key(m.settings.change).of(older.scene, newer.scene)
+        where = {"S_newer_older": newer.S_map_scene.inverse() @ older.S_map_scene, "S_frame_newer": newer.S_map_scene}
+        report = ChangeReport((gone,), 0.75, np.ones(3))
+        m.store.changes.save(report, key, older=older.scene, newer=newer.scene, **where)
+
+
 # --- captures --------------------------------------------------------------------------------------------------------
 
 
@@ -159,13 +198,16 @@ def write_samples(folder: Path) -> None:
     for seed, name in enumerate("abc"):
         formats.write(folder / f"{name}.ply", capture(seed))
         (folder / f"{name}.cameras.json").write_text(json.dumps(_frames(name)))
-    for name, x in (("pose", 5.0), ("pose2", 5.1)):
+    for name, box in (("then", True), ("now", False)):
+        formats.write(folder / f"{name}.ply", room(box))
+        (folder / f"{name}.cameras.json").write_text(json.dumps(_looks()))
+    for name, x in (("pose", 5.0), ("pose2", 5.1), ("same", 0.0)):
         pose = np.eye(4)
         pose[0, 3] = x
         np.savetxt(folder / f"{name}.txt", pose)
     if importlib.util.find_spec("onnx") is not None:
         for name, window in (("encoder", 16), ("encoder2", 8)):
-            (folder / f"{name}.onnx").write_bytes(_encoder(window))
+            (folder / f"{name}.onnx").write_bytes(image_encoder(window))
 
 
 def capture(seed: int, count: int = 400) -> Gaussians:
@@ -179,6 +221,45 @@ def capture(seed: int, count: int = 400) -> Gaussians:
     return Gaussians(points, np.tile([1.0, 0, 0, 0], (count, 1)), flat, np.full(count, 3.0), colours)
 
 
+def room(with_box: bool) -> Gaussians:
+    """The same box from the inside, closed, and in it one to be missed."""
+    points, sizes = [_sides((0, 0, 0), (4, 3, 2), 0.2)], [0.09]
+    if with_box:
+        points.append(_sides((2, 1.2, 0), (2.6, 1.8, 1), 0.1))
+        sizes.append(0.05)
+    scales = np.concatenate([np.full((len(part), 3), np.log(size)) for part, size in zip(points, sizes, strict=True)])
+    every = np.concatenate(points)
+    count, colours = len(every), np.sin(every * [3.0, 4.0, 5.0])[:, None]
+    return Gaussians(every, np.tile([1.0, 0, 0, 0], (count, 1)), scales, np.full(count, 5.0), colours)
+
+
+def _sides(low: tuple[float, ...], high: tuple[float, ...], step: float) -> np.ndarray:
+    """(N, 3) points on the six sides of a box."""
+    sides = []
+    for axis in range(3):
+        grid = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
+        for end in (low[axis], high[axis]):
+            grid[axis] = np.array([end])
+            sides.append(np.stack(np.meshgrid(*grid), -1).reshape(-1, 3))
+    return np.concatenate(sides)
+
+
+def _looks() -> list[dict[str, object]]:
+    """Cameras around the middle, which they see."""
+    frames = []
+    for i, (x, y) in enumerate(((0.6, 0.6), (3.4, 0.6), (3.4, 2.4), (0.6, 2.4), (2.3, 0.4), (0.5, 1.5))):
+        ahead = np.array([2.3 - x, 1.5 - y, -0.4])
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(ahead, right), ahead], 1)
+        frames.append(
+            {"id": i, "img_name": f"{i}", "width": 64, "height": 48, "position": [x, y, 1.4]}
+            | {"rotation": axes.tolist(), "fx": 30.0, "fy": 30.0}
+        )
+    return frames
+
+
 def _frames(name: str) -> list[dict[str, object]]:
     return [
         {"id": i, "img_name": f"{name}_{i}", "width": 32, "height": 24, "position": [2.0, 1.5, 1.0]}
@@ -187,24 +268,7 @@ def _frames(name: str) -> list[dict[str, object]]:
     ]
 
 
-def _encoder(window: int) -> bytes:
-    from onnx import TensorProto, helper
-
-    across = 32 // window
-    pool = helper.make_node(
-        "AveragePool", ["image"], ["pooled"], kernel_shape=[window, window], strides=[window, window]
-    )
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 3 * across * across])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
-
-
-FUNCTIONS = {"*litter": litter, "*older": older}
+FUNCTIONS = {"*litter": litter, "*older": older, "*compared": compared}
 
 
 def copy_map(source: Path, target: Path) -> None:

@@ -12,12 +12,14 @@ POINTS = {
     "ingest": [(0.5, "short-once"), (0.6, "eio-once"), (0.88, "kill-after")],
     "optimize": [(0.5, "kill-after"), (0.6, "enospc-once")],
     "export": [(0.1, "kill-before"), (0.3, "enospc-ever")],
+    "changes": [(0.5, "kill-after"), (0.6, "enospc-once")],
     "prune": [(0.4, "kill-before"), (0.5, "eio-ever")],
     "remove": [(0.3, "eio-once"), (0.5, "kill-after"), (0.7, "eio-ever")],
+    "purge": [(0.3, "kill-before"), (0.6, "eio-once")],
     "models-add": [(0.4, "kill-after"), (0.6, "eio-once")],
     "migrate": [(0.5, "kill-after"), (0.6, "enospc-once")],
 }
-CUTS = {"remove": 6, "ingest": 5, "export": 4, "models-add": 4}
+CUTS = {"remove": 6, "purge": 4, "ingest": 5, "export": 4, "export-shrunk": 4, "models-add": 4}
 
 
 def need(verb: str) -> None:

@@ -144,7 +144,7 @@ def gaussians_that_are_a_device_or_a_pipe(w: World) -> None:
 
 
 @case(
-    r"is a pipe or a device",
+    r"save what comes from it first",
     verbs=("ingest MAP HOME/../pipe.ply", "ingest MAP CAPTURES/c.ply --cameras HOME/../pipe.ply"),
 )
 def a_pipe_that_is_named_as_a_capture(w: World) -> None:
@@ -180,6 +180,11 @@ def a_capture_whose_name_steers_the_terminal(w: World) -> None:
 
 @case(r"has a control character", verbs=("ingest MAP CAPTURES/c.ply --name " + "\x1b[31mred",))
 def a_name_that_steers_the_terminal(w: World) -> None:
+    del w
+
+
+@case(r"refused .*\\x1b\[31mx", verbs=(f"list HOME/\x1b[31m{'x' * 300}.gsmap scenes",))
+def a_name_that_the_system_refuses_and_that_steers_the_terminal(w: World) -> None:
     del w
 
 

@@ -141,6 +141,17 @@ def test_what_a_killed_init_left_goes_with_the_next(tmp_path):
     assert left == {"site.gsmap", held.name, other.name, ".other.gsmap.0badcafe"}
 
 
+def test_a_reader_waits_for_no_lock_that_a_link_leads_to(tmp_path):
+    with Store.create(tmp_path / "m") as store, open(tmp_path / "theirs", "w") as theirs:
+        store.catalog.patience_s = 0.1
+        (store.folder / "lock").unlink()
+        (store.folder / "lock").symlink_to(tmp_path / "theirs")
+        fcntl.flock(theirs, fcntl.LOCK_EX)
+        with store.catalog.still():
+            pass
+        (store.folder / "lock").unlink()
+
+
 def test_prune_takes_what_a_killed_replacement_left(tmp_path):
     with Store.create(tmp_path / "m") as store:
         old, young, mine = ".settings.toml.0badcafe", ".settings.toml.1badcafe", ".notes.0badcafe"

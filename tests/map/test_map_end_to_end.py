@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_encoder import image_encoder
 
 import gsmap
 import gsmap.map
@@ -270,7 +271,7 @@ def test_bad_pairs_are_refused(site: Path) -> None:
 
 def test_models_are_checked_kept_and_used(copy: Path, tmp_path: Path) -> None:
     model = tmp_path / "encoder.onnx"
-    model.write_bytes(_image_encoder())
+    model.write_bytes(image_encoder())
     with gsmap.open(copy) as m:
         before = _objects(m.describe("capture_a")[0])
         m.add_model("clip", model, preset="unit")
@@ -285,21 +286,6 @@ def test_models_are_checked_kept_and_used(copy: Path, tmp_path: Path) -> None:
 
 def _objects(row: GraphRow) -> str:
     return next(layer.descriptor_id for layer in row.layers if layer.layer == "objects")
-
-
-def _image_encoder() -> bytes:
-    """A small ONNX image encoder: the mean of a 32 x 32 picture's quadrants."""
-    from onnx import TensorProto, helper
-
-    pool = helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[16, 16], strides=[16, 16])
-    flat = helper.make_node("Flatten", ["pooled"], ["features"])
-    graph = helper.make_graph(
-        [pool, flat],
-        "encoder",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 32, 32])],
-        [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["n", 12])],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
 
 
 def test_an_anchor_and_a_survey_hold_the_map(copy: Path) -> None:

@@ -104,6 +104,11 @@ def test_everything_in_it_is_listed_and_shown(opened: Map) -> None:
     for before, after in pairwise(revisions):
         opened.diff(before.number, after.number)
     assert opened.status().scenes == len(scenes)
+    for one in opened.store.changes.current():
+        assert len(opened.store.changes.load(one.number).changes) == len(one.changes)
+        for change in one.changes:
+            shown = opened.show_change(f"c{change.number}")
+            assert (shown.status == "confirmed") == bool(shown.history)
 
 
 def test_its_branches_and_tags_open(site: Path) -> None:

@@ -1,16 +1,11 @@
 """The methods that tools/bench_register.py compares run, and those that should find an easy pair do."""
 
-import sys
-from pathlib import Path
-
 import pytest
 from register_worlds import splat_world
+from registration_methods import ABLATIONS, METHODS, Capture
 
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.types import Sim3
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from registration_methods import ABLATIONS, METHODS, Capture
 
 UNSURE = ("no-context", "no-distance", "no-clique", "fpfh-nodes")  # what may well miss
 

@@ -1,5 +1,6 @@
 import multiprocessing
 
+import check_flips
 import pytest
 from store_postgres import NoServer, make_database, running_server
 from store_samples import make_cameras, make_gaussians
@@ -11,6 +12,14 @@ from gsmap.store import Store
 def store(tmp_path):
     with Store.create(tmp_path / "site.gsmap") as made:
         yield made
+
+
+@pytest.fixture
+def closed(tmp_path):
+    """A closed map of two scenes with free pages in its catalog."""
+    path = tmp_path / "site.gsmap"
+    check_flips.make_map(path)
+    return path
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from sqlalchemy import MetaData, select
-from store_samples import key, make_cameras, make_gaussians
+from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 from test_store_nouns import graph_of, layer, registration, tile
 
 from gsmap.store import Store
@@ -26,6 +26,7 @@ def fill(store: Store, folder: Path) -> None:
     store.graphs.save(SceneGraph(a.id, {"objects": layer()}), key("describe", a.id))
     store.registrations.save(registration(a.id, b.id), key("register"))
     store.registrations.review("a", "b", "confirm", "ok")
+    save_comparison(store, a.id, b.id, made_change([[0, 0, 0], [1, 1, 1]]))
     store.revisions.save(graph_of([a, b]))
     store.priors.set(Prior("a", Sim3.identity(), np.full(7, np.inf)))
     store.exports.add_tile(store.exports.begin("/tmp/out", revision=1), tile("a.ply", [a, b]))

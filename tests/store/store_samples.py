@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsmap.methods import RecipeKey
-from gsmap.types import Cameras, Gaussians
+from gsmap.types import Cameras, Change, ChangeReport, Gaussians, Sim3
 
 
 def key(stage: str, *inputs: str, **settings: object) -> RecipeKey:
@@ -25,3 +25,21 @@ def make_cameras(n: int = 3) -> Cameras:
     pose = np.tile(np.eye(4), (n, 1, 1))
     pose[:, 0, 3] = np.arange(n)
     return Cameras(pose, np.tile([100.0, 100, 32, 24], (n, 1)), np.tile([64, 48], (n, 1)), tuple("äbcdefgh"[:n]))
+
+
+def made_change(box, kind="moved", n=4, **more):
+    """A change whose arrays are of some length."""
+    moved = Sim3(np.eye(3), np.array([1.0, 0, 0])) if kind == "moved" else None
+    fields = {"S_after_before": moved, "symmetry": "half", "confidence": 0.75, "evidence": {"through": 0.1 + 0.2}}
+    fields |= {"voxels": np.linspace(*np.asarray(box, float), n).astype(np.float32)}
+    fields |= {"before": np.arange(n, dtype=np.int32), "after": np.arange(2 * n, dtype=np.int32)}
+    return Change(kind, np.asarray(box, np.float64), **(fields | more))
+
+
+def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newer=None, notes=()):
+    """Keep what a comparison of two scenes (by id) found."""
+    report = ChangeReport(tuple(found), 0.625, np.array([1.0, 0.5, 2.0]), tuple(notes))
+    identity = Sim3.identity()
+    made = key("change", older, newer, version=version)
+    poses = {"S_newer_older": S or identity, "S_frame_newer": S_frame_newer or identity}
+    return store.changes.save(report, made, older=older, newer=newer, **poses)

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import sqlite3
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,17 +12,6 @@ from page_samples import PAGE, flip
 
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store import Store, digests, sqlite
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import check_flips
-
-
-@pytest.fixture
-def closed(tmp_path):
-    """A closed map of two scenes with free pages in its catalog."""
-    path = tmp_path / "site.gsmap"
-    check_flips.make_map(path)
-    return path
 
 
 def without_digests(path: Path) -> None:

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 from sqlalchemy import func, insert, select, text
-from store_samples import key, make_cameras, make_gaussians
+from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 from test_store_nouns import graph_of, layer, registration, tile
 
 from gsmap.errors import StoreError
@@ -24,6 +24,8 @@ def fill(store):
     saved = store.registrations.save(registration(a.id, b.id), key("register"))
     store.registrations.adopt(saved.number)
     store.registrations.review("a", "b", "confirm", "ok")
+    save_comparison(store, a.id, b.id, made_change([[0, 0, 0], [1, 1, 1]]))
+    store.changes.review(1, "confirm", "ok")
     store.revisions.save(graph_of([a, b]))
     store.priors.set(Prior("a", Sim3.identity(), np.full(7, np.inf)))
     store.exports.add_tile(store.exports.begin("/tmp/out", revision=1), tile("a.ply", [a, b]))

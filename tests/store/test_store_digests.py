@@ -2,9 +2,9 @@
 
 import random
 import shutil
-import sys
 from pathlib import Path
 
+import check_flips
 import pytest
 import store_children
 from page_samples import PAGE, fill, flip
@@ -14,17 +14,6 @@ from gsmap.errors import CorruptError, DiskError
 from gsmap.store import Store, digests, sqlite
 from gsmap.store.handles import Handle
 from gsmap.store.wal import log_of, read_log
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-import check_flips
-
-
-@pytest.fixture
-def closed(tmp_path):
-    """A closed map of two scenes with free pages in its catalog."""
-    path = tmp_path / "site.gsmap"
-    check_flips.make_map(path)
-    return path
 
 
 @pytest.mark.parametrize("count", [12, pytest.param(200, marks=pytest.mark.slow)])

@@ -1,11 +1,13 @@
 """What is read inside one reading is of one moment, whatever others write meanwhile."""
 
+import numpy as np
 import pytest
-from store_samples import make_cameras, make_gaussians
+from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
 
 from gsmap.errors import NotFoundError
 from gsmap.map import reports
 from gsmap.store import Store
+from gsmap.types import SceneGraph
 
 
 def add(store, seed):
@@ -55,6 +57,28 @@ def test_reports_read_inside_one(store, report, monkeypatch):
 @pytest.mark.parametrize("read", ["gaussians", "cameras"])
 def test_arrays_that_are_pruned_while_they_are_read_are_not_called_damaged(store, monkeypatch, read):
     add(store, 1)
+    prune_when_read(store, monkeypatch)
+    with pytest.raises(NotFoundError, match="pruned while"):
+        getattr(store.scenes, read)("scene1")
+
+
+def test_a_graph_that_is_pruned_while_it_is_read_is_not_called_damaged(store, monkeypatch):
+    scene = add(store, 1).id
+    store.graphs.save(SceneGraph(scene), key("describe", scene))
+    prune_when_read(store, monkeypatch)
+    with pytest.raises(NotFoundError, match="pruned while"):
+        store.graphs.load(scene)
+
+
+def test_a_comparison_that_is_pruned_while_it_is_read_is_not_called_damaged(store, monkeypatch):
+    older, newer = (add(store, seed).id for seed in (1, 2))
+    kept = save_comparison(store, older, newer, made_change(np.array([[0.0, 0, 0], [1, 1, 1]])))
+    prune_when_read(store, monkeypatch)
+    with pytest.raises(NotFoundError, match="pruned while"):
+        store.changes.load(kept.number)
+
+
+def prune_when_read(store, monkeypatch):
     real = store.arrays.read
 
     def after_a_prune(*args, **options):
@@ -64,5 +88,3 @@ def test_arrays_that_are_pruned_while_they_are_read_are_not_called_damaged(store
         return real(*args, **options)
 
     monkeypatch.setattr(store.arrays, "read", after_a_prune)
-    with pytest.raises(NotFoundError, match="pruned while"):
-        getattr(store.scenes, read)("scene1")

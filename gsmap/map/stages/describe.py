@@ -31,6 +31,11 @@ def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
     return [scene for scene, key in keys.items() if key.digest not in present]
 
 
+def unthinned(scenes: Sequence[Scene]) -> list[Scene]:
+    """Those of the scenes that are described unasked: newer ones stand for a thinned one."""
+    return [scene for scene in scenes if scene.thinning is None]
+
+
 def describe(
     store: Store, scenes: Sequence[Scene], settings: Settings, progress: StageProgress, *, verify: bool = False
 ) -> dict[str, RecipeKey]:

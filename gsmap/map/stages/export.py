@@ -16,9 +16,10 @@ from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, Not
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
 from gsmap.export.tileset import is_stale, write_tilesets
+from gsmap.map.dates import is_until, last_of, undated_note
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
-from gsmap.merge import reach_m, recipe_key, uses_dates, with_steps
+from gsmap.merge import reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.store import Store
 from gsmap.types import MergeResult, Scene, ScenePose, Tile
@@ -35,6 +36,8 @@ class Request:
     Args:
         merge: the merger; None takes the one of the settings.
         steps: optimisation steps per tile; None takes what the merger's settings say.
+        prefer: whom to believe where captures disagree; None takes what the merger's settings say.
+        as_of: only captures dated at or before this take part.
     """
 
     format: str = "ply"
@@ -46,6 +49,8 @@ class Request:
     steps: int | None = None
     budget_s: float | None = None
     provenance: bool = False
+    prefer: str | None = None
+    as_of: str | None = None
 
     def options(self) -> list[str]:
         """The options of ``gsmap export`` that ask for the same."""
@@ -69,6 +74,8 @@ _OPTIONS = {
     "steps": "--steps",
     "budget_s": "--budget",
     "provenance": "--provenance",
+    "prefer": "--prefer",
+    "as_of": "--as-of",
 }
 
 
@@ -82,6 +89,7 @@ class Planned:
         method, params: the merger and its settings.
         recipe: how every tile is made.
         tiles: what the folder is to hold.
+        notes: what a person should know of what takes part.
     """
 
     revision: int | None
@@ -90,6 +98,7 @@ class Planned:
     params: Any
     recipe: TileRecipe
     tiles: list[PlannedTile]
+    notes: tuple[str, ...] = ()
 
 
 def plan(store: Store, request: Request, settings: Settings) -> Planned:
@@ -98,11 +107,17 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
     params = settings.merge.mergers[method]
     if request.steps is not None:
         params = with_steps(method, params, request.steps)
+    if request.prefer is not None:
+        params = with_prefer(method, params, request.prefer)
     recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
     _check(request, recipe)
     revision = store.revisions.current() if request.revision is None else request.revision
     placed = _placed(store, revision, request.component)
     scenes = {scene: store.scenes.get(scene) for scene in placed}
+    notes: tuple[str, ...] = ()
+    if request.as_of is not None:
+        scenes, notes = _as_of(scenes, request.as_of)
+        placed = {scene: placed[scene] for scene in scenes}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
     tiles = plan_tiles(
@@ -114,12 +129,12 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         reach_m=reach_m(method, params),
         max_tiles=settings.export.max_tiles,
     )
-    return Planned(revision, scenes, method, params, recipe, tiles)
+    return Planned(revision, scenes, method, params, recipe, tiles, notes)
 
 
 def export(
     store: Store, out: Path, request: Request, settings: Settings, progress: Progress, *, wait: bool = False
-) -> ExportResult:
+) -> tuple[ExportResult, tuple[str, ...]]:
     """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what.
 
     A map that was opened for reading, or whose disk is full, is exported too; then only the folder's own manifest says
@@ -127,6 +142,9 @@ def export(
 
     Args:
         wait: where another export is at work in the folder, until it has ended.
+
+    Returns:
+        What was made, and what a person should know of what took part.
 
     Raises:
         BusyError: another export is at work in the folder.
@@ -142,7 +160,7 @@ def export(
     with folder_lock(out, wait=wait, waiting=waiting), store.leases.attend("export", f"export {out.resolve()}"):
         if waited:
             planned = plan(store, request, settings)  # the map may have other poses now
-        return _export(store, out, request, planned, settings, progress)
+        return _export(store, out, request, planned, settings, progress), planned.notes
 
 
 def _export(
@@ -250,6 +268,16 @@ def _placed(store: Store, revision: int | None, component: int | None) -> dict[s
     if not placed:
         raise InputError("nothing to export: no scene has a place in the map yet; run gsmap update first")
     return placed
+
+
+def _as_of(scenes: dict[str, Scene], as_of: str) -> tuple[dict[str, Scene], tuple[str, ...]]:
+    """The scenes that were there by a date, and a remark on those of which nobody knows."""
+    until = last_of(as_of)
+    found = {scene: one for scene, one in scenes.items() if is_until(one.captured_at, until)}
+    note = undated_note(list(scenes.values()), as_of)
+    if not found:
+        raise NotFoundError(f"no capture with a place in the map is dated {as_of} or earlier{note and f'; {note}'}")
+    return found, (note,) if note else ()
 
 
 def _make(store: Store, planned: Planned, request: Request, tile: PlannedTile, progress: Progress) -> MergeResult:

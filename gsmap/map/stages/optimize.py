@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from gsmap.map.sharing import POLL_S
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
-from gsmap.types import Edge, PoseGraph, Prior
+from gsmap.types import Edge, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
 from gsmap.types.progress import StageProgress
 
@@ -60,17 +60,18 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
             )
         )
         named.append(f"{stored.key or stored.number} {stored.review}")
-    ups = _ups(store, {key.digest for key in graph_keys(store, living, settings).values()})
+    ups = _ups(store, living, {key.digest for key in graph_keys(store, living, settings).values()})
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
     key = solver.recipe_key(settings.optimize).of(*scenes, *named, canonical(told), canonical(ups))
     return PoseInputs(scenes, edges, priors, ups, key)
 
 
-def _ups(store: Store, present: Collection[str]) -> dict[str, np.ndarray]:
-    """What each scene's present graph (by key) says is up; where it has none yet, its newest graph."""
+def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dict[str, np.ndarray]:
+    """What each scene's present graph (by key) says is up; where it has none yet, its newest one, or what that said."""
     # Graphs come oldest first; the present one of a scene goes last.
     chosen = {graph.scene: graph.up for graph in sorted(store.graphs.list(), key=lambda graph: graph.key in present)}
-    return {scene: np.array(up) for scene, up in chosen.items() if up is not None}
+    of_thinned = {scene.id: scene.thinning.up for scene in living if scene.thinning is not None}
+    return {scene: np.array(up) for scene, up in (of_thinned | chosen).items() if up is not None}
 
 
 def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:

@@ -6,29 +6,29 @@ import os
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsmap.durable import files_below, refuse_links, remove_empty_folder, remove_file, remove_tree
+from gsmap.durable import (
+    files_below,
+    is_folder,
+    refuse_links,
+    remove_empty_folder,
+    remove_file,
+    remove_tree,
+    sync_folder,
+)
 from gsmap.errors import GsmapError, NotFoundError
 from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.tileset import FILE_NAME as TILESET
 from gsmap.export.tileset import LEVELS_FOLDER, is_stale
-from gsmap.export.write import STAGING
+from gsmap.export.write import leftovers
+from gsmap.map.pictures import FILE_NAME as PICTURES
+from gsmap.map.pictures import Pictures
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
 
 _COMPONENT = re.compile(r"component_\d+")
-
-
-@dataclass
-class _Tiles:
-    """What became of the folders that a map was exported to."""
-
-    tile_files: int = 0
-    cleaned: list[str] = field(default_factory=list)
-    unreachable: list[str] = field(default_factory=list)
 
 
 def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, Purge]]:
@@ -82,61 +82,70 @@ def _holds(store: Store, scene: str) -> bool:
 
 
 def _finish(store: Store, begun: Purge) -> Purge:
-    tiles = _Tiles()
+    unreachable = []
     for target in begun.receipt["pending"]["targets"]:
         try:
             out = Path(target)
             if os.path.lexists(out / FILE_NAME):
                 with folder_lock(out):
-                    _clean(store, out, begun.scene, tiles)
+                    begun = _clean(store, out, begun)
+            elif os.path.lexists(out / PICTURES):
+                if gone := Pictures.load(out, store.id).forget(out, begun.scene):
+                    begun = purging.note(store, begun, str(out), gone)
             else:
-                tiles.unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME}")
+                unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
-            tiles.unreachable.append(f"{target}: {error}")
-    gone = {"tile_files": tiles.tile_files, "cleaned": tiles.cleaned, "unreachable": tiles.unreachable}
-    return purging.finish(store, begun, gone)
+            unreachable.append(f"{target}: {error}")
+    return purging.finish(store, begun, unreachable)
 
 
-def _clean(store: Store, out: Path, scene: str, found: _Tiles) -> None:
-    """Delete what one folder holds of a scene; only in a folder that holds this map's export.
+def _clean(store: Store, out: Path, begun: Purge) -> Purge:
+    """Delete what one folder holds of a scene, if it is this map's export; the purge, with how many files that were.
 
     Tiles made with it; what no tile is any more, but an export had still to delete; and the coarser levels of 3D Tiles
-    and tilesets of components that had either, or whose levels may be of earlier tiles. The manifest comes last, so
-    that an interrupted purge finds all of it again.
+    and tilesets of components that had either, or whose levels may be of earlier tiles. The manifest names no tile of
+    these from the beginning, and what is to go until the end, so that an interrupted purge finds all of it again.
     """
     manifest = Manifest.load(out, store.id)
-    made_with_it = {at: tile for at, tile in manifest.tiles.items() if scene in tile.poses}
+    made_with_it = {at: tile for at, tile in manifest.tiles.items() if begun.scene in tile.poses}
     kept = {at: tile for at, tile in manifest.tiles.items() if at not in made_with_it}
     paths = {tile.path for tile in made_with_it.values() if tile.path}
     paths |= manifest.doomed - {tile.path for tile in kept.values()} - {""}
-    for leftover in [out / STAGING, *out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]:
-        remove_tree(out, *leftover.relative_to(out).parts)  # what an interrupted export left may be such a tile
-    gone = len(paths)
     touched = {path.split("/")[0] for path in paths}
+    stale = []
     for folder in _component_folders(out):
         tiles = [tile for tile in kept.values() if tile.path.startswith(f"{folder}/")]
         if folder in touched or not tiles or is_stale(out, tiles):
-            gone += _drop_levels(out, folder)
+            stale.append(folder)
+    num_files = len(paths) + sum(_num_levels(out, folder) for folder in stale)
+    if num_files or made_with_it:
+        begun = purging.note(store, begun, str(out), num_files)
+    for leftover in leftovers(out):
+        remove_tree(out, *leftover)  # what an interrupted export left may be such a tile
+    if made_with_it:
+        manifest.tiles, manifest.doomed = kept, paths
+        manifest.save(out)
+    for folder in stale:
+        remove_file(out, folder, TILESET)  # first: it names the levels, which the next export makes again
+        remove_tree(out, folder, LEVELS_FOLDER)
     for path in paths:
         remove_file(out, *path.split("/"))
     for folder in _component_folders(out):
         remove_empty_folder(out, folder)
-    if made_with_it or manifest.doomed:
-        manifest.tiles, manifest.doomed = kept, set()
+    for place in (*(out / folder for folder in _component_folders(out)), out):
+        if place == out or is_folder(place):
+            sync_folder(place)  # or they are back when the power was gone
+    if manifest.doomed:
+        manifest.doomed = set()
         manifest.save(out)
-    if gone or made_with_it:
-        found.tile_files += gone
-        found.cleaned.append(str(out))
+    return begun
 
 
 def _component_folders(out: Path) -> list[str]:
     return sorted(path.name for path in out.glob("component_*") if _COMPONENT.fullmatch(path.name))
 
 
-def _drop_levels(out: Path, folder: str) -> int:
-    """Delete a component's tileset and coarser levels; the next export makes them again. How many levels there were."""
+def _num_levels(out: Path, folder: str) -> int:
+    """How many files of coarser levels a component has."""
     refuse_links(out, folder, LEVELS_FOLDER)
-    levels = len(files_below(out / folder / LEVELS_FOLDER))
-    remove_file(out, folder, TILESET)  # first: it names the levels
-    remove_tree(out, folder, LEVELS_FOLDER)
-    return levels
+    return len(files_below(out / folder / LEVELS_FOLDER))

@@ -2,8 +2,8 @@
 
 Graph-GSReg's merging (voxelise the union, then minimise the difference to renders of the originals; no photographs
 needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
-shows least goes first, newer captures win where the place changed, and exposures can be balanced. With `owner_cells`
-and `newer_wins` off, an `ssim_weight` and `min_weight` of 0 and a `keep` of 1 it is the published method: an L1 fit of
+shows least goes first, the newest capture wins where the place changed, and exposures can be balanced. With
+`owner_cells` off, both preferred, an `ssim_weight` and `min_weight` of 0 and a `keep` of 1 it is the published method: an L1 fit of
 all voxels of the union.
 """
 
@@ -15,10 +15,11 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.voxels import merge_groups, voxel_labels
-from gsmap.merge import changes, exposure, references
-from gsmap.merge.changes import newer_surfaces, remove_disappeared
+from gsmap.merge import exposure, references
+from gsmap.merge.changes import Prefer, settle
 from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import inside, pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
@@ -98,12 +99,12 @@ class Params:
         longest_side_px: size of the pictures that are compared.
         balance_exposure: bring captures to one exposure first: even to the eye, but no longer what each capture looks
             like.
-        newer_wins: drop what later captures looked through.
+        prefer: who is shown where captures of other dates disagree: the ``newest``, who saw it ``best``, or ``both``.
         seed: of the order of views.
         rates: the optimiser's steps.
         stopping: when to stop, where the number of steps is not given.
         references: which views are reproduced.
-        changes: what counts as looked through, where newer captures win.
+        compare: what counts as disagreeing, unless both are shown.
         exposure: how exposures are compared, where they are balanced.
     """
 
@@ -121,12 +122,12 @@ class Params:
     min_cameras: int = 12
     longest_side_px: int = 960
     balance_exposure: bool = False
-    newer_wins: bool = True
+    prefer: Prefer = "newest"
     seed: int = 0
     rates: Rates = field(default_factory=Rates)
     stopping: Stopping = field(default_factory=Stopping)
     references: references.Params = field(default_factory=references.Params)
-    changes: changes.Params = field(default_factory=changes.Params)
+    compare: compare.Params = field(default_factory=compare.Params)
     exposure: exposure.Params = field(default_factory=exposure.Params)
 
     def __post_init__(self) -> None:
@@ -156,7 +157,7 @@ def min_cameras(params: Params) -> int:
 
 
 def uses_dates(params: Params) -> bool:
-    return params.newer_wins
+    return params.prefer != "both"
 
 
 def merge(
@@ -169,15 +170,9 @@ def merge(
     """Drop what is gone, balance exposures, render references, choose what to keep, and fit it to the references."""
     deadline = None if budget_s is None else time.monotonic() + budget_s
     notes: list[str] = []
-    newer = None
-    if params.newer_wins:
-        scenes, lost = remove_disappeared(scenes, params.changes)
-        newer = newer_surfaces(scenes, params.changes)
-        notes += [
-            f"{n} Gaussians of scene {s.scene_id[:12]} are gone by later captures"
-            for s, n in zip(scenes, lost, strict=True)
-            if n
-        ]
+    settled = settle(scenes, params.prefer, params.compare)
+    scenes = settled.scenes
+    notes += settled.notes()
     if params.balance_exposure:
         scenes, log_gains = balance_exposure(scenes, params.exposure)
         if log_gains.any():
@@ -187,12 +182,11 @@ def merge(
         bounds,
         params.halo_m,
         params.longest_side_px,
-        newer,
+        settled,
         lambda fraction, text: progress(0.2 * fraction, text),
         params.references,
-        params.changes,
     )
-    start, origin = _start(scenes, wanted, params, bounds)
+    start, origin, changed = _start(scenes, wanted, settled.changed, params, bounds)
     if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
@@ -207,24 +201,36 @@ def merge(
 
 
 def _start(
-    scenes: Sequence[PlacedScene], wanted: References, params: Params, bounds: np.ndarray | None
-) -> tuple[Gaussians, np.ndarray]:
-    """The voxelised originals within the halo, one capture per cell, and within the bounds only what shows most."""
+    scenes: Sequence[PlacedScene],
+    wanted: References,
+    changed: Sequence[np.ndarray],
+    params: Params,
+    bounds: np.ndarray | None,
+) -> tuple[Gaussians, np.ndarray, np.ndarray]:
+    """The voxelised originals within the halo, one capture per cell, and within the bounds only what shows most.
+
+    What stands where the place changed is taken as it is. Also the scene of each Gaussian, and which stood so.
+    """
     gaussians, origin = united(scenes)
     near = inside(gaussians.means, bounds, params.halo_m)
+    new = np.concatenate(changed)[near]
     labels = voxel_labels(gaussians.means[near], params.voxel_m)
+    # A Gaussian of what changed shares its voxel with none.
+    labels[new] = labels.max(initial=-1) + 1 + np.arange(int(new.sum()))
+    labels = np.unique(labels, return_inverse=True)[1]
     merged, heaviest = merge_groups(gaussians[near], labels)
     visible = np.bincount(labels, np.concatenate(wanted.visible_pixels)[near], minlength=len(merged))
-    origin = origin[near][heaviest]
+    origin, new = origin[near][heaviest], new[heaviest]
     stays = np.ones(len(merged), dtype=bool)
     if params.owner_cells:
         stays &= one_owner_per_cell(merged, origin, visible, params.cell_m, params.cover_m)
     stays &= visible >= WEIGHT_UNIT * params.min_weight
+    stays |= new
     mine = inside(merged.means, bounds)
     if params.keep < 1:
-        count = int(params.keep * inside(gaussians.means, bounds).sum())
-        stays &= ~mine | most_visible(visible, stays & mine, count)
-    return merged[stays], origin[stays]
+        count = int(params.keep * inside(gaussians.means, bounds).sum()) - int((new & mine).sum())
+        stays &= ~mine | new | most_visible(visible, stays & mine & ~new, max(count, 0))
+    return merged[stays], origin[stays], new[stays]
 
 
 def _fit(

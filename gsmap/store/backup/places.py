@@ -17,7 +17,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any, Protocol
 
-from gsmap.durable import sync_folder
+from gsmap.durable import make_folder, sync_folder
 from gsmap.errors import (
     ConfigError,
     DiskError,
@@ -27,6 +27,7 @@ from gsmap.errors import (
     NotFoundError,
     ReadOnlyError,
     StoreError,
+    of_system,
 )
 
 CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
@@ -136,7 +137,7 @@ class FolderPlace:
     def staging(self) -> Iterator[Path]:
         """A folder to work in; gone afterwards."""
         with self._explained():
-            self._make_folder(self.root / _STAGING)
+            make_folder(self.root / _STAGING)
             folder = Path(tempfile.mkdtemp(dir=self.root / _STAGING))
         try:
             yield folder
@@ -147,14 +148,14 @@ class FolderPlace:
         place = self._path(name)
         with self._explained():
             staged = self.root / _STAGING / uuid.uuid4().hex
-            self._make_folder(staged.parent)
+            make_folder(staged.parent)
             try:
                 with open(staged, "xb") as file:
                     for chunk in chunks:
                         file.write(chunk)
                     file.flush()
                     os.fsync(file.fileno())
-                self._make_folder(place.parent)
+                make_folder(place.parent)
                 os.replace(staged, place)
             finally:
                 staged.unlink(missing_ok=True)
@@ -194,15 +195,6 @@ class FolderPlace:
                 raise StoreError(f"{folder} is a link: a backup has none; it may lead anywhere")
         return self.root / name
 
-    def _make_folder(self, folder: Path) -> None:
-        made = []
-        while not folder.is_dir():
-            made.append(folder)
-            folder = folder.parent
-        for one in reversed(made):
-            one.mkdir(exist_ok=True)  # another thread may be faster
-            sync_folder(one.parent)
-
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:
         try:
@@ -210,12 +202,13 @@ class FolderPlace:
         except GsmapError:
             raise
         except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            kind = of_system(error)
+            if kind is DiskFullError:
                 text = f"{self.url}: the disk is full; make room and run it again: what is there is kept"
                 raise DiskFullError(text) from error
-            if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            if kind is ReadOnlyError:
                 raise ReadOnlyError(f"{self.url} cannot be written or read here ({error.strerror})") from error
-            if error.errno == errno.EIO:
+            if kind is DiskError:
                 raise DiskError(f"{self.url}: the disk failed ({error.filename or error.strerror})") from error
             if error.errno == errno.ELOOP:
                 raise StoreError(f"{error.filename} is a link: a backup has none; it may lead anywhere") from error

@@ -13,38 +13,26 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy import delete, inspect, null, select, text, update
+from sqlalchemy import delete, inspect, select, text
 
 from gsmap.durable import sync_folder
-from gsmap.errors import (
-    CorruptError,
-    DiskError,
-    DiskFullError,
-    GsmapError,
-    NotFoundError,
-    ReadOnlyError,
-    StoreError,
-)
+from gsmap.errors import CorruptError, DiskError, DiskFullError, GsmapError, NotFoundError, StoreError, of_system
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, staging, trust
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
-from gsmap.store.backup.states import ARRAYS, BRANCHES, State, Vanished, capture, read_file, read_state
+from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
+from gsmap.store.branches import FOLDER as BRANCHES
 from gsmap.store.catalog import Catalog
-from gsmap.store.copying import copy_catalog, empty_catalog
+from gsmap.store.copying import copy_catalog, empty_catalog, make_own, own_catalog
 from gsmap.store.explained import explained
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__
 
 _TRIES = 4  # states to begin with where others prune meanwhile
-_KINDS = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), DiskFullError),
-    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), ReadOnlyError),
-    errno.EIO: DiskError,
-}
 _log = logging.getLogger("gsmap.store")
 
 
@@ -137,7 +125,9 @@ def clone(store: Store, path: str | os.PathLike[str], progress: Progress = silen
             state = capture(store, folder, branches=False)
             made = _link_all(store, state, folder, target, progress)
             _settle(folder)
-            _rename(folder, made.map_id)
+            others = (schema.tiles, schema.exports, schema.backups)  # exported and backed up was the other map
+            make_own(folder, others, id=made.map_id, created_at=_catalog.now(), gsmap_version=__version__)
+            (folder / _catalog.LOCK_FILE).unlink(missing_ok=True)
             _synchronise(folder)
             _put_in_place(folder, target)
             _confirm(target)
@@ -246,13 +236,9 @@ def _compared(folder: Path, files: list[StoredFile], snapshot: Snapshot) -> Stat
 def _settle(folder: Path) -> None:
     """Nobody is at work on a map that was just made; and its catalogs get the digests that catalogs have."""
     for one in (folder, *_branches(folder)):
-        catalog = _own_catalog(one)
-        try:
-            with catalog.write() as connection:
-                if inspect(connection).has_table("leases"):
-                    connection.execute(delete(schema.leases))
-        finally:
-            catalog.close()
+        with contextlib.closing(own_catalog(one)) as catalog, catalog.write() as connection:
+            if inspect(connection).has_table("leases"):
+                connection.execute(delete(schema.leases))
         for left in (_catalog.LOCK_FILE, f"{sqlite.FILE}-wal", f"{sqlite.FILE}-shm"):
             (one / left).unlink(missing_ok=True)
 
@@ -261,31 +247,9 @@ def _branches(folder: Path) -> list[Path]:
     return sorted(file.parent for file in (folder / BRANCHES).glob(f"*/{sqlite.FILE}"))
 
 
-def _rename(folder: Path, map_id: str) -> None:
-    """Make a map of its own of a copy: another id; what was exported, backed up and solved was by the other map."""
-    catalog = _own_catalog(folder)
-    try:
-        with catalog.write() as connection:
-            before = connection.execute(select(schema.about.c.id)).scalar_one()
-            row = {"id": map_id, "created_at": _catalog.now(), "gsmap_version": __version__}
-            connection.execute(update(schema.about).values(row))
-            for table in (schema.tiles, schema.exports, schema.backups):
-                connection.execute(delete(table))
-            solved = select(schema.revisions.c.number).where(schema.revisions.c.origin.is_(null()))
-            for number in list(connection.execute(solved).scalars()):
-                mine = schema.revisions.c.number == number
-                connection.execute(
-                    update(schema.revisions).where(mine).values(origin={"map": before, "number": number})
-                )
-    finally:
-        catalog.close()
-    (folder / _catalog.LOCK_FILE).unlink(missing_ok=True)
-
-
 def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> State:
     """Copy ``map.sqlite`` into another database, with the present schema, and let the map remember it instead."""
-    own = _own_catalog(folder)
-    try:
+    with contextlib.closing(own_catalog(folder)) as own:
         migrate.upgrade(own)
         with own.read() as connection:
             map_id = connection.execute(select(schema.about.c.id)).scalar_one()
@@ -293,8 +257,6 @@ def _move_catalog(folder: Path, url: str, undo: contextlib.ExitStack) -> State:
         undo.callback(_empty_again, there)
         with explained(folder):
             copy_catalog(own, there, leave_out=("leases",))
-    finally:
-        own.close()
     state = read_state(folder / sqlite.FILE)
     for left in folder.glob(f"{sqlite.FILE}*"):
         left.unlink()
@@ -310,10 +272,6 @@ def _empty_again(catalog: Catalog) -> None:
             connection.execute(text("DROP TABLE alembic_version"))
     except GsmapError as error:
         _log.warning("the database %r keeps tables of a map that was not restored: %s", catalog.engine.url, error)
-
-
-def _own_catalog(folder: Path) -> Catalog:
-    return Catalog(folder, sqlite.engine(folder / sqlite.FILE, writable=True), writable=True)
 
 
 def _require_room(folder: Path, num_bytes: int) -> None:
@@ -351,6 +309,6 @@ def _writing(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        said = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-        kind = _KINDS.get(error.errno or 0, StoreError)
+        kind = of_system(error)
+        said = "the disk is full" if kind is DiskFullError else error.strerror or str(error)
         raise kind(f"{target} was not made: {said}") from error

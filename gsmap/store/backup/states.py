@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import re
 import shutil
 import sqlite3
-import stat
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
+from gsmap.durable import open_file
 from gsmap.errors import CorruptError, StoreError
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import catalog as _catalog
 from gsmap.store import sqlite
 from gsmap.store.arrays import StoredFile
 from gsmap.store.backup.places import CHUNK_BYTES
+from gsmap.store.branches import FOLDER as BRANCHES
+from gsmap.store.branches import MARKER as BRANCH_FILE
 from gsmap.store.branches import places
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog
@@ -31,10 +32,6 @@ if TYPE_CHECKING:
     from gsmap.store.store import Store
 
 ARRAYS = "arrays"
-BRANCHES = "branches"
-BRANCH_FILE = "branch.json"
-
-
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -223,10 +220,7 @@ def checked(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[by
 
 
 def _chunks(path: Path) -> Iterator[bytes]:
-    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    with open(handle, "rb") as opened:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise CorruptError(f"{path} is no file")
+    with open(open_file(path), "rb") as opened:
         while chunk := opened.read(CHUNK_BYTES):
             yield chunk
 

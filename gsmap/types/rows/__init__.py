@@ -10,8 +10,10 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
+from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.leases import AtWorkRow
+from gsmap.types.rows.life import ThinReport, ThinRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -58,8 +60,12 @@ __all__ = [
     "BackupReport",
     "BandRow",
     "BranchRow",
+    "ChangeDetail",
+    "ChangeRow",
+    "ChangesReport",
     "CheckReport",
     "CloneReport",
+    "ComparisonRow",
     "ComponentErrorRow",
     "ConvertReport",
     "DemoReport",
@@ -99,6 +105,8 @@ __all__ = [
     "SnapshotRow",
     "SplitReport",
     "TileRow",
+    "ThinReport",
+    "ThinRow",
     "TodoRow",
     "TrustReport",
     "UpdateReport",

@@ -63,6 +63,7 @@ class ExportReport(Row):
         recomputed: how many of them were made.
         reused: how many were unchanged.
         removed: how many files were taken away.
+        notes: what a person should know of what took part; what of how a tile was made is in the tile's.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -77,3 +78,4 @@ class ExportReport(Row):
     recomputed: int
     reused: int
     removed: int
+    notes: tuple[str, ...] = ()

@@ -59,6 +59,8 @@ class MergeReport(Row):
         num_facts: names, dates, notes and tags.
         num_priors: priors.
         num_models: models.
+        num_comparisons: pairs that were looked at for changes.
+        num_change_reviews: reviews of changes.
         num_revisions: revisions, as history.
         renamed: scenes whose name was taken here, the new name by the old one.
         revision: the revision that holds the newest poses of both; null where none was needed.
@@ -87,6 +89,8 @@ class MergeReport(Row):
     num_facts: int
     num_priors: int
     num_models: int
+    num_comparisons: int
+    num_change_reviews: int
     num_revisions: int
     renamed: Mapping[str, str]
     revision: int | None

@@ -1,0 +1,219 @@
+"""What both captures' pictures say of the cells of each one's surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.change.params import Params
+from gsmap.compare import Comparison, Looks, Pictured
+from gsmap.compare.colours import Balance
+from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.sh import rgb_of_sh0
+
+_CLIP_M = 0.15  # offsets beyond are other surfaces, not noise
+FLOOR = 0.03  # as in `gsmap.compare.colours`
+_STEEPEST = 0.2  # cosine below which a surface is seen too flat to measure an offset
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """The surface of one capture in M cells, and what the pictures of both say of each.
+
+    Args:
+        rows: (R,) Gaussians of the capture that are surface, and ``label`` (R,) the cell of each.
+        points, colours: (M, 3) means.
+        through, on, hidden: (M,) views of the other capture, summed over the cell's Gaussians.
+        offset_m: (M,) how far the other's surface lies behind this one along its normal, in the other's views;
+            ``offset_looks`` (M,) pixels that say so.
+        colour: (M, 3) mean difference to the other's colour, two of chroma and one of lightness: newer less older.
+        strength: (M,) the same as a multiple of what counts, texture that is off by a pixel forgiven.
+        looks: (M,) pixels that compared the colour.
+    """
+
+    rows: np.ndarray
+    label: np.ndarray
+    points: np.ndarray
+    colours: np.ndarray
+    through: np.ndarray
+    on: np.ndarray
+    hidden: np.ndarray
+    offset_m: np.ndarray
+    offset_looks: np.ndarray
+    colour: np.ndarray
+    strength: np.ndarray
+    looks: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def tree(self) -> Any:
+        return cKDTree(self.points) if len(self.points) else cKDTree(np.full((1, 3), np.inf))
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """(M, 3) unit normals; signs mean nothing."""
+        count = len(self.points)
+        if count < 4:
+            return np.tile([0.0, 0.0, 1.0], (count, 1))
+        near = self.points[self.tree.query(self.points, k=min(12, count))[1]]
+        near = near - near.mean(1, keepdims=True)
+        _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
+        return axes[:, :, 0]
+
+    def around(self, values: np.ndarray, radius_m: float) -> np.ndarray:
+        """(M, ...) sums of values over the cells within a radius of each."""
+        return self._neighbours(radius_m) @ values
+
+    def _neighbours(self, radius_m: float) -> Any:
+        cached = self.__dict__.setdefault("_sparse", {})
+        if radius_m not in cached:
+            from scipy.sparse import coo_matrix, identity
+
+            pairs = self.tree.query_pairs(radius_m, output_type="ndarray")
+            ones = np.ones(len(pairs), np.float32)
+            half = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(self), len(self))).tocsr()
+            cached[radius_m] = half + half.T + identity(len(self), np.float32, format="csr")
+        return cached[radius_m]
+
+
+@dataclass(eq=False)
+class _Sums:
+    """Sums over pixels by the Gaussian that shows most there."""
+
+    offset: np.ndarray
+    offset_looks: np.ndarray
+    colour: np.ndarray
+    strength: np.ndarray
+    looks: np.ndarray
+
+    @classmethod
+    def zeros(cls, count: int) -> _Sums:
+        return cls(np.zeros(count), np.zeros(count), np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+
+
+def sides(older: Looks, newer: Looks, comparison: Comparison, params: Params) -> tuple[Side, Side]:
+    """Both captures' surfaces with what is known of them."""
+    sums = _Sums.zeros(len(older.gaussians)), _Sums.zeros(len(newer.gaussians))
+    limits = _limits(comparison.balance, params)
+    for picture in comparison.newer_views:
+        _add(sums[0], sums[1], picture.other, picture.own, picture, comparison, limits, 0)
+    for picture in comparison.older_views:
+        _add(sums[0], sums[1], picture.own, picture.other, picture, comparison, limits, 1)
+    made = [
+        _side(looks, evidence, one, comparison.balance if k == 0 else None, params)
+        for k, (looks, evidence, one) in enumerate(
+            zip((older, newer), (comparison.older, comparison.newer), sums, strict=True)
+        )
+    ]
+    return made[0], made[1]
+
+
+def _limits(line: Balance, params: Params) -> tuple[float, float]:
+    """Chroma and lightness from which on colours differ."""
+    return (
+        max(params.min_chroma, params.colour_spreads * line.chroma_spread),
+        max(params.min_lightness, params.colour_spreads * line.lightness_spread),
+    )
+
+
+def _add(
+    older: _Sums, newer: _Sums, a: Any, b: Any, picture: Pictured, comparison: Comparison, limits, own: int
+) -> None:
+    """Add one camera's pair of pictures: ``a`` shows the older, ``b`` the newer; ``own`` is whose camera it is."""
+    both = a.solid & b.solid & (a.dominant_id >= 0) & (b.dominant_id >= 0)
+    base, share = comparison.tolerance_m
+    one = both & (np.abs(a.depth - b.depth) <= base + share * a.depth)
+    plain, beyond = _colour(a.colour, b.colour, comparison.balance, limits)
+    difference = plain[one]
+    offset = np.clip((b.depth - a.depth) * _along_normal(picture.own), -_CLIP_M, _CLIP_M)
+    # Of its own free space a capture is judge, so offsets are measured in the pictures of the other.
+    for sums, view, sign, is_other in ((older, a, 1.0, own == 1), (newer, b, -1.0, own == 0)):
+        ids, count = view.dominant_id[one], len(sums.looks)
+        sums.looks += np.bincount(ids, minlength=count)
+        sums.strength += np.bincount(ids, beyond[one], count)
+        for k in range(3):
+            sums.colour[:, k] += np.bincount(ids, difference[:, k], count)
+        sums.offset += np.bincount(ids, sign * offset[one], count)
+        sums.offset_looks += np.bincount(ids, minlength=count)
+
+
+def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
+    """Differences of colour (H, W, 3), two of chroma and one of lightness, and how far they go beyond what a shift by
+    a pixel explains (H, W), as multiples of the limits."""
+    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(
+        np.float32
+    )
+    log_b = np.log(np.clip(b, 0, 1) + np.float32(FLOOR))
+    bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
+    plain = _opponent(log_b - log_a, bright)
+    # A texture that is off by a pixel, or blurred in one of the captures, stays within what the other shows around.
+    strengths = []
+    for x, y in ((log_a, log_b), (log_b, log_a)):
+        low, high = _over_3x3(x, np.minimum), _over_3x3(x, np.maximum)
+        beyond = _opponent(y - np.clip(y, low, high), bright)
+        strengths.append(np.maximum(np.abs(beyond[..., :2]).max(-1) / limits[0], np.abs(beyond[..., 2]) / limits[1]))
+    return plain, np.minimum(*strengths)
+
+
+def _opponent(ratio: np.ndarray, bright: np.ndarray) -> np.ndarray:
+    """Red and blue against green, and the mean: as `gsmap.compare.Balance.differences` has them."""
+    green = ratio[..., 1]
+    parts = [ratio[..., 0] - green, ratio[..., 2] - green, ratio.mean(-1)]
+    return np.stack(parts, axis=-1) * bright[..., None]
+
+
+def _over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
+    """The ufunc over the 3 x 3 neighbours of each pixel (H, W, K); the border repeats."""
+    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
+    out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+    return out
+
+
+def _along_normal(view: Any) -> np.ndarray:
+    """(H, W) metres along the surface's normal per metre of depth."""
+    fx, fy, cx, cy = view.camera.intrinsics_px[0]
+    height, width = view.depth.shape
+    x = np.broadcast_to((np.arange(width) + 0.5 - cx) / fx, (height, width))
+    y = np.broadcast_to(((np.arange(height) + 0.5 - cy) / fy)[:, None], (height, width))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).astype(np.float32)
+    points = rays * view.depth[..., None]
+    across, down = np.zeros_like(points), np.zeros_like(points)
+    across[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    down[1:-1] = points[2:] - points[:-2]
+    normal = np.cross(across, down)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    # The distance between two planes across the ray is the depth between them times |n . ray|, rays of unit depth.
+    return np.clip(np.abs((normal * rays).sum(-1)), _STEEPEST, 1.0)
+
+
+def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None, params: Params) -> Side:
+    rows = np.flatnonzero(looks.surface)
+    gaussians = looks.gaussians
+    points = gaussians.means[rows].astype(np.float64)
+    label, counts = cell_labels(np.floor(points / params.cell_m))
+    colours = np.clip(rgb_of_sh0(gaussians.sh[rows, 0]).astype(np.float64), 0, 1)
+    if line is not None:
+        colours = np.clip(np.exp(np.log(colours + 0.03) * line.slope + line.offset) - 0.03, 0, 1)
+    total = lambda values: np.bincount(label, values[rows], len(counts))  # noqa: E731
+    looked, offset_looked = total(sums.looks), total(sums.offset_looks)
+    return Side(
+        rows,
+        label,
+        group_means(points, label, counts),
+        group_means(colours, label, counts),
+        total(evidence.through.astype(np.float64)),
+        total(evidence.on_surface.astype(np.float64)),
+        total(evidence.hidden.astype(np.float64)),
+        total(sums.offset) / np.maximum(offset_looked, 1),
+        offset_looked,
+        np.stack([total(sums.colour[:, k]) for k in range(3)], axis=1) / np.maximum(looked, 1)[:, None],
+        total(sums.strength) / np.maximum(looked, 1),
+        looked,
+    )

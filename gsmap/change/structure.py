@@ -1,0 +1,113 @@
+"""Floors, ceilings and walls: what things stand on and before, and what no thing grows into."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.change.components import components
+
+_BIN_M = 0.03
+_THICK_M = 0.045  # skirting boards, picture frames and the noise of a plane belong to it
+_LEVEL_M2, _WALL_M2 = 4.0, 0.8  # a smaller plane is a table or a cupboard
+_REACH_M = 0.16  # cells of one plane are linked over such gaps
+_WALL_M = 1.8  # a wall is at least this high, and ...
+_TO_CEILING_M = 0.2  # ... comes this close to the ceiling, where there is one
+_PIECE_M2 = 0.1  # of a wall that furniture hides, pieces at least so large are looked at
+_BESIDE_M = 0.3  # what lies so close to a wall, in its plane, is wall
+_MOST_PLANES = 24
+
+
+def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray:
+    """(M,) int: the plane of each cell, from 0, levels first; -1 for what is on none.
+
+    Args:
+        points, normals: (M, 3) of a surface in cells of ``cell_m``, z up.
+    """
+    label = np.full(len(points), -1, dtype=np.int64)
+    if len(points) < 50:
+        return label
+    found, ceiling = 0, np.inf
+    level = np.flatnonzero(np.abs(normals[:, 2]) > 0.9)
+    for height in _peaks(points[level, 2], _LEVEL_M2 / cell_m**2):
+        on = (np.abs(points[:, 2] - height) < _THICK_M) & (np.abs(normals[:, 2]) > 0.7) & (label < 0)
+        for piece in _pieces(points, np.flatnonzero(on), _LEVEL_M2 / cell_m**2):
+            label[piece] = found
+            found += 1
+            if height > np.median(points[:, 2]):
+                ceiling = max(height, ceiling if np.isfinite(ceiling) else height)
+    upright = np.flatnonzero(np.abs(normals[:, 2]) < 0.3)
+    for yaw in _directions(normals[upright]):
+        way = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        along = np.abs(normals[upright] @ way) > 0.94
+        for offset in _peaks(points[upright[along]] @ way, _WALL_M2 / cell_m**2):
+            on = (np.abs(points @ way - offset) < _THICK_M) & (np.abs(normals @ way) > 0.8) & (label < 0)
+            rows = _wall(points, np.flatnonzero(on), ceiling, cell_m)
+            if len(rows):
+                label[rows] = found
+                found += 1
+            if found >= _MOST_PLANES:
+                return label
+    return label
+
+
+def _wall(points: np.ndarray, rows: np.ndarray, ceiling: float, cell_m: float) -> np.ndarray:
+    """Those cells of an upright plane that are wall: large pieces up to the ceiling, and what little lies by them."""
+    pieces = _pieces(points, rows, _PIECE_M2 / cell_m**2)
+    tall = [p for p in pieces if np.ptp(points[p, 2]) > _WALL_M or points[p, 2].max() > ceiling - _TO_CEILING_M]
+    if not tall:
+        return rows[:0]
+    core = np.concatenate(tall)
+    if len(core) < _WALL_M2 / cell_m**2 or np.ptp(points[core, 2]) < _WALL_M:
+        return rows[:0]
+    if np.isfinite(ceiling) and points[core, 2].max() < ceiling - _TO_CEILING_M:
+        return rows[:0]
+    near = cKDTree(points[core]).query(points[rows], distance_upper_bound=_BESIDE_M)[0]
+    return rows[np.isfinite(near)]
+
+
+def _peaks(values: np.ndarray, fewest: float) -> list[float]:
+    """Places on a line where at least so many values lie, densest first, each taking what lies about it."""
+    if not len(values):
+        return []
+    low = values.min() - _BIN_M
+    counts = np.bincount(((values - low) / _BIN_M).astype(np.int64), minlength=3).astype(np.float64)
+    wide = np.convolve(counts, np.ones(3), "same")
+    peaks = []
+    while len(peaks) < _MOST_PLANES:
+        best = int(wide.argmax())
+        if wide[best] < fewest:
+            break
+        near = values[np.abs(values - (low + (best + 0.5) * _BIN_M)) < 1.5 * _BIN_M]
+        peaks.append(float(np.median(near)) if len(near) else low + (best + 0.5) * _BIN_M)
+        wide[max(0, best - 2) : best + 3] = 0
+    return peaks
+
+
+def _directions(normals: np.ndarray) -> list[float]:
+    """Yaws (radians, of half a turn) that many upright surfaces face, most first."""
+    if not len(normals):
+        return []
+    yaw = np.degrees(np.arctan2(normals[:, 1], normals[:, 0])) % 180
+    counts = np.bincount((yaw / 2).astype(np.int64) % 90, minlength=90).astype(np.float64)
+    wide = counts + np.roll(counts, 1) + np.roll(counts, -1)
+    found: list[float] = []
+    for _ in range(8):
+        best = int(wide.argmax())
+        if wide[best] < 0.02 * len(normals):
+            break
+        off = (yaw - (2 * best + 1) + 90) % 180 - 90
+        near = np.abs(off) < 4
+        found.append(float(np.radians(2 * best + 1 + (np.median(off[near]) if near.any() else 0))))
+        for k in range(-3, 4):
+            wide[(best + k) % 90] = 0
+    return found
+
+
+def _pieces(points: np.ndarray, rows: np.ndarray, fewest: float) -> list[np.ndarray]:
+    """Connected parts of a plane that are large enough."""
+    if len(rows) < fewest:
+        return []
+    labels = components(points[rows], _REACH_M)
+    counts = np.bincount(labels)
+    return [rows[labels == k] for k in np.flatnonzero(counts >= fewest)]

@@ -1,0 +1,133 @@
+"""Colours of two captures, compared after exposure, white balance and the strength of light are taken out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.compare.neighbourhoods import over_3x3
+from gsmap.compare.params import Params
+
+_FLOOR = 0.03  # added before logarithms: what is darker is noise
+_SAMPLES = 40_000  # pixels that a line is fitted to
+_ROUNDS = 6
+_FEWEST = 200  # pixels with which a line is fitted at all
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """How the colours of one capture become those of another: ``log b = slope * log a + offset``, per channel.
+
+    A display colour that was multiplied and raised to a power stays on such a line, so gain, gamma and white balance
+    are in it.
+
+    Args:
+        slope, offset: (3,) of the line.
+        chroma_spread, lightness_spread: robust standard deviation of what is left over where both captures agree.
+    """
+
+    slope: np.ndarray
+    offset: np.ndarray
+    chroma_spread: float
+    lightness_spread: float
+
+    def gains(self) -> np.ndarray:
+        """(3,) by which a middle grey of the first is multiplied to look like the second's."""
+        grey = np.log(0.5)
+        out: np.ndarray = np.exp((self.slope - 1) * grey + self.offset)
+        return out
+
+    def applied(self, colour: np.ndarray) -> np.ndarray:
+        """Colours (..., 3) of the first as the second would show them."""
+        logs = np.log(np.clip(colour, 0, 1) + np.float32(_FLOOR))
+        out = np.exp(logs * self.slope.astype(np.float32) + self.offset.astype(np.float32)) - np.float32(_FLOOR)
+        return np.clip(out, 0, 1).astype(np.float32)
+
+    def differences(self, a: np.ndarray, b: np.ndarray, both: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far two pictures (H, W, 3) of one view differ in chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
+
+        Ratios, so that shading cancels in the chroma, times the brightness, for nobody sees the hue of what is black.
+        Only what no pixel nearby explains counts: texture that lies half a pixel off is no paint.
+
+        Args:
+            both: (H, W) bool, pixels that show one surface; others explain nothing.
+        """
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
+        log_a = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
+        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
+        apart = [_apart(x, y, both) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True)]
+        return np.stack(apart[:2], axis=-1), apart[2]
+
+    def left_over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Differences of single colours (K, 3): chroma (K, 2) and lightness (K,)."""
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
+        log_a = log_a * self.slope + self.offset
+        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
+        red, blue, light = ((y - x) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True))
+        return np.stack([red, blue], axis=-1), light
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    """(...,) largest of three channels (..., 3)."""
+    out: np.ndarray = np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
+    return out
+
+
+def _tones(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Red over green, blue over green, and lightness, of logarithms of colours (..., 3)."""
+    red, green, blue = logs[..., 0], logs[..., 1], logs[..., 2]
+    return red - green, blue - green, (red + green + blue) / 3
+
+
+def _apart(a: np.ndarray, b: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """(H, W) by how much b lies above a (below: negative), beyond the ranges of both over 3 x 3 pixels."""
+    infinite = np.float32(1e3)  # beyond all logarithms of colours
+    low_a, low_b = (over_3x3(np.where(both, v, infinite), np.minimum) for v in (a, b))
+    high_a, high_b = (over_3x3(np.where(both, v, -infinite), np.maximum) for v in (a, b))
+    out: np.ndarray = np.where(both, np.maximum(low_b - high_a, 0) + np.minimum(high_b - low_a, 0), 0)
+    return out
+
+
+IDENTITY = Balance(np.ones(3), np.zeros(3), 0.0, 0.0)
+
+
+def balance(a: np.ndarray, b: np.ndarray) -> Balance:
+    """The robust line from colours a (K, 3) to b (K, 3) of the same surfaces; the identity where there are too few."""
+    if len(a) < _FEWEST:
+        return IDENTITY
+    step = max(1, len(a) // _SAMPLES)
+    x, y = (np.log(np.clip(v[::step], 0, 1).astype(np.float64) + _FLOOR) for v in (a, b))
+    slope, offset = np.ones(3), np.median(y - x, axis=0)
+    for channel in range(3):
+        for _ in range(_ROUNDS):
+            left = y[:, channel] - slope[channel] * x[:, channel] - offset[channel]
+            # Cauchy weights: what changed its colour may be a third of what is seen, and must not bend the line.
+            scale = max(1.4826 * float(np.median(np.abs(left))), 1e-4)
+            weight = 1 / (1 + (left / (1.5 * scale)) ** 2)
+            mean_x, mean_y = np.average(x[:, channel], weights=weight), np.average(y[:, channel], weights=weight)
+            centred = x[:, channel] - mean_x
+            # A prior towards slope 1: a place of one colour tells an offset and no slope.
+            prior = 0.01 * weight.sum()
+            covariance = (weight * centred * (y[:, channel] - mean_y)).sum() + prior
+            slope[channel] = np.clip(covariance / ((weight * centred**2).sum() + prior), 0.4, 2.5)
+            offset[channel] = mean_y - slope[channel] * mean_x
+    line = Balance(slope, offset, 0.0, 0.0)
+    chroma, lightness = line.left_over(a[::step], b[::step])
+    spread = 1.4826 * float(np.median(np.maximum(*np.abs(chroma).T)))
+    return Balance(slope, offset, spread, 1.4826 * float(np.median(np.abs(lightness))))
+
+
+def limits(line: Balance, params: Params) -> tuple[float, float]:
+    """Differences of chroma and of lightness that light and noise explain."""
+    return (
+        max(params.min_chroma, params.chroma_spreads * line.chroma_spread),
+        max(params.min_lightness, params.lightness_spreads * line.lightness_spread),
+    )
+
+
+def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray, params: Params) -> np.ndarray:
+    """Where colours differ by more than light and noise explain."""
+    most = np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1]))
+    out: np.ndarray = (most > limits(line, params)[0]) | (np.abs(lightness) > limits(line, params)[1])
+    return out

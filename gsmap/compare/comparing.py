@@ -1,0 +1,209 @@
+"""Two captures seen from the cameras of both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.compare.colours import Balance, balance, differ
+from gsmap.compare.evidence import Evidence, Tally
+from gsmap.compare.looks import Looks, Placed, View, place, view_of
+from gsmap.compare.params import Params
+from gsmap.render import render
+from gsmap.types import Gaussians
+
+UNSURE, AGREE, COLOUR, OTHER_BEFORE, OTHER_BEHIND = 0, 1, 2, 3, 4
+"""Outcomes of a pixel of one capture's own view. ``UNSURE``: one of them shows nothing there, an edge, or a surface
+that was not seen well. ``AGREE``: one surface, one colour. ``COLOUR``: one surface in two colours. ``OTHER_BEFORE``:
+the other capture has a thing where this one looked through. ``OTHER_BEHIND``: this one has a thing before what the
+other shows, which proves nothing by itself: the other's cameras may never have seen the place from here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pictured:
+    """One view of a capture with what the other capture shows from there.
+
+    Args:
+        own: the capture's own view.
+        other: the other's surfaces from the same camera.
+        outcome: (H, W) uint8, one of the five outcomes.
+        one: (H, W) bool, both show one surface, well seen or not.
+        covered: (H, W) bool, the other has a thing before what this one shows, though perhaps at an edge.
+        chroma, lightness: (H, W, 2) and (H, W) float32 differences of colour there, newer less older.
+    """
+
+    own: View
+    other: View
+    outcome: np.ndarray
+    one: np.ndarray
+    covered: np.ndarray
+    chroma: np.ndarray
+    lightness: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What two captures say of each other.
+
+    Args:
+        older, newer: evidence of each one's Gaussians, by the views of the other.
+        older_views, newer_views: each capture's own views, with the other rendered from there.
+        balance: brings the older's colours to the newer's.
+        tolerance_m: (base, share): depths differ when by more than ``base + share * depth``.
+    """
+
+    older: Evidence
+    newer: Evidence
+    older_views: tuple[Pictured, ...]
+    newer_views: tuple[Pictured, ...]
+    balance: Balance
+    tolerance_m: tuple[float, float]
+
+
+def compare(older: Looks, newer: Looks, params: Params | None = None) -> Comparison:
+    """Compare two captures that lie in one metric frame.
+
+    Each is rendered from the other's cameras once, its surfaces alone: from where its own cameras never stood its haze
+    hides everything.
+    """
+    params = params or Params()
+    surfaces = {id(one): _surface(one) for one in (older, newer)}
+    crossed = [
+        [
+            (own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)], params))
+            for i in range(len(own.views))
+        ]
+        for own, other in ((older, newer), (newer, older))
+    ]
+    tolerance = _tolerance([pair for pairs in crossed for pair in pairs], params)
+    line = _line(crossed, tolerance)
+    pictured = [
+        [_outcomes(own, sure, other, line, sign, tolerance, params) for own, sure, other in pairs]
+        for pairs, sign in zip(crossed, (-1, 1), strict=True)
+    ]
+    tallies = Tally(len(older.gaussians)), Tally(len(newer.gaussians))
+    for judged, judge, by, of in ((tallies[0], tallies[1], newer, older), (tallies[1], tallies[0], older, newer)):
+        for picture, sure, own in zip(pictured[by is newer], by.sure, by.placed, strict=True):
+            at = place(of.gaussians.means, picture.own, params.nearest_m)
+            _count(judged, at, picture, sure, tolerance)
+            _count_colour(judge, own, picture, tolerance)
+    evidence = [
+        tally.evidence(one.gaussians.means, one.surface, line, params)
+        for tally, one in zip(tallies, (older, newer), strict=True)
+    ]
+    return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
+
+
+def _surface(looks: Looks) -> tuple[Gaussians, np.ndarray]:
+    rows = np.flatnonzero(looks.surface)
+    return (looks.gaussians if len(rows) == len(looks.surface) else looks.gaussians[rows]), rows
+
+
+def _seen_by(view: View, gaussians: Gaussians, rows: np.ndarray, params: Params) -> View:
+    seen = render(gaussians, view.camera)
+    dominant = seen.dominant_id[0]
+    whole = np.where(dominant >= 0, rows[np.maximum(dominant, 0)] if len(rows) else -1, -1).astype(np.int32)
+    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], whole, view.camera, params)
+
+
+def _tolerance(pairs: list[tuple[View, np.ndarray, View]], params: Params) -> tuple[float, float]:
+    """Base and share of the depth: what the pair's own surfaces scatter by, within limits."""
+    found = []
+    for own, sure, other in pairs:
+        both = (sure & other.solid)[::2, ::2]
+        off = np.abs(other.depth - own.depth)[::2, ::2][both]
+        limit = params.most_tolerance_m + params.tolerance_share * own.depth[::2, ::2][both]
+        found.append(off[off < limit])
+    off = np.concatenate(found) if found else np.zeros(0)
+    spread = 1.4826 * float(np.median(off)) if len(off) else params.most_tolerance_m
+    base = float(np.clip(params.tolerance_spreads * spread, params.least_tolerance_m, params.most_tolerance_m))
+    return base, params.tolerance_share
+
+
+def _line(crossed: list[list[tuple[View, np.ndarray, View]]], tolerance: tuple[float, float]) -> Balance:
+    """The older's colours to the newer's, from all pixels on one surface."""
+    older, newer = [], []
+    for pairs, own_is_newer in zip(crossed, (False, True), strict=True):
+        for own, sure, other in pairs:
+            one = (sure & other.solid & _one_surface(own, other, tolerance))[::2, ::2]
+            mine, theirs = own.colour[::2, ::2][one], other.colour[::2, ::2][one]
+            older.append(theirs if own_is_newer else mine)
+            newer.append(mine if own_is_newer else theirs)
+    return balance(np.concatenate(older), np.concatenate(newer)) if older else balance(*np.zeros((2, 0, 3)))
+
+
+def _one_surface(own: View, other: View, tolerance: tuple[float, float]) -> np.ndarray:
+    base, share = tolerance
+    out: np.ndarray = np.abs(own.depth - other.depth) <= base + share * own.depth
+    return out
+
+
+def _outcomes(
+    own: View,
+    sure: np.ndarray,
+    other: View,
+    line: Balance,
+    sign: int,
+    tolerance: tuple[float, float],
+    params: Params,
+) -> Pictured:
+    """``line`` takes the older's colours to the newer's."""
+    base, share = tolerance
+    gap = base + share * own.depth
+    one = own.solid & other.solid & _one_surface(own, other, tolerance)
+    both = sure & other.solid
+    covered = own.opaque & other.opaque & (other.depth < own.depth - gap)
+    older, newer = (other, own) if sign > 0 else (own, other)
+    chroma, lightness = line.differences(older.colour, newer.colour, one)
+    outcome = np.full(own.depth.shape, UNSURE, dtype=np.uint8)
+    outcome[one & sure] = AGREE
+    outcome[one & sure & differ(line, chroma, lightness, params)] = COLOUR
+    # Beyond both neighbourhoods' extremes: a pixel off at an edge proves nothing.
+    outcome[both & (other.far < own.near - gap)] = OTHER_BEFORE
+    outcome[both & (other.near > own.far + gap)] = OTHER_BEHIND
+    return Pictured(own, other, outcome, one, covered, chroma, lightness)
+
+
+def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolerance: tuple[float, float]) -> None:
+    """Where the Gaussians of one capture lie in a view of the other."""
+    view, (base, share) = picture.own, tolerance
+    near, far = view.near[at.row, at.column], view.far[at.row, at.column]
+    gap = base + share * at.z
+    known = view.solid[at.row, at.column]
+    through = known & (at.z < near - gap)
+    hidden = known & (at.z > far + gap)
+    # Where depths jump within a few pixels, lying somewhere between proves nothing.
+    on = known & ~through & ~hidden & (far - near < 4 * gap)
+    tally.through[at.index[through]] += 1
+    tally.hidden[at.index[hidden]] += 1
+    grazed = view.opaque[at.row, at.column] & (at.z < view.depth[at.row, at.column] - gap)
+    tally.grazed[at.index[grazed]] += 1
+    tally.on_surface[at.index[on]] += 1
+    tally.covered[at.index[on & picture.covered[at.row, at.column]]] += 1
+    looked = through | on
+    tally.sure[at.index[looked & sure[at.row, at.column]]] += 1
+    tally.sharpness[at.index[looked]] += view.pixels_a_metre(at.z[looked]) ** 2
+    _add_colour(tally, at, on, picture)
+
+
+def _count_colour(tally: Tally, at: Placed, picture: Pictured, tolerance: tuple[float, float]) -> None:
+    """What a capture's own view says of the colours of its own Gaussians."""
+    base, share = tolerance
+    _add_colour(tally, at, np.abs(at.z - picture.own.depth[at.row, at.column]) <= base + share * at.z, picture)
+
+
+def _add_colour(tally: Tally, at: Placed, on: np.ndarray, picture: Pictured) -> None:
+    row, column, index = at.row[on], at.column[on], at.index[on]
+    one = picture.one[row, column]
+    row, column, index = row[one], column[one], index[one]
+    tally.colour_seen[index] += 1
+    tally.chroma[index] += picture.chroma[row, column]
+    tally.lightness[index] += picture.lightness[row, column]
+
+
+def pictures(comparison: Comparison) -> Iterator[Pictured]:
+    """All views of both."""
+    yield from comparison.older_views
+    yield from comparison.newer_views

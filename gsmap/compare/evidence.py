@@ -1,0 +1,143 @@
+"""What one capture's pictures say of each Gaussian of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.compare.colours import Balance, limits
+from gsmap.compare.params import Params
+from gsmap.geometry.voxels import voxel_labels
+
+UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
+"""States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
+what the other capture shows. ``SAME``: on the surface that the other shows. ``REPAINTED``: on it, in another colour.
+``GONE``: the other looked through it; of a Gaussian of the newer capture that means that it is new."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """For each of N Gaussians of a capture, in how many views of the other it was what.
+
+    Args:
+        through, on_surface, hidden: (N,) int32 views.
+        sure: (N,) int32 views that looked at it or through it and saw that surface well.
+        sharpness: (N,) float32 as in `Looks`, over the other's views that looked at it or through it.
+        colour_seen: (N,) int32 views, of either capture, in which its colour could be compared.
+        chroma, lightness: (N, 2) and (N,) float32 means, over these views, of by how much the newer's colour differs.
+        state: (N,) int8, one of the five, after neighbours have voted.
+    """
+
+    through: np.ndarray
+    on_surface: np.ndarray
+    hidden: np.ndarray
+    sure: np.ndarray
+    sharpness: np.ndarray
+    colour_seen: np.ndarray
+    chroma: np.ndarray
+    lightness: np.ndarray
+    state: np.ndarray
+
+
+_PART = 0.3  # of a difference that a Gaussian must have itself, where its neighbours have it
+_BORDER = 0.4  # of its neighbours that changed, for a Gaussian to be at a change's border
+_ROUNDS = 2
+
+
+class Tally:
+    """Counts of evidence, while it is gathered."""
+
+    def __init__(self, count: int) -> None:
+        self.through = np.zeros(count, dtype=np.int32)
+        self.on_surface = np.zeros(count, dtype=np.int32)
+        self.hidden = np.zeros(count, dtype=np.int32)
+        self.grazed = np.zeros(count, dtype=np.int32)  # views in which it is before the surface, though perhaps at an edge
+        self.covered = np.zeros(count, dtype=np.int32)  # on the surface, but its own capture shows something before it
+        self.sure = np.zeros(count, dtype=np.int32)
+        self.sharpness = np.zeros(count, dtype=np.float32)
+        self.colour_seen = np.zeros(count, dtype=np.int32)
+        self.chroma = np.zeros((count, 2), dtype=np.float32)
+        self.lightness = np.zeros(count, dtype=np.float32)
+
+    def evidence(self, points: np.ndarray, shows: np.ndarray, line: Balance, params: Params) -> Evidence:
+        """The counts and what they come to; ``shows`` (N,) says which Gaussians are part of a surface and vote."""
+        often = np.maximum(self.colour_seen, 1).astype(np.float32)
+        chroma, lightness = self.chroma / often[:, None], self.lightness / often
+        near = _Neighbours(points, shows, params)
+        state = self._geometry(near, params)
+        # What is near the other's surface, yet part of a thing that stood before it, is no part of that surface.
+        beside = near.sums((state == GONE).astype(np.int32)) >= 2
+        state[(state == SAME) & (self.covered > self.colour_seen) & (beside | (self.through >= 1))] = GONE
+        same = state == SAME
+        seen = same & (self.colour_seen >= 1) & shows
+        limit = limits(line, params)
+        differs = np.maximum(np.abs(chroma).max(1) / limit[0], np.abs(lightness) / limit[1])
+        state[same & (near.mean(np.where(seen, differs, 0), seen) >= 1) & (differs >= _PART)] = REPAINTED
+        # What differs less, and alone, is noise; beside what is sure it is its border.
+        for _ in range(_ROUNDS):
+            beside = near.sums((state >= REPAINTED).astype(np.int32)) >= _BORDER * np.maximum(near.count, 1)
+            state[(state == SAME) & beside & (differs >= _PART)] = REPAINTED
+        _follow(state, near, self.grazed > 0, self.colour_seen < params.min_views)
+        counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
+        return Evidence(*counts, chroma, lightness, state)
+
+    def _geometry(self, near: _Neighbours, params: Params) -> np.ndarray:
+        through, on = near.sums(self.through), near.sums(self.on_surface)
+        judged = self.through + self.on_surface
+        few, share = params.min_views, params.min_share
+        state = np.full(len(judged), UNSEEN, dtype=np.int8)
+        state[self.hidden >= few] = HIDDEN
+        # A Gaussian counts as much as all of its neighbours together.
+        own = judged / np.maximum(through + on, 1)
+        total = judged + own * (through + on)
+        part = (self.through + own * through) / np.maximum(total, 1e-9)
+        # One look at a surface that others of the capture's views saw too, or a few at what none but they saw.
+        enough = (judged >= 1) & ((self.sure + near.sums(self.sure) >= 1) | (judged >= few))
+        state[enough] = np.where(part[enough] >= share, GONE, SAME)
+        return state
+
+
+class _Neighbours:
+    """The nearest Gaussians that show, of each."""
+
+    def __init__(self, points: np.ndarray, shows: np.ndarray, params: Params) -> None:
+        from scipy.spatial import cKDTree
+
+        self.rows = np.flatnonzero(shows)
+        self.index = np.zeros((len(points), 0), dtype=np.int64)
+        self.distance = np.zeros((len(points), 0))
+        if len(self.rows):
+            tree = cKDTree(points[self.rows])
+            count = min(params.neighbours, len(self.rows))
+            self.distance, self.index = tree.query(points, count, distance_upper_bound=params.cell_m)
+            self.distance, self.index = (v.reshape(len(points), -1) for v in (self.distance, self.index))
+
+    @property
+    def count(self) -> np.ndarray:
+        """(N,) neighbours within reach."""
+        out: np.ndarray = (self.index < len(self.rows)).sum(1)
+        return out
+
+    def mean(self, values: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """(N,) means of values (N,) over those neighbours that are among ``of`` (N,), at least three; 0 for fewer."""
+        count = self.sums(of.astype(np.int32))
+        out: np.ndarray = np.where(count >= 3, self.sums(np.where(of, values, 0)) / np.maximum(count, 1), 0)
+        return out
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """(N, ...) sums of values (N, ...) over the neighbours within reach."""
+        padded = np.concatenate([values[self.rows], np.zeros_like(values[:1])])
+        out: np.ndarray = padded[self.index].sum(1, dtype=np.float64)
+        return out
+
+
+def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray, doubtful: np.ndarray) -> None:
+    """What nobody judged goes with those around it that were, where most of these are gone or repainted."""
+    votes = np.stack([near.sums((state == s).astype(np.int32)) for s in (SAME, REPAINTED, GONE)])
+    open_ = (state < SAME) | ((state == SAME) & doubtful)
+    most = votes.argmax(0)
+    sure = (votes.max(0) >= 3) & (2 * votes.max(0) > votes.sum(0))
+    state[(state < SAME) & grazed & ~(sure & (most == 0))] = GONE
+    sure &= most > 0
+    state[open_ & sure] = np.array([SAME, REPAINTED, GONE], dtype=np.int8)[most[open_ & sure]]

@@ -1,0 +1,98 @@
+"""What several captures are sure of together, as if it were one capture: views chosen by coverage, newest first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsmap.compare.comparing import AGREE, OTHER_BEHIND, UNSURE, Comparison
+from gsmap.compare.looks import Looks, View, place
+from gsmap.compare.params import Params
+from gsmap.types import Gaussians, PlacedScene
+
+_SAMPLE = 1500  # points of a capture by which views of others are chosen
+_ENOUGH = 5  # views of a point: more add little
+
+
+def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, params: Params | None = None) -> Looks:
+    """The looks of several captures as one, with those views alone that look at what ``of`` shows.
+
+    Args:
+        parts: captures from the newest to the oldest, and of each (N,) which Gaussians still stand; rows of the answer
+            are these, one capture after another.
+        of: the capture that is going to be compared.
+    """
+    params = params or Params()
+    chosen = _chosen([looks for looks, _ in parts], of, params)
+    views, sure, placed, first = [], [], [], 0
+    for (looks, stays), picked in zip(parts, chosen, strict=True):
+        row = np.where(stays, np.cumsum(stays) - 1 + first, -1).astype(np.int32)
+        first += int(stays.sum())
+        for v in picked:
+            view, at = looks.views[v], looks.placed[v]
+            dominant = np.where(view.dominant_id >= 0, row[view.dominant_id], -1)
+            kept = stays[at.index]
+            views.append(replace(view, dominant_id=dominant))
+            sure.append(looks.sure[v])
+            placed.append(
+                replace(at, index=row[at.index[kept]], row=at.row[kept], column=at.column[kept], z=at.z[kept])
+            )
+    gaussians = Gaussians.concatenate([looks.gaussians[stays] for looks, stays in parts])
+    surface, times_seen, sharpness = (
+        np.concatenate([getattr(looks, name)[stays] for looks, stays in parts])
+        for name in ("surface", "times_seen", "sharpness")
+    )
+    scene = PlacedScene(gaussians, scene_id="+".join(looks.scene.scene_id for looks, _ in parts))
+    return Looks(scene, tuple(views), surface, times_seen, sharpness, tuple(sure), tuple(placed))
+
+
+def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
+    """The looks of the older capture of a comparison, sure of nothing where a newer one disagrees.
+
+    Its colours are brought to the newer's, so that captures before it are compared with one exposure.
+
+    Args:
+        stays: (N,) which of its Gaussians still stand.
+    """
+    sure, views = [], []
+    for own, picture in zip(looks.sure, comparison.older_views, strict=True):
+        shown = picture.own.dominant_id
+        stands = (shown >= 0) & stays[shown]
+        undisputed = (picture.outcome == AGREE) | (picture.outcome == UNSURE) | (picture.outcome == OTHER_BEHIND)
+        sure.append(own & stands & undisputed)
+        views.append(_balanced(picture.own, comparison))
+    return replace(looks, views=tuple(views), sure=tuple(sure))
+
+
+def _balanced(view: View, comparison: Comparison) -> View:
+    return replace(view, colour=comparison.balance.applied(view.colour))
+
+
+def _chosen(captures: Sequence[Looks], of: PlacedScene, params: Params) -> list[list[int]]:
+    """Of each capture the views to take: at most ``max_views`` in all, one after another what adds most coverage."""
+    chosen: list[list[int]] = [[] for _ in captures]
+    points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]
+    names = [(c, v) for c, looks in enumerate(captures) for v in range(len(looks.views))]
+    if not names or not len(points):
+        return chosen
+    sees = np.zeros((len(names), len(points)), dtype=np.float32)
+    for i, (c, v) in enumerate(names):
+        view = captures[c].views[v]
+        at = place(points, view, params.nearest_m)
+        # What is behind a surface is not seen, whatever stands in the picture's frame.
+        seen = at.z < view.far[at.row, at.column] + params.most_tolerance_m
+        # Among views that see as much, the newest.
+        sees[i, at.index[seen]] = 1 + 0.2 * (len(captures) - c) / len(captures)
+    wanting = np.full(len(points), _ENOUGH, dtype=np.float32)
+    for _ in range(min(params.max_views, len(names))):
+        gain = sees @ np.minimum(wanting, 1)
+        best = int(np.argmax(gain))
+        if gain[best] <= 0:
+            break
+        c, v = names[best]
+        chosen[c].append(v)
+        wanting = np.maximum(wanting - (sees[best] > 0), 0)
+        sees[best] = 0
+    return [sorted(picked) for picked in chosen]

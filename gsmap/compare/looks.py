@@ -1,0 +1,151 @@
+"""A capture through its own cameras: what it is sure of, and how well it saw each of its Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.compare.neighbourhoods import extremes, shrunk
+from gsmap.compare.params import Params
+from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.voxels import voxel_labels
+from gsmap.render import render
+from gsmap.types import Cameras, Gaussians, PlacedScene
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One small picture of a capture.
+
+    Args:
+        camera: one camera, the frame of the comparison.
+        colour: (H, W, 3) float32, in [0, 1].
+        depth: (H, W) float32 camera-space z, metres.
+        near, far: (H, W) float32 lowest and highest depth over 3 x 3 pixels: at an edge a depth is a mixture of what
+            lies before and behind it, and proves nothing between the two.
+        opaque: (H, W) bool, shows a surface.
+        solid: (H, W) bool, so it does, and so do the eight neighbours.
+        dominant_id: (H, W) int32 Gaussian of the capture that shows most, -1 for none.
+    """
+
+    camera: Cameras
+    colour: np.ndarray
+    depth: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+    opaque: np.ndarray
+    solid: np.ndarray
+    dominant_id: np.ndarray
+
+    def pixels_a_metre(self, z: np.ndarray) -> np.ndarray:
+        """How finely the picture shows what lies at depths z."""
+        out: np.ndarray = (self.camera.intrinsics_px[0, 0] / z).astype(np.float32)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Which points fall in a picture (``index``), on which pixels, at which depth ``z``."""
+
+    index: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    z: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """One capture, rendered once from a bounded number of its own cameras.
+
+    Args:
+        scene: the capture.
+        views: V pictures of it.
+        surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen.
+        times_seen: (N,) int32 pictures in which a Gaussian lies on the surface that is shown.
+        sharpness: (N,) float32 sum over these of (pixels a metre)^2: more looks and nearer ones see better.
+        sure: per view (H, W) bool, solid, and a surface that enough of the capture's views saw.
+        placed: per view, where its own Gaussians fall in it.
+    """
+
+    scene: PlacedScene
+    views: tuple[View, ...]
+    surface: np.ndarray
+    times_seen: np.ndarray
+    sharpness: np.ndarray
+    sure: tuple[np.ndarray, ...]
+    placed: tuple[Placed, ...]
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return self.scene.gaussians
+
+
+def look(scene: PlacedScene, params: Params | None = None) -> Looks:
+    """Render a capture from its own cameras; one without cameras has no views and says nothing of others."""
+    params = params or Params()
+    count = len(scene.gaussians)
+    largest = np.zeros(count, dtype=np.float32)
+    views = []
+    for camera in own_cameras(scene, params):
+        view, weight = _view(scene.gaussians, camera, params)
+        views.append(view)
+        np.maximum(largest, weight, out=largest)
+    times_seen, sharpness = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.float32)
+    placed = tuple(place(scene.gaussians.means, view, params.nearest_m) for view in views)
+    for view, at in zip(views, placed, strict=True):
+        margin = params.least_tolerance_m
+        on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
+        times_seen[at.index[on]] += 1
+        sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
+    well = _best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
+    sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
+    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sharpness, sure, placed)
+
+
+def _best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
+    """(N,) the largest count in each point's cell: a place was seen as often as what shows it best."""
+    if not len(points):
+        return counts
+    cell = voxel_labels(points, cell_m)
+    best = np.zeros(int(cell.max()) + 1, dtype=counts.dtype)
+    np.maximum.at(best, cell, counts)
+    out: np.ndarray = best[cell]
+    return out
+
+
+def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
+    """At most ``max_views`` cameras of a capture, evenly along its path, small."""
+    if scene.cameras is None or not len(scene.cameras) or not len(scene.gaussians):
+        return []
+    rows = np.unique(np.linspace(0, len(scene.cameras) - 1, min(params.max_views, len(scene.cameras))).round())
+    small = scene.cameras[rows.astype(np.int64)].resized(params.longest_side_px)
+    return [small[i] for i in range(len(small))]
+
+
+def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
+    """Points (N, 3) in a view, those alone that lie in the picture and beyond ``nearest_m``."""
+    pixels, z = project(points, view.camera.T_camera_frame[0], view.camera.intrinsics_px[0])
+    index = np.flatnonzero(in_image(pixels, z, view.camera.sizes_px[0], near=nearest_m))
+    column, row = pixels[index].astype(np.int32).T
+    return Placed(index.astype(np.int32), row, column, z[index])
+
+
+def _view(gaussians: Gaussians, camera: Cameras, params: Params) -> tuple[View, np.ndarray]:
+    seen = render(gaussians, camera, max_weight=True)
+    return view_of(seen.colour[0], seen.alpha[0], seen.depth[0], seen.dominant_id[0], camera, params), seen.max_weight
+
+
+def view_of(
+    colour: np.ndarray,
+    alpha: np.ndarray,
+    depth: np.ndarray,
+    dominant_id: np.ndarray,
+    camera: Cameras,
+    params: Params,
+) -> View:
+    """A picture with what its neighbourhoods say."""
+    opaque = alpha > params.min_alpha
+    near, far = extremes(depth, opaque)
+    solid = opaque & shrunk(opaque)
+    return View(camera, np.clip(colour, 0, 1), depth, near, far, opaque, solid, dominant_id)

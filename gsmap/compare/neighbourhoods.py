@@ -1,0 +1,39 @@
+"""Pictures over 3 x 3 pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def extremes(depth: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) lowest and highest opaque depth over 3 x 3 pixels; inf and -inf where nothing is opaque."""
+    low = np.where(opaque, depth, np.float32(np.inf))
+    high = np.where(opaque, depth, np.float32(-np.inf))
+    return over_3x3(low, np.minimum), over_3x3(high, np.maximum)
+
+
+def shrunk(mask: np.ndarray) -> np.ndarray:
+    """A mask (H, W) without the pixels that have another beside them."""
+    return over_3x3(mask, np.logical_and)
+
+
+def grown(mask: np.ndarray, times: int = 1) -> np.ndarray:
+    """A mask (H, W) with every pixel beside it, ``times`` times."""
+    for _ in range(times):
+        mask = over_3x3(mask, np.logical_or)
+    return mask
+
+
+def over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
+    """The ufunc over each pixel's 3 x 3 neighbourhood; the border repeats."""
+    padded = np.pad(values, 1, mode="edge")
+    rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
+    out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+    return out
+
+
+def ranges(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, K) lowest and highest value of each channel over 3 x 3 pixels."""
+    channels = [picture[..., c] for c in range(picture.shape[-1])]
+    low, high = (np.stack([over_3x3(c, pick) for c in channels], axis=-1) for pick in (np.minimum, np.maximum))
+    return low, high

@@ -1,0 +1,161 @@
+"""Changes as typed rows, in the map's frame of today."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+
+from gsmap.errors import ConfigError
+from gsmap.map.dates import last_of, parsed
+from gsmap.map.one_state import of_one_state
+from gsmap.map.reports import scenes_by_id
+from gsmap.map.settings import Settings
+from gsmap.map.stages.change import Wanted, lacking
+from gsmap.store import Store
+from gsmap.store.change_rows import Comparison, StoredChange, moved_box
+from gsmap.types import PoseGraph, Scene
+from gsmap.types.rows import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow, PairEventRow
+
+_ID = re.compile(r"c(\d{1,9})")
+
+
+def number_of(text: str) -> int | None:
+    """The number of a change by what it is called (``c12``); None for anything else."""
+    found = _ID.fullmatch(text)
+    return None if found is None else int(found[1])
+
+
+def within(asked: Wanted, since: str | None, between: Sequence[str] | None, as_of: str | None) -> Wanted:
+    """Those pairs whose newer capture is dated after ``since``; or after the first and at or before the second of
+    ``between``; and at or before ``as_of``. A day that is named as an end is all of it.
+
+    Raises:
+        ConfigError: a date that is none, two ways of saying since when, or an end before its beginning.
+    """
+    if since is not None and between is not None:
+        raise ConfigError("say since when, or between which dates: not both")
+    first = between[0] if between is not None else since
+    start = None if first is None else parsed(first)
+    ends = [last_of(text) for text in (between[1] if between is not None else None, as_of) if text is not None]
+    if start is not None and any(end < start for end in ends):
+        raise ConfigError(f"no date lies after {first} and before a date that is earlier: give the earlier one first")
+
+    def holds(when: datetime) -> bool:
+        return (start is None or when > start) and all(when <= end for end in ends)
+
+    return replace(asked, pairs=[pair for pair in asked.pairs if holds(asked.visits[pair[1]].when)])
+
+
+@of_one_state
+def changes_report(
+    store: Store,
+    settings: Settings,
+    asked: Wanted,
+    *,
+    min_confidence: float,
+) -> ChangesReport:
+    """What is known of the pairs asked for."""
+    known, placed = scenes_by_id(store), store.revisions.get()
+    missing = set(lacking(store, asked, settings))
+    pairs = set(asked.pairs)
+    chosen = [one for one in store.changes.current() if (one.older, one.newer) in pairs]
+    chosen.sort(key=lambda one: (asked.visits[one.newer].when, asked.visits[one.older].when), reverse=True)
+    stale = [one for one in chosen if (one.older, one.newer) in missing]
+    never = missing - {(one.older, one.newer) for one in chosen}
+    notes = list(asked.notes)
+    if stale:
+        notes.append(f"{len(stale)} pairs were compared by another recipe or at other poses: {_WRITE}")
+    if never:
+        notes.append(f"{len(never)} pairs are not compared yet: {_WRITE}")
+    if chosen and not any(scene.scale_policy == "known" for scene in known.values()):
+        notes.append("no scene's scale is known, so lengths are in the map's own unit")
+    rows = [_row(one, change, known, placed) for one in chosen for change in one.changes]
+    return ChangesReport(
+        changes=tuple(ChangeRow(**row) for row in rows if row["confidence"] >= min_confidence),
+        pairs=tuple(_comparison_row(one, known) for one in chosen),
+        notes=tuple(notes),
+    )
+
+
+_WRITE = "gsmap changes does where the map can be written"
+
+
+@of_one_state
+def change_row(store: Store, number: int) -> ChangeRow:
+    """One change, as it is now."""
+    comparison, change = _find(store, number)
+    return ChangeRow(**_row(comparison, change, scenes_by_id(store), store.revisions.get()))
+
+
+@of_one_state
+def change_detail(store: Store, number: int) -> ChangeDetail:
+    """Everything known of one change."""
+    comparison, change = _find(store, number)
+    words = [PairEventRow(at=one.created_at, what=one.review, reason=one.note) for one in store.changes.reviews(number)]
+    return ChangeDetail(
+        **_row(comparison, change, scenes_by_id(store), store.revisions.get()),
+        num_voxels=change.num_voxels,
+        compared_at=comparison.created_at,
+        notes=comparison.notes,
+        history=tuple(words),
+    )
+
+
+def num_open(store: Store, min_confidence: float) -> int:
+    """How many changes nobody has looked at yet."""
+    every = (change for one in store.changes.current() for change in one.changes)
+    return sum(change.status == "open" and change.confidence >= min_confidence for change in every)
+
+
+def _find(store: Store, number: int) -> tuple[Comparison, StoredChange]:
+    change = store.changes.get(number)
+    return store.changes.comparison(change.comparison), change
+
+
+def _pair(one: Comparison, known: dict[str, Scene]) -> dict[str, Any]:
+    older, newer = known[one.older], known[one.newer]
+    return {
+        "older": older.id,
+        "older_name": older.name,
+        "older_at": older.captured_at,
+        "newer": newer.id,
+        "newer_name": newer.name,
+        "newer_at": newer.captured_at,
+    }
+
+
+def _row(one: Comparison, change: StoredChange, known: dict[str, Scene], placed: PoseGraph | None) -> dict[str, Any]:
+    """The fields of a `ChangeRow`; what was found in the map's frame of then, in that of today."""
+    pose = placed.poses.get(one.newer) if placed is not None else None
+    S_map_frame = None if pose is None else pose.S_map_scene @ one.S_frame_newer.inverse()
+    moved = None
+    if S_map_frame is not None and change.S_after_before is not None:
+        moved = S_map_frame @ change.S_after_before @ S_map_frame.inverse()
+    return {
+        **_pair(one, known),
+        "id": f"c{change.number}",
+        "kind": change.kind,
+        "component": None if pose is None else pose.component,
+        "box_m": None if S_map_frame is None else moved_box(change.box, S_map_frame),
+        "before": change.num_before,
+        "after": change.num_after,
+        "S_after_before": moved,
+        "symmetry": change.symmetry,
+        "confidence": change.confidence,
+        "evidence": dict(change.evidence),
+        "status": change.status,
+    }
+
+
+def _comparison_row(one: Comparison, known: dict[str, Scene]) -> ComparisonRow:
+    return ComparisonRow(
+        **_pair(one, known),
+        num_changes=len(one.changes),
+        seen_share=one.seen_share,
+        gains=one.gains,
+        compared_at=one.created_at,
+        notes=one.notes,
+    )

@@ -1,0 +1,142 @@
+"""Pictures of changes in a folder, and which scenes each shows: what a purge has to find again."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from gsmap.durable import make_folder, open_file, remove_file, write_text_whole, write_whole
+from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.store import Store
+from gsmap.types import PlacedScene, Sim3
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows import ChangeRow
+
+_log = logging.getLogger("gsmap.map")
+FILE_NAME = "changes.json"
+_VERSION = 1
+_PICTURE = re.compile(r"c\d+\.png")
+_MAX_BYTES = 1 << 26
+
+
+@dataclass
+class Pictures:
+    """What a folder of pictures holds: ids of the two scenes by file."""
+
+    map_id: str
+    scenes: dict[str, list[str]] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, folder: Path, map_id: str) -> Pictures:
+        """What is there; nothing where the folder is empty or missing.
+
+        Raises:
+            ConfigError: it holds something else, or pictures of another map.
+            InputError: what it holds cannot be read.
+        """
+        path = folder / FILE_NAME
+        if not os.path.lexists(path):
+            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+                raise ConfigError(f"{folder} holds other things: give an empty or a new folder for pictures")
+            return cls(map_id)
+        try:
+            with open(open_file(path), "rb") as file:
+                content = json.loads(file.read(_MAX_BYTES))
+            owner, version = str(content["map_id"]), content["version"]
+            scenes = {str(name): [str(scene) for scene in ids] for name, ids in content["pictures"].items()}
+        except (OSError, *MALFORMED) as error:
+            raise InputError(f"{path} was not written by gsmap ({error!r}): give another folder") from error
+        if owner != map_id or version != _VERSION:
+            raise ConfigError(f"{folder} holds pictures of another map ({owner[:12]}): give another folder")
+        return cls(map_id, {name: ids for name, ids in scenes.items() if _PICTURE.fullmatch(name)})
+
+    def save(self, folder: Path) -> None:
+        content = {"version": _VERSION, "map_id": self.map_id, "pictures": self.scenes}
+        write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
+
+    def forget(self, folder: Path, scene: str) -> int:
+        """Delete the pictures that show a scene; how many there were."""
+        gone = [name for name, ids in self.scenes.items() if scene in ids]
+        for name in gone:
+            remove_file(folder, name)
+            del self.scenes[name]
+        if gone:
+            self.save(folder)
+        return len(gone)
+
+
+def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageProgress) -> dict[str, str]:
+    """Draw each change before and after; the files by id of change.
+
+    Args:
+        rows: changes of pairs that have a place in the map.
+
+    Raises:
+        ConfigError, InputError: see `Pictures.load`.
+    """
+    known = Pictures.load(folder, store.id)
+    rows = [row for row in rows if row.box_m is not None]
+    make_folder(folder)
+    _note(store, folder)
+    known.scenes |= {f"{row.id}.png": [row.older, row.newer] for row in rows}
+    known.save(folder)  # first: what an interrupted run leaves is known to a purge
+    files: dict[str, str] = {}
+    for pair in dict.fromkeys((row.older, row.newer) for row in rows):
+        drawer = _Drawer(store, *pair)
+        for row in rows:
+            if (row.older, row.newer) == pair:
+                progress("pictures", len(files) / len(rows), row.id)
+                files[row.id] = str(folder / f"{row.id}.png")
+                write_whole(folder / f"{row.id}.png", partial(drawer.draw, row))
+    progress("pictures", 1.0, f"{len(files)} pictures")
+    return files
+
+
+class _Drawer:
+    """Two captures, read once for all their changes."""
+
+    def __init__(self, store: Store, older: str, newer: str) -> None:
+        graph = store.revisions.get()
+        assert graph is not None
+        self._store = store
+        self._S_map_newer = graph.poses[newer].S_map_scene
+        self._older = _placed(store, older, graph.poses[older].S_map_scene)
+        self._newer = _placed(store, newer, self._S_map_newer)
+
+    def draw(self, row: ChangeRow, path: Path) -> None:
+        from PIL import Image
+
+        from gsmap.view.change_picture import draw_change
+
+        change = self._store.changes.get(int(row.id[1:]))
+        comparison = self._store.changes.comparison(change.comparison)
+        voxels = self._store.changes.load(change.comparison).changes[change.place].voxels
+        points = (self._S_map_newer @ comparison.S_frame_newer.inverse()).apply(voxels)
+        assert row.box_m is not None
+        Image.fromarray(draw_change(self._older, self._newer, row.box_m, points)).save(path, format="PNG")
+
+
+def _placed(store: Store, scene: str, S: Sim3) -> PlacedScene:
+    gaussians, cameras = store.scenes.gaussians(scene), store.scenes.cameras(scene)
+    return PlacedScene(transform_gaussians(gaussians, S), transform_cameras(cameras, S), scene)
+
+
+def _note(store: Store, folder: Path) -> None:
+    """Have the map know of the folder, as it does of exports."""
+    if str(folder.resolve()) in {one.target for one in store.exports.list()}:
+        return
+    refused = "" if store.catalog.writable else f"{store.location} is read-only"
+    if not refused:
+        try:
+            store.exports.begin(folder, revision=None, settings={"pictures": True})
+        except (DiskFullError, ReadOnlyError) as error:
+            refused = str(error)
+    if refused:
+        _log.warning("%s: the map does not know of these pictures, so a purge will not find them", refused)

@@ -1,0 +1,37 @@
+"""What the map answers, as typed rows (`gsmap.types.rows`), read from the store."""
+
+from gsmap.map.reports.common import names, scenes_by_id
+from gsmap.map.reports.one_scene import graph_row, prior_row, scene_report
+from gsmap.map.reports.pairs import EDGE_STATUSES, edge_row, edge_rows, pair_report, rows_of_edges
+from gsmap.map.reports.revisions import made_after, pose_change_rows, revision_row, revision_rows, update_report
+from gsmap.map.reports.scenes import SCENE_STATUSES, ingest_row, pose_rows, scene_row, scene_rows
+from gsmap.map.reports.upkeep import check_report, export_report, model_rows, prune_report, setting_rows, tile_rows
+
+__all__ = [
+    "EDGE_STATUSES",
+    "SCENE_STATUSES",
+    "check_report",
+    "edge_row",
+    "edge_rows",
+    "export_report",
+    "graph_row",
+    "ingest_row",
+    "made_after",
+    "model_rows",
+    "names",
+    "pair_report",
+    "pose_change_rows",
+    "pose_rows",
+    "prior_row",
+    "prune_report",
+    "revision_row",
+    "revision_rows",
+    "rows_of_edges",
+    "scene_report",
+    "scene_row",
+    "scene_rows",
+    "scenes_by_id",
+    "setting_rows",
+    "tile_rows",
+    "update_report",
+]

@@ -1,0 +1,39 @@
+"""What all reports share: names by id, and words that may be asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NoReturn
+
+from gsmap.errors import ConfigError, CorruptError
+from gsmap.map.one_state import of_one_state
+from gsmap.store import Store
+from gsmap.types import Scene
+from gsmap.types.rows import SceneRef
+
+
+@of_one_state
+def names(store: Store) -> dict[str, str]:
+    """The name of every scene by its id, removed ones included."""
+    return ByScene((scene, found.name) for scene, found in scenes_by_id(store).items())
+
+
+def scenes_by_id(store: Store) -> dict[str, Scene]:
+    """Every scene by its id, removed ones included."""
+    return ByScene((scene.id, scene) for scene in [*store.scenes.list(removed=True), *store.scenes.list()])
+
+
+class ByScene(dict[str, Any]):
+    """What is known of every scene, by its id. A row that names another one is not gsmap's."""
+
+    def __missing__(self, scene: str) -> NoReturn:
+        raise CorruptError(f"the catalog has results of scene {scene[:12]}, which it does not have: run gsmap check")
+
+
+def refs(scenes: Iterable[str], name_of: Mapping[str, str]) -> tuple[SceneRef, ...]:
+    return tuple(SceneRef(scene=scene, scene_name=name_of[scene]) for scene in scenes)
+
+
+def one_of(value: str | None, known: Sequence[str]) -> None:
+    if value is not None and value not in known:
+        raise ConfigError(f"there is no status {value!r}: choose one of {', '.join(known)}")

@@ -1,0 +1,139 @@
+"""Everything known of one scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.map.one_state import of_one_state
+from gsmap.map.reports.pairs import edge_rows
+from gsmap.map.reports.scenes import row_of_scene
+from gsmap.methods import RecipeKey
+from gsmap.store import Store
+from gsmap.types import Scene, SceneGraph, ScenePose
+from gsmap.types.rows import FactRow, GraphRow, LayerRow, NodeRow, PriorRow, SceneEdgeRow, SceneReport
+
+
+@of_one_state
+def scene_report(store: Store, scene: Scene, graph: SceneGraph | None, graph_note: str = "") -> SceneReport:
+    """Everything known of one scene.
+
+    Args:
+        graph: its graph; None where there is none.
+        graph_note: what is to be known of which graph that is.
+    """
+    placed = store.revisions.get()
+    pose = placed.poses.get(scene.id) if placed else None
+    known = pose is not None and pose.covariance is not None
+    facts = store.scenes.facts(scene.id)
+    noted = next((fact.value for fact in reversed(facts) if fact.kind == "note"), "")
+    return SceneReport(
+        **vars(row_of_scene(scene, placed, graph.num_nodes if graph else None, noted)),
+        origin=scene.source,
+        sh_degree=scene.sh_degree,
+        num_cameras=scene.num_cameras,
+        cameras_synthesised=scene.cameras_synthesised,
+        antialiased=scene.antialiased,
+        bounds=scene.bounds,
+        notes=(*store.scenes.notes(scene.id), *(graph.notes if graph else ()), *([graph_note] if graph_note else ())),
+        rotation_sigma_deg=_rotation_sigma_deg(pose) if pose and known else None,
+        translation_sigma_m=_translation_sigma(pose) if pose and known else None,
+        covariance=pose.covariance if pose else None,
+        prior=prior_row(store, scene),
+        up=graph.up if graph else None,
+        unit_m=graph.unit_m if graph else None,
+        layers=_layer_rows(graph) if graph else (),
+        edges=_edges_of(store, scene),
+        nodes=_node_rows(graph) if graph else (),
+        history=tuple(
+            FactRow(at=fact.created_at, fact=fact.kind, value=fact.value, author=fact.author) for fact in facts
+        ),
+    )
+
+
+def _rotation_sigma_deg(pose: ScenePose) -> float:
+    assert pose.covariance is not None
+    return float(np.degrees(np.sqrt(np.diag(pose.covariance)[:3].max())))
+
+
+def _translation_sigma(pose: ScenePose) -> float:
+    assert pose.covariance is not None
+    return float(np.sqrt(np.diag(pose.covariance)[3:6].max()) * pose.S_map_scene.scale)
+
+
+def prior_row(store: Store, scene: Scene) -> PriorRow | None:
+    """What is known of a scene's pose from outside, and what the newest poses made of it."""
+    placed = store.revisions.get()
+    for prior in store.priors.list():
+        if prior.scene == scene.id:
+            outweighed = placed is not None and scene.id in placed.provenance.contradicted_priors
+            return PriorRow(
+                scene=scene.id,
+                scene_name=scene.name,
+                S_map_scene=prior.S_map_scene,
+                sigmas=prior.sigmas,
+                up=prior.up,
+                up_sigma_rad=prior.up_sigma_rad,
+                outcome="not solved yet" if placed is None else "outweighed by the edges" if outweighed else "used",
+            )
+    return None
+
+
+def _edges_of(store: Store, scene: Scene) -> tuple[SceneEdgeRow, ...]:
+    out = []
+    for row in edge_rows(store):
+        if scene.id in (row.target, row.source):
+            at_target = row.source == scene.id
+            out.append(
+                SceneEdgeRow(
+                    scene=row.target if at_target else row.source,
+                    scene_name=row.target_name if at_target else row.source_name,
+                    status=row.status,
+                    used=row.used,
+                    overlap=row.overlap,
+                    num_inliers=row.num_inliers,
+                    reason=row.reason,
+                )
+            )
+    return tuple(out)
+
+
+def _layer_rows(graph: SceneGraph) -> tuple[LayerRow, ...]:
+    return tuple(
+        LayerRow(layer=name, num_nodes=len(layer), descriptor_id=layer.descriptor_id, unit_m=layer.unit_m)
+        for name, layer in graph.layers.items()
+    )
+
+
+def _node_rows(graph: SceneGraph) -> tuple[NodeRow, ...]:
+    """Objects first: they are the ones people browse; then the landmarks of the scene's own unit."""
+    shown = [name for name in ("objects", "landmarks") if name in graph.layers] or list(graph.layers)[:1]
+    return tuple(
+        NodeRow(
+            layer=name,
+            index=i,
+            position=layer.positions[i],
+            size=layer.extents[i, 1] - layer.extents[i, 0],
+            type=int(layer.types[i]),
+            weight=float(layer.weights[i]),
+            num_views=int(layer.num_views[i]),
+        )
+        for name in shown
+        for layer in [graph.layers[name]]
+        for i in range(len(layer))
+    )
+
+
+def graph_row(store: Store, scene: Scene, key: RecipeKey) -> GraphRow:
+    """The graph of a scene under a key, which was made."""
+    graph = store.graphs.load(scene.id, key)
+    assert graph is not None
+    return GraphRow(
+        scene=scene.id,
+        scene_name=scene.name,
+        num_nodes=graph.num_nodes,
+        layers=_layer_rows(graph),
+        up=graph.up,
+        unit_m=graph.unit_m,
+        key=key.digest,
+        notes=graph.notes,
+    )

@@ -1,0 +1,151 @@
+"""Pairs of scenes: their edges, and all that was found and said of one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from gsmap.map.dates import is_after, parsed
+from gsmap.map.one_state import of_one_state
+from gsmap.map.reports.common import names, one_of
+from gsmap.map.reports.scenes import scene_rows
+from gsmap.store import Store
+from gsmap.store.registrations import StoredRegistration
+from gsmap.types import PoseGraph, Registration, Scene
+from gsmap.types.rows import EdgeRow, PairEventRow, PairReport
+
+EDGE_STATUSES = ("accepted", "rejected", "no_match")
+
+
+@of_one_state
+def edge_rows(
+    store: Store,
+    *,
+    component: int | None = None,
+    status: str | None = None,
+    after: str | None = None,
+    tag: str | None = None,
+    as_of: str | None = None,
+) -> list[EdgeRow]:
+    """The current edge of every pair that was tried.
+
+    Args:
+        component, tag: only those both of whose scenes are in it, or have it.
+        status: only those of this one.
+        after: ISO 8601; only those registered after it.
+        as_of: ISO 8601; only those both of whose scenes are dated at or before it.
+
+    Raises:
+        ConfigError: no such status, or a date that is none.
+    """
+    one_of(status, EDGE_STATUSES)
+    since = None if after is None else parsed(after)
+    inside = None
+    if component is not None or tag is not None or as_of is not None:
+        inside = {row.id for row in scene_rows(store, component=component, tag=tag, as_of=as_of)}
+    return [
+        row
+        for row in _edge_rows(store, store.registrations.current())
+        if (inside is None or {row.target, row.source} <= inside)
+        and (status is None or row.status == status)
+        and (since is None or is_after(row.registered_at, since))
+    ]
+
+
+@of_one_state
+def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
+    """The current edges of the pairs of these registrations, in their order."""
+    rows = {frozenset((row.target, row.source)): row for row in _edge_rows(store, store.registrations.current())}
+    return [rows[frozenset((edge.target, edge.source))] for edge in made]
+
+
+@of_one_state
+def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
+    """The current edge of a pair; one that has none (a lone measurement was withdrawn) is ``never registered``."""
+    current = store.registrations.get(a.id, b.id)
+    return EdgeRow(**_never_registered(a, b)) if current is None else _edge_rows(store, [current])[0]
+
+
+def _edge_rows(store: Store, edges: Iterable[StoredRegistration]) -> list[EdgeRow]:
+    placed, name_of = store.revisions.get(), names(store)
+    return [_edge_row(stored, placed, name_of) for stored in edges]
+
+
+def _edge_row(stored: StoredRegistration, placed: PoseGraph | None, name_of: Mapping[str, str]) -> EdgeRow:
+    edge = stored.registration
+    outcome = placed.outcomes.get((edge.target, edge.source)) if placed else None
+    status, reason = edge.status, edge.reason or (outcome.reason if outcome else "")
+    if stored.review == "confirm":
+        status, reason = "accepted", "confirmed by a person"
+    elif stored.review == "reject":
+        status, reason = "rejected", "rejected by a person"
+    return EdgeRow(
+        target=edge.target,
+        target_name=name_of[edge.target],
+        source=edge.source,
+        source_name=name_of[edge.source],
+        status=status,
+        reason=reason,
+        S_target_source=edge.S_target_source,
+        scale=edge.scale,
+        information=edge.information,
+        num_inliers=edge.num_inliers,
+        num_correspondences=edge.num_correspondences,
+        overlap=edge.overlap,
+        seconds={step: edge.seconds.get(step, 0.0) for step in ("match", "refine", "verdict")},
+        used=_USED[outcome.use] if outcome else False,
+        undecided=outcome is not None and outcome.undecided,
+        review=stored.review,
+        proposer=edge.proposer,
+        registered_at=stored.created_at,
+    )
+
+
+_USED: dict[str, bool | str] = {"used": True, "tentative": "tentative", "unused": False}
+
+
+@of_one_state
+def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
+    """Everything known of one pair: its current edge, the evidence it rests on, and all that was said before."""
+    current = store.registrations.get(a.id, b.id)
+    events = [
+        PairEventRow(at=old.created_at, what=old.registration.status, reason=old.registration.reason)
+        for old in store.registrations.history(a.id, b.id)
+    ]
+    events += [
+        PairEventRow(at=word.created_at, what=word.review, reason=word.note)
+        for word in store.registrations.reviews(a.id, b.id)
+    ]
+    history = tuple(sorted(events, key=lambda event: event.at))
+    if current is None:
+        return PairReport(**_never_registered(a, b), evidence={}, history=history)
+    placed, edge = store.revisions.get(), current.registration
+    outcome = placed.outcomes.get((edge.target, edge.source)) if placed else None
+    return PairReport(
+        **vars(_edge_row(current, placed, names(store))),
+        exact=edge.exact,
+        evidence=edge.evidence,
+        residual_chi2=outcome.residual_chi2 if outcome else None,
+        notes=edge.notes,
+        history=history,
+    )
+
+
+def _never_registered(a: Scene, b: Scene) -> dict[str, Any]:
+    """The fields of `EdgeRow` of a pair without an edge."""
+    return {
+        "target": a.id,
+        "target_name": a.name,
+        "source": b.id,
+        "source_name": b.name,
+        "status": "never registered",
+        "reason": "",
+        "S_target_source": None,
+        "scale": None,
+        "information": None,
+        "num_inliers": 0,
+        "num_correspondences": 0,
+        "overlap": 0.0,
+        "seconds": {},
+        "used": False,
+    }

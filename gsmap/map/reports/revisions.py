@@ -1,0 +1,108 @@
+"""What the optimiser answered, and how answers differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from gsmap.map.dates import is_after, parsed
+from gsmap.map.one_state import of_one_state
+from gsmap.map.reports.common import names, refs, scenes_by_id
+from gsmap.map.reports.pairs import edge_rows
+from gsmap.map.reports.scenes import scene_rows
+from gsmap.store import Store
+from gsmap.store.revisions import Revision
+from gsmap.types import PoseGraph
+from gsmap.types.rows import IngestRow, PairRef, PoseChangeRow, RevisionRow, UpdateReport
+
+
+@of_one_state
+def revision_rows(store: Store) -> list[RevisionRow]:
+    """Every answer of the optimiser, oldest first."""
+    name_of = names(store)
+    return [
+        _revision_row(revision, store.revisions.get(revision.number), name_of) for revision in store.revisions.list()
+    ]
+
+
+def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionRow]:
+    """Those made after a date (ISO 8601); all where it is None.
+
+    Raises:
+        ConfigError: a date that is none.
+    """
+    since = None if after is None else parsed(after)
+    return [row for row in rows if since is None or is_after(row.created_at, since)]
+
+
+@of_one_state
+def revision_row(store: Store, number: int) -> RevisionRow:
+    """One answer of the optimiser."""
+    found = next(revision for revision in store.revisions.list() if revision.number == number)
+    return _revision_row(found, store.revisions.get(number), names(store))
+
+
+def _revision_row(revision: Revision, graph: PoseGraph | None, name_of: Mapping[str, str]) -> RevisionRow:
+    assert graph is not None
+    uses = [outcome.use for outcome in graph.outcomes.values()]
+    return RevisionRow(
+        number=revision.number,
+        created_at=revision.created_at,
+        scenes=revision.num_scenes,
+        components=revision.num_components,
+        edges_used=uses.count("used"),
+        edges_tentative=uses.count("tentative"),
+        edges_refused=uses.count("unused"),
+        undecided=tuple(
+            PairRef(target=a, target_name=name_of[a], source=b, source_name=name_of[b]) for a, b in graph.undecided
+        ),
+        solver=graph.provenance.method,
+        contradicted_priors=refs(graph.provenance.contradicted_priors, name_of),
+        settings=graph.settings,
+        notes=graph.notes,
+        note=revision.note,
+        key=revision.key,
+        dropped_at=revision.dropped_at,
+    )
+
+
+@of_one_state
+def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRow]:
+    """How each scene differs between two revisions, measured at its middle.
+
+    Raises:
+        NotFoundError: no such revision.
+    """
+    from gsmap.optimize import diff
+
+    old, new = store.revisions.get(before), store.revisions.get(after)
+    assert old is not None
+    assert new is not None
+    known = scenes_by_id(store)
+    changes = diff(old, new, {scene.id: scene.bounds.mean(0) for scene in known.values()})
+    return [
+        PoseChangeRow(
+            scene=change.scene,
+            scene_name=known[change.scene].name,
+            change=change.kind,
+            rotation_deg=change.rotation_deg,
+            translation_m=change.translation,
+            scale_ratio=change.scale_ratio,
+            component_before=change.components[0],
+            component_after=change.components[1],
+            status_before=change.statuses[0],
+            status_after=change.statuses[1],
+        )
+        for change in changes.values()
+    ]
+
+
+@of_one_state
+def update_report(store: Store, ingested: Sequence[IngestRow]) -> UpdateReport:
+    """What an update took in, and the map as it is now."""
+    revisions = store.revisions.list()
+    return UpdateReport(
+        ingested=tuple(ingested),
+        scenes=tuple(scene_rows(store)),
+        edges=tuple(edge_rows(store)),
+        revision=revision_row(store, revisions[-1].number) if revisions else None,
+    )

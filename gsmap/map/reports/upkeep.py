@@ -1,0 +1,107 @@
+"""Exports, models, settings, and what keeps a map sound."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsmap.map.one_state import of_one_state
+from gsmap.map.reports.common import names, refs
+from gsmap.settings import leaves
+from gsmap.store import Store
+from gsmap.store.integrity import Check, Pruned
+from gsmap.types import Tile
+from gsmap.types.rows import CheckReport, ExportReport, ModelRow, PruneReport, SettingRow, TileRow
+
+if TYPE_CHECKING:
+    from gsmap.export import ExportResult
+    from gsmap.map.settings import Settings
+
+
+@of_one_state
+def tile_rows(store: Store) -> list[TileRow]:
+    """Every tile of every folder exported to."""
+    name_of = names(store)
+    return [
+        _tile_row(Path(target), tile, name_of)
+        for target in store.exports.targets()
+        for tile in store.exports.tiles(target)
+    ]
+
+
+@of_one_state
+def export_report(store: Store, out: Path, made: ExportResult, notes: Sequence[str] = ()) -> ExportReport:
+    """What an export did."""
+    name_of = names(store)
+    return ExportReport(
+        out=str(out),
+        tiles=tuple(_tile_row(out, tile, name_of) for tile in made.tiles if tile.path),
+        recomputed=made.recomputed,
+        reused=made.reused,
+        removed=made.removed,
+        notes=tuple(notes),
+    )
+
+
+def _tile_row(out: Path, tile: Tile, name_of: Mapping[str, str]) -> TileRow:
+    return TileRow(
+        out=str(out),
+        path=tile.path,
+        component=tile.component,
+        bounds=tile.bounds,
+        num_gaussians=tile.num_gaussians,
+        scenes=refs(tile.poses, name_of),
+        merge=str(tile.recipe.get("method", "")).partition(" ")[0],
+        recipe=tile.recipe,
+        truncated=tile.truncated,
+        sha256=tile.sha256,
+        notes=tile.notes,
+    )
+
+
+def model_rows(store: Store) -> list[ModelRow]:
+    """The map's ONNX models."""
+    return [
+        ModelRow(
+            kind=model.kind,
+            name=model.name,
+            sha256=model.sha256,
+            preset=model.options.get("preset"),
+            path=str(model.path),
+        )
+        for model in store.models.list()
+    ]
+
+
+def setting_rows(settings: Settings) -> list[SettingRow]:
+    """Every setting with its default, unit and meaning."""
+    defaults = {leaf.name: leaf.value for leaf in leaves(type(settings)())}
+    return [
+        SettingRow(name=leaf.name, value=leaf.value, default=defaults.get(leaf.name), unit=leaf.unit, doc=leaf.meaning)
+        for leaf in leaves(settings)
+    ]
+
+
+def check_report(found: Check) -> CheckReport:
+    """What reading every byte found."""
+    return CheckReport(
+        ok=found.ok,
+        problems=found.problems,
+        orphans=found.orphans,
+        num_groups=found.num_groups,
+        num_bytes=found.num_bytes,
+        unverified=found.unverified,
+    )
+
+
+def prune_report(pruned: Pruned, dry_run: bool) -> PruneReport:
+    """What was reclaimed, or would be."""
+    return PruneReport(
+        dry_run=dry_run,
+        scene_names=tuple(pruned.scenes),
+        revisions=tuple(pruned.revisions),
+        num_graphs=pruned.num_graphs,
+        num_orphans=pruned.num_orphans,
+        num_bytes=pruned.num_bytes,
+    )

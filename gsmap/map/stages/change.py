@@ -1,0 +1,144 @@
+"""Changes: which captures are compared, and what changed between those that the present recipe has not compared."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+from gsmap.change import recipe_key
+from gsmap.engine import run_jobs
+from gsmap.errors import InputError, NotFoundError
+from gsmap.map.dates import NO_DATE, parsed
+from gsmap.map.jobs import compare_scenes
+from gsmap.map.settings import Settings
+from gsmap.map.sharing import SharedJobs, noting
+from gsmap.map.visits import Visit, has_moved, pairs_of_visits
+from gsmap.methods import RecipeKey
+from gsmap.store import Store
+from gsmap.store.change_rows import Comparison
+from gsmap.types import Scene
+from gsmap.types.progress import StageProgress
+
+_NAMED = 5  # scenes that a remark names
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """The comparisons that a map asks for.
+
+    Args:
+        visits: the dated captures that have a place, by scene id.
+        pairs: (older, newer) scene ids.
+        notes: who is left out, and why.
+    """
+
+    visits: dict[str, Visit]
+    pairs: list[tuple[str, str]]
+    notes: tuple[str, ...]
+
+
+def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = None) -> Wanted:
+    """Which captures are to be compared (`gsmap.map.visits`), or the two that are named; no array is read.
+
+    Raises:
+        NotFoundError: the map has no poses yet, or a scene that is named has no place.
+        InputError: of two scenes that are named, which one is newer is not known, or they share no frame.
+    """
+    graph = store.revisions.get()
+    if graph is None:
+        raise NotFoundError("the map has no poses yet, so that nothing can be compared: run gsmap update first")
+    scenes = store.scenes.list() if pair is None else list(pair)
+    undated = [scene.name for scene in scenes if scene.captured_at is None]
+    visits = {
+        scene.id: Visit(scene.id, parsed(scene.captured_at), pose.component, pose.S_map_scene, scene.bounds)
+        for scene in scenes
+        if scene.captured_at is not None and (pose := graph.poses.get(scene.id)) is not None
+    }
+    if pair is None:
+        unplaced = [scene.name for scene in scenes if scene.id not in graph.poses]
+        notes = [f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})"] if undated else []
+        if unplaced:
+            notes.append(f"{_names(unplaced)} no place in the map yet: run gsmap update")
+        return Wanted(visits, pairs_of_visits(list(visits.values()), settings.visits), tuple(notes))
+    for scene in pair:
+        if scene.id not in graph.poses:
+            raise NotFoundError(f"scene {scene.name} has no place in the map yet: run gsmap update first")
+    if undated:
+        raise InputError(f"{_names(undated)} no date: which one is newer is not known ({NO_DATE})")
+    older, newer = sorted((visits[scene.id] for scene in pair), key=lambda visit: visit.when)
+    if older.when == newer.when:
+        raise InputError(f"{pair[0].name} and {pair[1].name} have the same date: which one is newer is not known")
+    if older.component != newer.component:
+        raise InputError(f"{pair[0].name} and {pair[1].name} lie in two components: nothing ties one to the other")
+    return Wanted(visits, [(older.scene, newer.scene)], ())
+
+
+def lacking(store: Store, asked: Wanted, settings: Settings) -> list[tuple[str, str]]:
+    """Those of the pairs that have to be compared: for the first time, by another recipe, or at other poses."""
+    done = {(one.older, one.newer) for one in _valid(store.changes.current(), asked, settings)}
+    return [pair for pair in asked.pairs if pair not in done]
+
+
+def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProgress, *, verify: bool = False) -> int:
+    """Compare what has to be compared; returns how many pairs were.
+
+    Args:
+        verify: read the arrays of the comparisons that are there, and make those again that are damaged.
+    """
+    keys = {_key(settings, *pair).digest: pair for pair in asked.pairs}
+
+    def done(wanted_keys: Collection[str]) -> set[str]:
+        valid = {one.key: one.number for one in _valid(store.changes.current(), asked, settings)}
+        there = {key for key in wanted_keys if key in valid}
+        damaged = store.changes.damaged(valid[key] for key in there) if verify else set()
+        return {key for key in there if valid[key] not in damaged}
+
+    todo = set(keys) - done(keys)
+    jobs = {key: _job(store, asked, settings, keys[key]) for key in keys if key in todo}
+    names = {scene.id: scene.name for scene in store.scenes.list()}
+    shared = SharedJobs(store, "changes", "comparison", jobs, done, progress)
+    results = shared.results(lambda arguments: run_jobs(compare_scenes, arguments, settings.engine))
+    kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are compared and kept")
+    with kept, closing(results):
+        for key, report in results:
+            older, newer = (asked.visits[scene] for scene in keys[key])
+            found = store.changes.save(
+                report,
+                _key(settings, older.scene, newer.scene),
+                older=older.scene,
+                newer=newer.scene,
+                S_newer_older=newer.S_map_scene.inverse() @ older.S_map_scene,
+                S_frame_newer=newer.S_map_scene,
+            )
+            shared.saved(key, f"{names[older.scene]}-{names[newer.scene]}: {len(found.changes)} changes")
+    return len(jobs)
+
+
+def _valid(current: Iterable[Comparison], asked: Wanted, settings: Settings) -> list[Comparison]:
+    """The comparisons that are what would be found now."""
+    pairs = set(asked.pairs)
+    return [
+        one
+        for one in current
+        if (one.older, one.newer) in pairs
+        and one.whole
+        and one.key == _key(settings, one.older, one.newer).digest
+        and not has_moved(asked.visits[one.older], asked.visits[one.newer], one.S_newer_older, settings.visits)
+    ]
+
+
+def _key(settings: Settings, older: str, newer: str) -> RecipeKey:
+    return recipe_key(settings.change).of(older, newer)
+
+
+def _job(store: Store, asked: Wanted, settings: Settings, pair: tuple[str, str]) -> tuple[object, ...]:
+    """The arguments of `compare_scenes`."""
+    sides = [(visit.scene, visit.S_map_scene, visit.when.isoformat()) for visit in (asked.visits[s] for s in pair)]
+    return (store.location, *sides, settings.change)
+
+
+def _names(names: Sequence[str]) -> str:
+    """Names, and the verb ``have`` that goes with them."""
+    shown = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    return f"{shown} {'has' if len(names) == 1 else 'have'}"

@@ -1,0 +1,191 @@
+"""Supersede: a capture that was trained again takes the place of the one that is in the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmap import describe as describing
+from gsmap import register as registering
+from gsmap.errors import InputError
+from gsmap.ingest import Capture
+from gsmap.map import models
+from gsmap.map.settings import Settings
+from gsmap.map.stages.describe import graph_keys
+from gsmap.methods import RecipeKey
+from gsmap.register import SceneView, recipe_key
+from gsmap.render import backend
+from gsmap.store import Store, scene_id
+from gsmap.store.registrations import StoredRegistration
+from gsmap.store.superseding import inherit
+from gsmap.types import Registration, Scene, SceneGraph, Sim3
+from gsmap.types.progress import StageProgress
+from gsmap.types.registration import Proposal
+
+_SAME_FRAME_M = 0.05  # two trainings from one set of frames lie in each other within millimetres
+
+
+@dataclass(frozen=True)
+class Superseded:
+    """What became of a capture in the place of another.
+
+    Args:
+        scene: the new one.
+        notes: what a person should know.
+    """
+
+    scene: Scene
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Carried:
+    """An edge of the scene that goes, as one of the scene that comes.
+
+    Args:
+        edge: as it is to be kept, under a key; None where a person measured it.
+        review, note: the word that stands on it.
+    """
+
+    edge: Registration
+    key: RecipeKey | None
+    review: str | None
+    note: str
+
+
+def supersede(
+    store: Store, capture: Capture, ref: str, settings: Settings, progress: StageProgress, *, named: bool
+) -> Superseded:
+    """Put a capture in the place of a scene, whole or not at all; see `gsmap.map.Map.ingest`.
+
+    Args:
+        ref: the scene that goes.
+        named: the capture's name was given; else it takes that of the scene.
+
+    Raises:
+        InputError: it lies in another frame than the scene, or is in the map already; nothing is changed.
+    """
+    old = store.scenes.get(ref)
+    if capture.scale_policy == "auto":
+        capture = replace(capture, scale_policy=old.scale_policy)
+    coming = replace(old, id=scene_id(capture.gaussians, capture.cameras), scale_policy=capture.scale_policy)
+    if any(coming.id == scene.id for scene in store.scenes.list()):
+        raise InputError(f"the capture to supersede {old.name} is in the map already: there is nothing to put in place")
+    progress("ingest", 0.0, f"comparing with {old.name}")
+    graph = _describe(store, coming.id, capture, settings)
+    view = SceneView(coming.id, capture.gaussians, capture.cameras, graph, capture.scale_policy)
+    _check_frame(old, _view(store, old, settings), view, settings)
+    carried = list(_carried(store, old, coming, view, settings, progress))
+    # A date that was read beside the capture does not overrule what was said of the same frames.
+    dated = capture.captured_at is not None and (not capture.dated_by or old.captured_at is None)
+    dated_by = ["", *(fact.author for fact in store.scenes.facts(old.id) if fact.kind == "captured_at")][-1]
+    with store.transaction():
+        store.scenes.remove(old.id)
+        scene, _ = store.scenes.add(
+            capture.gaussians,
+            capture.cameras,
+            name=capture.name if named else old.name,
+            scale_policy=capture.scale_policy,
+            captured_at=capture.captured_at if dated else old.captured_at,
+            source=capture.source,
+            antialiased=capture.antialiased,
+            notes=capture.notes,
+            dated_by=capture.dated_by if dated else dated_by,
+        )
+        inherit(store, old.id, scene.id)
+        store.graphs.save(graph, graph_keys(store, [scene], settings)[scene.id])
+        for one in carried:
+            store.registrations.save(one.edge, one.key)
+            if one.review is not None:
+                store.registrations.review(one.edge.target, one.edge.source, one.review, one.note)
+    progress("ingest", 1.0, f"{scene.name} in the place of {old.id[:12]}")
+    held = [one.edge.status for one in carried if one.edge.S_target_source is not None]
+    notes = [f"it took the place of scene {old.id[:12]} ({old.name})"]
+    if held:
+        notes.append(f"{held.count('accepted')} of {len(held)} edges hold: gsmap optimize {store.location} uses them")
+    return Superseded(scene, tuple(notes))
+
+
+def _describe(store: Store, new_id: str, capture: Capture, settings: Settings) -> SceneGraph:
+    """The graph of a capture that is not in the map yet."""
+    rendered_by = backend(settings.describe.object.render_backend)
+    params = replace(settings.describe, object=replace(settings.describe.object, render_backend=rendered_by))
+    return describing.describe(
+        new_id, capture.gaussians, capture.cameras, params, models.specs(store), scale_policy=capture.scale_policy
+    )
+
+
+def _view(store: Store, scene: Scene, settings: Settings) -> SceneView:
+    """A scene of the map as registration sees it; its graph is made where it lacks one, and not kept."""
+    gaussians, cameras = store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id)
+    graph = store.graphs.load(scene.id, graph_keys(store, [scene], settings)[scene.id])
+    if graph is None:
+        capture = Capture(gaussians, cameras, scene.name, scale_policy=scene.scale_policy)
+        graph = _describe(store, scene.id, capture, settings)
+    return SceneView(scene.id, gaussians, cameras, graph, scene.scale_policy)
+
+
+def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings: Settings) -> None:
+    """Refuse a capture whose surfaces do not lie on those of the scene that it is to supersede."""
+    as_they_lie = Proposal("superseding", Sim3.identity(), with_scale=False, num_inliers=0)
+    found = registering.check_pose(old_view, new_view, as_they_lie, settings.register)
+    advice = "ingest it without --supersedes, and registration finds where it lies"
+    if found.status != "accepted" or found.S_target_source is None:
+        raise InputError(f"the capture does not lie where scene {old.name} lies ({found.reason}): {advice}")
+    corners = np.array(np.meshgrid(*np.asarray(old.bounds).T)).reshape(3, -1).T
+    off = np.linalg.norm(found.S_target_source.apply(corners) - corners, axis=1).max() * old_view.graph.unit_m
+    if off > _SAME_FRAME_M:
+        raise InputError(f"the capture lies {off:.2f} m off where scene {old.name} lies: {advice}")
+
+
+def _carried(
+    store: Store, old: Scene, coming: Scene, view: SceneView, settings: Settings, progress: StageProgress
+) -> Iterator[_Carried]:
+    """The edges of the scene that goes, for the one that comes: poses are checked, and none is searched."""
+    living = {scene.id: scene for scene in store.scenes.list()}
+    known = [stored for stored in store.registrations.current() if old.id in _ends(stored)]
+    recipe = recipe_key(settings.register)
+    for i, stored in enumerate(known):
+        (other,) = (living[scene] for scene in _ends(stored) if scene != old.id)
+        said = [word for word in store.registrations.reviews(old.id, other.id) if word.review == stored.review]
+        word = (stored.review, said[-1].note if said else "")
+        keys = graph_keys(store, [coming, other], settings)
+        progress("ingest", (i + 1) / (len(known) + 2), f"checking the edge to {other.name}")
+        edge, S = stored.registration, stored.registration.S_target_source
+        ends = [coming.id if scene == old.id else scene for scene in _ends(stored)]
+        alike = replace(edge, target=ends[0], source=ends[1])
+        if stored.manual:
+            yield _Carried(alike, None, *word)
+            continue
+        if S is None:
+            alike = replace(alike, notes=(*edge.notes, f"known of scene {old.id[:12]}, which it superseded"))
+            yield _Carried(alike, recipe.of(*(keys[end].digest for end in ends)), *word)
+            continue
+        target, source = sorted(ends)
+        views = {coming.id: view, other.id: _view(store, other, settings)}
+        known_pose = _proposal(edge, S if target == ends[0] else S.inverse())
+        found = registering.check_pose(views[target], views[source], known_pose, settings.register)
+        if stored.review == "confirm" and found.S_target_source is None:  # a person vouches for the pose as it was
+            found = replace(alike, notes=(*edge.notes, f"confirmed of scene {old.id[:12]}; of this: {found.reason}"))
+        key = recipe.of(keys[found.target].digest, keys[found.source].digest)
+        yield _Carried(found, key, *word)
+
+
+def _ends(stored: StoredRegistration) -> Sequence[str]:
+    return stored.registration.target, stored.registration.source
+
+
+def _proposal(edge: Registration, S_target_source: Sim3) -> Proposal:
+    """An edge as a proposal, with what its correspondences said of it."""
+    return Proposal(
+        edge.proposer,
+        S_target_source,
+        with_scale=not S_target_source.is_rigid,
+        num_inliers=edge.num_inliers,
+        num_correspondences=edge.num_correspondences,
+        exact=edge.exact,
+        log_nfa=edge.evidence.get("log_nfa", float("nan")),
+        runner_up=edge.evidence.get("runner_up", float("nan")),
+    )

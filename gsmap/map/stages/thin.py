@@ -1,0 +1,139 @@
+"""Thin: captures that newer ones supersede are kept compact, the oldest first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from gsmap.compare import Looks
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map.settings import Settings
+from gsmap.map.sharing import noting
+from gsmap.store import Store, compact
+from gsmap.thin import fidelity_db, look, seen_again, shown
+from gsmap.types import PlacedScene, Scene
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows import ThinReport, ThinRow
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a thinning.
+
+    Args:
+        keep_days: what was captured in so many days before ``now`` stays whole; None: only the budget counts.
+        budget_bytes: thin no more than it takes for the arrays of living scenes to fit; None: all that may be.
+        dry_run: change nothing.
+        now: ISO 8601; None for the present.
+    """
+
+    keep_days: float | None = None
+    budget_bytes: int | None = None
+    dry_run: bool = False
+    now: str | None = None
+
+
+def thin(store: Store, request: Request, settings: Settings, progress: StageProgress) -> ThinReport:
+    """Keep superseded captures compact, the oldest first, and reclaim what that frees.
+
+    A capture is superseded where newer ones, dated and kept whole, looked at nearly all of its surface: they stand for
+    it when a new capture is registered or a picture localised. Poses, registrations and words stay.
+
+    Raises:
+        ConfigError: neither days nor a budget, or negative ones.
+        NotFoundError: the map has no poses, or no dated captures.
+    """
+    if request.keep_days is None and request.budget_bytes is None:
+        raise ConfigError("say what to keep: days (--keep-days 365), a size (--budget 2GiB), or both")
+    if (request.keep_days or 0) < 0 or (request.budget_bytes or 0) < 0:
+        raise ConfigError("days and sizes must not be negative")
+    graph = store.revisions.get()
+    if graph is None:
+        raise NotFoundError("the map has no poses yet, so nobody knows what supersedes what: run gsmap update first")
+    living = {scene.id: scene for scene in store.scenes.list()}
+    dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
+    if not dated:
+        raise NotFoundError("no capture has a date: gsmap edit MAP SCENE --captured-at DATE tells which is older")
+    now = datetime.now(UTC) if request.now is None else datetime.fromisoformat(request.now)
+    before = now - timedelta(days=request.keep_days or 0)
+    old = [scene for scene in dated if _when(scene) < before and scene.thinning is None and scene.id in graph.poses]
+    sizes = {scene: _num_bytes(store, scene) for scene in living}
+    whole = {scene.id for scene in dated if scene.thinning is None and scene.id in graph.poses}
+    looks: dict[str, Looks] = {}
+
+    def placed(scene: Scene) -> PlacedScene:
+        S = graph.poses[scene.id].S_map_scene
+        gaussians = transform_gaussians(store.scenes.gaussians(scene.id), S)
+        return PlacedScene(gaussians, transform_cameras(store.scenes.cameras(scene.id), S), scene.id)
+
+    def looked(scene: Scene) -> Looks:
+        if scene.id not in looks:
+            looks[scene.id] = look(placed(scene), settings.thin.compare)
+        return looks[scene.id]
+
+    rows: list[ThinRow] = []
+    with noting(lambda: f"{sum(row.thinned for row in rows)} captures are thinned"):
+        for done, scene in enumerate(old):
+            if request.budget_bytes is not None and sum(sizes.values()) <= request.budget_bytes:
+                break
+            progress("thin", done / len(old), scene.name)
+            component = graph.poses[scene.id].component
+            beside = [other for other in dated if other.id in whole and graph.poses[other.id].component == component]
+            newer = [other for other in beside if _when(other) > _when(scene)]
+            share = (
+                seen_again(placed(scene), [looked(other) for other in newer], settings.thin.compare) if newer else 0.0
+            )
+            if share < settings.thin.min_seen_again:
+                why = f"newer captures saw {share:.0%} of it" if newer else "no newer capture lies beside it"
+                rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why))
+                continue
+            own = PlacedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
+            stays = shown(own, settings.thin)
+            kept = compact.rounded(own.gaussians[stays])
+            fidelity = fidelity_db(own, kept, settings.thin)
+            if fidelity < settings.thin.min_fidelity_db:
+                why = f"compact, its pictures would keep {fidelity:.1f} dB"
+                rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why, fidelity))
+                continue
+            after = compact.num_bytes(own.gaussians[stays])
+            if not request.dry_run:
+                up = next((g.up for g in reversed(store.graphs.list()) if g.scene == scene.id), None)
+                store.scenes.thin(scene.id, stays, up=up)
+                after = _num_bytes(store, scene.id)
+            rows.append(_row(scene, sizes[scene.id], after, share, "", fidelity))
+            sizes[scene.id] = after
+            whole.discard(scene.id)
+            looks.pop(scene.id, None)
+    freed = 0 if request.dry_run else store.reclaim().num_bytes
+    progress("thin", 1.0, f"{sum(row.thinned for row in rows)} thinned")
+    return ThinReport(
+        dry_run=request.dry_run,
+        scenes=tuple(rows),
+        num_bytes=sum(sizes.values()),
+        num_bytes_freed=freed,
+        fits=request.budget_bytes is None or sum(sizes.values()) <= request.budget_bytes,
+    )
+
+
+def _row(scene: Scene, before: int, after: int, seen: float, reason: str, fidelity: float | None = None) -> ThinRow:
+    return ThinRow(
+        scene=scene.id,
+        name=scene.name,
+        captured_at=scene.captured_at or "",
+        thinned=not reason,
+        num_bytes_before=before,
+        num_bytes_after=after,
+        seen_again=seen,
+        fidelity_db=fidelity,
+        reason=reason,
+    )
+
+
+def _num_bytes(store: Store, scene: str) -> int:
+    """Of a scene's arrays and its graphs'."""
+    return store.scenes.num_bytes(scene) + store.graphs.num_bytes(scene)
+
+
+def _when(scene: Scene) -> datetime:
+    return datetime.fromisoformat(scene.captured_at or "")

@@ -1,0 +1,129 @@
+"""Which captures of a place are compared with which: each with the visits just before it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+
+from gsmap.errors import ConfigError
+from gsmap.types import Sim3
+
+_SAMPLES = 12  # points along each axis of a capture's box at which it is asked who was there before
+_COVERED = 0.99  # of these points: the box is covered
+
+
+@dataclass(frozen=True)
+class Params:
+    """Which captures are compared, and when they are compared again.
+
+    Args:
+        min_new_share: an earlier capture is compared with if it shows at least this share of a capture's box that no
+            later one of them shows.
+        most: with so many earlier captures at most.
+        moved_m: a pair is compared again when one of the two has moved by more than this against the other, anywhere
+            in what they share.
+        moved_deg: and when it has turned by more.
+    """
+
+    min_new_share: float = 0.1
+    most: int = 8
+    moved_m: float = 0.02
+    moved_deg: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not 0 < self.min_new_share <= 1:
+            raise ConfigError(f"visits.min_new_share must be a share in (0, 1], got {self.min_new_share}")
+        for name in ("most", "moved_m", "moved_deg"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"visits.{name} must not be negative, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """A dated capture that has a place in the map.
+
+    Args:
+        scene: its id.
+        when: it was captured.
+        component: whose frame it is placed in.
+        S_map_scene: where it lies.
+        bounds: (2, 3) box of its Gaussians, scene frame.
+    """
+
+    scene: str
+    when: datetime
+    component: int
+    S_map_scene: Sim3
+    bounds: np.ndarray
+
+    def corners(self) -> np.ndarray:
+        """(8, 3) of its box, map frame."""
+        return self.S_map_scene.apply(np.array(np.meshgrid(*np.asarray(self.bounds).T)).reshape(3, -1).T)
+
+
+def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, str]]:
+    """(older, newer) scene ids: every capture with the newest earlier ones that together show what it shows.
+
+    Not all pairs: what changed over several visits is what changed from each to the next. Boxes alone decide, so that
+    nothing is read; captures of one moment are of one visit, and not compared.
+    """
+    found: list[tuple[str, str]] = []
+    ordered = sorted(visits, key=lambda visit: (visit.when, visit.scene))
+    boxes = {visit.scene: _around(visit.corners()) for visit in ordered}
+    for i, newer in enumerate(ordered):
+        left = np.ones(_SAMPLES**3, dtype=bool)
+        points, count = _samples(newer), 0
+        for older in reversed(ordered[:i]):
+            if count == params.most or left.mean() <= 1 - _COVERED:
+                break
+            if older.when == newer.when or older.component != newer.component:
+                continue
+            if not _touch(boxes[older.scene], boxes[newer.scene]):
+                continue
+            seen = left & _inside(points, older)
+            if seen.mean() >= params.min_new_share:
+                found.append((older.scene, newer.scene))
+                left, count = left & ~seen, count + 1
+    return found
+
+
+def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3, params: Params) -> bool:
+    """Whether two captures lie otherwise to each other than ``S_newer_older`` says, by more than they may."""
+    now = newer.S_map_scene.inverse() @ older.S_map_scene
+    turn = now.rotation @ S_newer_older.rotation.T
+    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    if np.degrees(np.arctan2(sine, (np.trace(turn) - 1) / 2)) > params.moved_deg:
+        return True
+    a, b = _around(older.corners()), _around(newer.corners())
+    shared = np.array([np.maximum(a[0], b[0]), np.minimum(a[1], b[1])])
+    if not (shared[1] >= shared[0]).all():
+        shared = b
+    corners = np.array(np.meshgrid(*shared.T)).reshape(3, -1).T
+    in_newer = newer.S_map_scene.inverse().apply(corners)
+    off = S_newer_older.apply(now.inverse().apply(in_newer)) - in_newer
+    return bool(np.linalg.norm(off, axis=1).max() * newer.S_map_scene.scale > params.moved_m)
+
+
+def _samples(visit: Visit) -> np.ndarray:
+    """(N, 3) points all over a capture's box, map frame."""
+    low, high = np.asarray(visit.bounds, dtype=np.float64)
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    grid = np.array(np.meshgrid(steps, steps, steps, indexing="ij")).reshape(3, -1).T
+    return visit.S_map_scene.apply(low + grid * (high - low))
+
+
+def _inside(points: np.ndarray, visit: Visit) -> np.ndarray:
+    low, high = visit.bounds
+    local = visit.S_map_scene.inverse().apply(points)
+    return np.asarray(((local >= low) & (local <= high)).all(1))
+
+
+def _around(corners: np.ndarray) -> np.ndarray:
+    return np.array([corners.min(0), corners.max(0)])
+
+
+def _touch(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool((a[0] <= b[1]).all() and (b[0] <= a[1]).all())

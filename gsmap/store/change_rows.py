@@ -1,0 +1,244 @@
+"""Rows of comparisons and changes as they are read, and which changes of two comparisons are one."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Row, select
+
+from gsmap.store.matrices import to_array, to_pose
+from gsmap.store.schema import change_reviews, changes, comparisons, scenes
+from gsmap.types import Sim3
+from gsmap.types.change import ChangeKind, Symmetry
+
+KIND = "changes"
+OPEN = "open"
+_STATUS = {None: OPEN, "confirm": "confirmed", "reject": "rejected"}
+
+# Boxes of one change by two comparisons overlap: by this share of what they cover together, each made larger by half a
+# voxel of 10 cm first, since that of a picture on a wall has no thickness to speak of.
+_SAME_SHARE = 0.1
+_PAD_M = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class StoredChange:
+    """A change, as its newest comparison has it.
+
+    Args:
+        number: of the change; it keeps it when its pair is compared again.
+        older, newer: scene ids.
+        kind, box, S_after_before, symmetry, confidence, evidence: as in `gsmap.types.change.Change`, lengths and frames
+            are those of the comparison.
+        num_voxels, num_before, num_after: how long its arrays are.
+        status: what people say of it: ``open``, ``confirmed`` or ``rejected``.
+        comparison: number of the comparison, and ``place`` in it.
+        found_at: when it was compared.
+    """
+
+    number: int
+    older: str
+    newer: str
+    kind: ChangeKind
+    box: np.ndarray
+    S_after_before: Sim3 | None
+    symmetry: Symmetry
+    confidence: float
+    evidence: Mapping[str, float]
+    num_voxels: int
+    num_before: int
+    num_after: int
+    status: str
+    comparison: int
+    place: int
+    found_at: str
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two captures that were compared, without the arrays (`Changes.load`).
+
+    Args:
+        number: unique in the map, growing.
+        older, newer: scene ids.
+        key: `RecipeKey.digest`; the two scenes are its inputs.
+        recipe: digest of its recipe.
+        S_newer_older: the relative pose that it was made with.
+        S_frame_newer: takes the newer scene to the frame of its boxes; metres where the map has them.
+        seen_share, gains, notes: as in `gsmap.types.change.ChangeReport`.
+        changes: what changed, surest first.
+        whole: its arrays were not pruned.
+    """
+
+    number: int
+    older: str
+    newer: str
+    key: str
+    recipe: str | None
+    S_newer_older: Sim3
+    S_frame_newer: Sim3
+    seen_share: float
+    gains: np.ndarray
+    notes: tuple[str, ...]
+    changes: tuple[StoredChange, ...]
+    whole: bool
+    created_at: str
+
+
+@dataclass(frozen=True)
+class ChangeReview:
+    """A person's word on a change: ``confirm``, ``reject`` or ``withdraw``."""
+
+    review: str
+    note: str
+    created_at: str
+
+
+def pair_of(older: str, newer: str) -> str:
+    """The two ids, lower first."""
+    return ":".join(sorted((older, newer)))
+
+
+def newest(connection: Connection, pair: str) -> Row[Any] | None:
+    """The comparison of a pair that counts."""
+    query = select(comparisons).where(comparisons.c.pair == pair)
+    return connection.execute(query.order_by(comparisons.c.created_at.desc(), comparisons.c.number.desc())).first()
+
+
+def newest_of_all(connection: Connection) -> list[Row[Any]]:
+    """The comparison of every pair that counts, in the order they were made; scenes may be gone."""
+    query = select(comparisons).order_by(comparisons.c.created_at, comparisons.c.number)
+    return list({row.pair: row for row in connection.execute(query)}.values())
+
+
+def named_groups(
+    ours: Connection, theirs: Connection, only: Collection[str] | None
+) -> Iterator[tuple[str, str, str | None]]:
+    """(kind, scene, group) of the arrays of their newest comparisons whose scenes are here or come along."""
+    here = set(ours.execute(select(scenes.c.id)).scalars())
+    for row in newest_of_all(theirs):
+        ends = {row.older, row.newer}
+        if only is None or ends <= here | set(only):
+            yield from ((KIND, end, row.group_id) for end in ends)
+
+
+def same_changes(
+    connection: Connection, older: str, newer: str, S_frame_newer: Sim3, found: Sequence[tuple[str, np.ndarray]]
+) -> dict[int, int]:
+    """Which changes of a comparison are changes that its pair has already: their numbers, by place.
+
+    Args:
+        found: kind and box of each, in the frame that ``S_frame_newer`` takes the newer scene to.
+    """
+    boxes: list[tuple[float, int, int]] = []
+    for number, old, pose in latest_changes(connection, pair_of(older, newer)):
+        if old.older != older:
+            continue  # their dates were corrected: what appeared has disappeared
+        moved = moved_box(old.box, S_frame_newer @ pose.inverse())
+        for i, (kind, box) in enumerate(found):
+            if kind == old.kind and (share := _overlap(moved, box)) >= _SAME_SHARE:
+                boxes.append((-share, number, i))
+    same: dict[int, int] = {}
+    for _, number, i in sorted(boxes):
+        if i not in same and number not in same.values():
+            same[i] = number
+    return same
+
+
+def moved_box(box: np.ndarray, S: Sim3) -> np.ndarray:
+    """(2, 3) box, along the axes, around a box that was moved."""
+    corners = S.apply(np.array(np.meshgrid(*np.asarray(box).T)).reshape(3, -1).T)
+    return np.array([corners.min(0), corners.max(0)])
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of what two boxes cover together that both cover."""
+    a, b = (np.array([box[0] - _PAD_M, box[1] + _PAD_M]) for box in (a, b))
+    both = float(np.prod(np.maximum(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0.0)))
+    return both / (float(np.prod(a[1] - a[0])) + float(np.prod(b[1] - b[0])) - both)
+
+
+def latest_changes(connection: Connection, pair: str) -> list[tuple[int, StoredChange, Sim3]]:
+    """Every change that a pair ever had, as it was found last: its number, and the S_frame_newer of its box."""
+    query = select(comparisons).where(comparisons.c.pair == pair)
+    rows = connection.execute(query.order_by(comparisons.c.created_at, comparisons.c.number)).all()
+    latest: dict[int, tuple[int, StoredChange, Sim3]] = {}
+    for one in read_comparisons(connection, rows):
+        latest |= {change.number: (change.number, change, one.S_frame_newer) for change in one.changes}
+    return list(latest.values())
+
+
+def carried_words(connection: Connection, pair: str, same: Mapping[int, int]) -> list[str]:
+    """What becomes of the words on a pair's changes when it is compared again."""
+    notes = []
+    for number, change, _ in latest_changes(connection, pair):
+        if change.status == OPEN:
+            continue
+        if number in same.values():
+            notes.append(f"c{number} was {change.status} before this comparison: it stays so")
+        else:
+            notes.append(f"c{number}, which was {change.status}, is not found any more")
+    return notes
+
+
+def read_comparison(connection: Connection, row: Row[Any]) -> Comparison:
+    return read_comparisons(connection, [row])[0]
+
+
+def read_comparisons(connection: Connection, rows: Sequence[Row[Any]]) -> list[Comparison]:
+    """Comparisons with their changes and what people say of these."""
+    wanted = {row.number: row for row in rows}
+    query = select(changes).order_by(changes.c.comparison, changes.c.place)
+    if len(wanted) == 1:
+        query = query.where(changes.c.comparison == next(iter(wanted)))
+    said: dict[int, str | None] = {}
+    words = select(change_reviews).order_by(change_reviews.c.created_at, change_reviews.c.number)
+    for word in connection.execute(words):
+        said[word.change] = None if word.review == "withdraw" else word.review
+    of: dict[int, list[StoredChange]] = {number: [] for number in wanted}
+    for line in connection.execute(query):
+        if line.comparison in wanted:
+            of[line.comparison].append(_stored(line, wanted[line.comparison], said))
+    return [
+        Comparison(
+            number=row.number,
+            older=row.older,
+            newer=row.newer,
+            key=row.key,
+            recipe=row.recipe,
+            S_newer_older=to_pose(row.S_newer_older),
+            S_frame_newer=to_pose(row.S_frame_newer),
+            seen_share=row.seen_share,
+            gains=to_array(row.gains),
+            notes=tuple(row.notes),
+            changes=tuple(of[row.number]),
+            whole=row.group_id is not None or not of[row.number],
+            created_at=row.created_at,
+        )
+        for row in rows
+    ]
+
+
+def _stored(line: Row[Any], row: Row[Any], said: Mapping[int, str | None]) -> StoredChange:
+    number = line.number if line.same_as is None else line.same_as
+    return StoredChange(
+        number=number,
+        older=row.older,
+        newer=row.newer,
+        kind=line.kind,
+        box=to_array(line.box),
+        S_after_before=to_pose(line.S_after_before),
+        symmetry=line.symmetry,
+        confidence=line.confidence,
+        evidence=line.evidence,
+        num_voxels=line.num_voxels,
+        num_before=line.num_before,
+        num_after=line.num_after,
+        status=_STATUS[said.get(number)],
+        comparison=row.number,
+        place=line.place,
+        found_at=row.created_at,
+    )

@@ -1,0 +1,275 @@
+"""What changed between captures, and what people said of it. Nothing is overwritten."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from sqlalchemy import insert, select
+
+from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
+from gsmap.methods import RecipeKey
+from gsmap.store import recipes
+from gsmap.store.arrays import Arrays, digest
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.change_rows import (
+    KIND,
+    OPEN,
+    ChangeReview,
+    Comparison,
+    StoredChange,
+    carried_words,
+    newest,
+    newest_of_all,
+    pair_of,
+    read_comparison,
+    read_comparisons,
+    same_changes,
+)
+from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.store.groups import manifest, publish, unless_pruned
+from gsmap.store.layout import Shape
+from gsmap.store.matrices import from_array, from_pose
+from gsmap.store.scene_refs import living_ids, resolve, scene_name
+from gsmap.store.schema import change_reviews, changes, comparisons, scenes
+from gsmap.types import Sim3
+from gsmap.types.change import Change, ChangeReport
+from gsmap.types.plain import plain
+
+REVIEWS = ("confirm", "reject", "withdraw")
+
+
+class Changes:
+    """The changes of a map. Of a pair its newest comparison counts, whichever of the two was called the older then.
+
+    A change keeps its number, and with it what was said of it, when its pair is compared again: the change of the same
+    kind whose box overlaps that of the earlier one most is the same change.
+    """
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
+        self._catalog = catalog
+        self._arrays = arrays
+
+    def save(
+        self, report: ChangeReport, key: RecipeKey, *, older: str, newer: str, S_newer_older: Sim3, S_frame_newer: Sim3
+    ) -> Comparison:
+        """Keep what a comparison found; the same again mends damaged bytes.
+
+        Args:
+            key: its recipe; its inputs are the two scenes, the older one first.
+            older, newer: scene ids.
+            S_newer_older, S_frame_newer: see `Comparison`.
+
+        Raises:
+            InputError: the key is of other scenes, or a scene with itself.
+            NotFoundError: a scene that is not in the map.
+        """
+        if key.inputs != (older, newer) or older == newer:
+            raise InputError(f"the key of a comparison must have its two scenes {older} and {newer} as its inputs")
+        arrays = _to_arrays(report.changes)
+        text = f"{key.digest}{from_pose(S_newer_older)}{from_pose(S_frame_newer)}"
+        group_id = digest(*arrays.values(), text=text) if report.changes else None
+        row = {
+            "older": older,
+            "newer": newer,
+            "pair": pair_of(older, newer),
+            "key": key.digest,
+            "S_newer_older": from_pose(S_newer_older),
+            "S_frame_newer": from_pose(S_frame_newer),
+            "seen_share": float(report.seen_share),
+            "gains": from_array(np.asarray(report.gains)),
+            "group_id": group_id,
+        }
+        staging = self._arrays.stage(arrays) if report.changes else contextlib.nullcontext()
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+            for scene in (older, newer):
+                resolve(connection, scene)
+            known = manifest(connection, group_id or "")
+            if group_id is not None and staged and (not known or self._arrays.problems(KIND, group_id, known)):
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
+            before = newest(connection, pair_of(older, newer))
+            same = ("older", "newer", "key", "group_id", "S_newer_older", "S_frame_newer")
+            if before is not None and all(getattr(before, name) == row[name] for name in same):
+                return read_comparison(connection, before)
+            boxes = [(change.kind, np.asarray(change.box)) for change in report.changes]
+            told = same_changes(connection, older, newer, S_frame_newer, boxes)
+            made = {
+                "recipe": recipes.keep(connection, key),
+                "notes": [*report.notes, *carried_words(connection, pair_of(older, newer), told)],
+                "created_at": now(),
+            }
+            number = connection.execute(insert(comparisons).returning(comparisons.c.number), row | made).scalar_one()
+            lines = [
+                {
+                    "comparison": number,
+                    "place": i,
+                    "same_as": told.get(i),
+                    "kind": change.kind,
+                    "box": from_array(change.box),
+                    "S_after_before": from_pose(change.S_after_before),
+                    "symmetry": change.symmetry,
+                    "confidence": float(change.confidence),
+                    **{f"num_{name}": len(getattr(change, name)) for name in _PARTS},
+                    "evidence": {name: float(value) for name, value in plain(dict(change.evidence)).items()},
+                }
+                for i, change in enumerate(report.changes)
+            ]
+            if lines:
+                connection.execute(insert(changes), lines)
+            stored = connection.execute(select(comparisons).where(comparisons.c.number == number)).one()
+            return read_comparison(connection, stored)
+
+    def current(self) -> list[Comparison]:
+        """The newest comparison of every pair of living scenes, in the order they were made."""
+        with self._catalog.read() as connection:
+            living = living_ids(connection)
+            rows = [row for row in newest_of_all(connection) if {row.older, row.newer} <= living]
+            return read_comparisons(connection, rows)
+
+    def comparison(self, number: int) -> Comparison:
+        """A comparison by its number.
+
+        Raises:
+            NotFoundError: there is none.
+        """
+        with self._catalog.read() as connection:
+            row = connection.execute(select(comparisons).where(comparisons.c.number == number)).first()
+            if row is None:
+                raise NotFoundError(f"no comparison {number} in this map")
+            return read_comparison(connection, row)
+
+    def load(self, comparison: int) -> ChangeReport:
+        """A comparison with its arrays.
+
+        Raises:
+            NotFoundError: no such comparison, or its arrays were pruned.
+            CorruptError: bytes on disk are missing or differ, or are not what a comparison can have found.
+        """
+        with self._catalog.read() as connection:
+            found = self.comparison(comparison)
+            group = select(comparisons.c.group_id).where(comparisons.c.number == comparison)
+            group_id = connection.execute(group).scalar_one() or ""
+            files = manifest(connection, group_id)
+            # Rows of a scene that was thinned since count what it had then.
+            sizes = {
+                row.id: row.num_gaussians if row.thinned is None else row.thinned["num_gaussians"]
+                for row in connection.execute(select(scenes))
+            }
+        if not found.whole:
+            raise NotFoundError(
+                f"the arrays of comparison {comparison} were pruned: gsmap changes MAP makes those of today's again"
+            )
+        parts: list[dict[str, np.ndarray]] = []
+        if found.changes:
+            counts = _counts(found.changes)
+            shapes: dict[str, Shape] = {name: (sum(counts[name]), *_PARTS[name][0][1:]) for name in _PARTS}
+            with unless_pruned(self._catalog, group_id, f"comparison {comparison} was dropped or made again"):
+                arrays = self._arrays.read(KIND, group_id, files, only=tuple(shapes), shapes=shapes)
+            where = f"{KIND}/{group_id}"
+            parts = _parts(arrays, found.changes, sizes[found.older], sizes[found.newer], where)
+        of_type = (_change(stored, part) for stored, part in zip(found.changes, parts, strict=True))
+        return ChangeReport(tuple(of_type), found.seen_share, found.gains, found.notes)
+
+    def damaged(self, numbers: Iterable[int]) -> set[int]:
+        """Those of the comparisons whose arrays differ from what was written; every byte of them is read."""
+        with self._catalog.read() as connection:
+            query = select(comparisons.c.number, comparisons.c.group_id).where(comparisons.c.group_id.is_not(None))
+            groups = {row.number: row.group_id for row in connection.execute(query)}
+            return {
+                number
+                for number in numbers
+                if number in groups
+                and self._arrays.problems(KIND, groups[number], manifest(connection, groups[number]))
+            }
+
+    def get(self, number: int) -> StoredChange:
+        """A change by its number, as its newest comparison has it.
+
+        Raises:
+            NotFoundError: there is none, its scenes are gone, or its pair was compared again and it is no longer found.
+        """
+        with self._catalog.read() as connection:
+            row = connection.execute(
+                select(comparisons.c.pair)
+                .join(changes, changes.c.comparison == comparisons.c.number)
+                .where(changes.c.number == number, changes.c.same_as.is_(None))
+            ).first()
+            if row is None:
+                raise NotFoundError(f"this map has no change c{number}: gsmap changes MAP lists them")
+            found = newest(connection, row.pair)
+            assert found is not None
+            for change in read_comparison(connection, found).changes:
+                if change.number == number:
+                    return change
+            names = " and ".join(scene_name(connection, scene) for scene in (found.older, found.newer))
+        raise NotFoundError(f"change c{number} is no longer found: {names} were compared again on {found.created_at}")
+
+    def review(self, number: int, review: str, note: str = "") -> StoredChange:
+        """Write down a person's word on a change: ``confirm`` it, ``reject`` it, or ``withdraw`` the last word.
+
+        Raises:
+            NotFoundError: see `get`.
+            InputError: nothing to withdraw.
+            ConfigError: another word.
+        """
+        if review not in REVIEWS:
+            raise ConfigError(f"a review is one of {', '.join(REVIEWS)}, got {review!r}")
+        with self._catalog.write() as connection:
+            if review == "withdraw" and self.get(number).status == OPEN:
+                raise InputError(f"nobody has reviewed c{number}: there is nothing to withdraw")
+            self.get(number)
+            row = {"change": number, "review": review, "note": note, "created_at": now()}
+            connection.execute(insert(change_reviews), row)
+            return self.get(number)
+
+    def reviews(self, number: int) -> list[ChangeReview]:
+        """Everything people said of a change, oldest first."""
+        query = select(change_reviews).where(change_reviews.c.change == number)
+        with self._catalog.read() as connection:
+            rows = connection.execute(query.order_by(change_reviews.c.created_at, change_reviews.c.number))
+            return [ChangeReview(row.review, row.note, row.created_at) for row in rows]
+
+
+def _change(stored: StoredChange, part: Mapping[str, np.ndarray]) -> Change:
+    return Change(
+        stored.kind,
+        stored.box,
+        **part,
+        S_after_before=stored.S_after_before,
+        symmetry=stored.symmetry,
+        confidence=stored.confidence,
+        evidence=stored.evidence,
+    )
+
+
+_PARTS = {"voxels": ((0, 3), np.float32), "before": ((0,), np.int32), "after": ((0,), np.int32)}
+
+
+def _to_arrays(found: Sequence[Change]) -> dict[str, np.ndarray]:
+    """The arrays of changes, one after another."""
+    return {
+        name: np.concatenate([np.zeros(shape, kind), *(np.asarray(getattr(one, name), dtype=kind) for one in found)])
+        for name, (shape, kind) in _PARTS.items()
+    }
+
+
+def _parts(
+    arrays: Mapping[str, np.ndarray], found: Sequence[StoredChange], older: int, newer: int, where: str
+) -> list[dict[str, np.ndarray]]:
+    """`_to_arrays` undone.
+
+    Args:
+        older, newer: how many Gaussians each scene has.
+        where: what messages call it.
+    """
+    most = {"before": older, "after": newer}
+    fits = all(((arrays[name] >= 0) & (arrays[name] < count)).all() for name, count in most.items())
+    if not fits or not np.isfinite(arrays["voxels"]).all():
+        raise CorruptError(f"{where} is not what a comparison can have found: run gsmap check")
+    cut = {name: np.split(arrays[name], np.cumsum(counts)[:-1]) for name, counts in _counts(found).items()}
+    return [{name: cut[name][i] for name in _PARTS} for i in range(len(found))]
+
+
+def _counts(found: Sequence[StoredChange]) -> dict[str, list[int]]:
+    return {name: [getattr(one, f"num_{name}") for one in found] for name in _PARTS}

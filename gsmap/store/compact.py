@@ -1,0 +1,127 @@
+"""Gaussians in a fifth of their bytes: what is kept of a capture that newer ones supersede.
+
+Each value is rounded to 8 bits (positions to 16 within their chunk, rotations to the three smallest of their
+components at 10), which pictures of the capture do not show: `gsmap.thin` measures it. Rows stay rows, so that pieces
+of a scene are read as before.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from gsmap.errors import CorruptError
+from gsmap.formats.quantise import from_smallest_three, logits_of_bytes, opacity_bytes, smallest_three
+from gsmap.store.layout import CHUNK_ROWS, Shape
+from gsmap.types import Gaussians
+
+_SQRT2 = np.sqrt(2.0)
+_LEVELS_16, _LEVELS_10, _LEVELS_8 = 65535.0, 1023.0, 255.0
+# Finer than these nothing shows in a picture (over 50 dB), and coarser values pack better.
+_SIZE_STEP = 0.06  # of the logarithm: 6 percent
+_COLOUR_STEP = 0.02  # 0.006 of a colour in [0, 1]
+_GLOSS_STEP = 0.06  # of what depends on the direction
+_VALUES = ("log_scales", "sh0", "sh_rest")
+
+
+def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """The arrays of compact Gaussians, in the same order; chunks are `CHUNK_ROWS` rows.
+
+    Args:
+        gaussians: finite (`gsmap.ingest.validate`), sorted so that a chunk is small (Morton order).
+    """
+    n, k = gaussians.sh.shape[:2]
+    starts = np.arange(0, n, CHUNK_ROWS)
+    low = np.stack([gaussians.means[s : s + CHUNK_ROWS].min(0) for s in starts]) if n else np.zeros((0, 3))
+    high = np.stack([gaussians.means[s : s + CHUNK_ROWS].max(0) for s in starts]) if n else np.zeros((0, 3))
+    boxes = np.stack([low, high], axis=1).astype(np.float64)
+    chunk = np.arange(n) // CHUNK_ROWS
+    size = np.maximum(boxes[:, 1] - boxes[:, 0], 1e-30)
+    means = np.round((gaussians.means - boxes[chunk, 0]) / size[chunk] * _LEVELS_16)
+    largest, three = smallest_three(gaussians.quats)
+    q = np.round((three / _SQRT2 + 0.5) * _LEVELS_10).astype(np.uint32)
+    out = {
+        "compact.boxes": boxes,
+        "compact.means": _bytes_apart(means.astype(np.uint16)),
+        "compact.quats": (largest.astype(np.uint32) << 30) | (q[:, 0] << 20) | (q[:, 1] << 10) | q[:, 2],
+        "compact.opacities": opacity_bytes(gaussians.logit_opacities),
+    }
+    for name, value, step in (
+        ("log_scales", gaussians.log_scales, _SIZE_STEP),
+        ("sh0", gaussians.sh[:, 0], _COLOUR_STEP),
+        ("sh_rest", gaussians.sh[:, 1:].reshape(n, 3 * (k - 1)), _GLOSS_STEP),
+    ):
+        lowest = value.min(0) if n else np.zeros(value.shape[1])
+        spread = value.max(0) - lowest if n else np.zeros(value.shape[1])
+        steps = np.maximum(step, spread / _LEVELS_8)
+        out[f"compact.{name}_range"] = np.stack([lowest, steps]).astype(np.float64)
+        out[f"compact.{name}"] = np.round((value - lowest) / steps).astype(np.uint8)
+    return out
+
+
+def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
+    """The Gaussians again.
+
+    Args:
+        arrays: those of `pack`; of boxes and ranges all, of the others the rows that were read.
+        rows: (N,) which rows these are, of all.
+
+    Raises:
+        CorruptError: numbers that `pack` does not write.
+    """
+    boxes = arrays["compact.boxes"]
+    ranges = {name: arrays[f"compact.{name}_range"] for name in _VALUES}
+    if not all(np.isfinite(a).all() for a in (boxes, *ranges.values())):
+        raise CorruptError("a compact scene holds boxes or ranges that are not finite: ingest its capture again")
+    chunk = rows // CHUNK_ROWS
+    size = boxes[:, 1] - boxes[:, 0]
+    means = boxes[chunk, 0] + _bytes_together(arrays["compact.means"]) / _LEVELS_16 * size[chunk]
+    packed = arrays["compact.quats"]
+    three = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
+    quats = from_smallest_three(packed >> 30, (three / _LEVELS_10 - 0.5) * _SQRT2)
+    value = {name: low + arrays[f"compact.{name}"] * step for name, (low, step) in ranges.items()}
+    sh = np.concatenate([value["sh0"], value["sh_rest"]], axis=1).reshape(len(rows), -1, 3)
+    return Gaussians(means, quats, value["log_scales"], logits_of_bytes(arrays["compact.opacities"]), sh)
+
+
+def rounded(gaussians: Gaussians) -> Gaussians:
+    """What would be read of Gaussians that are kept compact."""
+    return unpack(pack(gaussians), np.arange(len(gaussians)))
+
+
+def num_bytes(gaussians: Gaussians) -> int:
+    """About what Gaussians take on the disk where they are kept compact: their arrays, packed as in a map."""
+    return sum(len(zlib.compress(array.tobytes(), 1)) for array in pack(gaussians).values())
+
+
+def shapes(n: int, sh_degree: int) -> dict[str, Shape]:
+    """The shapes of the arrays of `pack`."""
+    k = 3 * (sh_degree + 1) ** 2 - 3
+    return {
+        "compact.boxes": (-(-n // CHUNK_ROWS), 2, 3),
+        "compact.log_scales_range": (2, 3),
+        "compact.sh0_range": (2, 3),
+        "compact.sh_rest_range": (2, k),
+        "compact.means": (n, 6),
+        "compact.quats": (n,),
+        "compact.opacities": (n,),
+        "compact.log_scales": (n, 3),
+        "compact.sh0": (n, 3),
+        "compact.sh_rest": (n, k),
+    }
+
+
+WHOLE: Sequence[str] = ("compact.boxes", *(f"compact.{name}_range" for name in _VALUES))
+"""Arrays that are read whole, whichever rows are wanted."""
+
+
+def _bytes_apart(values: np.ndarray) -> np.ndarray:
+    """(N, 3) uint16 as (N, 6) uint8, high bytes first: they hardly change from row to row, and pack well."""
+    return np.concatenate([values >> 8, values & 255], axis=1).astype(np.uint8)
+
+
+def _bytes_together(values: np.ndarray) -> np.ndarray:
+    out: np.ndarray = (values[:, :3].astype(np.uint16) << 8) | values[:, 3:]
+    return out

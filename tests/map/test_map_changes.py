@@ -1,0 +1,330 @@
+"""Changes of a map: which captures are compared, when again, and what is told. What finds changes is stood in for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import gsmap.change
+import gsmap.map
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.geometry.rotations import exp_so3
+from gsmap.map import Map
+from gsmap.map.visits import Params, Visit, has_moved, pairs_of_visits
+from gsmap.store.change_rows import moved_box
+from gsmap.types import Cameras, Change, ChangeReport, Gaussians, PlacedScene, PoseGraph, ScenePose, Sim3
+
+DATES = {"may": "2026-05-31T15:00:00Z", "june": "2026-06-30", "july": "2026-07-31"}
+CHAIR = np.array([[0.0, 0, 0], [0.5, 0.5, 1]])
+
+
+@dataclass
+class Seen:
+    """What was compared, as ids, and where the place lies in the map."""
+
+    pairs: list[tuple[str, str]] = field(default_factory=list)
+    S_map_place: Sim3 = field(default_factory=Sim3.identity)
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
+    """Stands in for what finds changes: a chair moved by a metre, and less surely the wall was painted."""
+    found = Seen()
+
+    def compare(older: PlacedScene, newer: PlacedScene, params: object = None, progress: object = None) -> ChangeReport:
+        assert older.cameras is not None
+        assert older.captured_at < newer.captured_at
+        found.pairs.append((older.scene_id, newer.scene_id))
+        moved = Sim3(np.eye(3), np.array([1.0, 0, 0]))
+        rows = np.arange(3, dtype=np.int32)
+        box = moved_box(CHAIR, found.S_map_place)
+        chair = Change("moved", box, CHAIR.astype(np.float32), rows, rows[:2], moved, "half", 0.9, {"through": 7.0})
+        wall = Change("recoloured", CHAIR + 3, CHAIR.astype(np.float32) + 3, rows, rows, confidence=0.35)
+        return ChangeReport((chair, wall), 0.75, np.array([1.0, 1.1, 0.9]), ("it was dark",))
+
+    monkeypatch.setattr(gsmap.change, "compare", compare)
+    monkeypatch.setenv("GSMAP_WORKERS", "1")
+    return found
+
+
+@pytest.fixture
+def site(tmp_path: Path, seen: Seen) -> Iterator[Map]:
+    """Three dated captures of one place, placed."""
+    with gsmap.map.create(tmp_path / "site.gsmap") as m:
+        for i, (name, date) in enumerate(DATES.items()):
+            m.ingest(_cloud(i), cameras=_cameras(), name=name, captured_at=date, scale="known")
+        place(m)
+        yield m
+
+
+def _cloud(seed: int, n: int = 60) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    quats, sizes = np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), -3.0)
+    return Gaussians(rng.uniform(-1, 1, (n, 3)), quats, sizes, np.zeros(n), rng.normal(size=(n, 1, 3)))
+
+
+def _cameras() -> Cameras:
+    pose = np.eye(4)
+    pose[2, 3] = -4.0
+    return Cameras(pose[None], np.array([[40.0, 40, 16, 12]]), np.array([[32, 24]]), ("a",))
+
+
+def place(m: Map, every: Sim3 | None = None, **poses: Sim3) -> None:
+    """A new revision: scenes by name at their poses, the others at the origin, all of it moved."""
+    every = every or Sim3.identity()
+    placed = {s.id: every @ poses.get(s.name, Sim3.identity()) for s in m.scenes()}
+    m.store.revisions.save(PoseGraph({s: ScenePose(s, pose, 0, "placed") for s, pose in placed.items()}))
+
+
+def at(x: float, turn_deg: float = 0.0) -> Sim3:
+    return Sim3(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.array([x, 0, 0]))
+
+
+def names(m: Map, seen: Seen) -> list[tuple[str, str]]:
+    name_of = {scene.id: scene.name for scene in m.scenes()}
+    done = [(name_of[a], name_of[b]) for a, b in seen.pairs]
+    seen.pairs.clear()
+    return done
+
+
+def test_each_capture_is_compared_with_the_one_before_it_and_only_once(site: Map, seen: Seen) -> None:
+    report = site.changes()
+    assert names(site, seen) == [("may", "june"), ("june", "july")]
+    assert [(pair.older_name, pair.newer_name) for pair in report.pairs] == [("june", "july"), ("may", "june")]
+    assert [(row.id, row.kind, row.newer_name) for row in report.changes] == [
+        ("c3", "moved", "july"),
+        ("c4", "recoloured", "july"),
+        ("c1", "moved", "june"),
+        ("c2", "recoloured", "june"),
+    ]
+    (chair, *_) = report.changes
+    assert (chair.before, chair.after, chair.symmetry, chair.status, chair.picture) == (3, 2, "half", "open", None)
+    assert (chair.evidence, chair.confidence, chair.older_at[:10]) == ({"through": 7.0}, 0.9, "2026-06-30")
+    assert (report.pairs[0].seen_share, report.pairs[0].notes, report.notes) == (0.75, ("it was dark",), ())
+    assert site.changes().to_json() == report.to_json()
+    assert seen.pairs == []
+    # A new capture costs its own pair.
+    site.ingest(_cloud(9), cameras=_cameras(), name="august", captured_at="2026-08-31", scale="known")
+    place(site)
+    site.changes()
+    assert names(site, seen) == [("july", "august")]
+
+
+def test_a_pair_that_is_named_is_compared_whatever_lies_between(site: Map, seen: Seen) -> None:
+    report = site.changes("july:may")
+    assert names(site, seen) == [("may", "july")]
+    assert [pair.pair for pair in report.pairs] == ["may:july"]
+    assert len(site.changes().pairs) == 2
+
+
+def test_damaged_arrays_of_a_pair_that_is_named_are_made_again(site: Map, seen: Seen) -> None:
+    site.changes()
+    for path in site.store.home.glob("arrays/changes/*/voxels/zarr.json"):
+        path.write_bytes(b"")
+    names(site, seen)
+    site.changes()
+    assert seen.pairs == []
+    site.changes("may:june")
+    site.changes("june:july")
+    assert len(names(site, seen)) == 2
+    assert site.check().ok
+
+
+def test_only_of_the_dates_asked_for(site: Map, seen: Seen) -> None:
+    def pairs(**options: object) -> list[str]:
+        return [pair.pair for pair in site.changes(**options).pairs]
+
+    assert pairs(since="2026-07-01") == ["june:july"]
+    assert names(site, seen) == [("june", "july")]
+    assert pairs(between=("2026-05-01", "2026-06-30")) == ["may:june"]
+    assert pairs(as_of="2026-06-30") == ["may:june"]
+    assert pairs(since="2026-08-01") == []
+    assert pairs(since="2026-05-01", as_of="2026-06-29") == []
+    for wrong in ({"since": "soon"}, {"since": "2026-01-01", "between": ("2026-01-01", "2026-02-01")}):
+        with pytest.raises(ConfigError):
+            pairs(**wrong)
+    with pytest.raises(ConfigError, match="the earlier one first"):
+        pairs(between=("2026-07-01", "2026-06-01"))
+    assert {row.kind for row in site.changes(min_confidence=0.5).changes} == {"moved"}
+
+
+def test_nobody_guesses_which_capture_is_newer(site: Map, seen: Seen) -> None:
+    site.edit("june", captured_at="none")
+    report = site.changes()
+    assert names(site, seen) == [("may", "july")]
+    assert report.notes == (
+        "june has no date: which one is newer is not known (gsmap edit MAP SCENE --captured-at DATE tells)",
+    )
+    with pytest.raises(InputError, match="june has no date"):
+        site.changes("may:june")
+    site.edit("june", captured_at=DATES["july"])
+    with pytest.raises(InputError, match="same date"):
+        site.changes("july:june")
+
+
+def test_dates_that_are_corrected_turn_a_pair_round(site: Map, seen: Seen) -> None:
+    site.changes("may:june")
+    site.confirm("c1")
+    site.edit("may", captured_at="2026-07-01")
+    report = site.changes("may:june")
+    assert names(site, seen) == [("may", "june"), ("june", "may")]
+    assert [row.id for row in report.changes] == ["c3", "c4"]
+    assert {row.status for row in report.changes} == {"open"}
+
+
+def test_places_come_from_the_newest_poses(site: Map, seen: Seen) -> None:
+    site.changes()
+    names(site, seen)
+    turn = Sim3(exp_so3(np.array([0, 0, np.pi / 2])), np.array([10.0, 0, 0]))
+    place(site, turn)  # all of the map: nothing moved against another
+    report = site.changes()
+    assert seen.pairs == []
+    box = report.changes[0].box_m
+    np.testing.assert_allclose(box, [[9.5, 0, 0], [10, 0.5, 1]], atol=1e-9)
+    np.testing.assert_allclose(report.changes[0].S_after_before.translation, [0, 1, 0], atol=1e-9)
+    place(site, turn, july=at(0.01))
+    site.changes()
+    assert seen.pairs == []
+    place(site, turn, july=at(0.03))
+    seen.S_map_place = turn
+    site.confirm("c3", "I moved it")
+    again = site.changes()
+    assert names(site, seen) == [("june", "july")]
+    (chair,) = [row for row in again.changes if row.id == "c3"]  # the same change, with the word on it
+    assert (chair.status, chair.kind) == ("confirmed", "moved")
+    assert "c3 was confirmed before this comparison: it stays so" in again.pairs[0].notes
+    np.testing.assert_allclose(chair.box_m, box, atol=1e-9)
+
+
+def test_other_settings_compare_again(site: Map, seen: Seen) -> None:
+    site.changes()
+    names(site, seen)
+    site.with_settings({"change.min_confidence": 0.4})
+    site.changes()
+    assert len(names(site, seen)) == 2
+
+
+def test_words_on_changes(site: Map, seen: Seen) -> None:
+    site.changes()
+    assert {row.what: row.count for row in site.status().todo}["changes"] == 4
+    assert site.confirm("c1", "seen it").status == "confirmed"
+    assert site.reject("c2").status == "rejected"
+    assert {row.what: row.count for row in site.status().todo}["changes"] == 2
+    detail = site.show_change("c1")
+    assert [(event.what, event.reason) for event in detail.history] == [("confirm", "seen it")]
+    assert (detail.num_voxels, detail.notes) == (2, ("it was dark",))
+    assert site.confirm("c1", withdraw=True).status == "open"
+    for wrong in ("c9", "chair"):
+        with pytest.raises(NotFoundError):
+            site.show_change(wrong)
+    with pytest.raises(NotFoundError, match="no change c9"):
+        site.confirm("c9")
+
+
+def test_a_map_that_cannot_be_written_tells_what_it_knows(
+    site: Map, seen: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site.changes("may:june")
+    site.close()
+    names_before = list(seen.pairs)
+    with Map(gsmap.map.map.Store.open(site.store.home, "r")) as m:
+        report = m.changes()
+        assert [pair.pair for pair in report.pairs] == ["may:june"]
+        assert report.notes == ("1 pairs are not compared yet: gsmap changes does where the map can be written",)
+    assert seen.pairs == names_before
+
+
+def test_pictures_of_changes_go_with_a_scene_that_is_purged(site: Map, seen: Seen, tmp_path: Path) -> None:
+    out = tmp_path / "pictures"
+    report = site.changes(pictures=out)
+    assert {Path(row.picture).name for row in report.changes} == {"c1.png", "c2.png", "c3.png", "c4.png"}
+    assert all(Image.open(row.picture).size[0] > 300 for row in report.changes)
+    assert site.changes(pictures=out).changes[0].picture == report.changes[0].picture
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("")
+    with pytest.raises(ConfigError, match="holds other things"):
+        site.changes(pictures=tmp_path / "mine")
+    with gsmap.map.create(tmp_path / "other.gsmap") as other:
+        other.ingest(_cloud(0), cameras=_cameras(), name="a", captured_at="2026-01-01")
+        place(other)
+        with pytest.raises(ConfigError, match="pictures of another map"):
+            other.changes(pictures=out)
+    gone = next(scene.id for scene in site.scenes() if scene.name == "may")
+    receipt = site.purge("may")
+    assert (receipt.num_tiles, receipt.exports, receipt.unreachable) == (2, (str(out),), ())
+    assert sorted(path.name for path in out.iterdir()) == ["c3.png", "c4.png", "changes.json"]
+    assert gone not in (out / "changes.json").read_text()
+
+
+def test_without_poses_there_is_nothing_to_compare(tmp_path: Path, seen: Seen) -> None:
+    with gsmap.map.create(tmp_path / "m.gsmap") as m:
+        m.ingest(_cloud(0), cameras=_cameras(), name="a", captured_at="2026-01-01", scale="unknown")
+        with pytest.raises(NotFoundError, match="no poses yet"):
+            m.changes()
+        place(m)
+        assert m.changes().pairs == ()
+        m.ingest(_cloud(1), cameras=_cameras(), name="b", captured_at="2026-02-01", scale="unknown")
+        assert m.changes().notes == ("b has no place in the map yet: run gsmap update",)
+        with pytest.raises(NotFoundError, match="b has no place in the map yet"):
+            m.changes("a:b")
+        place(m)
+        assert m.changes().notes == ("no scene's scale is known, so lengths are in the map's own unit",)
+
+
+# -- which captures are compared
+
+
+def visit(name: str, day: int, x: tuple[float, float] = (0, 4), component: int = 0, pose: Sim3 | None = None) -> Visit:
+    bounds = np.array([[x[0], 0, 0], [x[1], 4, 2]])
+    when = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(days=day)
+    return Visit(name, when, component, pose or Sim3.identity(), bounds)
+
+
+def test_a_capture_meets_the_visits_that_together_cover_it() -> None:
+    hall, north, south = visit("hall", 0, (0, 8)), visit("north", 1, (0, 4)), visit("south", 2, (4, 8))
+    found = pairs_of_visits([visit("all", 3, (0, 8)), south, hall, north], Params())
+    assert set(found) == {("hall", "north"), ("hall", "south"), ("south", "all"), ("north", "all")}
+    assert len(found) == 4  # the hall of day 0 was seen again since
+    # What hardly reaches in, lies elsewhere, in another frame, or is of the same moment.
+    others = [
+        visit("near", 0, (3.7, 8)),
+        visit("far", 0, (20, 24)),
+        visit("other", 0, component=1),
+        visit("same", 1),
+    ]
+    assert pairs_of_visits([*others, visit("new", 1)], Params()) == []
+    met = pairs_of_visits([*others, visit("new", 1)], Params(min_new_share=0.01))
+    assert met == [("near", "new"), ("near", "same")]
+    assert pairs_of_visits([north, south, hall, visit("all", 3, (0, 8))], Params(most=1))[-1] == ("south", "all")
+    with pytest.raises(ConfigError):
+        Params(min_new_share=0)
+
+
+def test_a_capture_lies_where_its_pose_says() -> None:
+    turned = Sim3(exp_so3(np.array([0, 0, np.pi / 2])), np.array([4.0, 0, 0]), 1.0)
+    old = visit("old", 0, (0, 4), pose=turned)  # over the same four metres again
+    assert pairs_of_visits([old, visit("new", 1)], Params()) == [("old", "new")]
+    assert pairs_of_visits([visit("old", 0, pose=at(40.0)), visit("new", 1)], Params()) == []
+
+
+def test_how_far_a_pair_may_move_before_it_is_compared_again() -> None:
+    a, b = visit("a", 0), visit("b", 1)
+    for then, moved in (
+        (Sim3.identity(), False),
+        (at(0.019), False),
+        (at(0.021), True),
+        (at(0.0, 0.19), False),
+        (at(0.0, 0.25), True),
+    ):
+        assert has_moved(a, b, then, Params()) is moved
+    # Metres of the map, whatever the scenes' units are.
+    big = Sim3(np.eye(3), np.zeros(3), 10.0)
+    c, d = (visit(name, 0, (0, 0.4), pose=big) for name in "cd")
+    assert has_moved(c, d, at(0.003), Params())
+    assert not has_moved(c, d, at(0.0019), Params())

@@ -1,0 +1,109 @@
+"""Scenes that are kept compact: what is read of them, what goes, and how they come back."""
+
+import numpy as np
+import pytest
+from store_samples import key, make_cameras, make_gaussians
+
+from gsmap.errors import InputError
+from gsmap.geometry.morton import morton_order
+from gsmap.geometry.rotations import quats_to_matrices
+from gsmap.store import Store, compact
+from gsmap.store.layout import CHUNK_ROWS
+from gsmap.types import Gaussians, SceneGraph
+
+
+def sorted_gaussians(n=500, degree=1, seed=0) -> Gaussians:
+    made = make_gaussians(n, seed=seed, degree=degree)
+    return made[morton_order(made.means)]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("n", [1, 700, CHUNK_ROWS + 9])
+def test_compact_gaussians_differ_by_less_than_a_step(n, degree):
+    g = sorted_gaussians(n, degree)
+    back = compact.rounded(g)
+    assert back.sh.shape == g.sh.shape
+    assert np.abs(back.means - g.means).max() <= 10 / 65535
+    turn = np.einsum("nij,nkj->nik", quats_to_matrices(back.quats), quats_to_matrices(g.quats))
+    assert np.trace(turn, axis1=1, axis2=2).min() > 3 - 1e-4
+    assert np.abs(back.opacities - g.opacities).max() <= 0.51 / 255
+    for rounded, exact, least in (
+        (back.log_scales, g.log_scales, 0.06),
+        (back.sh[:, 0], g.sh[:, 0], 0.02),
+        (back.sh[:, 1:].reshape(n, -1), g.sh[:, 1:].reshape(n, -1), 0.06),
+    ):
+        step = np.maximum(least, np.ptp(exact, axis=0) / 255) if exact.size else 0
+        assert (np.abs(rounded - exact) <= 0.5001 * step + 1e-6).all()
+
+
+def test_values_that_are_all_equal_and_extreme_opacities_come_back():
+    g = sorted_gaussians(20)
+    same = Gaussians(np.tile(g.means[:1], (20, 1)), g.quats, g.log_scales[:1].repeat(20, 0), np.full(20, 40.0), g.sh)
+    back = compact.rounded(same)
+    np.testing.assert_allclose(back.means, same.means, atol=1e-6)
+    np.testing.assert_allclose(back.log_scales, same.log_scales, atol=1e-6)
+    assert np.isfinite(back.logit_opacities).all()
+
+
+def test_a_thinned_scene_reads_whole_and_in_pieces(store):
+    g = make_gaussians(3 * CHUNK_ROWS)
+    scene, _ = store.scenes.add(g, make_cameras(), name="a")
+    before = store.scenes.gaussians("a")
+    shown = np.arange(len(g)) % 3 > 0
+    thinned = store.scenes.thin("a", shown, up=(0.0, 0.0, 1.0))
+    assert thinned.thinning.num_gaussians == len(g)
+    assert thinned.thinning.up == (0.0, 0.0, 1.0)
+    assert (thinned.id, thinned.num_gaussians) == (scene.id, int(shown.sum()))
+    np.testing.assert_array_equal(thinned.bounds, scene.bounds)
+    after = store.scenes.gaussians("a")
+    np.testing.assert_allclose(after.means, before.means[shown], atol=2e-4)
+    np.testing.assert_array_equal(store.scenes.cameras("a").T_frame_camera, make_cameras().T_frame_camera)
+    box = np.array([[3.0, 3, 3], [5, 5, 5]])  # in the last chunk
+    reach = 3 * after.scales.max(1, keepdims=True)
+    wanted = ((after.means >= box[0] - reach) & (after.means <= box[1] + reach)).all(1)
+    np.testing.assert_array_equal(store.scenes.gaussians("a", box).means, after.means[wanted])
+    assert store.check().ok
+
+
+def test_thinning_frees_what_was_there_but_not_what_a_tag_names(store):
+    for i, name in enumerate("ab"):
+        scene, _ = store.scenes.add(make_gaussians(2000, seed=i), make_cameras(), name=name)
+        store.graphs.save(SceneGraph(scene.id), key("describe", scene.id))
+    whole = store.scenes.num_bytes("a")
+    store.scenes.thin("a", np.ones(2000, bool))
+    assert store.scenes.num_bytes("a") < 0.4 * whole
+    assert store.graphs.load("a") is None
+    assert store.graphs.load("b") is not None
+    assert store.reclaim().num_bytes > 0.9 * whole
+    store.branches.make("before", tag=True)
+    store.scenes.thin("b", np.ones(2000, bool))
+    assert store.reclaim().num_bytes == 0
+    assert store.check().ok
+    with Store.open(f"{store.location}@before", "r") as tag:
+        assert tag.scenes.get("b").thinning is None
+        np.testing.assert_array_equal(
+            np.sort(tag.scenes.gaussians("b").means[:, 0]), np.sort(make_gaussians(2000, 1).means[:, 0])
+        )
+
+
+def test_ingesting_the_capture_again_makes_it_whole(store):
+    g = make_gaussians(900)
+    store.scenes.add(g, make_cameras(), name="a")
+    before = store.scenes.gaussians("a")
+    store.scenes.thin("a", np.arange(900) < 800)
+    store.reclaim()
+    again, new = store.scenes.add(g, make_cameras(), name="other")
+    assert (again.name, again.thinning, again.num_gaussians, new) == ("a", None, 900, True)
+    np.testing.assert_array_equal(store.scenes.gaussians("a").sh, before.sh)
+    store.reclaim()
+    assert store.check().ok
+
+
+def test_what_cannot_be_thinned_is_refused_and_nothing_changes(store):
+    store.scenes.add(make_gaussians(50), make_cameras(), name="a")
+    for shown in (np.ones(49, bool), np.zeros(50, bool)):
+        with pytest.raises(InputError, match="cannot keep"):
+            store.scenes.thin("a", shown)
+    once = store.scenes.thin("a", np.arange(50) < 40)
+    assert store.scenes.thin("a", np.ones(40, bool)).thinning == once.thinning
+    assert store.scenes.get("a").num_gaussians == 40

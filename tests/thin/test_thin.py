@@ -1,0 +1,59 @@
+"""What supersedes a capture, and what of it shows: against walls whose answers are known."""
+
+import numpy as np
+import pytest
+from synthetic_walls import cameras_facing, wall
+
+from gsmap.compare import Params as CompareParams
+from gsmap.errors import ConfigError
+from gsmap.render import render
+from gsmap.thin import Params, fidelity_db, look, seen_again, shown
+from gsmap.types import Gaussians, PlacedScene
+
+
+@pytest.fixture
+def older():
+    return PlacedScene(wall(1, -2, 2), cameras_facing(np.linspace(-1.5, 1.5, 9)), "old")
+
+
+@pytest.mark.parametrize(("middles", "low", "high"), [((-1.5, 1.5), 0.75, 1.0), ((-1.5, -1.0), 0.1, 0.6)])
+def test_how_much_newer_captures_saw(older, middles, low, high):
+    newer = PlacedScene(wall(2, -2, 2), cameras_facing(np.linspace(*middles, 9)), "new")
+    assert low <= seen_again(older, [look(newer)], CompareParams()) <= high
+
+
+def test_captures_add_up_and_none_saw_nothing(older):
+    halves = [
+        PlacedScene(wall(2, -2, 2), cameras_facing(np.linspace(low, high, 9)), f"new{low}")
+        for low, high in ((-1.5, -0.5), (0.5, 1.5))
+    ]
+    alone = [seen_again(older, [look(half)]) for half in halves]
+    assert seen_again(older, [look(half) for half in halves]) > max(alone) + 0.1
+    assert seen_again(older, []) == 0.0
+
+
+def test_what_no_picture_shows_goes_and_the_pictures_stay(older):
+    behind = wall(3, -2, 2, z=0.4)
+    both = PlacedScene(Gaussians.concatenate([older.gaussians, behind]), older.cameras, "both")
+    stays = shown(both, Params())
+    n = len(older.gaussians)
+    assert stays[:n].mean() > 0.5
+    assert stays[n:].mean() < 0.2
+    kept = both.gaussians[stays]
+    camera = both.cameras[4].resized(480)
+    before, after = (np.clip(render(g, camera).colour, 0, 1) for g in (both.gaussians, kept))
+    error = ((before - after) ** 2).mean()
+    assert fidelity_db(both, kept, Params(pictures=100)) == pytest.approx(-10 * np.log10(error), abs=6)
+    assert fidelity_db(both, both.gaussians, Params()) == float("inf")
+    assert fidelity_db(both, both.gaussians[: n // 2], Params()) < 30
+
+
+def test_without_cameras_all_stays_and_nothing_is_known():
+    bare = PlacedScene(wall(1, -1, 1), None, "bare")
+    assert shown(bare, Params()).all()
+    assert np.isnan(fidelity_db(bare, bare.gaussians, Params()))
+
+
+def test_settings_that_cannot_be():
+    with pytest.raises(ConfigError, match="min_seen_again"):
+        Params(min_seen_again=2)
