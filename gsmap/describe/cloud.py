@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.describe.colour import srgb_to_lab
 from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians

@@ -24,7 +24,7 @@ from gsmap.types.plain import plain
 
 KIND = "graphs"
 
-_THINGS = ("members", "positions", "extents", "colours")
+_THINGS = ("members", "positions", "extents", "colours", "samples", "sample_colours", "sample_counts")
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,8 @@ class Graphs:
             layers[name] = NodeLayer(**own, **layer["rest"])
         things = None
         if (about := row.about.get("things")) is not None:
-            members, positions, extents, colours = (arrays[f"things.{name}"] for name in _THINGS)
-            things = Things(members, positions, extents, colours, about["unit_m"])
+            parts: dict[str, Any] = {name: arrays[f"things.{name}"] for name in _THINGS}
+            things = Things(**parts, unit_m=about["unit_m"])
         up = to_array(row.about["up"])
         return SceneGraph(row.scene, layers, up, row.about["unit_m"], tuple(row.about["notes"]), things)
 

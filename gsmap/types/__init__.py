@@ -4,6 +4,7 @@ from gsmap.types.cameras import Cameras
 from gsmap.types.change import CHANGE_KINDS, Change, ChangeKind, ChangeReport
 from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
+from gsmap.types.map_object import SIGHTING_STATES, MapObject, Sighting, SightingState
 from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
@@ -15,6 +16,7 @@ from gsmap.types.tile import Tile
 
 __all__ = [
     "CHANGE_KINDS",
+    "SIGHTING_STATES",
     "Cameras",
     "Change",
     "ChangeKind",
@@ -23,6 +25,7 @@ __all__ = [
     "EdgeOutcome",
     "FileInfo",
     "Gaussians",
+    "MapObject",
     "MergeResult",
     "NodeLayer",
     "PlacedScene",
@@ -35,6 +38,8 @@ __all__ = [
     "Scene",
     "SceneGraph",
     "ScenePose",
+    "Sighting",
+    "SightingState",
     "Sim3",
     "Thinning",
     "Things",

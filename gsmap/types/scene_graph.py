@@ -76,6 +76,9 @@ class Things:
         positions: (M, 3) float64 mean of the members, scene frame and unit.
         extents: (M, 2, 3) float64 lowest and highest corner around the members, scene frame and unit.
         colours: (M, 3) float32 median colour, CIE L*a*b* (D65).
+        samples: (K, 3) float64 centres of some members of each thing, scene frame and unit, thing after thing,
+        sample_colours: (K, 3) float32 their colours,
+        sample_counts: (M,) int32 and how many there are of each: a thing is known by them when the capture is thinned.
         unit_m: metres per scene unit that they were found under.
 
     Raises:
@@ -86,20 +89,30 @@ class Things:
     positions: np.ndarray
     extents: np.ndarray
     colours: np.ndarray
+    samples: np.ndarray
+    sample_colours: np.ndarray
+    sample_counts: np.ndarray
     unit_m: float = 1.0
 
     def __post_init__(self) -> None:
         kinds = {"members": np.int32, "positions": np.float64, "extents": np.float64, "colours": np.float32}
+        kinds |= {"samples": np.float64, "sample_colours": np.float32, "sample_counts": np.int32}
         for name, dtype in kinds.items():
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=dtype))
         m = len(self.positions)
         shapes = {"positions": (m, 3), "extents": (m, 2, 3), "colours": (m, 3), "members": (self.members.size,)}
+        shapes["sample_counts"] = (m,)
         for name, shape in shapes.items():
             array = getattr(self, name)
             if array.shape != shape:
                 raise InputError(f"Things.{name} must have shape {shape}, got {array.shape}")
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise InputError(f"Things.{name} holds NaN or infinity")
+        counted = int(self.sample_counts.sum())
+        if (self.sample_counts < 0).any() or not self.samples.shape == self.sample_colours.shape == (counted, 3):
+            raise InputError(f"Things has counts of {counted} samples and {self.samples.shape} of them")
+        if not (np.isfinite(self.samples).all() and np.isfinite(self.sample_colours).all()):
+            raise InputError("Things.samples holds NaN or infinity")
         if self.members.size and not (self.members.min() >= -1 and self.members.max() < m):
             raise InputError(f"Things.members names things outside -1 to {m - 1}")
         if not (np.isfinite(self.unit_m) and self.unit_m > 0):

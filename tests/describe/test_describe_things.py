@@ -170,6 +170,8 @@ def test_the_key_of_a_graph_without_things_is_that_of_older_releases():
         {"extents": np.zeros((2, 3))},
         {"positions": np.full((1, 3), np.nan)},
         {"unit_m": 0.0},
+        {"sample_counts": np.array([2])},
+        {"samples": np.zeros((2, 3))},
     ],
 )
 def test_things_that_do_not_fit_together_are_refused(change):
@@ -178,6 +180,9 @@ def test_things_that_do_not_fit_together_are_refused(change):
         "positions": np.zeros((1, 3)),
         "extents": np.zeros((1, 2, 3)),
         "colours": np.zeros((1, 3)),
+        "samples": np.zeros((1, 3)),
+        "sample_colours": np.zeros((1, 3)),
+        "sample_counts": np.array([1]),
     }
     assert len(Things(**good)) == 1
     assert SceneGraph("a", things=Things(**good)).num_nodes == 0  # they are no nodes: nothing is registered by them

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.describe.colour import srgb_to_lab
+from gsmap.geometry.colour import srgb_to_lab
 from gsmap.types.views import Mask, SceneContext, View
 
 VERSION = 1

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.describe.colour import srgb_to_lab
 from gsmap.describe.objects.structure import Structure, components, find_structure
+from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.directions import level_frame
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import rgb_of_sh0
@@ -22,6 +22,7 @@ from gsmap.types.views import Cloud
 VERSION = 1
 
 _NEIGHBOURS = 12
+_SAMPLES = 300  # of a thing: enough for the cells that it is compared by, and for looking for it
 _WIDEST_M = 10_000.0  # a place so wide, or so far from metric, has no furniture to tell
 _BAND_M = 0.25  # the colour of a wall is told for squares of this side,
 _AROUND_M = 1.5  # from all of the wall so far to either side at that height: pictures are narrower
@@ -86,11 +87,16 @@ def find_things(
     parts = np.split(order, np.searchsorted(members[order], np.arange(count + 1)))[1:-1]
     colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[:, 0]), 0.0, 1.0))
     means = gaussians.means.astype(np.float64)
+    chosen = [p[np.linspace(0, len(p) - 1, min(len(p), _SAMPLES)).astype(int)] for p in parts]
+    samples = np.concatenate([np.zeros(0, np.int64), *chosen])
     return Things(
         members,
         np.array([means[p].mean(0) for p in parts]).reshape(-1, 3),
         np.array([[means[p].min(0), means[p].max(0)] for p in parts]).reshape(-1, 2, 3),
         np.array([np.median(colours[p], axis=0) for p in parts]).reshape(-1, 3),
+        means[samples],
+        colours[samples],
+        np.array([len(c) for c in chosen]),
         unit_m,
     )
 
@@ -236,7 +242,7 @@ class _Surface:
         return foreign
 
     def _hanging(self, free: np.ndarray, distinct: np.ndarray, wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Patches on walls, label (N,) of each point, -1 for none: those that hang there, and all that are of a wall."""
+        """Patches on walls, label (N,) of each point, -1 for none: those that hang, and all that are of a wall."""
         # A trim is thin: by its core a patch is told from it, then the core is given its rim back.
         same = self.near & (wall[self.a] == wall[self.b]) & (wall[self.a] >= 0)
         others = np.bincount(self.a[same], distinct[self.b[same]], minlength=self.count)

@@ -1,0 +1,40 @@
+"""The map-level scene graph for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gsmap.objects.permanence import permanence
+from gsmap.objects.relations import relations
+from gsmap.types import MapObject
+
+
+def object_graph(objects: Sequence[MapObject], dates: Mapping[str, str | None], metres: float = 1.0) -> Any:
+    """A `networkx.MultiDiGraph`: a node per object, an edge per relation, whose attributes GraphML can say.
+
+    Nodes: ``kind`` (object), ``name``, ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
+    ``seen``, ``looks``, ``half_life_days`` (absent where unknown), ``there`` (the newest look shows it). Edges:
+    ``kind`` (on, in, next to).
+
+    Args:
+        dates: as for `permanence`.
+        metres: per unit of the map.
+    """
+    import networkx as nx
+
+    graph = nx.MultiDiGraph()
+    for thing in objects:
+        stays = permanence(thing, dates)
+        looks = [sighting.state for sighting in thing.sightings if sighting.state != "unseen"]
+        facts: dict[str, Any] = {"kind": "object", "name": thing.name, "component": thing.component}
+        facts |= {axis: float(value) for axis, value in zip("xyz", thing.position, strict=True)}
+        facts |= {f"size_{axis}": float(v) for axis, v in zip("xyz", thing.box[1] - thing.box[0], strict=True)}
+        facts |= {channel: float(value) for channel, value in zip("Lab", thing.colour, strict=True)}
+        facts |= {"seen": stays.seen, "looks": stays.looks, "there": bool(looks) and looks[-1] == "seen"}
+        if stays.half_life_days is not None:
+            facts["half_life_days"] = stays.half_life_days
+        graph.add_node(thing.id, **facts)
+    for relation in relations(objects, metres):
+        graph.add_edge(relation.source, relation.target, kind=relation.kind)
+    return graph

@@ -1,0 +1,136 @@
+"""Whether a capture looked at a place, and whether something stood there: by its own cameras, in its own renders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.colour import srgb_to_lab
+from gsmap.geometry.projection import in_image, project
+from gsmap.render import render
+from gsmap.types import Cameras, Gaussians, SightingState
+
+
+@dataclass(frozen=True)
+class Params:
+    """How captures look for things.
+
+    Args:
+        max_views: of a capture's cameras, evenly spread.
+        longest_side_px: of a render.
+        tolerance_m: a surface so near to a point is its own, beside
+        tolerance: this share of its distance.
+        min_looked: a capture that looked at less than this share of a place says nothing of it.
+        min_there: a thing is there where so much of what was looked at is a surface of its colour,
+        same_shape: or so much of it a surface of any colour: a thing that was painted.
+        patch_m: edge of the cells over which colours are averaged.
+        max_lab: mean colours that differ by less are alike, L*a*b* units.
+    """
+
+    max_views: int = 32
+    longest_side_px: int = 128
+    tolerance_m: float = 0.1
+    tolerance: float = 0.02
+    min_looked: float = 0.5
+    min_there: float = 0.5
+    same_shape: float = 0.9
+    patch_m: float = 0.25
+    max_lab: float = 14.0
+
+
+@dataclass(frozen=True, eq=False)
+class Eyes:
+    """What a capture's cameras see, frame and unit of the capture.
+
+    Args:
+        cameras: one each.
+        depths: (H, W) float32 each, 0 where nothing was drawn.
+        colours: (H, W, 3) float32 each, L*a*b*.
+    """
+
+    cameras: tuple[Cameras, ...]
+    depths: tuple[np.ndarray, ...]
+    colours: tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Glance:
+    """What a capture saw at some points.
+
+    Args:
+        through: (K,) bool, some view's surface lies clearly behind the point.
+        on: (K,) bool, some view's surface lies on it.
+        colours: (K, 3) mean colour of that surface, L*a*b*; NaN where there is none.
+    """
+
+    through: np.ndarray
+    on: np.ndarray
+    colours: np.ndarray
+
+
+def open_eyes(gaussians: Gaussians, cameras: Cameras | None, params: Params | None = None) -> Eyes:
+    """Render a capture through its own cameras; without cameras it has seen nothing."""
+    params = params or Params()
+    if cameras is None or not len(cameras) or cameras.synthesised:
+        return Eyes((), (), ())
+    rows = np.unique(np.linspace(0, len(cameras) - 1, min(params.max_views, len(cameras))).round().astype(int))
+    small = cameras[rows].resized(params.longest_side_px)
+    views = tuple(small[i] for i in range(len(small)))
+    seen = [render(gaussians, view, dominant_id=False) for view in views]
+    return Eyes(
+        views,
+        tuple(np.where(image.alpha[0] > 0.5, image.depth[0], 0) for image in seen),
+        tuple(srgb_to_lab(np.clip(np.nan_to_num(image.colour[0]), 0, 1)) for image in seen),
+    )
+
+
+def glance(eyes: Eyes, points: np.ndarray, unit_m: float, params: Params | None = None) -> Glance:
+    """What a capture saw at points (K, 3), its frame and unit; ``unit_m`` is metres per unit."""
+    params = params or Params()
+    through, times = np.zeros(len(points), bool), np.zeros(len(points))
+    colours = np.zeros((len(points), 3))
+    for view, depth, colour in zip(eyes.cameras, eyes.depths, eyes.colours, strict=True):
+        pixels, z = project(points, view.T_camera_frame[0], view.intrinsics_px[0])
+        rows = np.flatnonzero(in_image(pixels, z, view.sizes_px[0], near=0.05 / unit_m))
+        column, row = pixels[rows].astype(np.int64).T
+        surface = depth[row, column]
+        margin = params.tolerance_m / unit_m + params.tolerance * z[rows]
+        through[rows] |= (surface > 0) & (surface > z[rows] + margin)
+        on = (surface > 0) & (np.abs(surface - z[rows]) <= margin)
+        times[rows[on]] += 1
+        colours[rows[on]] += colour[row[on], column[on]]
+    with np.errstate(invalid="ignore"):
+        return Glance(through, times > 0, colours / times[:, None])
+
+
+def judge(
+    seen: Glance, points: np.ndarray, colours: np.ndarray, shift: np.ndarray, params: Params | None = None
+) -> tuple[SightingState, float]:
+    """Whether a thing that other captures show is there.
+
+    Args:
+        seen: what the capture saw at its points.
+        points: (K, 3) of it, metres.
+        colours: (K, 3) its own there, L*a*b*.
+        shift: (3,) by which the capture's colours differ from those, for another exposure.
+
+    Returns:
+        The state: ``unseen`` where too little of its place was looked at; ``seen`` where most of what was looked at
+        is a surface of its colour and was not looked through; else ``absent``. And the share that was looked at.
+    """
+    params = params or Params()
+    looked = seen.through | seen.on
+    share = float(looked.mean()) if len(looked) else 0.0
+    if share < params.min_looked:
+        return "unseen", share
+    # Books and leaves differ from pixel to pixel: what is compared is the mean of a patch.
+    rows = np.flatnonzero(seen.on)
+    off = seen.colours[rows] - shift - colours[rows]
+    label, counts = cell_labels(np.floor(points[rows] / params.patch_m))
+    alike = np.zeros(len(points), bool)
+    alike[rows] = (np.linalg.norm(group_means(off, label, counts), axis=1) < params.max_lab)[label]
+    solid = seen.on & ~seen.through
+    there = (solid & alike).sum() >= params.min_there * looked.sum() or solid.sum() >= params.same_shape * looked.sum()
+    return ("seen" if there else "absent"), share

@@ -1,0 +1,77 @@
+"""How objects of one place stand to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gsmap.types import MapObject
+
+RelationKind = Literal["on", "in", "next to"]
+
+
+@dataclass(frozen=True)
+class Relation:
+    """``source`` is ``kind`` ``target``, by the objects' ids; ``next to`` holds both ways and is given once."""
+
+    source: str
+    kind: RelationKind
+    target: str
+
+
+@dataclass(frozen=True)
+class Params:
+    """When a relation holds.
+
+    Args:
+        on_m: what stands on a thing begins so near to its top.
+        over: and so much of its footprint lies over it.
+        inside: what is in a thing has so much of its box in that of the thing.
+        next_m: things next to each other are no farther apart in plan.
+    """
+
+    on_m: float = 0.12
+    over: float = 0.5
+    inside: float = 0.8
+    next_m: float = 0.3
+
+
+def relations(objects: Sequence[MapObject], metres: float = 1.0, params: Params | None = None) -> list[Relation]:
+    """``on``, ``in`` and ``next to`` of objects that are there together, by their boxes (z up).
+
+    Args:
+        objects: of any component; only those of one component that some capture shows both of, or that were last
+            seen by the same one, are related.
+        metres: per unit of the map.
+    """
+    params = params or Params()
+    out = []
+    boxes = np.array([thing.box for thing in objects]).reshape(-1, 2, 3) * metres
+    last = [_last(thing) for thing in objects]
+    for i, one in enumerate(objects):
+        size = np.maximum(boxes[i, 1] - boxes[i, 0], 1e-6)
+        low, high = np.maximum(boxes[:, 0], boxes[i, 0]), np.minimum(boxes[:, 1], boxes[i, 1])
+        overlap = np.clip(high - low, 0, None)
+        over = overlap[:, :2].prod(1) / size[:2].prod()
+        inside = overlap.prod(1) / size.prod()
+        gap = np.linalg.norm(np.clip(low - high, 0, None)[:, :2], axis=1)
+        for j, other in enumerate(objects):
+            if i == j or one.component != other.component or last[i] != last[j]:
+                continue
+            bigger = np.prod(boxes[j, 1] - boxes[j, 0]) > size.prod()
+            if inside[j] >= params.inside and bigger:
+                out.append(Relation(one.id, "in", other.id))
+            elif over[j] >= params.over and abs(boxes[i, 0, 2] - boxes[j, 1, 2]) < params.on_m:
+                out.append(Relation(one.id, "on", other.id))
+            elif i < j and gap[j] < params.next_m and overlap[j, 2] > 0 and inside[j] < params.inside:
+                out.append(Relation(one.id, "next to", other.id))
+    return out
+
+
+def _last(thing: MapObject) -> bool:
+    """Whether it is there still: the newest look at its place shows it."""
+    looks = [sighting.state for sighting in thing.sightings if sighting.state != "unseen"]
+    return bool(looks) and looks[-1] == "seen"
