@@ -60,7 +60,7 @@ def main() -> int:
     print(f"thinned {sum(row.thinned for row in report.scenes)} of {len(report.scenes)} in {cpu:.1f} CPU s")
     for row in report.scenes:
         if not row.thinned:
-            print(f"  {row.name} stays: {row.reason}")
+            print(f"  {row.scene_name} stays: {row.reason}")
     print(f"one visit          {one / 1e6:7.2f} MB")
     print(f"{args.visits:2} visits          {every / 1e6:7.2f} MB   {every / one:5.2f}x")
     print(f"{args.visits:2} visits, thinned {thinned / 1e6:7.2f} MB   {thinned / one:5.2f}x")
@@ -106,7 +106,7 @@ def scores(m: Map, visits: list[synthetic.DemoCapture], out: Path) -> dict[str, 
     for k, visit in enumerate(visits[:-1]):
         scene = m.store.scenes.get(visit.name)
         alone = at_photographs(m.store.scenes.gaussians(scene.id), visit, Sim3.identity())
-        m.export(out / visit.name, tile_size_m=0, merge="voxel", as_of=date(k), prefer="newest")
+        m.export(out / visit.name, tile_size_m=0, merge="voxel", as_of=date(k))
         tile = next((out / visit.name).rglob("*.ply"))
         S_scene_map = poses[scene.id].S_map_scene.inverse()
         found[visit.name] = alone, at_photographs(formats.read(tile), visit, S_scene_map)

@@ -119,7 +119,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
 def _row(scene: Scene, before: int, after: int, seen: float, reason: str, fidelity: float | None = None) -> ThinRow:
     return ThinRow(
         scene=scene.id,
-        name=scene.name,
+        scene_name=scene.name,
         captured_at=scene.captured_at or "",
         thinned=not reason,
         num_bytes_before=before,
