@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from gsmap import compare
-from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, UNSEEN, Comparison, Looks
+from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.placed import overlapping
 from gsmap.render import render
@@ -140,7 +140,8 @@ class _Verdict:
 
 def _verdict(older: Looks, newer: Looks, found: Comparison, prefer: Prefer) -> _Verdict:
     lost = np.isin(found.older.state, (GONE, REPAINTED))
-    changed = np.isin(found.newer.state, (GONE, REPAINTED)) | _revealed(newer, found)
+    changed = np.isin(found.newer.state, (GONE, REPAINTED))
+    changed |= (found.newer.state != SAME) & _revealed(newer, found)
     beaten = np.zeros(len(changed), dtype=bool)
     if prefer == "best":
         stays = lost & (older.sharpness > found.older.sharpness)
