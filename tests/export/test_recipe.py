@@ -80,7 +80,7 @@ def test_another_date_makes_the_tiles_of_its_scene_dirty_where_the_merger_uses_d
     again = row.export(Params("tto"))
     assert again.recomputed == sum("d" in t.poses for t in first.tiles) > 0
     assert again.reused == sum("d" not in t.poses for t in first.tiles) > 0
-    undated = Params("tto").mergers.with_params("tto", tto.Params(newer_wins=False))
+    undated = Params("tto").mergers.with_params("tto", tto.Params(prefer="both"))
     row.export(Params("tto", undated))
     row.dates["d"] = None
     assert row.export(Params("tto", undated)).recomputed == 0
