@@ -61,7 +61,8 @@ class Looks:
     Args:
         scene: the capture.
         views: V pictures of it.
-        surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen.
+        surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen;
+            all of a capture without pictures.
         times_seen: (N,) int32 pictures in which a Gaussian lies on the surface that is shown.
         sharpness: (N,) float32 sum over these of (pixels a metre)^2: more looks and nearer ones see better.
         sure: per view (H, W) bool, solid, and a surface that enough of the capture's views saw.
@@ -100,7 +101,8 @@ def look(scene: PlacedScene, params: Params | None = None) -> Looks:
         sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
     well = _best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
-    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sharpness, sure, placed)
+    surface = largest >= params.min_weight if views else np.ones(count, dtype=bool)
+    return Looks(scene, tuple(views), surface, times_seen, sharpness, sure, placed)
 
 
 def _best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:

@@ -121,7 +121,18 @@ def test_every_setting_of_a_merger_is_in_its_recipe():
     before = recipe_key("tto")
     for leaf in leaves(tto.Params()):
         value = leaf.value
-        new = not value if isinstance(value, bool) else 3 if value is None else value * 2 if value <= 0.5 else value / 2
+        if isinstance(value, str):
+            new = "best"
+        else:
+            new = (
+                not value
+                if isinstance(value, bool)
+                else 3
+                if value is None
+                else value * 2
+                if value <= 0.5
+                else value / 2
+            )
         new = type(value)(new) if isinstance(value, int) and not isinstance(value, bool) else new
         new = 1 if value == 0 and new == 0 else new
         after = recipe_key("tto", changed(tto.Params(), {leaf.name: new}))
