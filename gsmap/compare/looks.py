@@ -127,10 +127,12 @@ def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
 
 def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
     """Points (N, 3) in a view, those alone that lie in the picture and beyond ``nearest_m``."""
-    pixels, z = project(points, view.camera.T_camera_frame[0], view.camera.intrinsics_px[0])
-    index = np.flatnonzero(in_image(pixels, z, view.camera.sizes_px[0], near=nearest_m))
-    column, row = pixels[index].astype(np.int32).T
-    return Placed(index.astype(np.int32), row, column, z[index])
+    T, size_px = view.camera.T_camera_frame[0], view.camera.sizes_px[0]
+    before = np.flatnonzero(points @ T[2, :3].astype(points.dtype) + points.dtype.type(T[2, 3]) > nearest_m)
+    pixels, z = project(points[before], T, view.camera.intrinsics_px[0])
+    inside = np.flatnonzero(in_image(pixels, z, size_px, near=nearest_m))
+    column, row = pixels[inside].astype(np.int32).T
+    return Placed(before[inside].astype(np.int32), row, column, z[inside])
 
 
 def _view(gaussians: Gaussians, camera: Cameras, params: Params) -> tuple[View, np.ndarray]:
