@@ -120,19 +120,11 @@ def _find(
         else:
             newer[k - len(older)] = with_behind(newer[k - len(older)], paint.cells[1])
     older, newer = gathered(older, both[0]), gathered(newer, both[1])
-    for _ in range(2):
-        moves = find_moves(older, newer, both, cells, looks, params)
-        for move in moves:
-            evidence = {"fit": move.score, "next_fit": move.runner_up}
-            things = (older[move.older], newer[move.newer])
-            found.append(_Found("moved", things, None, move.S_after_before, move.symmetry, evidence))
-        older = [t for k, t in enumerate(older) if all(k != m.older for m in moves)]
-        newer = [t for k, t in enumerate(newer) if all(k != m.newer for m in moves)]
-        # What did not move as it is may be two things side by side, of which one did.
-        split = [_split(mine, theirs, both, k) for k, mine, theirs in ((0, older, newer), (1, newer, older))]
-        if len(split[0]) == len(older) and len(split[1]) == len(newer):
-            break
-        older, newer = split
+    moves, older, newer = find_moves(older, newer, both, cells, looks, params)
+    for move in moves:
+        evidence = {"fit": move.score, "next_fit": move.runner_up}
+        found.append(_Found("moved", (move.older, move.newer), None, move.S_after_before, move.symmetry, evidence))
+    older, newer = _split(older, newer, both, 0), _split(newer, older, both, 1)
     return found + _in_place(older, newer, both)
 
 

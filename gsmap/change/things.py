@@ -67,8 +67,7 @@ def _judge(side: Side, plane: np.ndarray, params: Params) -> Cells:
     moved = (through >= _FEWEST_LOOKS) & (through >= params.min_share * (through + on)) & (side.through >= side.on)
     looks = side.around(side.looks, _SMOOTH_M)
     strength = side.around(side.strength * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
-    offset_looks = side.around(side.offset_looks, _SMOOTH_M)
-    offset = side.around(side.offset_m * side.offset_looks, _SMOOTH_M) / np.maximum(offset_looks, 1)
+    offset = side.around(side.offset_m * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
     painted = ~moved & (looks >= _FEWEST_LOOKS) & (strength >= _FAINT)
     plane = np.where(moved, -1, plane)  # What one can walk through is no wall.
     thing = np.full(len(side), -1, dtype=np.int64)
