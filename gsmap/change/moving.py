@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap.change.components import components
 from gsmap.change.params import Params
-from gsmap.change.poses import TINT_M, about_up, settled, voted
+from gsmap.change.poses import about_up, features, settled, tints, voted
 from gsmap.change.sides import Side
 from gsmap.change.things import Cells, Thing, joined, parts
 from gsmap.compare import Looks
 from gsmap.compare.looks import place
 from gsmap.types import Sim3
 
-_ALIKE = 0.2  # colours that differ by less may be one thing's in another light
+_ALIKE = 0.12  # tints that differ by less may be one thing's
+_DARKER = 0.12  # and a thing may be that much lighter or darker elsewhere
 _FEWEST = 30  # cells with which a thing can be told from others
 _COARSE, _FINE, _JUDGED = 80, 300, 250  # cells that are laid on others, and that are asked whether they fit
 _TRIED, _KEPT = 10, 3  # poses that are looked at, and that are followed to the end
 _AS_GOOD = 0.92  # a pose that scores this share of the best is not told from it
 _LEAST_M = 0.08  # a thing that was moved by less, and not turned, was not moved
 _APART_M = 0.15  # the middle of a symmetric thing stays this near
+_BESIDE_M = 0.5  # how far beyond a moved thing more of it is looked for
 _TAKES_M, _TAKES = 0.1, 0.5  # what lies, to this share, so close to where a thing moved is a part of it
-_PANEL_M = 0.15, 1.6  # what is thinner and higher is a door: it opens and shuts
+_PANEL_M = 0.15, 1.0  # what is thinner and higher is a door: it opens and shuts
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,7 @@ class _Capture:
     """One capture, and what of its things has not been found elsewhere yet."""
 
     side: Side
+    cells: Cells
     looks: Looks
     things: list[Thing]
     tree: Any
@@ -61,14 +65,14 @@ class _Capture:
     @classmethod
     def of(cls, side: Side, cells: Cells, looks: Looks, things: Sequence[Thing]) -> _Capture:
         loose = np.flatnonzero(cells.plane < 0)
-        return cls(side, looks, list(things), cKDTree(_features(side, loose)))
+        return cls(side, cells, looks, list(things), cKDTree(_features(side, loose)))
 
     def points(self, thing: Thing) -> np.ndarray:
         return self.side.points[thing.cells]
 
 
 def _features(side: Side, rows: np.ndarray) -> np.ndarray:
-    return np.concatenate([side.points[rows], side.colours[rows] * TINT_M], axis=1)
+    return features(side.points[rows], side.colours[rows])
 
 
 def find_moves(
@@ -87,9 +91,44 @@ def find_moves(
         found = [m for m in (_best_from(a, b, False, params), _best_from(b, a, True, params)) if m is not None]
         if not found:
             return moves, a.things, b.things
-        move = max(found, key=lambda m: m.score)
-        moves.append(move)
+        move = _completed(max(found, key=lambda m: m.score), a, b, params)
         a.things, b.things = _without(a.things, move.older), _without(b.things, move.newer)
+        moves.append(move)
+
+
+def _completed(move: Move, a: _Capture, b: _Capture, params: Params) -> Move:
+    """The move with all that went along: cells beside it that fit by it, whether or not they seemed to have changed."""
+    S = move.S_after_before
+    older = _with_more(move.older, a, b, S, params)
+    newer = _with_more(move.newer, b, a, S.inverse(), params)
+    return replace(move, older=older, newer=newer)
+
+
+def _with_more(thing: Thing, here: _Capture, there: _Capture, pose: Sim3, params: Params) -> Thing:
+    side, cells = here.side, here.cells
+    points = here.points(thing)
+    low, high = points.min(0) - _BESIDE_M, points.max(0) + _BESIDE_M
+    rows = np.flatnonzero(
+        np.isin(cells.thing, np.unique(cells.thing[thing.cells]))
+        & ((side.points > low) & (side.points < high)).all(1)
+    )
+    _, alike = _fits(rows, pose.apply(side.points[rows]), side, there.side, params)
+    rows = rows[alike]
+    if not len(rows):
+        return thing
+    # Only what hangs together with the rest of it.
+    every = np.union1d(rows, thing.cells)
+    labels = components(side.points[every], _TAKES_M)
+    mine = np.unique(labels[np.isin(every, thing.cells)])
+    every = every[np.isin(labels, mine)]
+    near = cKDTree(side.points[every])
+    moved, painted = thing.moved, thing.painted
+    for other in here.things:
+        inside = other.cells[np.isfinite(near.query(side.points[other.cells], distance_upper_bound=0.06)[0])]
+        every = np.union1d(every, inside)
+        moved = np.union1d(moved, np.intersect1d(other.moved, inside))
+        painted = np.union1d(painted, np.intersect1d(other.painted, inside))
+    return replace(thing, cells=every, moved=moved, painted=painted)
 
 
 def _without(things: list[Thing], gone: Thing) -> list[Thing]:
@@ -136,11 +175,11 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
     if not there.things:
         return None
     changed = np.unique(np.concatenate([t.cells for t in there.things]))
-    features = _features(here.side, seed.cells)
-    coarse, fine = (features[:: max(1, len(features) // count)] for count in (_COARSE, _FINE))
+    whole = _features(here.side, seed.cells)
+    coarse, fine = (whole[:: max(1, len(whole) // count)] for count in (_COARSE, _FINE))
     hopes = []
     for _, pose in voted(
-        features[:, :3],
+        here.points(seed),
         here.side.colours[seed.cells],
         there.side.points[changed],
         there.side.colours[changed],
@@ -173,14 +212,16 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
     score, pose, mine, theirs = best
     runner_up = max((s for s, p in scores if _differ(p, pose, points)), default=0.0)
     symmetry = _symmetry(mine, theirs, here, there, pose, score, params)
+    if symmetry == "none" and runner_up > params.most_ambiguous * score:
+        return None
     if back:
         return Move(theirs, mine, pose.inverse(), score, runner_up, symmetry)
     return Move(mine, theirs, pose, score, runner_up, symmetry)
 
 
-def _near(features: np.ndarray, tree: Any, pose: Sim3) -> float:
+def _near(moving: np.ndarray, tree: Any, pose: Sim3) -> float:
     """How close cells come to cells of their colour, in [0, 1]."""
-    moved = np.concatenate([pose.apply(features[:, :3]), features[:, 3:]], axis=1)
+    moved = np.concatenate([pose.apply(moving[:, :3]), moving[:, 3:]], axis=1)
     distance, _ = tree.query(moved, distance_upper_bound=0.1)
     return float((1 - np.minimum(distance, 0.1) / 0.1).mean())
 
@@ -212,17 +253,28 @@ def _score(mine: Thing, theirs: Thing, here: _Capture, there: _Capture, pose: Si
 
 def _agreement(thing: Thing, here: _Capture, there: _Capture, pose: Sim3, params: Params) -> float:
     rows = thing.cells[:: max(1, len(thing.cells) // _JUDGED)]
-    moved, colours = pose.apply(here.side.points[rows]), here.side.colours[rows]
-    distance, near = there.side.tree.query(moved, k=4, distance_upper_bound=1.5 * params.moved_within_m)
-    on = np.isfinite(distance[:, 0])
-    apart = np.linalg.norm(there.side.colours[np.minimum(near, len(there.side) - 1)] - colours[:, None], axis=2)
-    fits = on & (np.where(np.isfinite(distance), apart, np.inf).min(1) < _ALIKE)
+    moved = pose.apply(here.side.points[rows])
+    on, alike = _fits(rows, moved, here.side, there.side, params)
     through = ~on
     through[~on] = _looked_through(moved[~on], there.looks)
     seen = int((on | through).sum())
     if seen < min(0.7 * _FEWEST, 0.3 * len(rows)):
         return 0.0
-    return float(fits.sum() / seen)
+    return float(alike.sum() / seen)
+
+
+def _fits(
+    rows: np.ndarray, moved: np.ndarray, side: Side, other: Side, params: Params
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which cells, where they have moved to (N, 3), lie on the other capture's surface, and which on their colour."""
+    distance, near = other.tree.query(moved, k=4, distance_upper_bound=1.5 * params.moved_within_m)
+    on = np.isfinite(distance[:, 0])
+    theirs = other.tints[np.minimum(near, len(other) - 1)]
+    apart = theirs - side.tints[rows][:, None]
+    if on.sum() >= _FEWEST:  # Where it stands now it may be lighter or darker.
+        apart[..., 0] -= np.clip(np.median(apart[on, 0, 0]), -_DARKER, _DARKER)
+    unlike = np.where(np.isfinite(distance), np.linalg.norm(apart, axis=2), np.inf).min(1)
+    return on, on & (unlike < _ALIKE)
 
 
 def _looked_through(points: np.ndarray, looks: Looks) -> np.ndarray:
@@ -240,13 +292,13 @@ def _symmetry(
 ) -> Literal["none", "half", "any"]:
     """Whether the thing, turned about its own middle, fits as well."""
     points = here.points(mine)
-    features = _features(here.side, mine.cells)[:: max(1, len(points) // _FINE)]
+    fine = _features(here.side, mine.cells)[:: max(1, len(points) // _FINE)]
     middle = 0.5 * (np.quantile(points, 0.02, axis=0) + np.quantile(points, 0.98, axis=0))
     fits = []
     for turn in (np.pi, np.pi / 3, -np.pi / 2):
         rotation = about_up(turn)
         turned = pose @ Sim3(rotation, middle - rotation @ middle)
-        laid = settled(features, there.tree, turned, (0.12, 0.1, 0.08, 0.06))
+        laid = settled(fine, there.tree, turned, (0.12, 0.1, 0.08, 0.06))
         stays = np.linalg.norm(laid.apply(middle) - pose.apply(middle)) < _APART_M
         yaw = np.arctan2(*(laid.rotation @ turned.rotation.T)[[1, 0], 0])
         good = stays and abs(yaw) < 0.3

@@ -9,11 +9,22 @@ import numpy as np
 
 from gsmap.types import Sim3
 
-TINT_M = 0.2
-"""Metres that a difference of colour of 1 counts for, where neighbours are looked for."""
+_TINT_M = 0.25  # metres that a difference of hue of 1 counts for, where neighbours are looked for
+_LIGHT = 0.5  # and of lightness so much of it: elsewhere a thing stands in another light
+
+
+def tints(colours: np.ndarray) -> np.ndarray:
+    """(N, 3) lightness and two of hue, in which the distance says how unlike two colours (N, 3) in [0, 1] are."""
+    light, green = colours.mean(1), colours[:, 1]
+    return np.stack([_LIGHT * light, 0.8 * (colours[:, 0] - green), 0.8 * (colours[:, 2] - green)], axis=1)
+
+
+def features(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """(N, 6) place and tint, both in metres."""
+    return np.concatenate([points, tints(colours) * _TINT_M], axis=1)
 
 _VOTERS, _VOTED = 150, 900  # cells that vote, and that are voted for
-_LEVEL_M, _TINT = 0.06, 0.12  # a pair of cells votes if their heights and colours differ by less
+_LEVEL_M, _TINT = 0.06, 0.1  # a pair of cells votes if their heights and colours differ by less
 _BIN_M = 0.1
 _PEAKS = 2  # of each yaw
 _LOW_M = 0.25  # what stands higher may stand at another height afterwards
@@ -40,7 +51,7 @@ def voted(
     """
     mine, theirs = _few(len(points), _VOTERS), _few(len(onto), _VOTED)
     a, b = points[mine], onto[theirs]
-    alike = ((colours[mine][:, None] - onto_colours[theirs][None]) ** 2).sum(2) < _TINT**2
+    alike = ((tints(colours[mine])[:, None] - tints(onto_colours[theirs])[None]) ** 2).sum(2) < _TINT**2
     rise = b[None, :, 2] - a[:, None, 2]
     levels = [0.0]
     if len(a) and np.quantile(a[:, 2], 0.03) > _LOW_M and alike.any():
@@ -85,22 +96,22 @@ def _peaks(shift: np.ndarray, weight: np.ndarray) -> list[tuple[float, np.ndarra
     return found
 
 
-def settled(features: np.ndarray, target: Any, start: Sim3, radii_m: Sequence[float]) -> Sim3:
+def settled(moving: np.ndarray, target: Any, start: Sim3, radii_m: Sequence[float]) -> Sim3:
     """Point-to-point ICP over yaw and shift; neighbours are near in place and colour.
 
     Args:
-        features: (N, 6) place and colour times `TINT_M`.
-        target: cKDTree of such features.
+        moving: (N, 6) `features`.
+        target: cKDTree of the other's.
         radii_m: one step at each.
     """
     pose = start
     for radius in radii_m:
-        moved = pose.apply(features[:, :3])
-        distance, row = target.query(np.concatenate([moved, features[:, 3:]], axis=1), distance_upper_bound=2 * radius)
+        moved = pose.apply(moving[:, :3])
+        distance, row = target.query(np.concatenate([moved, moving[:, 3:]], axis=1), distance_upper_bound=2 * radius)
         hit = np.isfinite(distance)
         if hit.sum() < 10:
             return pose
-        source, onto = features[hit, :3], target.data[row[hit], :3]
+        source, onto = moving[hit, :3], target.data[row[hit], :3]
         weight = 1 / (1 + (distance[hit] / (0.5 * radius)) ** 2) ** 2
         mean_s, mean_t = (np.average(p, axis=0, weights=weight) for p in (source, onto))
         s, t = source - mean_s, onto - mean_t

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.change.params import Params
+from gsmap.change.poses import tints
 from gsmap.compare import Comparison, Looks, Pictured, View
 from gsmap.compare.colours import Balance
 from gsmap.geometry.cells import cell_labels, group_means
@@ -52,6 +53,11 @@ class Side:
     @cached_property
     def tree(self) -> Any:
         return cKDTree(self.points) if len(self.points) else cKDTree(np.full((1, 3), np.inf))
+
+    @cached_property
+    def tints(self) -> np.ndarray:
+        """(M, 3) of the colours; see `gsmap.change.poses.tints`."""
+        return tints(self.colours)
 
     @cached_property
     def normals(self) -> np.ndarray:

@@ -21,6 +21,7 @@ _BOX_M = 0.1  # ... but not what lies farther than this beyond all that has
 _SAME_M = 0.15  # ... nor what is the same as ever and lies farther from what changed
 _LINK_M = 0.08  # cells of one thing, where nothing but the room's shell is between things
 _RING_M = (0.04, 0.12)  # how far from a change of colour its surroundings begin and end
+_MOST = 0.35
 _MUCH, _MANY = 0.25, 100  # of a thing, and cells: so much of it does not change its colour by a shadow
 _LIT_OTHERWISE = 0.035  # spread of what agrees, beyond which the whole place is lit otherwise
 _DARK = 0.8  # a change that is lightness to this share may be a shadow, a lamp, or a window at night
@@ -181,7 +182,8 @@ def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params)
 def is_paint(paint: Paint, line: Balance, params: Params) -> bool:
     """Whether a change of colour is paint, and neither light nor a texture that two trainings show differently."""
     if not paint.is_shell and paint.share >= _MUCH and sum(map(len, paint.cells)) >= _MANY:
-        return paint.strength >= 0.75 * params.min_paint and paint.leak <= 2.5 * params.most_leak
+        less = 0.6 if paint.share >= _MOST and paint.coherence >= _COHERENT else 0.75
+        return paint.strength >= less * params.min_paint and paint.leak <= 2.5 * params.most_leak
     least = params.min_paint
     if max(line.chroma_spread, line.lightness_spread) > _LIT_OTHERWISE:
         least *= 1.6
