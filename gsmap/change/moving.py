@@ -28,7 +28,10 @@ _AS_GOOD = 0.92  # a pose that scores this share of the best is not told from it
 _LEAST_M = 0.08  # a thing that was moved by less, and not turned, was not moved
 _APART_M = 0.15  # the middle of a symmetric thing stays this near
 _BESIDE_M = 0.5  # how far beyond a moved thing more of it is looked for
-_TAKES_M, _TAKES = 0.1, 0.5  # what lies, to this share, so close to where a thing moved is a part of it
+_TAKES_M = 0.1  # what lies so close to where a thing moved is a part of it
+_PIECES_M = 0.4  # pieces so close to each other that went the same way are one thing's
+_ROUNDS = 2
+_NUDGE = 0.35  # radians
 _PANEL_M = 0.15, 1.0  # what is thinner and higher is a door: it opens and shuts
 
 
@@ -87,13 +90,51 @@ def find_moves(
     a = _Capture.of(sides[0], cells[0], looks[0], older)
     b = _Capture.of(sides[1], cells[1], looks[1], newer)
     moves: list[Move] = []
-    while True:
-        found = [m for m in (_best_from(a, b, False, params), _best_from(b, a, True, params)) if m is not None]
-        if not found:
-            return moves, a.things, b.things
-        move = _completed(max(found, key=lambda m: m.score), a, b, params)
-        a.things, b.things = _without(a.things, move.older), _without(b.things, move.newer)
-        moves.append(move)
+    for _ in range(_ROUNDS):
+        found = _moves_from(a, b, False, params) + _moves_from(b, a, True, params)
+        news = []
+        for move in sorted(found, key=lambda m: -m.score):
+            if not any(_overlap(move, other, a, b) for other in moves + news):
+                news.append(_completed(move, a, b, params))
+                a.things, b.things = _without(a.things, news[-1].older), _without(b.things, news[-1].newer)
+        if not news:
+            break
+        moves += news
+    return _united(moves, a, b), a.things, b.things
+
+
+def _moves_from(here: _Capture, there: _Capture, back: bool, params: Params) -> list[Move]:
+    """The moves of each thing of one capture to the other; ``back`` where it is the newer."""
+    found = (_moved(seed, here, there, back, params) for seed in _seeds(here))
+    return [move for move in found if move is not None]
+
+
+def _overlap(move: Move, other: Move, a: _Capture, b: _Capture) -> bool:
+    """Whether a move is of a thing of which another move, of another kind, has been found."""
+    same = not _differ(move.S_after_before, other.S_after_before, a.points(move.older))
+    for capture, mine, theirs in ((a, move.older, other.older), (b, move.newer, other.newer)):
+        if len(np.intersect1d(mine.cells, theirs.cells)) > 0.3 * min(len(mine.cells), len(theirs.cells)):
+            return True
+        near = cKDTree(capture.points(theirs)).query(capture.points(mine), distance_upper_bound=_TAKES_M)[0]
+        if not same and np.isfinite(near).mean() > 0.5:
+            return True
+    return False
+
+
+def _united(moves: list[Move], a: _Capture, b: _Capture) -> list[Move]:
+    """Moves, of which those of neighbouring pieces that went the same way are one."""
+    kept: list[Move] = []
+    for move in sorted(moves, key=lambda m: -len(m.older.cells) - len(m.newer.cells)):
+        points = a.points(move.older)
+        for k, other in enumerate(kept):
+            apart = cKDTree(a.points(other.older)).query(points)[0].min()
+            if apart < _PIECES_M and not _differ(move.S_after_before, other.S_after_before, points):
+                older, newer = joined(other.older, move.older), joined(other.newer, move.newer)
+                kept[k] = replace(other, older=older, newer=newer)
+                break
+        else:
+            kept.append(move)
+    return kept
 
 
 def _completed(move: Move, a: _Capture, b: _Capture, params: Params) -> Move:
@@ -141,16 +182,6 @@ def _without(things: list[Thing], gone: Thing) -> list[Thing]:
     return left
 
 
-def _best_from(here: _Capture, there: _Capture, back: bool, params: Params) -> Move | None:
-    """The surest move of any thing of one capture to the other; ``back`` where it is the newer."""
-    best: Move | None = None
-    for seed in _seeds(here):
-        move = _moved(seed, here, there, back, params)
-        if move is not None and (best is None or move.score > best.score):
-            best = move
-    return best
-
-
 def _seeds(capture: _Capture) -> list[Thing]:
     """Things that may have moved: those that one could look through in part; and of some only that part."""
     seeds = []
@@ -177,18 +208,23 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
     changed = np.unique(np.concatenate([t.cells for t in there.things]))
     whole = _features(here.side, seed.cells)
     coarse, fine = (whole[:: max(1, len(whole) // count)] for count in (_COARSE, _FINE))
-    hopes = []
-    for _, pose in voted(
-        here.points(seed),
+    points = here.points(seed)
+    tried = voted(
+        points,
         here.side.colours[seed.cells],
         there.side.points[changed],
         there.side.colours[changed],
         params.yaw_starts,
-    )[:_TRIED]:
+    )
+    starts = [pose for _, pose in tried[:_TRIED]]
+    # Pushed or turned a little: most votes are then for what did not change.
+    middle = points.mean(0)
+    starts += [Sim3(about_up(yaw), middle - about_up(yaw) @ middle) for yaw in (-_NUDGE, 0.0, _NUDGE)]
+    hopes = []
+    for pose in starts:
         laid = settled(coarse, there.tree, pose, (0.2, 0.15, 0.12, 0.1))
         hopes.append((_near(coarse, there.tree, laid), laid))
     kept: list[Sim3] = []
-    points = here.points(seed)
     for _, pose in sorted(hopes, key=lambda h: -h[0]):
         if len(kept) < _KEPT and all(_differ(pose, other, points) for other in kept):
             kept.append(pose)
@@ -201,16 +237,17 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
         theirs = _covered(there, points, pose)
         if theirs is None:
             continue
-        more = _covered(here, there.points(theirs), pose.inverse())
-        mine = seed if more is None else joined(seed, more)
+        mine = joined(seed, _covered(here, there.points(theirs), pose.inverse(), whole=2.0) or seed)
         score = _score(mine, theirs, here, there, pose, params)
         scores.append((score, pose))
         if best is None or score > best[0]:
             best = score, pose, mine, theirs
-    if best is None or best[0] < params.min_moved:
+    if best is None:
         return None
     score, pose, mine, theirs = best
     runner_up = max((s for s, p in scores if _differ(p, pose, points)), default=0.0)
+    if score < params.min_moved + 0.1 * runner_up / max(score, 1e-6) or min(len(mine.moved), len(theirs.moved)) < 12:
+        return None
     symmetry = _symmetry(mine, theirs, here, there, pose, score, params)
     if symmetry == "none" and runner_up > params.most_ambiguous * score:
         return None
@@ -232,13 +269,13 @@ def _differ(a: Sim3, b: Sim3, points: np.ndarray) -> bool:
     return bool(np.linalg.norm(a.apply(few) - b.apply(few), axis=1).mean() > 0.15)
 
 
-def _covered(capture: _Capture, points: np.ndarray, pose: Sim3) -> Thing | None:
-    """What of a capture's things lies where points come to lie: those that do as a whole."""
+def _covered(capture: _Capture, points: np.ndarray, pose: Sim3, whole: float = 0.5) -> Thing | None:
+    """What of a capture's things lies where points come to lie: things as a whole, of which this share does."""
     tree = cKDTree(pose.apply(points))
     taken = []
     for thing in capture.things:
         near = np.isfinite(tree.query(capture.points(thing), distance_upper_bound=_TAKES_M)[0])
-        if near.mean() >= _TAKES:
+        if near.mean() >= whole:
             taken.append(thing)
         elif near.sum() >= _FEWEST:
             taken.append(parts(thing, thing.cells[near])[0])

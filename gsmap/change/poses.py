@@ -25,6 +25,7 @@ def features(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
 
 _VOTERS, _VOTED = 150, 900  # cells that vote, and that are voted for
 _LEVEL_M, _TINT = 0.06, 0.1  # a pair of cells votes if their heights and colours differ by less
+_SINK_M = 0.04
 _BIN_M = 0.1
 _PEAKS = 2  # of each yaw
 _LOW_M = 0.25  # what stands higher may stand at another height afterwards
@@ -119,5 +120,8 @@ def settled(moving: np.ndarray, target: Any, start: Sim3, radii_m: Sequence[floa
             (weight * (s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])).sum(), (weight * (s[:, :2] * t[:, :2]).sum(1)).sum()
         )
         rotation = about_up(float(yaw))
-        pose = Sim3(rotation, mean_t - rotation @ mean_s)
+        shift = mean_t - rotation @ mean_s
+        # What stands on a floor does not sink or rise; only its height was measured differently.
+        shift[2] = np.clip(shift[2], start.translation[2] - _SINK_M, start.translation[2] + _SINK_M)
+        pose = Sim3(rotation, shift)
     return pose
