@@ -29,9 +29,10 @@ _LEAST_M = 0.08  # a thing that was moved by less, and not turned, was not moved
 _APART_M = 0.15  # the middle of a symmetric thing stays this near
 _BESIDE_M = 0.5  # how far beyond a moved thing more of it is looked for
 _TAKES_M = 0.1  # what lies so close to where a thing moved is a part of it
+_ABOUT_M = 0.3  # around the place where a thing stood
 _PIECES_M = 0.4  # pieces so close to each other that went the same way are one thing's
 _ROUNDS = 2
-_NUDGE = 0.35  # radians
+_NUDGES = (-0.5, -0.25, 0.0, 0.25, 0.5)  # radians, for what was turned where it stands
 _PANEL_M = 0.15, 1.0  # what is thinner and higher is a door: it opens and shuts
 
 
@@ -157,6 +158,9 @@ def _with_more(thing: Thing, here: _Capture, there: _Capture, pose: Sim3, params
     rows = rows[alike]
     if not len(rows):
         return thing
+    # What does not fit, and lies by nothing that does, belongs to something else.
+    fits = np.isfinite(cKDTree(side.points[rows]).query(points, distance_upper_bound=_TAKES_M)[0])
+    thing, _ = parts(thing, thing.cells[fits])
     # Only what hangs together with the rest of it.
     every = np.union1d(rows, thing.cells)
     labels = components(side.points[every], _TAKES_M)
@@ -205,21 +209,21 @@ def _is_panel(points: np.ndarray) -> bool:
 def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Params) -> Move | None:
     if not there.things:
         return None
-    changed = np.unique(np.concatenate([t.cells for t in there.things]))
+    points = here.points(seed)
+    onto = _targets(there, points)
     whole = _features(here.side, seed.cells)
     coarse, fine = (whole[:: max(1, len(whole) // count)] for count in (_COARSE, _FINE))
-    points = here.points(seed)
     tried = voted(
         points,
         here.side.colours[seed.cells],
-        there.side.points[changed],
-        there.side.colours[changed],
+        there.side.points[onto],
+        there.side.colours[onto],
         params.yaw_starts,
     )
     starts = [pose for _, pose in tried[:_TRIED]]
     # Pushed or turned a little: most votes are then for what did not change.
     middle = points.mean(0)
-    starts += [Sim3(about_up(yaw), middle - about_up(yaw) @ middle) for yaw in (-_NUDGE, 0.0, _NUDGE)]
+    starts += [Sim3(about_up(yaw), middle - about_up(yaw) @ middle) for yaw in _NUDGES]
     hopes = []
     for pose in starts:
         laid = settled(coarse, there.tree, pose, (0.2, 0.15, 0.12, 0.1))
@@ -245,6 +249,10 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
     if best is None:
         return None
     score, pose, mine, theirs = best
+    polished = settled(fine, there.tree, pose, (0.06,) * 10)
+    again = _score(mine, theirs, here, there, polished, params)
+    if again > score:
+        score, pose = again, polished
     runner_up = max((s for s, p in scores if _differ(p, pose, points)), default=0.0)
     if score < params.min_moved + 0.1 * runner_up / max(score, 1e-6) or min(len(mine.moved), len(theirs.moved)) < 12:
         return None
@@ -254,6 +262,16 @@ def _moved(seed: Thing, here: _Capture, there: _Capture, back: bool, params: Par
     if back:
         return Move(theirs, mine, pose.inverse(), score, runner_up, symmetry)
     return Move(mine, theirs, pose, score, runner_up, symmetry)
+
+
+def _targets(there: _Capture, points: np.ndarray) -> np.ndarray:
+    """Cells that a thing's may have become: what changed, and what stands where it stood."""
+    changed = np.concatenate([t.cells for t in there.things])
+    side = there.side
+    low, high = points.min(0) - _ABOUT_M, points.max(0) + _ABOUT_M
+    beside = np.flatnonzero((there.cells.plane < 0) & ((side.points > low) & (side.points < high)).all(1))
+    out: np.ndarray = np.union1d(changed, beside)
+    return out
 
 
 def _near(moving: np.ndarray, tree: Any, pose: Sim3) -> float:
