@@ -91,8 +91,9 @@ def find_moves(
     a = _Capture.of(sides[0], cells[0], looks[0], older)
     b = _Capture.of(sides[1], cells[1], looks[1], newer)
     moves: list[Move] = []
+    asked: set[bytes] = set()
     for _ in range(_ROUNDS):
-        found = _moves_from(a, b, False, params) + _moves_from(b, a, True, params)
+        found = _moves_from(a, b, False, asked, params) + _moves_from(b, a, True, asked, params)
         news = []
         for move in sorted(found, key=lambda m: -m.score):
             if not any(_overlap(move, other, a, b) for other in moves + news):
@@ -104,10 +105,16 @@ def find_moves(
     return _united(moves, a, b), a.things, b.things
 
 
-def _moves_from(here: _Capture, there: _Capture, back: bool, params: Params) -> list[Move]:
-    """The moves of each thing of one capture to the other; ``back`` where it is the newer."""
-    found = (_moved(seed, here, there, back, params) for seed in _seeds(here))
-    return [move for move in found if move is not None]
+def _moves_from(here: _Capture, there: _Capture, back: bool, asked: set[bytes], params: Params) -> list[Move]:
+    """The moves of each thing of one capture, but those ``asked`` before; ``back`` where it is the newer."""
+    found = []
+    for seed in _seeds(here):
+        name = bytes([back]) + seed.cells.tobytes()
+        if name not in asked:
+            asked.add(name)
+            move = _moved(seed, here, there, back, params)
+            found += [move] if move is not None else []
+    return found
 
 
 def _overlap(move: Move, other: Move, a: _Capture, b: _Capture) -> bool:

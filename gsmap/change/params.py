@@ -30,7 +30,7 @@ class Params:
         min_confidence: changes less sure than this are not reported.
     """
 
-    compare: compare.Params = field(default_factory=lambda: compare.Params(longest_side_px=160))
+    compare: compare.Params = field(default_factory=lambda: compare.Params(longest_side_px=160, max_views=40))
     cell_m: float = 0.05
     voxel_m: float = 0.1
     reach_m: float = 0.1
