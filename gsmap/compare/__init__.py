@@ -16,7 +16,7 @@ from gsmap.compare.comparing import (
 from gsmap.compare.evidence import GONE, HIDDEN, REPAINTED, SAME, UNSEEN, Evidence
 from gsmap.compare.joining import joined, outdated
 from gsmap.compare.looks import Looks, View, look
-from gsmap.compare.neighbourhoods import grown
+from gsmap.compare.neighbourhoods import grown, ranges
 from gsmap.compare.params import Params
 
 VERSION = 1
@@ -46,4 +46,5 @@ __all__ = [
     "joined",
     "look",
     "outdated",
+    "ranges",
 ]

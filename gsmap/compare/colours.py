@@ -45,7 +45,7 @@ class Balance:
         return np.clip(out, 0, 1).astype(np.float32)
 
     def differences(self, a: np.ndarray, b: np.ndarray, both: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far two pictures (H, W, 3) of one view differ in chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
+        """How far two pictures (H, W, 3) of one view differ: chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
 
         Ratios, so that shading cancels in the chroma, times the brightness, for nobody sees the hue of what is black.
         Only what no pixel nearby explains counts: texture that lies half a pixel off is no paint.
@@ -118,8 +118,16 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
     return Balance(slope, offset, spread, 1.4826 * float(np.median(np.abs(lightness))))
 
 
+def limits(line: Balance, params: Params) -> tuple[float, float]:
+    """Differences of chroma and of lightness that light and noise explain."""
+    return (
+        max(params.min_chroma, params.chroma_spreads * line.chroma_spread),
+        max(params.min_lightness, params.lightness_spreads * line.lightness_spread),
+    )
+
+
 def differ(line: Balance, chroma: np.ndarray, lightness: np.ndarray, params: Params) -> np.ndarray:
     """Where colours differ by more than light and noise explain."""
-    return (np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1])) > max(params.min_chroma, params.colour_spreads * line.chroma_spread)) | (
-        np.abs(lightness) > max(params.min_lightness, params.colour_spreads * line.lightness_spread)
-    )
+    most = np.maximum(np.abs(chroma[..., 0]), np.abs(chroma[..., 1]))
+    out: np.ndarray = (most > limits(line, params)[0]) | (np.abs(lightness) > limits(line, params)[1])
+    return out

@@ -71,7 +71,10 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
     params = params or Params()
     surfaces = {id(one): _surface(one) for one in (older, newer)}
     crossed = [
-        [(own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)], params)) for i in range(len(own.views))]
+        [
+            (own.views[i], own.sure[i], _seen_by(own.views[i], *surfaces[id(other)], params))
+            for i in range(len(own.views))
+        ]
         for own, other in ((older, newer), (newer, older))
     ]
     tolerance = _tolerance([pair for pairs in crossed for pair in pairs], params)
@@ -87,7 +90,7 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             _count(judged, at, picture, sure, tolerance)
             _count_colour(judge, own, picture, tolerance)
     evidence = [
-        tally.evidence(one.gaussians.means, one.surface, params)
+        tally.evidence(one.gaussians.means, one.surface, line, params)
         for tally, one in zip(tallies, (older, newer), strict=True)
     ]
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.compare.colours import Balance, limits
 from gsmap.compare.params import Params
-from gsmap.geometry.voxels import voxel_labels
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
@@ -51,7 +51,9 @@ class Tally:
         self.through = np.zeros(count, dtype=np.int32)
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
-        self.grazed = np.zeros(count, dtype=np.int32)  # views in which it is before the surface, though perhaps at an edge
+        self.grazed = np.zeros(
+            count, dtype=np.int32
+        )  # views in which it is before the surface, though perhaps at an edge
         self.covered = np.zeros(count, dtype=np.int32)  # on the surface, but its own capture shows something before it
         self.sure = np.zeros(count, dtype=np.int32)
         self.sharpness = np.zeros(count, dtype=np.float32)
@@ -59,7 +61,7 @@ class Tally:
         self.chroma = np.zeros((count, 2), dtype=np.float32)
         self.lightness = np.zeros(count, dtype=np.float32)
 
-    def evidence(self, points: np.ndarray, shows: np.ndarray, params: Params) -> Evidence:
+    def evidence(self, points: np.ndarray, shows: np.ndarray, line: Balance, params: Params) -> Evidence:
         """The counts and what they come to; ``shows`` (N,) says which Gaussians are part of a surface and vote."""
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
@@ -70,7 +72,8 @@ class Tally:
         state[(state == SAME) & (self.covered > self.colour_seen) & (beside | (self.through >= 1))] = GONE
         same = state == SAME
         seen = same & (self.colour_seen >= 1) & shows
-        differs = _differs(np.column_stack([chroma, lightness]), seen, near, params)
+        limit = limits(line, params)
+        differs = np.maximum(np.abs(chroma).max(1) / limit[0], np.abs(lightness) / limit[1])
         state[same & (near.mean(np.where(seen, differs, 0), seen) >= 1) & (differs >= _PART)] = REPAINTED
         # What differs less, and alone, is noise; beside what is sure it is its border.
         for _ in range(_ROUNDS):
@@ -104,12 +107,11 @@ class _Neighbours:
 
         self.rows = np.flatnonzero(shows)
         self.index = np.zeros((len(points), 0), dtype=np.int64)
-        self.distance = np.zeros((len(points), 0))
         if len(self.rows):
             tree = cKDTree(points[self.rows])
             count = min(params.neighbours, len(self.rows))
-            self.distance, self.index = tree.query(points, count, distance_upper_bound=params.cell_m)
-            self.distance, self.index = (v.reshape(len(points), -1) for v in (self.distance, self.index))
+            index = tree.query(points, count, distance_upper_bound=params.cell_m)[1]
+            self.index = np.asarray(index, dtype=np.int64).reshape(len(points), -1)
 
     @property
     def count(self) -> np.ndarray:
@@ -128,21 +130,6 @@ class _Neighbours:
         padded = np.concatenate([values[self.rows], np.zeros_like(values[:1])])
         out: np.ndarray = padded[self.index].sum(1, dtype=np.float64)
         return out
-
-
-def _differs(own: np.ndarray, seen: np.ndarray, near: _Neighbours, params: Params) -> np.ndarray:
-    """(N,) by how much colours differ, where 1 is more than light and noise explain.
-
-    Args:
-        own: (N, 3) mean differences, two of chroma and one of lightness.
-        seen: (N,) which have one.
-    """
-    if not seen.any():
-        return np.zeros(len(own))
-    spread = 1.4826 * np.median(np.abs(own[seen]), axis=0)
-    limit = np.maximum([params.min_chroma, params.min_chroma, params.min_lightness], params.colour_spreads * spread)
-    out: np.ndarray = (np.abs(own) / limit).max(1)
-    return out
 
 
 def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray, doubtful: np.ndarray) -> None:

@@ -23,8 +23,9 @@ class Params:
         tolerance_share: and this share of the depth more.
         min_views: views that must agree before anything is concluded, and that must have seen a surface well.
         min_share: of the views that could judge, these must agree.
-        min_chroma, min_lightness: colours, in [0, 1], that differ by less after exposure is balanced are one;
-        colour_spreads: nor do those within that many robust standard deviations of what agrees.
+        min_chroma, min_lightness: colours, in [0, 1], that differ by less after exposure is balanced are one,
+        chroma_spreads, lightness_spreads: and so are those within that many robust standard deviations of the pair's
+            own differences, which are large where one was lit otherwise.
         cell_m: Gaussians that near vote together,
         neighbours: at most so many of them.
     """
@@ -42,7 +43,8 @@ class Params:
     min_share: float = 0.6
     min_chroma: float = 0.06
     min_lightness: float = 0.2
-    colour_spreads: float = 4.0
+    chroma_spreads: float = 3.0
+    lightness_spreads: float = 5.0
     cell_m: float = 0.12
     neighbours: int = 16
 

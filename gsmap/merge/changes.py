@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from gsmap import compare
-from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, UNSEEN, Comparison, Looks
+from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.placed import overlapping
 from gsmap.render import render
@@ -20,7 +20,9 @@ Prefer = Literal["newest", "best", "both"]
 """Who wins where captures disagree: the ``newest``, whoever saw it ``best``, or nobody, so that ``both`` show."""
 
 _SHOWS = 0.1  # share of a pixel from which on what is disputed shows in it
+_NEAR_M = 0.25  # of what changed, within which shards of it are looked for
 _NEGLIGIBLE_GAIN = 0.01
+_INTRUDES = 0.15  # difference of colour, of [0, 1], by which a picture has become another
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class Settled:
             if len(others):
                 disputed |= _share_of_pixels(others, own, small) > _SHOWS
         # A Gaussian's skirts reach beyond the pixels in which it shows.
-        disputed = compare.grown(disputed, 1)
+        disputed = compare.grown(disputed)
         rows = ((np.arange(height) + 0.5) * disputed.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * disputed.shape[1] / width).astype(int)
         out: np.ndarray = disputed[np.ix_(rows, columns)]
@@ -94,12 +96,15 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
             found = compare.compare(looks, joined, params)
             verdict = _verdict(looks, joined, found, prefer)
             keeps[i] &= ~verdict.lost
+            if prefer == "newest":
+                keeps[i] &= ~_intruders(scenes[i].gaussians, keeps[i], joined, found, verdict)
             first = 0
             for one in parts:
                 rows = np.flatnonzero(one.shows)
                 mine = slice(first, first + len(rows))
                 changed[one.scene][rows[verdict.changed[mine]]] = True
                 keeps[one.scene][rows[verdict.beaten[mine]]] = False
+                one.shows[rows[verdict.beaten[mine]]] = False
                 first += len(rows)
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
             # Truth grows by what is new to it alone, so that it stays as large as the place.
@@ -135,7 +140,8 @@ class _Verdict:
 
 def _verdict(older: Looks, newer: Looks, found: Comparison, prefer: Prefer) -> _Verdict:
     lost = np.isin(found.older.state, (GONE, REPAINTED))
-    changed = np.isin(found.newer.state, (GONE, REPAINTED)) | _revealed(newer, found)
+    changed = np.isin(found.newer.state, (GONE, REPAINTED))
+    changed |= (found.newer.state != SAME) & _revealed(newer, found)
     beaten = np.zeros(len(changed), dtype=bool)
     if prefer == "best":
         stays = lost & (older.sharpness > found.older.sharpness)
@@ -154,6 +160,41 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
         bare = (picture.outcome == OTHER_BEFORE) & (dominant >= 0)
         bared += np.bincount(dominant[bare], minlength=count)
     out: np.ndarray = (bared >= 2) & (bared >= 0.2 * shown)
+    return out
+
+
+def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict) -> np.ndarray:
+    """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
+
+    A last look at what evidence of single Gaussians leaves: shards at edges, what is smaller than a tolerance.
+    """
+    rows = np.flatnonzero(stays)
+    count = len(newer.gaussians)
+    together = Gaussians.concatenate([newer.gaussians, older[rows]])
+    good, bad = np.zeros(len(rows)), np.zeros(len(rows))
+    for view in newer.views:
+        seen = render(together, view.camera, depth=False)
+        shown = seen.dominant_id[0]
+        theirs = view.opaque & (shown >= count)
+        low, high = compare.ranges(view.colour)
+        colour = np.clip(seen.colour[0][theirs], 0, 1)
+        worse = (np.maximum(low[theirs] - colour, colour - high[theirs]) > _INTRUDES).any(1)
+        shown = shown[theirs] - count
+        bad += np.bincount(shown[worse], minlength=len(rows))
+        good += np.bincount(shown[~worse], minlength=len(rows))
+    out = np.zeros(len(older), dtype=bool)
+    out[rows[bad > good]] = True
+    from scipy.spatial import cKDTree
+
+    disputed = np.concatenate([older.means[verdict.lost], newer.gaussians.means[verdict.changed]])
+    at = np.flatnonzero(out)
+    if len(at):
+        reach = (
+            cKDTree(disputed).query(older.means[at], distance_upper_bound=_NEAR_M)[0]
+            if len(disputed)
+            else np.full(len(at), np.inf)
+        )
+        out[at[np.isinf(reach)]] = False
     return out
 
 
