@@ -52,6 +52,7 @@ class ThinReport(Row):
     Args:
         dry_run: whether nothing was changed.
         scenes: the captures that were old enough, oldest first.
+        num_undated: captures without a date, which stay as they are.
         num_bytes: of the arrays and graphs of all living scenes now.
         num_bytes_freed: on disk; 0 in a dry run, or where a branch or a tag still names what was there.
         fits: whether that is within the budget.
@@ -61,6 +62,7 @@ class ThinReport(Row):
 
     dry_run: bool
     scenes: tuple[ThinRow, ...]
+    num_undated: int
     num_bytes: int
     num_bytes_freed: int
     fits: bool
