@@ -29,6 +29,8 @@ VERBS = (
     "edge",
     "prior",
     "changes",
+    "graph",
+    "history",
     "edit",
     "export",
     "list",

@@ -48,6 +48,8 @@ OBJECTS: dict[str, Object] = {
     "edge": One(rows.EdgeRow),
     "prior": Maybe("prior", rows.PriorRow),
     "changes": One(rows.ChangesReport),
+    "graph": One(rows.ObjectsReport),
+    "history": One(rows.HistoryReport),
     "edit": One(rows.SceneRow),
     "export": One(rows.ExportReport),
     "list scenes": Many("scenes", rows.SceneRow),

@@ -33,10 +33,12 @@ from gsmap.types.rows import (
     EvaluationReport,
     ExportReport,
     GraphRow,
+    HistoryReport,
     IngestRow,
     MapStatus,
     MergeReport,
     ModelRow,
+    ObjectsReport,
     PairReport,
     PoseChangeRow,
     PoseRow,
@@ -56,6 +58,8 @@ from gsmap.types.rows import (
 )
 
 if TYPE_CHECKING:
+    import networkx
+
     from gsmap.map.settings import Settings
     from gsmap.map.stages.register import Pairs
     from gsmap.view import ViewServer
@@ -402,6 +406,47 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map import changes
 
         return changes.change_arrays(self.store, changes.named(name))
+
+    # --- objects -----------------------------------------------------------------------------------------------------
+
+    def objects(self) -> ObjectsReport:
+        """``gsmap graph MAP``: things of all captures as objects of the map, and how they stand to each other.
+
+        Raises:
+            NotFoundError: the map has no poses yet.
+        """
+        from gsmap.map.objects import known_objects, objects_report
+
+        return objects_report(known_objects(self.store, self.settings, self._progress))
+
+    def graph(self) -> networkx.MultiDiGraph:
+        """The same as a `networkx.MultiDiGraph` (see `gsmap.objects.object_graph`)."""
+        from gsmap.map.objects import as_networkx, known_objects
+
+        return as_networkx(known_objects(self.store, self.settings, self._progress))
+
+    def write_graph(self, out: str | os.PathLike[str], format: str = "json") -> ObjectsReport:
+        """Write the same as ``json`` or ``graphml``, whole or not at all."""
+        from gsmap.map.objects import known_objects, objects_report, write_graph
+
+        known = known_objects(self.store, self.settings, self._progress)
+        write_graph(known, out, format)
+        return objects_report(known)
+
+    def history(self, place: str | None = None, *, box: Sequence[float] | None = None) -> HistoryReport:
+        """What stood at a place, when it was seen, and when it was gone.
+
+        Args:
+            place: an object by its id, or a point ``X,Y,Z`` of the map.
+            box: six numbers, its lowest and highest corner.
+
+        Raises:
+            ConfigError: not one place.
+            NotFoundError: no such object, or the map has no poses yet.
+        """
+        from gsmap.map.objects import history_report, known_objects
+
+        return history_report(known_objects(self.store, self.settings, self._progress), place, box)
 
     # --- export ------------------------------------------------------------------------------------------------------
 

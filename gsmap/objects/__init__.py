@@ -1,7 +1,7 @@
 """Things of captures become objects of the map: fused, looked for in every capture, related, and counted."""
 
 from gsmap.objects.fuse import Node, Placed, fuse
-from gsmap.objects.graph import object_graph
+from gsmap.objects.graph import graphml, object_graph
 from gsmap.objects.looks import Eyes, Glance, glance, judge, open_eyes
 from gsmap.objects.make import Capture, Params, make_objects, recipe_key
 from gsmap.objects.permanence import Permanence, permanence
@@ -18,6 +18,7 @@ __all__ = [
     "Relation",
     "fuse",
     "glance",
+    "graphml",
     "judge",
     "make_objects",
     "object_graph",

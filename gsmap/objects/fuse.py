@@ -48,8 +48,8 @@ class Params:
     cell_m: float = 0.12
     min_contained: float = 0.45
     min_size: float = 0.2
-    max_lab: float = 20.0
-    same_shape: float = 0.5
+    max_lab: float = 15.0
+    same_shape: float = 0.4
 
 
 def fuse(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from typing import Any
 
 from gsmap.objects.permanence import permanence
@@ -26,15 +27,23 @@ def object_graph(objects: Sequence[MapObject], dates: Mapping[str, str | None], 
     graph = nx.MultiDiGraph()
     for thing in objects:
         stays = permanence(thing, dates)
-        looks = [sighting.state for sighting in thing.sightings if sighting.state != "unseen"]
         facts: dict[str, Any] = {"kind": "object", "name": thing.name, "component": thing.component}
         facts |= {axis: float(value) for axis, value in zip("xyz", thing.position, strict=True)}
         facts |= {f"size_{axis}": float(v) for axis, v in zip("xyz", thing.box[1] - thing.box[0], strict=True)}
         facts |= {channel: float(value) for channel, value in zip("Lab", thing.colour, strict=True)}
-        facts |= {"seen": stays.seen, "looks": stays.looks, "there": bool(looks) and looks[-1] == "seen"}
+        facts |= {"seen": stays.seen, "looks": stays.looks, "there": thing.there}
         if stays.half_life_days is not None:
             facts["half_life_days"] = stays.half_life_days
         graph.add_node(thing.id, **facts)
     for relation in relations(objects, metres):
         graph.add_edge(relation.source, relation.target, kind=relation.kind)
     return graph
+
+
+def graphml(graph: Any) -> str:
+    """The graph as GraphML."""
+    import networkx as nx
+
+    text = BytesIO()
+    nx.write_graphml(graph, text)
+    return text.getvalue().decode()

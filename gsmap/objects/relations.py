@@ -43,35 +43,27 @@ def relations(objects: Sequence[MapObject], metres: float = 1.0, params: Params 
     """``on``, ``in`` and ``next to`` of objects that are there together, by their boxes (z up).
 
     Args:
-        objects: of any component; only those of one component that some capture shows both of, or that were last
-            seen by the same one, are related.
+        objects: of any component; those of one component are related that are both there still, or both gone.
         metres: per unit of the map.
     """
     params = params or Params()
     out = []
     boxes = np.array([thing.box for thing in objects]).reshape(-1, 2, 3) * metres
-    last = [_last(thing) for thing in objects]
+    size = np.maximum(boxes[:, 1] - boxes[:, 0], 1e-6)
     for i, one in enumerate(objects):
-        size = np.maximum(boxes[i, 1] - boxes[i, 0], 1e-6)
         low, high = np.maximum(boxes[:, 0], boxes[i, 0]), np.minimum(boxes[:, 1], boxes[i, 1])
         overlap = np.clip(high - low, 0, None)
-        over = overlap[:, :2].prod(1) / size[:2].prod()
-        inside = overlap.prod(1) / size.prod()
+        inside, footprint = overlap.prod(1) / size[i].prod(), overlap[:, :2].prod(1)
+        over = footprint / size[i, :2].prod()
+        apart = footprint < params.over * np.minimum(size[:, :2].prod(1), size[i, :2].prod())
         gap = np.linalg.norm(np.clip(low - high, 0, None)[:, :2], axis=1)
         for j, other in enumerate(objects):
-            if i == j or one.component != other.component or last[i] != last[j]:
+            if i == j or one.component != other.component or one.there != other.there:
                 continue
-            bigger = np.prod(boxes[j, 1] - boxes[j, 0]) > size.prod()
-            if inside[j] >= params.inside and bigger:
+            if inside[j] >= params.inside and size[j].prod() > size[i].prod():
                 out.append(Relation(one.id, "in", other.id))
             elif over[j] >= params.over and abs(boxes[i, 0, 2] - boxes[j, 1, 2]) < params.on_m:
                 out.append(Relation(one.id, "on", other.id))
-            elif i < j and gap[j] < params.next_m and overlap[j, 2] > 0 and inside[j] < params.inside:
+            elif i < j and gap[j] < params.next_m and overlap[j, 2] > 0 and apart[j]:
                 out.append(Relation(one.id, "next to", other.id))
     return out
-
-
-def _last(thing: MapObject) -> bool:
-    """Whether it is there still: the newest look at its place shows it."""
-    looks = [sighting.state for sighting in thing.sightings if sighting.state != "unseen"]
-    return bool(looks) and looks[-1] == "seen"

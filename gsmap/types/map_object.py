@@ -64,3 +64,8 @@ class MapObject:
     def looks(self) -> int:
         """Captures that show it, or looked where it stood and do not."""
         return sum(sighting.state != "unseen" for sighting in self.sightings)
+
+    @property
+    def there(self) -> bool:
+        """Whether the newest capture that looked at its place shows it."""
+        return next((s.state == "seen" for s in reversed(self.sightings) if s.state != "unseen"), False)

@@ -76,8 +76,8 @@ class Things:
         positions: (M, 3) float64 mean of the members, scene frame and unit.
         extents: (M, 2, 3) float64 lowest and highest corner around the members, scene frame and unit.
         colours: (M, 3) float32 median colour, CIE L*a*b* (D65).
-        samples: (K, 3) float64 centres of some members of each thing, scene frame and unit, thing after thing,
-        sample_colours: (K, 3) float32 their colours,
+        samples: (K, 3) float64 mean of the members in each small cell, scene frame and unit, thing after thing,
+        sample_colours: (K, 3) float32 their mean colours,
         sample_counts: (M,) int32 and how many there are of each: a thing is known by them when the capture is thinned.
         unit_m: metres per scene unit that they were found under.
 

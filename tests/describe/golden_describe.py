@@ -70,7 +70,10 @@ def _objects() -> dict[str, np.ndarray]:
 def _things() -> dict[str, np.ndarray]:
     gaussians, _ = room(n=4000)
     found = find_things(gaussians, surface_cloud(gaussians), _UP, 1.0)
-    return {name: getattr(found, name) for name in ("members", "positions", "extents", "colours", "samples", "sample_colours")}
+    return {
+        name: getattr(found, name)
+        for name in ("members", "positions", "extents", "colours", "samples", "sample_colours")
+    }
 
 
 def _segmenter() -> dict[str, np.ndarray]:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.describe.objects.structure import Structure, components, find_structure
+from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.directions import level_frame
 from gsmap.geometry.rotations import quats_to_matrices
@@ -22,7 +23,7 @@ from gsmap.types.views import Cloud
 VERSION = 1
 
 _NEIGHBOURS = 12
-_SAMPLES = 300  # of a thing: enough for the cells that it is compared by, and for looking for it
+_SAMPLE_M = 0.08  # edge of the cells of a thing's samples: finer than what they are compared by
 _WIDEST_M = 10_000.0  # a place so wide, or so far from metric, has no furniture to tell
 _BAND_M = 0.25  # the colour of a wall is told for squares of this side,
 _AROUND_M = 1.5  # from all of the wall so far to either side at that height: pictures are narrower
@@ -87,16 +88,20 @@ def find_things(
     parts = np.split(order, np.searchsorted(members[order], np.arange(count + 1)))[1:-1]
     colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[:, 0]), 0.0, 1.0))
     means = gaussians.means.astype(np.float64)
-    chosen = [p[np.linspace(0, len(p) - 1, min(len(p), _SAMPLES)).astype(int)] for p in parts]
-    samples = np.concatenate([np.zeros(0, np.int64), *chosen])
+    # One sample a cell: as many as it takes to show where a thing is, whatever its detail.
+    rows = np.flatnonzero(members >= 0)
+    cells = np.floor(means[rows] * unit_m / _SAMPLE_M).astype(np.int64)
+    labels, counts = cell_labels(np.column_stack([members[rows], cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
+    of_cell = np.empty(len(counts), np.int64)
+    of_cell[labels] = members[rows]
     return Things(
         members,
         np.array([means[p].mean(0) for p in parts]).reshape(-1, 3),
         np.array([[means[p].min(0), means[p].max(0)] for p in parts]).reshape(-1, 2, 3),
         np.array([np.median(colours[p], axis=0) for p in parts]).reshape(-1, 3),
-        means[samples],
-        colours[samples],
-        np.array([len(c) for c in chosen]),
+        group_means(means[rows], labels, counts),
+        group_means(colours[rows].astype(np.float64), labels, counts),
+        np.bincount(of_cell, minlength=count),
         unit_m,
     )
 

@@ -27,6 +27,7 @@ from gsmap.types.rows.maps import (
     TodoRow,
     ViewReport,
 )
+from gsmap.types.rows.objects import HistoryReport, ObjectRow, ObjectsReport, RelationRow, SightingRow
 from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairRef, PairReport
 from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
 from gsmap.types.rows.scenes import (
@@ -75,6 +76,7 @@ __all__ = [
     "ExportReport",
     "FactRow",
     "GraphRow",
+    "HistoryReport",
     "ImageErrorRow",
     "IngestRow",
     "InitReport",
@@ -85,6 +87,8 @@ __all__ = [
     "ModelRow",
     "NeesRow",
     "NodeRow",
+    "ObjectRow",
+    "ObjectsReport",
     "PairEventRow",
     "PairRef",
     "PairReport",
@@ -94,6 +98,7 @@ __all__ = [
     "PriorRow",
     "PruneReport",
     "PurgeReport",
+    "RelationRow",
     "RestoreReport",
     "RevisionRow",
     "Row",
@@ -102,11 +107,12 @@ __all__ = [
     "SceneReport",
     "SceneRow",
     "SettingRow",
+    "SightingRow",
     "SnapshotRow",
     "SplitReport",
-    "TileRow",
     "ThinReport",
     "ThinRow",
+    "TileRow",
     "TodoRow",
     "TrustReport",
     "UpdateReport",

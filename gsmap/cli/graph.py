@@ -1,0 +1,46 @@
+"""gsmap graph: the scene graph of the whole map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+
+
+def command(
+    map: MapPath,
+    out: Annotated[str | None, typer.Argument(metavar="[OUT]", help="The file to write it to.")] = None,
+    format: Annotated[
+        str | None,
+        typer.Option("--format", help="`json` (what --json prints) or `graphml`; by default by the file's name."),
+    ] = None,
+    sets: Sets = None,
+    preset: Preset = None,
+    json: AsJson = False,
+) -> None:
+    """Show the objects of the map, over all captures, and how they stand to each other; or write them to a file.
+
+    Example: `gsmap graph site.gsmap site.graphml`
+    """
+    from gsmap.errors import ConfigError
+
+    if format is not None and out is None:
+        raise ConfigError(f"name a file to write as {format}: gsmap graph {map} OUT --format {format}")
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
+        if out is None:
+            report = m.objects()
+        else:
+            report = m.write_graph(out, format or ("graphml" if out.endswith(".graphml") else "json"))
+            say(f"wrote {out}")
+    for note in report.notes:
+        say(note)
+    if json:
+        print_rows("graph", report, json)
+        return
+    if out is None and report.objects:
+        print_table("objects", report.objects[0].columns, report.objects)
+    if out is None and report.relations:
+        print_table("relations", report.relations[0].columns, report.relations)
+    say(f"{len(report.objects)} objects, {len(report.relations)} relations")

@@ -1,0 +1,39 @@
+"""gsmap history: what stood where, and when."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+
+
+def command(
+    map: MapPath,
+    place: Annotated[
+        str | None,
+        typer.Argument(metavar="[OBJECT|X,Y,Z]", help="An object's id (gsmap graph lists them), or a point."),
+    ] = None,
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option("--box", metavar="X0 Y0 Z0 X1 Y1 Z1", help="All that ever stood in this box."),
+    ] = None,
+    sets: Sets = None,
+    preset: Preset = None,
+    json: AsJson = False,
+) -> None:
+    """Show what stood at a place: when it was seen, when it was gone, and which captures did not look there.
+
+    Example: `gsmap history site.gsmap 1.5,0.2,0.8`
+    """
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
+        report = m.history(place, box=box)
+    for note in report.notes:
+        say(note)
+    if json:
+        print_rows("history", report, json)
+        return
+    if report.objects:
+        print_table("objects", report.objects[0].columns, report.objects)
+        print_table("sightings", report.sightings[0].columns, report.sightings)

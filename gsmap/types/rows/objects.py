@@ -1,0 +1,139 @@
+"""Objects of the map, their sightings and relations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from gsmap.types.rows.base import Row
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObjectRow(Row):
+    """One thing of the map, over all captures that show it.
+
+    Args:
+        id: 8 hex digits; captures that come later do not change it.
+        component: of the map, whose frame everything is in.
+        position: mean of its Gaussians, where it was last seen as a thing of its own.
+        size: of the box around it where it was last seen, along the map's axes.
+        colour: median colour, CIE L*a*b*.
+        seen: captures that show it.
+        looks: captures that show it, or that looked where it stood and do not.
+        there: whether the newest of these shows it.
+        first_seen: date of the oldest capture that shows it, ISO 8601; null where that has none.
+        last_seen: of the newest.
+        half_life_days: after which half of such objects are gone, by how long this one was watched; null where too few
+            looks have dates.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "id": "object",
+        "position": "position",
+        "size": "size",
+        "seen": "seen",
+        "looks": "of looks",
+        "there": "there",
+        "first_seen": "first seen",
+        "last_seen": "last seen",
+        "half_life_days": "half-life (days)",
+    }
+
+    id: str
+    component: int
+    position: np.ndarray
+    size: np.ndarray
+    colour: np.ndarray
+    seen: int
+    looks: int
+    there: bool
+    first_seen: str | None
+    last_seen: str | None
+    half_life_days: float | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RelationRow(Row):
+    """How one object stands to another; both are there still, or neither is.
+
+    Args:
+        source: id of an object.
+        relation: ``on``, ``in`` or ``next to``; the last holds both ways and is given once.
+        target: id of the other.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"source": "object", "relation": "is", "target": "object"}
+
+    source: str
+    relation: str
+    target: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ObjectsReport(Row):
+    """The scene graph of the map.
+
+    Args:
+        objects: its nodes; of each component the largest first.
+        relations: its edges.
+        notes: what a person should know, such as captures that tell nothing.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"objects": "objects", "relations": "relations"}
+
+    objects: tuple[ObjectRow, ...]
+    relations: tuple[RelationRow, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SightingRow(Row):
+    """What one capture says of one object.
+
+    Args:
+        object: id of it.
+        scene: id of the capture.
+        scene_name: of it.
+        captured_at: when it was captured, ISO 8601; null where nobody knows.
+        state: ``seen``; ``absent`` (the capture looked at or through its place, and it is not there); ``unseen`` (the
+            capture did not look there, which says nothing).
+        box_m: lowest and highest corner around it; null where it was not seen.
+        looked: share of its place that the capture looked at.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "object": "object",
+        "captured_at": "captured",
+        "scene_name": "scene",
+        "state": "state",
+        "box_m": "box",
+        "looked": "looked at",
+    }
+
+    object: str
+    scene: str
+    scene_name: str
+    captured_at: str | None
+    state: str
+    box_m: np.ndarray | None
+    looked: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HistoryReport(Row):
+    """What stood at a place, and when.
+
+    Args:
+        objects: what was ever seen there.
+        sightings: what each capture says of each of them, oldest first.
+        notes: what a person should know, such as captures that tell nothing.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"objects": "objects", "sightings": "sightings"}
+
+    objects: tuple[ObjectRow, ...]
+    sightings: tuple[SightingRow, ...]
+    notes: tuple[str, ...] = ()
