@@ -42,7 +42,6 @@ ALTERNATIVES: dict[str, Any] = {
     "register.polisher": "photometric",
     "register.proposers.graph.kinds": ("landmarks",),
     "register.proposers.graph.consistency.test": "ratio",
-    "merge.mergers.tto.prefer": "best",
 }
 """Another value of a setting that takes only certain words."""
 
