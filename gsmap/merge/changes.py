@@ -19,7 +19,7 @@ from gsmap.types import Cameras, Gaussians, PlacedScene
 Prefer = Literal["newest", "best", "both"]
 """Who wins where captures disagree: the ``newest``, whoever saw it ``best``, or nobody, so that ``both`` show."""
 
-_SHOWS = 0.1  # share of a pixel from which on what is disputed shows in it
+_SHOWS = 0.15  # share of a pixel from which on what is disputed shows in it
 _NEAR_M = 0.25  # of what changed, within which shards of it are looked for
 _NEGLIGIBLE_GAIN = 0.01
 _INTRUDES = 0.15  # difference of colour, of [0, 1], by which a picture has become another
@@ -84,7 +84,7 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
     changed = [np.zeros(len(s.gaussians), dtype=bool) for s in scenes]
     rivals = [_none(s) for s in scenes]
     truth: list[_Standing] = []
-    for group in _newest_first(scenes) if prefer != "both" else []:
+    for group in _by_date(scenes) if prefer != "both" else []:
         added = []
         for i in group:
             looks = compare.look(scenes[i], params)
@@ -218,12 +218,18 @@ def _none(scene: PlacedScene) -> Gaussians:
     return scene.gaussians[np.zeros(0, dtype=np.int64)]
 
 
-def _newest_first(scenes: Sequence[PlacedScene]) -> list[list[int]]:
+def _by_date(scenes: Sequence[PlacedScene]) -> list[list[int]]:
     """Indices of the scenes that have a date and meet another, by date, newest first; those of one date together."""
     times = {i: _time(scene.captured_at) for i, scene in enumerate(scenes)}
     dated = {i: time for i, time in times.items() if time is not None}
     groups = [[i for i, then in dated.items() if then == time] for time in sorted(set(dated.values()), reverse=True)]
     return groups if len(groups) > 1 else []
+
+
+def newest_first(scenes: Sequence[PlacedScene]) -> list[int]:
+    """Indices of all scenes, the newest first; those without a date last, in their order."""
+    times = [_time(scene.captured_at) for scene in scenes]
+    return sorted(range(len(scenes)), key=lambda i: (-t.timestamp() if (t := times[i]) else np.inf, i))
 
 
 def _time(text: str | None) -> datetime | None:
