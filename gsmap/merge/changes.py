@@ -19,6 +19,12 @@ from gsmap.types import Cameras, Gaussians, PlacedScene
 Prefer = Literal["newest", "best", "both"]
 """Who wins where captures disagree: the ``newest``, whoever saw it ``best``, or nobody, so that ``both`` show."""
 
+LOOKING_M = 10.0
+"""How far around a tile captures and cameras are read where they are compared."""
+
+MIN_CAMERAS = 12
+"""Cameras of each capture that are read at least for that, the nearest, wherever they stand."""
+
 _SHOWS = 0.15  # share of a pixel from which on what is disputed shows in it
 _NEAR_M = 0.25  # of what changed, within which shards of it are looked for
 _NEGLIGIBLE_GAIN = 0.01

@@ -42,6 +42,8 @@ ALTERNATIVES: dict[str, Any] = {
     "register.proposers.graph.kinds": ("landmarks",),
     "register.proposers.graph.consistency.test": "ratio",
     "merge.mergers.tto.prefer": "best",
+    "merge.mergers.union.prefer": "best",
+    "merge.mergers.voxel.prefer": "best",
 }
 """Another value of a setting that takes only certain words."""
 
