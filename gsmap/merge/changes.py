@@ -27,7 +27,7 @@ MIN_CAMERAS = 12
 
 _SHOWS = 0.15  # share of a pixel from which on what is disputed shows in it
 _NEAR_M = 0.25  # of what changed, within which shards of it are looked for
-_NEGLIGIBLE_GAIN = 0.01
+_NEGLIGIBLE_GAIN = 0.02
 _INTRUDES = 0.15  # difference of colour, of [0, 1], by which a picture has become another
 
 
@@ -36,7 +36,7 @@ class Settled:
     """Captures after those that disagree have been told apart.
 
     Args:
-        scenes: without the Gaussians that are overruled, in the order they were given.
+        scenes: without the Gaussians that are overruled and in the newest's exposure, in the order they were given.
         lost: how many Gaussians each lost.
         changed: per scene (N,) bool, the Gaussians that stand where another capture was overruled: nothing of an older
             capture is left there to share the work with, so they stay as they are.
@@ -83,12 +83,14 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
     From the newest capture back, each older one is compared once with what all newer ones are sure of together: N
     captures cost N comparisons. A Gaussian leaves where that looked through it, or shows its surface in another colour
     (exposure apart); with ``best`` only if it also saw the place better, and otherwise the newer's Gaussians leave.
-    What no newer capture saw stays. Captures without a date, or of one date, overrule nothing.
+    What no newer capture saw stays. All of it is brought to the newest's exposure. Captures without a date, or of one
+    date, overrule nothing.
     """
     params = params or compare.Params()
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
     changed = [np.zeros(len(s.gaussians), dtype=bool) for s in scenes]
     rivals = [_none(s) for s in scenes]
+    gains = np.ones((len(scenes), 3))
     truth: list[_Standing] = []
     for group in _by_date(scenes) if prefer != "both" else []:
         added = []
@@ -101,6 +103,7 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
             joined = compare.joined([(one.looks, one.shows) for one in parts], scenes[i], params)
             found = compare.compare(looks, joined, params)
             verdict = _verdict(looks, joined, found, prefer)
+            gains[i] = _gains(found)
             keeps[i] &= ~verdict.lost
             if prefer == "newest":
                 keeps[i] &= ~_intruders(scenes[i].gaussians, keeps[i], joined, found, verdict)
@@ -114,11 +117,11 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
                 first += len(rows)
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
             # Truth grows by what is new to it alone, so that it stays as large as the place.
-            shows = keeps[i] & np.isin(found.older.state, (UNSEEN, HIDDEN))
-            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), found), shows))
+            shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
+            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), gains[i]), shows))
         truth += added
     return Settled(
-        [replace(s, gaussians=s.gaussians[k]) if not k.all() else s for s, k in zip(scenes, keeps, strict=True)],
+        [_left(s, k, gain) for s, k, gain in zip(scenes, keeps, gains, strict=True)],
         [int((~k).sum()) for k in keeps],
         [c[k] for c, k in zip(changed, keeps, strict=True)],
         rivals,
@@ -204,11 +207,21 @@ def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Compari
     return out
 
 
-def _in_one_exposure(looks: Looks, found: Comparison) -> Looks:
+def _gains(found: Comparison) -> np.ndarray:
+    """(3,) by which the older's colours are multiplied, so that the place shows in one exposure: the newest's."""
     gains = found.balance.gains()
-    if np.abs(np.log(gains)).max() < _NEGLIGIBLE_GAIN:
-        return looks
-    return replace(looks, scene=replace(looks.scene, gaussians=apply_gain(looks.gaussians, gains)))
+    return gains if np.abs(np.log(gains)).max() > _NEGLIGIBLE_GAIN else np.ones(3)
+
+
+def _left(scene: PlacedScene, stays: np.ndarray, gains: np.ndarray) -> PlacedScene:
+    if stays.all() and (gains == 1).all():
+        return scene
+    gaussians = scene.gaussians[stays]
+    return replace(scene, gaussians=gaussians if (gains == 1).all() else apply_gain(gaussians, gains))
+
+
+def _in_one_exposure(looks: Looks, gains: np.ndarray) -> Looks:
+    return replace(looks, scene=_left(looks.scene, np.ones(len(looks.gaussians), dtype=bool), gains))
 
 
 def _share_of_pixels(these: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
