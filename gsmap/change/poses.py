@@ -23,6 +23,7 @@ def features(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
     """(N, 6) place and tint, both in metres."""
     return np.concatenate([points, tints(colours) * _TINT_M], axis=1)
 
+
 _VOTERS, _VOTED = 150, 900  # cells that vote, and that are voted for
 _LEVEL_M, _TINT = 0.06, 0.1  # a pair of cells votes if their heights and colours differ by less
 _SINK_M = 0.04
