@@ -94,7 +94,7 @@ def find_moves(
     asked: set[bytes] = set()
     for _ in range(_ROUNDS):
         found = _moves_from(a, b, False, asked, params) + _moves_from(b, a, True, asked, params)
-        news = []
+        news: list[Move] = []
         for move in sorted(found, key=lambda m: -m.score):
             if not any(_overlap(move, other, a, b) for other in moves + news):
                 whole = _completed(move, a, b, params)

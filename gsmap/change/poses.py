@@ -86,7 +86,7 @@ def _peaks(shift: np.ndarray, weight: np.ndarray) -> list[tuple[float, np.ndarra
     index = (cells[:, 0] - low[0]) * deep + cells[:, 1] - low[1]
     votes = np.bincount(index, weight, int(wide * deep)).reshape(wide, deep)
     padded = np.pad(votes, 1)
-    total = sum(padded[x : x + wide, y : y + deep] for x in range(3) for y in range(3))
+    total = np.sum([padded[x : x + wide, y : y + deep] for x in range(3) for y in range(3)], axis=0)
     found = []
     for _ in range(_PEAKS):
         x, y = np.unravel_index(int(np.argmax(total)), total.shape)
