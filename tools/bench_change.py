@@ -61,6 +61,8 @@ def main() -> int:
                 for row in PART[part](place, args):
                     rows.append({"part": part, "place": folder.name, **row})
                     print(shown(rows[-1]), flush=True)
+    for line in losses(rows):
+        print(line)
     total = Counter()
     for row in rows:
         total.update({key: row[key] for key in COUNTS if row["part"] == "changes"})
@@ -264,6 +266,24 @@ def shown(row: dict[str, Any]) -> str:
     shares = "/".join(f"{x:.3f}" for x in row["old_mix_new"])
     ghosts = " ".join(f"{t} {x:.1%}" for t, x in row["ghosts"].items())
     return f"{head} {figures} old/mix/new {shares} ghosts {ghosts} n {row['gaussians']} {row['cpu_s']} CPU s"
+
+
+def losses(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """For each way of merging, over all places: the worst losses against the newest alone, and against dated tto."""
+    merged = {(row["place"], row["way"]): row for row in rows if row["part"] == "merge" and "psnr" in row}
+    for way in dict.fromkeys(way for _, way in merged):
+        own = {place: row for (place, w), row in merged.items() if w == way}
+        parts = [f"{way:8} at worst"]
+        alone = [(merged[place, "alone"], row) for place, row in own.items() if (place, "alone") in merged]
+        for kind in ("changed", "new", "recoloured", "vacated") if alone else ():
+            lost = np.nanmax([a["psnr"][kind] - row["psnr"][kind] for a, row in alone])
+            parts.append(f"{kind} {lost:+.2f} dB below alone,")
+        dated = [(merged[place, "dated"], row) for place, row in own.items() if (place, "dated") in merged]
+        if dated:
+            gained = min(row["held"]["same"] - d["held"]["same"] for d, row in dated)
+            parts.append(f"held same {gained:+.2f} dB against dated,")
+        parts.append(f"old or mix {max(sum(row['old_mix_new'][:2]) for row in own.values()):.3f}")
+        yield " ".join(parts)
 
 
 PART = {"register": register, "merge": merge, "changes": changes, "as-of": as_of}

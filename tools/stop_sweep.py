@@ -80,6 +80,9 @@ def main() -> int:
     parser.add_argument("--captures", type=Path, help="a folder of captures; three small ones are made else")
     parser.add_argument("--within", type=float, default=10.0, help="seconds after the start to stop a run within")
     args = parser.parse_args()
+    for signum in SIGNALS:  # nohup, and a shell that starts this in the background, have the runs ignore some
+        if signal.getsignal(signum) == signal.SIG_IGN:
+            signal.signal(signum, signal.SIG_DFL)
     rng, worst, num_wrong, complete = random.Random(args.seed), 0.0, 0, 0
     with tempfile.TemporaryDirectory(prefix="stop_sweep_") as folder:
         captures = args.captures or Path(folder) / "captures"

@@ -43,6 +43,8 @@ _IN_PLACE_M = 0.1  # cells of two captures so close to each other are of one pla
 _IN_PLACE = 0.3  # ... and so are two things, if this share of the smaller one is
 _REPAINTED = 0.03  # where less of it was looked through, a thing was painted and not replaced, ...
 _FEWEST_MOVED = 8  # ... or fewer cells
+_GONE = 0.5  # share of what changed that was looked through, from which a thing went or came as a whole
+_ONE_PLACE = 0.4  # share of the larger footprint that both cover, if one took the other's place
 _SPLIT = (0.15, 0.85)  # share of a thing that stands where another does, for it to be two side by side
 _FEWEST_OF_PART = 60
 
@@ -120,19 +122,11 @@ def _find(
         else:
             newer[k - len(older)] = with_behind(newer[k - len(older)], paint.cells[1])
     older, newer = gathered(older, both[0]), gathered(newer, both[1])
-    for _ in range(2):
-        moves = find_moves(older, newer, both, cells, looks, params)
-        for move in moves:
-            evidence = {"fit": move.score, "next_fit": move.runner_up}
-            things = (older[move.older], newer[move.newer])
-            found.append(_Found("moved", things, None, move.S_after_before, move.symmetry, evidence))
-        older = [t for k, t in enumerate(older) if all(k != m.older for m in moves)]
-        newer = [t for k, t in enumerate(newer) if all(k != m.newer for m in moves)]
-        # What did not move as it is may be two things side by side, of which one did.
-        split = [_split(mine, theirs, both, k) for k, mine, theirs in ((0, older, newer), (1, newer, older))]
-        if len(split[0]) == len(older) and len(split[1]) == len(newer):
-            break
-        older, newer = split
+    moves, older, newer = find_moves(older, newer, both, cells, looks, params)
+    for move in moves:
+        evidence = {"fit": move.score, "next_fit": move.runner_up}
+        found.append(_Found("moved", (move.older, move.newer), None, move.S_after_before, move.symmetry, evidence))
+    older, newer = _split(older, newer, both, 0), _split(newer, older, both, 1)
     return found + _in_place(older, newer, both)
 
 
@@ -172,8 +166,21 @@ def _in_place(older: list[Thing], newer: list[Thing], both: tuple[Side, Side]) -
         mine = [older[i] for i in np.flatnonzero(labels[: len(older)] == k)]
         theirs = [newer[j] for j in np.flatnonzero(labels[len(older) :] == k)]
         a, b = (reduce(joined, things) if things else None for things in (mine, theirs))
-        found.append(_Found(_kind_in_place(a, b, both), (a, b)))
+        if a is not None and b is not None and _are_two(a, b, both):
+            found += [_Found("disappeared", (a, None)), _Found("appeared", (None, b))]
+        else:
+            found.append(_Found(_kind_in_place(a, b, both), (a, b)))
     return found
+
+
+def _are_two(older: Thing, newer: Thing, both: tuple[Side, Side]) -> bool:
+    """Whether what went and what came only touch: then neither took the other's place."""
+    if min(len(t.moved) / max(len(t.changed), 1) for t in (older, newer)) < _GONE:
+        return False
+    boxes = [np.quantile(side.points[t.cells], (0.03, 0.97), axis=0) for side, t in zip(both, (older, newer), strict=True)]
+    low, high = np.maximum(boxes[0][0], boxes[1][0])[:2], np.minimum(boxes[0][1], boxes[1][1])[:2]
+    shared = float(np.prod(np.maximum(high - low, 0)))
+    return shared < _ONE_PLACE * max(float(np.prod((box[1] - box[0])[:2])) for box in boxes)
 
 
 def _kind_in_place(older: Thing | None, newer: Thing | None, both: tuple[Side, Side]) -> ChangeKind:
@@ -184,7 +191,10 @@ def _kind_in_place(older: Thing | None, newer: Thing | None, both: tuple[Side, S
         return "recoloured"
     if older is None or newer is None:
         return "appeared" if older is None else "disappeared"
-    # What a thing stood on or before changed its colour too, and is no thing in its place.
+    # What a thing stood on or before is seen in another light without it, and is no thing in its place.
+    gone = [len(t.moved) / max(len(t.changed), 1) for t in (older, newer)]
+    if max(gone) >= _GONE and min(gone) < _REPAINTED:
+        return "appeared" if moved[1] > moved[0] else "disappeared"
     slight = [_is_slight(a, b) for a, b in (((both[0], older), (both[1], newer)), ((both[1], newer), (both[0], older)))]
     if moved[1] > moved[0] and slight[0]:
         return "appeared"

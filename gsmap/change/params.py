@@ -26,10 +26,11 @@ class Params:
         yaw_starts: turns about the vertical from which a moved thing is looked for.
         moved_within_m: a moved thing lies this close to where it is said to stand.
         min_moved: share of a thing that fits where it is said to stand, there and back.
+        most_ambiguous: a move is not claimed where another fits this share as well, unless it is the thing's symmetry.
         min_confidence: changes less sure than this are not reported.
     """
 
-    compare: compare.Params = field(default_factory=lambda: compare.Params(longest_side_px=160))
+    compare: compare.Params = field(default_factory=lambda: compare.Params(longest_side_px=160, max_views=40))
     cell_m: float = 0.05
     voxel_m: float = 0.1
     reach_m: float = 0.1
@@ -43,6 +44,7 @@ class Params:
     yaw_starts: int = 24
     moved_within_m: float = 0.05
     min_moved: float = 0.68
+    most_ambiguous: float = 0.92
     min_confidence: float = 0.3
 
     def __post_init__(self) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsmap.change.params import Params
-from gsmap.compare import Comparison, Looks, Pictured
+from gsmap.change.poses import tints
+from gsmap.compare import Comparison, Looks, Pictured, View
 from gsmap.compare.colours import Balance
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.sh import rgb_of_sh0
@@ -28,11 +29,10 @@ class Side:
         rows: (R,) Gaussians of the capture that are surface, and ``label`` (R,) the cell of each.
         points, colours: (M, 3) means.
         through, on, hidden: (M,) views of the other capture, summed over the cell's Gaussians.
-        offset_m: (M,) how far the other's surface lies behind this one along its normal, in the other's views;
-            ``offset_looks`` (M,) pixels that say so.
+        offset_m: (M,) mean by which the other's surface lies behind this one, along its normal.
         colour: (M, 3) mean difference to the other's colour, two of chroma and one of lightness: newer less older.
         strength: (M,) the same as a multiple of what counts, texture that is off by a pixel forgiven.
-        looks: (M,) pixels that compared the colour.
+        looks: (M,) pixels that compared both.
     """
 
     rows: np.ndarray
@@ -43,7 +43,6 @@ class Side:
     on: np.ndarray
     hidden: np.ndarray
     offset_m: np.ndarray
-    offset_looks: np.ndarray
     colour: np.ndarray
     strength: np.ndarray
     looks: np.ndarray
@@ -54,6 +53,11 @@ class Side:
     @cached_property
     def tree(self) -> Any:
         return cKDTree(self.points) if len(self.points) else cKDTree(np.full((1, 3), np.inf))
+
+    @cached_property
+    def tints(self) -> np.ndarray:
+        """(M, 3) of the colours; see `gsmap.change.poses.tints`."""
+        return tints(self.colours)
 
     @cached_property
     def normals(self) -> np.ndarray:
@@ -87,24 +91,24 @@ class _Sums:
     """Sums over pixels by the Gaussian that shows most there."""
 
     offset: np.ndarray
-    offset_looks: np.ndarray
     colour: np.ndarray
     strength: np.ndarray
     looks: np.ndarray
 
     @classmethod
     def zeros(cls, count: int) -> _Sums:
-        return cls(np.zeros(count), np.zeros(count), np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+        return cls(np.zeros(count), np.zeros((count, 3)), np.zeros(count), np.zeros(count))
 
 
 def sides(older: Looks, newer: Looks, comparison: Comparison, params: Params) -> tuple[Side, Side]:
     """Both captures' surfaces with what is known of them."""
     sums = _Sums.zeros(len(older.gaussians)), _Sums.zeros(len(newer.gaussians))
     limits = _limits(comparison.balance, params)
-    for picture in comparison.newer_views:
-        _add(sums[0], sums[1], picture.other, picture.own, picture, comparison, limits, 0)
-    for picture in comparison.older_views:
-        _add(sums[0], sums[1], picture.own, picture.other, picture, comparison, limits, 1)
+    # Every second view of each: neighbouring views of a walk show the same.
+    for picture in comparison.newer_views[::2]:
+        _add(sums, (picture.other, picture.own), picture, comparison, limits)
+    for picture in comparison.older_views[1::2]:
+        _add(sums, (picture.own, picture.other), picture, comparison, limits)
     made = [
         _side(looks, evidence, one, comparison.balance if k == 0 else None, params)
         for k, (looks, evidence, one) in enumerate(
@@ -123,32 +127,33 @@ def _limits(line: Balance, params: Params) -> tuple[float, float]:
 
 
 def _add(
-    older: _Sums, newer: _Sums, a: Any, b: Any, picture: Pictured, comparison: Comparison, limits, own: int
+    sums: tuple[_Sums, _Sums],
+    views: tuple[View, View],
+    picture: Pictured,
+    comparison: Comparison,
+    limits: tuple[float, float],
 ) -> None:
-    """Add one camera's pair of pictures: ``a`` shows the older, ``b`` the newer; ``own`` is whose camera it is."""
-    both = a.solid & b.solid & (a.dominant_id >= 0) & (b.dominant_id >= 0)
+    """Add what one camera shows of the older and of the newer capture."""
+    a, b = views
     base, share = comparison.tolerance_m
-    one = both & (np.abs(a.depth - b.depth) <= base + share * a.depth)
+    one = a.solid & b.solid & (a.dominant_id >= 0) & (b.dominant_id >= 0)
+    one &= np.abs(a.depth - b.depth) <= base + share * a.depth
     plain, beyond = _colour(a.colour, b.colour, comparison.balance, limits)
-    difference = plain[one]
-    offset = np.clip((b.depth - a.depth) * _along_normal(picture.own), -_CLIP_M, _CLIP_M)
-    # Of its own free space a capture is judge, so offsets are measured in the pictures of the other.
-    for sums, view, sign, is_other in ((older, a, 1.0, own == 1), (newer, b, -1.0, own == 0)):
-        ids, count = view.dominant_id[one], len(sums.looks)
-        sums.looks += np.bincount(ids, minlength=count)
-        sums.strength += np.bincount(ids, beyond[one], count)
+    difference, beyond = plain[one], beyond[one]
+    offset = np.clip((b.depth - a.depth) * _along_normal(picture.own), -_CLIP_M, _CLIP_M)[one]
+    for into, view, sign in zip(sums, views, (1.0, -1.0), strict=True):
+        ids, count = view.dominant_id[one], len(into.looks)
+        into.looks += np.bincount(ids, minlength=count)
+        into.strength += np.bincount(ids, beyond, count)
         for k in range(3):
-            sums.colour[:, k] += np.bincount(ids, difference[:, k], count)
-        sums.offset += np.bincount(ids, sign * offset[one], count)
-        sums.offset_looks += np.bincount(ids, minlength=count)
+            into.colour[:, k] += np.bincount(ids, difference[:, k], count)
+        into.offset += np.bincount(ids, sign * offset, count)
 
 
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
     """Differences of colour (H, W, 3), two of chroma and one of lightness, and how far they go beyond what a shift by
     a pixel explains (H, W), as multiples of the limits."""
-    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(
-        np.float32
-    )
+    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
     log_b = np.log(np.clip(b, 0, 1) + np.float32(FLOOR))
     bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
     plain = _opponent(log_b - log_a, bright)
@@ -202,7 +207,7 @@ def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None, params
     if line is not None:
         colours = np.clip(np.exp(np.log(colours + 0.03) * line.slope + line.offset) - 0.03, 0, 1)
     total = lambda values: np.bincount(label, values[rows], len(counts))  # noqa: E731
-    looked, offset_looked = total(sums.looks), total(sums.offset_looks)
+    looked = total(sums.looks)
     return Side(
         rows,
         label,
@@ -211,8 +216,7 @@ def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None, params
         total(evidence.through.astype(np.float64)),
         total(evidence.on_surface.astype(np.float64)),
         total(evidence.hidden.astype(np.float64)),
-        total(sums.offset) / np.maximum(offset_looked, 1),
-        offset_looked,
+        total(sums.offset) / np.maximum(looked, 1),
         np.stack([total(sums.colour[:, k]) for k in range(3)], axis=1) / np.maximum(looked, 1)[:, None],
         total(sums.strength) / np.maximum(looked, 1),
         looked,

@@ -9,7 +9,7 @@ from gsmap.change.components import components
 
 _BIN_M = 0.03
 _THICK_M = 0.045  # skirting boards, picture frames and the noise of a plane belong to it
-_LEVEL_M2, _WALL_M2 = 4.0, 0.8  # a smaller plane is a table or a cupboard
+_LEVEL_M2, _WALL_M2 = 4.0, 0.5  # a smaller plane is a table or a cupboard
 _REACH_M = 0.16  # cells of one plane are linked over such gaps
 _WALL_M = 1.8  # a wall is at least this high, and ...
 _TO_CEILING_M = 0.2  # ... comes this close to the ceiling, where there is one

@@ -21,6 +21,7 @@ _BOX_M = 0.1  # ... but not what lies farther than this beyond all that has
 _SAME_M = 0.15  # ... nor what is the same as ever and lies farther from what changed
 _LINK_M = 0.08  # cells of one thing, where nothing but the room's shell is between things
 _RING_M = (0.04, 0.12)  # how far from a change of colour its surroundings begin and end
+_MOST = 0.35
 _MUCH, _MANY = 0.25, 100  # of a thing, and cells: so much of it does not change its colour by a shadow
 _LIT_OTHERWISE = 0.035  # spread of what agrees, beyond which the whole place is lit otherwise
 _DARK = 0.8  # a change that is lightness to this share may be a shadow, a lamp, or a window at night
@@ -67,8 +68,7 @@ def _judge(side: Side, plane: np.ndarray, params: Params) -> Cells:
     moved = (through >= _FEWEST_LOOKS) & (through >= params.min_share * (through + on)) & (side.through >= side.on)
     looks = side.around(side.looks, _SMOOTH_M)
     strength = side.around(side.strength * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
-    offset_looks = side.around(side.offset_looks, _SMOOTH_M)
-    offset = side.around(side.offset_m * side.offset_looks, _SMOOTH_M) / np.maximum(offset_looks, 1)
+    offset = side.around(side.offset_m * side.looks, _SMOOTH_M) / np.maximum(looks, 1)
     painted = ~moved & (looks >= _FEWEST_LOOKS) & (strength >= _FAINT)
     plane = np.where(moved, -1, plane)  # What one can walk through is no wall.
     thing = np.full(len(side), -1, dtype=np.int64)
@@ -182,7 +182,8 @@ def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params)
 def is_paint(paint: Paint, line: Balance, params: Params) -> bool:
     """Whether a change of colour is paint, and neither light nor a texture that two trainings show differently."""
     if not paint.is_shell and paint.share >= _MUCH and sum(map(len, paint.cells)) >= _MANY:
-        return paint.strength >= 0.75 * params.min_paint and paint.leak <= 2.5 * params.most_leak
+        less = 0.6 if paint.share >= _MOST and paint.coherence >= _COHERENT else 0.75
+        return paint.strength >= less * params.min_paint and paint.leak <= 2.5 * params.most_leak
     least = params.min_paint
     if max(line.chroma_spread, line.lightness_spread) > _LIT_OTHERWISE:
         least *= 1.6

@@ -53,7 +53,7 @@ def _tell(report: PurgeReport, map: str) -> None:
     for name in report.backups:
         say(f"the backup {name} may hold it")
     for name in report.exports:
-        say(f"tiles were deleted in {name}: export again to fill their places")
+        say(f"tiles or pictures were deleted in {name}: export again to fill the places of tiles")
     for name in report.unreachable:
         say(f"tiles made with it may lie in {name}")
     for name in report.mentions:

@@ -44,9 +44,11 @@ def command(
     for row in report.scenes:
         if row.thinned:
             verb = "would be thinned" if dry_run else "is thinned"
-            say(f"{row.name} {verb}: {row.num_bytes_before / 1e6:.1f} to {row.num_bytes_after / 1e6:.1f} MB")
+            say(f"{row.scene_name} {verb}: {row.num_bytes_before / 1e6:.1f} to {row.num_bytes_after / 1e6:.1f} MB")
         else:
-            say(f"{row.name} stays as it is: {row.reason}")
+            say(f"{row.scene_name} stays as it is: {row.reason}")
+    if report.num_undated:
+        say(f"{report.num_undated} captures have no date and stay: gsmap edit MAP SCENE --captured-at DATE gives one")
     print(f"{'would hold' if dry_run else 'holds'} {report.num_bytes / 1e6:.1f} MB")
     if not report.fits:
         say(f"that is more than {budget}: nothing else is old, superseded and dated")

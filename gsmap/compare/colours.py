@@ -45,7 +45,7 @@ class Balance:
         return np.clip(out, 0, 1).astype(np.float32)
 
     def differences(self, a: np.ndarray, b: np.ndarray, both: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far two pictures (H, W, 3) of one view differ in chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
+        """How far two pictures (H, W, 3) of one view differ: chroma (H, W, 2) and lightness (H, W), as seen in [0, 1].
 
         Ratios, so that shading cancels in the chroma, times the brightness, for nobody sees the hue of what is black.
         Only what no pixel nearby explains counts: texture that lies half a pixel off is no paint.

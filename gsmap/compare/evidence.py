@@ -8,7 +8,6 @@ import numpy as np
 
 from gsmap.compare.colours import Balance, limits
 from gsmap.compare.params import Params
-from gsmap.geometry.voxels import voxel_labels
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
@@ -52,7 +51,9 @@ class Tally:
         self.through = np.zeros(count, dtype=np.int32)
         self.on_surface = np.zeros(count, dtype=np.int32)
         self.hidden = np.zeros(count, dtype=np.int32)
-        self.grazed = np.zeros(count, dtype=np.int32)  # views in which it is before the surface, though perhaps at an edge
+        self.grazed = np.zeros(
+            count, dtype=np.int32
+        )  # views in which it is before the surface, though perhaps at an edge
         self.covered = np.zeros(count, dtype=np.int32)  # on the surface, but its own capture shows something before it
         self.sure = np.zeros(count, dtype=np.int32)
         self.sharpness = np.zeros(count, dtype=np.float32)
@@ -106,12 +107,11 @@ class _Neighbours:
 
         self.rows = np.flatnonzero(shows)
         self.index = np.zeros((len(points), 0), dtype=np.int64)
-        self.distance = np.zeros((len(points), 0))
         if len(self.rows):
             tree = cKDTree(points[self.rows])
             count = min(params.neighbours, len(self.rows))
-            self.distance, self.index = tree.query(points, count, distance_upper_bound=params.cell_m)
-            self.distance, self.index = (v.reshape(len(points), -1) for v in (self.distance, self.index))
+            index = tree.query(points, count, distance_upper_bound=params.cell_m)[1]
+            self.index = np.asarray(index, dtype=np.int64).reshape(len(points), -1)
 
     @property
     def count(self) -> np.ndarray:

@@ -61,7 +61,8 @@ class Looks:
     Args:
         scene: the capture.
         views: V pictures of it.
-        surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen.
+        surface: (N,) bool, which Gaussians show in these pictures; the others are haze, or were never seen;
+            all of a capture without pictures.
         times_seen: (N,) int32 pictures in which a Gaussian lies on the surface that is shown.
         sharpness: (N,) float32 sum over these of (pixels a metre)^2: more looks and nearer ones see better.
         sure: per view (H, W) bool, solid, and a surface that enough of the capture's views saw.
@@ -100,7 +101,8 @@ def look(scene: PlacedScene, params: Params | None = None) -> Looks:
         sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
     well = _best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
-    return Looks(scene, tuple(views), largest >= params.min_weight, times_seen, sharpness, sure, placed)
+    surface = largest >= params.min_weight if views else np.ones(count, dtype=bool)
+    return Looks(scene, tuple(views), surface, times_seen, sharpness, sure, placed)
 
 
 def _best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
@@ -125,10 +127,12 @@ def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
 
 def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
     """Points (N, 3) in a view, those alone that lie in the picture and beyond ``nearest_m``."""
-    pixels, z = project(points, view.camera.T_camera_frame[0], view.camera.intrinsics_px[0])
-    index = np.flatnonzero(in_image(pixels, z, view.camera.sizes_px[0], near=nearest_m))
-    column, row = pixels[index].astype(np.int32).T
-    return Placed(index.astype(np.int32), row, column, z[index])
+    T, size_px = view.camera.T_camera_frame[0], view.camera.sizes_px[0]
+    before = np.flatnonzero(points @ T[2, :3].astype(points.dtype) + points.dtype.type(T[2, 3]) > nearest_m)
+    pixels, z = project(points[before], T, view.camera.intrinsics_px[0])
+    inside = np.flatnonzero(in_image(pixels, z, size_px, near=nearest_m))
+    column, row = pixels[inside].astype(np.int32).T
+    return Placed(before[inside].astype(np.int32), row, column, z[inside])
 
 
 def _view(gaussians: Gaussians, camera: Cameras, params: Params) -> tuple[View, np.ndarray]:

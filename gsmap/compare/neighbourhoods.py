@@ -25,10 +25,13 @@ def grown(mask: np.ndarray, times: int = 1) -> np.ndarray:
 
 
 def over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
-    """The ufunc over each pixel's 3 x 3 neighbourhood; the border repeats."""
-    padded = np.pad(values, 1, mode="edge")
-    rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
-    out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+    """The ufunc (``minimum``, ``maximum`` and their like) over each pixel's 3 x 3 neighbourhood."""
+    rows = values.copy()
+    pick(rows[1:], values[:-1], out=rows[1:])
+    pick(rows[:-1], values[1:], out=rows[:-1])
+    out: np.ndarray = rows.copy()
+    pick(out[:, 1:], rows[:, :-1], out=out[:, 1:])
+    pick(out[:, :-1], rows[:, 1:], out=out[:, :-1])
     return out
 
 

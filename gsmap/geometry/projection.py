@@ -27,8 +27,9 @@ def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.nd
 
 def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: float = 0.0) -> np.ndarray:
     """(N,) bool: beyond ``near`` (the points' unit) and inside an image of ``size_px`` = ``width height``."""
+    (column, row), (width, height) = pixels.T, np.asarray(size_px)
     with np.errstate(invalid="ignore"):
-        return (depth > near) & (pixels >= 0).all(1) & (pixels < np.asarray(size_px)).all(1)
+        return (depth > near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
 
 def on_surface(

@@ -8,7 +8,9 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
-from gsmap.errors import ConfigError
+import numpy as np
+
+from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map.dates import last_of, parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports import scenes_by_id
@@ -16,7 +18,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.change import Wanted, lacking
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison, StoredChange, moved_box
-from gsmap.types import PoseGraph, Scene
+from gsmap.types import Change, PoseGraph, Scene
 from gsmap.types.rows import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow, PairEventRow
 
 _ID = re.compile(r"c(\d{1,9})")
@@ -26,6 +28,18 @@ def number_of(text: str) -> int | None:
     """The number of a change by what it is called (``c12``); None for anything else."""
     found = _ID.fullmatch(text)
     return None if found is None else int(found[1])
+
+
+def named(text: str) -> int:
+    """The number of a change by what it is called.
+
+    Raises:
+        NotFoundError: changes are not called so.
+    """
+    number = number_of(text)
+    if number is None:
+        raise NotFoundError(f"no change is called {text!r}: they are called c1, c2, ... (gsmap changes MAP)")
+    return number
 
 
 def within(asked: Wanted, since: str | None, between: Sequence[str] | None, as_of: str | None) -> Wanted:
@@ -88,6 +102,28 @@ def change_row(store: Store, number: int) -> ChangeRow:
     """One change, as it is now."""
     comparison, change = _find(store, number)
     return ChangeRow(**_row(comparison, change, scenes_by_id(store), store.revisions.get()))
+
+
+def change_arrays(store: Store, number: int) -> Change:
+    """One change with its arrays, in the map's frame of today.
+
+    Raises:
+        NotFoundError: no such change, or the newer capture has no place now.
+        CorruptError: its arrays are damaged.
+    """
+    comparison, change = _find(store, number)
+    graph = store.revisions.get()
+    if graph is None or comparison.newer not in graph.poses:
+        raise NotFoundError(f"c{number} has no place now: its newer capture has none (gsmap update)")
+    S = graph.poses[comparison.newer].S_map_scene @ comparison.S_frame_newer.inverse()
+    found = store.changes.load(comparison.number).changes[change.place]
+    moved = found.S_after_before
+    return replace(
+        found,
+        box=moved_box(found.box, S),
+        voxels=S.apply(found.voxels).astype(np.float32),
+        S_after_before=None if moved is None else S @ moved @ S.inverse(),
+    )
 
 
 @of_one_state

@@ -19,7 +19,7 @@ from gsmap.map import values as as_values
 from gsmap.map.logs import logged
 from gsmap.map.sharing import at_work
 from gsmap.store import Store
-from gsmap.types import Cameras, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
+from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
     BackupReport,
@@ -395,10 +395,17 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map import changes
 
-        number = changes.number_of(name)
-        if number is None:
-            raise NotFoundError(f"no change is called {name!r}: they are called c1, c2, ... (gsmap changes MAP)")
-        return changes.change_detail(self.store, number)
+        return changes.change_detail(self.store, changes.named(name))
+
+    def read_change(self, name: str) -> Change:
+        """A change (``c12``) with its arrays, map frame: voxels, and rows of the Gaussians of either capture.
+
+        Raises:
+            NotFoundError: no change is called so, it is no longer found, or has no place now.
+        """
+        from gsmap.map import changes
+
+        return changes.change_arrays(self.store, changes.named(name))
 
     # --- objects -----------------------------------------------------------------------------------------------------
 

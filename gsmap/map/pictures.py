@@ -14,6 +14,7 @@ from pathlib import Path
 from gsmap.durable import make_folder, open_file, remove_file, write_text_whole, write_whole
 from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map.changes import change_arrays, named
 from gsmap.store import Store
 from gsmap.types import PlacedScene, Sim3
 from gsmap.types.progress import StageProgress
@@ -106,21 +107,17 @@ class _Drawer:
         graph = store.revisions.get()
         assert graph is not None
         self._store = store
-        self._S_map_newer = graph.poses[newer].S_map_scene
         self._older = _placed(store, older, graph.poses[older].S_map_scene)
-        self._newer = _placed(store, newer, self._S_map_newer)
+        self._newer = _placed(store, newer, graph.poses[newer].S_map_scene)
 
     def draw(self, row: ChangeRow, path: Path) -> None:
         from PIL import Image
 
         from gsmap.view.change_picture import draw_change
 
-        change = self._store.changes.get(int(row.id[1:]))
-        comparison = self._store.changes.comparison(change.comparison)
-        voxels = self._store.changes.load(change.comparison).changes[change.place].voxels
-        points = (self._S_map_newer @ comparison.S_frame_newer.inverse()).apply(voxels)
-        assert row.box_m is not None
-        Image.fromarray(draw_change(self._older, self._newer, row.box_m, points)).save(path, format="PNG")
+        change = change_arrays(self._store, named(row.id))
+        drawn = draw_change(self._older, self._newer, change.box, change.voxels)
+        Image.fromarray(drawn).save(path, format="PNG")
 
 
 def _placed(store: Store, scene: str, S: Sim3) -> PlacedScene:

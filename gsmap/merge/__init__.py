@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap import render
+from gsmap import compare, render
 from gsmap.errors import ConfigError, InputError
 from gsmap.merge.placed import inside
 from gsmap.methods import MethodParams, RecipeKey, family
@@ -154,7 +154,8 @@ def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
     """
     settings = plain(checked_params(method, params))
     backend = render.backend() if merger(method).RENDERS else ""
-    return RecipeKey("merge", method, {"merge": VERSION} | family("merger").version(method), settings, backend)
+    versions = {"merge": VERSION} | ({"compare": compare.VERSION} if merger(method).RENDERS else {})
+    return RecipeKey("merge", method, versions | family("merger").version(method), settings, backend)
 
 
 def merge(

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from gsmap import compare
-from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, UNSEEN, Comparison, Looks
+from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.placed import overlapping
 from gsmap.render import render
@@ -56,8 +56,7 @@ class Settled:
             if len(others):
                 disputed |= _share_of_pixels(others, own, small) > _SHOWS
         # A Gaussian's skirts reach beyond the pixels in which it shows.
-        disputed = compare.grown(disputed, int(__import__('os').environ.get('GROW','1')))
-        if __import__('os').environ.get('NOMASK'): disputed[:]=False
+        disputed = compare.grown(disputed)
         rows = ((np.arange(height) + 0.5) * disputed.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * disputed.shape[1] / width).astype(int)
         out: np.ndarray = disputed[np.ix_(rows, columns)]
@@ -105,6 +104,7 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
                 mine = slice(first, first + len(rows))
                 changed[one.scene][rows[verdict.changed[mine]]] = True
                 keeps[one.scene][rows[verdict.beaten[mine]]] = False
+                one.shows[rows[verdict.beaten[mine]]] = False
                 first += len(rows)
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
             # Truth grows by what is new to it alone, so that it stays as large as the place.
@@ -140,7 +140,8 @@ class _Verdict:
 
 def _verdict(older: Looks, newer: Looks, found: Comparison, prefer: Prefer) -> _Verdict:
     lost = np.isin(found.older.state, (GONE, REPAINTED))
-    changed = np.isin(found.newer.state, (GONE, REPAINTED)) | _revealed(newer, found)
+    changed = np.isin(found.newer.state, (GONE, REPAINTED))
+    changed |= (found.newer.state != SAME) & _revealed(newer, found)
     beaten = np.zeros(len(changed), dtype=bool)
     if prefer == "best":
         stays = lost & (older.sharpness > found.older.sharpness)
@@ -162,9 +163,7 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
     return out
 
 
-def _intruders(
-    older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict
-) -> np.ndarray:
+def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict) -> np.ndarray:
     """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
 
     A last look at what evidence of single Gaussians leaves: shards at edges, what is smaller than a tolerance.
@@ -190,7 +189,11 @@ def _intruders(
     disputed = np.concatenate([older.means[verdict.lost], newer.gaussians.means[verdict.changed]])
     at = np.flatnonzero(out)
     if len(at):
-        reach = cKDTree(disputed).query(older.means[at], distance_upper_bound=_NEAR_M)[0] if len(disputed) else np.full(len(at), np.inf)
+        reach = (
+            cKDTree(disputed).query(older.means[at], distance_upper_bound=_NEAR_M)[0]
+            if len(disputed)
+            else np.full(len(at), np.inf)
+        )
         out[at[np.isinf(reach)]] = False
     return out
 

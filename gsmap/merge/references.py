@@ -90,12 +90,13 @@ def render_references(
     for done, (i, camera) in enumerate(todo):
         progress(done / len(todo), "rendering the captures")
         seen = render(scenes[i].gaussians, camera, max_weight=True)
-        _count(seen, pixels[i], largest[i])
+        disputed = None if settled is None else settled.overruled_pixels(i, camera)
+        _count(seen, disputed, pixels[i], largest[i])
         whole = pieces[i] is scenes[i].gaussians
         local = seen if whole else render(pieces[i], camera, depth=False, dominant_id=False)
         weight = local.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, halo_m / 2)
-        if settled is not None:
-            weight = weight * ~settled.overruled_pixels(i, camera)
+        if disputed is not None:
+            weight = weight * ~disputed
         share = float(weight.mean())
         if share < params.min_share:
             continue
@@ -115,8 +116,10 @@ def render_references(
     )
 
 
-def _count(seen: Rendered, pixels: np.ndarray, largest: np.ndarray) -> None:
-    dominant = seen.dominant_id[seen.dominant_id >= 0]
+def _count(seen: Rendered, disputed: np.ndarray | None, pixels: np.ndarray, largest: np.ndarray) -> None:
+    """What shows where something was taken away was never seen there: it counts for nothing."""
+    shown = seen.dominant_id[0] if disputed is None else np.where(disputed, -1, seen.dominant_id[0])
+    dominant = shown[shown >= 0]
     pixels += np.bincount(dominant, minlength=len(pixels))
     np.maximum(largest, seen.max_weight, out=largest)
 

@@ -117,7 +117,12 @@ def newest_of_all(connection: Connection) -> list[Row[Any]]:
 def named_groups(
     ours: Connection, theirs: Connection, only: Collection[str] | None
 ) -> Iterator[tuple[str, str, str | None]]:
-    """(kind, scene, group) of the arrays of their newest comparisons whose scenes are here or come along."""
+    """(kind, scene, group) of the arrays that go from one map into another: those of the newest comparisons of scenes
+    that are there or come along.
+
+    Args:
+        only: ids of the scenes that come; None for all.
+    """
     here = set(ours.execute(select(scenes.c.id)).scalars())
     for row in newest_of_all(theirs):
         ends = {row.older, row.newer}

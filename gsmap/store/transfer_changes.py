@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
 
 from gsmap.store.change_rows import KIND, newest_of_all, same_changes
 from gsmap.store.matrices import to_array, to_pose
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
-
-if TYPE_CHECKING:
-    from gsmap.store.transfer import Transfer
+from gsmap.store.transfer import Transfer
 
 
 def comparisons_of(transfer: Transfer) -> None:

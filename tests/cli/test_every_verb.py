@@ -81,6 +81,7 @@ RUNS = {
     "restore-scene": "restore-scene MAP left --from SITE",
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
+    "thin": "thin MAP --keep-days 365 --dry-run",
     "migrate": "migrate MAP",
     "backup": "backup MAP TMP/backup --verify --keep 1",
     "backup --list": "backup MAP TMP/saved --list",

@@ -80,7 +80,7 @@ def test_another_date_makes_the_tiles_of_its_scene_dirty_where_the_merger_uses_d
     again = row.export(Params("tto"))
     assert again.recomputed == sum("d" in t.poses for t in first.tiles) > 0
     assert again.reused == sum("d" not in t.poses for t in first.tiles) > 0
-    undated = Params("tto").mergers.with_params("tto", tto.Params(newer_wins=False))
+    undated = Params("tto").mergers.with_params("tto", tto.Params(prefer="both"))
     row.export(Params("tto", undated))
     row.dates["d"] = None
     assert row.export(Params("tto", undated)).recomputed == 0
@@ -121,7 +121,18 @@ def test_every_setting_of_a_merger_is_in_its_recipe():
     before = recipe_key("tto")
     for leaf in leaves(tto.Params()):
         value = leaf.value
-        new = not value if isinstance(value, bool) else 3 if value is None else value * 2 if value <= 0.5 else value / 2
+        if isinstance(value, str):
+            new = "best"
+        else:
+            new = (
+                not value
+                if isinstance(value, bool)
+                else 3
+                if value is None
+                else value * 2
+                if value <= 0.5
+                else value / 2
+            )
         new = type(value)(new) if isinstance(value, int) and not isinstance(value, bool) else new
         new = 1 if value == 0 and new == 0 else new
         after = recipe_key("tto", changed(tto.Params(), {leaf.name: new}))

@@ -55,6 +55,21 @@ def a_scene_with_a_path_for_an_id(w: World) -> None:
     w.set("UPDATE scenes SET id = '../../home' WHERE name = 'a'")
 
 
+@case(ROWS, verbs=("check MAP", "prune MAP", "changes MAP"))
+def a_comparison_whose_arrays_lie_elsewhere(w: World) -> None:
+    w.set("UPDATE comparisons SET group_id = '../../../home/photos'")
+
+
+@case(ROWS, verbs=("changes MAP", "show MAP c1", "status MAP"))
+def a_change_of_a_kind_that_there_is_not(w: World) -> None:
+    w.set("UPDATE changes SET kind = '../../home'")
+
+
+@case(ROWS, verbs=("changes MAP", "show MAP c1", "status MAP"))
+def a_change_without_a_box(w: World) -> None:
+    w.set("UPDATE changes SET box = '[1, 2]'")
+
+
 @case(ROWS)
 def a_graph_whose_arrays_lie_elsewhere(w: World) -> None:
     w.set("UPDATE graphs SET group_id = '../../../home/photos'")
@@ -122,6 +137,9 @@ def names_and_notes_that_steer_the_terminal(w: World) -> None:
     w.set("UPDATE revisions SET note = ?, notes = ?", _WORDS, json.dumps([_WORDS]))
     w.set("UPDATE registrations SET reason = ?, proposer = ?, evidence = ?", _WORDS, _WORDS, json.dumps({_WORDS: 1}))
     w.set("UPDATE poses SET status = ?", _WORDS)
+    w.set("UPDATE comparisons SET notes = ?", json.dumps([_WORDS]))
+    w.set("UPDATE changes SET evidence = ?", json.dumps({_WORDS: 1}))
+    w.set("UPDATE change_reviews SET note = ?", _WORDS)
 
 
 @case(works=("list MAP scenes", "models list MAP"))

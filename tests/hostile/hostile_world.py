@@ -15,10 +15,23 @@ import numpy as np
 
 import gsmap.map
 from gsmap import formats
+from gsmap.change import recipe_key
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, digests
-from gsmap.types import Cameras, Gaussians, NodeLayer, PoseGraph, Prior, Registration, SceneGraph, ScenePose, Sim3
+from gsmap.types import (
+    Cameras,
+    Change,
+    ChangeReport,
+    Gaussians,
+    NodeLayer,
+    PoseGraph,
+    Prior,
+    Registration,
+    SceneGraph,
+    ScenePose,
+    Sim3,
+)
 
 MAX_MEMORY = 6 << 30  # of address space beyond what is mapped already; far below what a bomb would take
 
@@ -44,7 +57,10 @@ def make_world(root: Path) -> None:
     """``root/site.gsmap`` with two scenes and something of everything, ``root/tiles`` exported from it, and
     ``root/home``: the person's own folders, files and other map."""
     with Store.create(root / "site.gsmap") as store:
-        a, b = (store.scenes.add(make_gaussians(i), make_cameras(), name=name)[0] for i, name in enumerate("ab"))
+        a, b = (
+            store.scenes.add(make_gaussians(i), make_cameras(), name=name, captured_at=f"2026-01-0{i + 1}")[0]
+            for i, name in enumerate("ab")
+        )
         for scene in (a, b):
             rng = np.random.default_rng(3)
             m = 4
@@ -67,6 +83,11 @@ def make_world(root: Path) -> None:
         options = {"kind": "clip", "sha256": "0" * 64, "preset": "unit", "mean": [0.0] * 3, "std": [1.0] * 3}
         store.models.add("net", root / "net.onnx", kind="clip", options=options | {"inputs": [], "outputs": []})
     with gsmap.map.open(root / "site.gsmap") as m:
+        box, rows = np.array([[0.0, 0, 0], [1, 1, 1]]), np.arange(3, dtype=np.int32)
+        chair = Change("moved", box, box.astype(np.float32), rows, rows, pose, confidence=0.9)
+        report, key = ChangeReport((chair,), 1.0, np.ones(3), ("dark",)), recipe_key(m.settings.change).of(a.id, b.id)
+        m.store.changes.save(report, key, older=a.id, newer=b.id, S_newer_older=pose, S_frame_newer=pose)
+        m.confirm("c1", "seen")
         m.export(root / "tiles", merge="union", tile_size_m=0)
     (root / "captures").mkdir()
     formats.write(root / "captures" / "c.ply", make_gaussians(5))
@@ -223,6 +244,9 @@ ALL = (
     "prune MAP --dry-run",
     "migrate MAP",
     "edit MAP a --note dry",
+    "changes MAP",
+    "show MAP c1",
+    "confirm MAP c1",
     "settings MAP --set merge.method=union",
     "export MAP TILES",
 )

@@ -188,6 +188,9 @@ def test_places_come_from_the_newest_poses(site: Map, seen: Seen) -> None:
     box = report.changes[0].box_m
     np.testing.assert_allclose(box, [[9.5, 0, 0], [10, 0.5, 1]], atol=1e-9)
     np.testing.assert_allclose(report.changes[0].S_after_before.translation, [0, 1, 0], atol=1e-9)
+    arrays = site.read_change(report.changes[0].id)
+    np.testing.assert_allclose(arrays.voxels, turn.apply(CHAIR), atol=1e-6)
+    np.testing.assert_array_equal(arrays.after, [0, 1])
     place(site, turn, july=at(0.01))
     site.changes()
     assert seen.pairs == []

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import default_params, merge
-from gsmap.merge.changes import newer_surfaces, overruled_pixels, remove_disappeared
+from gsmap.merge.changes import settle
 from gsmap.merge.exposure import apply_gain, balance_exposure
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
@@ -63,17 +63,10 @@ def merged(method: str, **settings: object) -> Callable[[], dict[str, np.ndarray
 
 
 def changes() -> dict[str, np.ndarray]:
-    pair = scenes()
-    kept, lost = remove_disappeared(pair)
-    (newer, none) = newer_surfaces(pair)
-    depth = np.full((32, 48), 1.5, np.float32)
-    return {
-        "lost": np.array(lost),
-        "kept": kept[0].gaussians.means,
-        "surfaces": newer[0].means,
-        "none": np.array(len(none)),
-        "overruled": overruled_pixels(cameras(np.zeros(1)), depth, newer),
-    }
+    found = settle(scenes())
+    pixels = found.overruled_pixels(0, cameras(np.zeros(1)))
+    kept = {f"kept_{s.scene_id}": s.gaussians.means for s in found.scenes}
+    return kept | {"lost": np.array(found.lost), "changed": found.changed[1], "overruled": pixels}
 
 
 def exposure() -> dict[str, np.ndarray]:

@@ -162,4 +162,4 @@ def test_captures_without_a_date_are_told_where_dates_decide():
     assert note.startswith("1 of 3 captures have no date: which one is newer is not known")
     assert notes(dates[:2]) == notes([None]) == []
     assert notes(dates, shift=5.0) == []  # they do not meet
-    assert notes(dates, "voxel") == notes(dates, params=replace(default_params("tto"), newer_wins=False)) == []
+    assert notes(dates, "voxel") == notes(dates, params=replace(default_params("tto"), prefer="both")) == []

@@ -1,12 +1,10 @@
 import numpy as np
-from synthetic_walls import cameras_facing, texture, two_scenes, wall
+from synthetic_walls import cameras_facing, two_scenes, wall
 
 from gsmap.merge import PlacedScene
-from gsmap.merge.changes import newer_surfaces, remove_disappeared
 from gsmap.merge.exposure import apply_gain, balance_exposure
 from gsmap.merge.references import render_references, surface_points, view_schedule
 from gsmap.render import render
-from gsmap.types import Gaussians
 
 
 def quiet(fraction, text):
@@ -67,33 +65,3 @@ def test_captures_that_do_not_meet_keep_their_exposure():
     a = PlacedScene(wall(0, -3, -2), cameras_facing([-2.5]), "a")
     b = PlacedScene(apply_gain(wall(1, 2, 3), np.full(3, 1.5)), cameras_facing([2.5]), "b")
     assert not balance_exposure([a, b])[1].any()
-
-
-def test_what_a_later_capture_looked_through_is_gone():
-    box = wall(5, -0.2, 0.2, z=-0.5, colour=lambda x, y: 1 - texture(x, y), half_height=0.15)
-    before = Gaussians.concatenate([wall(0, -1.5, 1.5), box])
-    cameras = cameras_facing(np.linspace(-0.6, 0.6, 7))
-    old = PlacedScene(before, cameras, "old", "2026-01-01T00:00:00+00:00")
-    new = PlacedScene(wall(1, -1.5, 1.5), cameras, "new", "2026-02-01T00:00:00+00:00")
-    kept, lost = remove_disappeared([old, new])
-    assert lost == [len(box), 0]
-    assert kept[0].gaussians.means[:, 2].min() > -0.1
-    # The other way round the box is new, and stays; so it does where nobody knows the time.
-    assert remove_disappeared([PlacedScene(before, cameras, "x", new.captured_at), old])[1][0] == 0
-    assert remove_disappeared([PlacedScene(before, cameras, "x"), new])[1] == [0, 0]
-
-
-def test_newer_surfaces_are_not_asked_away_by_older_pictures():
-    box = wall(5, -0.2, 0.2, z=-0.5, colour=lambda x, y: 1 - texture(x, y), half_height=0.15)
-    cameras = cameras_facing(np.linspace(-0.6, 0.6, 7))
-    old = PlacedScene(wall(1, -1.5, 1.5), cameras, "old", "2026-01-01T00:00:00+00:00")
-    new = PlacedScene(Gaussians.concatenate([wall(0, -1.5, 1.5), box]), cameras, "new", "2026-02-01T00:00:00+00:00")
-    later = newer_surfaces([old, new])
-    assert [len(x) for x in later] == [1, 0]
-    plain = render_references([old, new], None, 0.0, 64, None, quiet)
-    views = render_references([old, new], None, 0.0, 64, later, quiet)
-    middle = 3  # looks straight at the box
-    assert plain.weights[middle][24, 32] > 250
-    assert views.weights[middle][24, 32] == 0
-    assert views.weights[middle][24, 4] > 250
-    np.testing.assert_array_equal(views.weights[middle + 7], plain.weights[middle + 7])

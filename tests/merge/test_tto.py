@@ -196,7 +196,7 @@ def test_ssim_is_part_of_what_is_fitted():
     assert structure(with_ssim) > structure(without) + 1e-4
 
 
-PLAIN = Params(owner_cells=False, ssim_weight=0.0, min_weight=0.0, keep=1.0, newer_wins=False, voxel_m=0.01)
+PLAIN = Params(owner_cells=False, ssim_weight=0.0, min_weight=0.0, keep=1.0, prefer="both", voxel_m=0.01)
 
 
 @pytest.mark.parametrize("bounds", [None, np.array([[-0.3, -2, -2], [0.6, 2, 2]])])
@@ -214,10 +214,10 @@ def test_the_published_method_fits_every_voxel_of_the_union_by_l1(watched, bound
     assert watched.last.losses[0] == pytest.approx(error.sum() / (3 * (masks / 255).sum()), rel=1e-4)
 
 
-def test_without_newer_wins_dates_decide_nothing():
+def test_where_both_are_preferred_dates_decide_nothing():
     a, b = two_scenes()
     dated = [replace(a, captured_at="2026-01-01"), replace(b, captured_at="2026-02-01")]
-    params = Params(steps=5, newer_wins=False)
+    params = Params(steps=5, prefer="both")
     assert not tto.uses_dates(params)
     assert tto.uses_dates(Params())
     np.testing.assert_array_equal(merge([a, b], "tto", params).gaussians.sh, merge(dated, "tto", params).gaussians.sh)

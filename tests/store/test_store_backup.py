@@ -1,6 +1,7 @@
 """A backup in a folder: what it saves, when it refuses, and what several at once do to each other."""
 
 import fcntl
+import json
 import os
 import shutil
 import subprocess
@@ -381,6 +382,22 @@ def test_one_whose_lease_was_taken_away_stops(filled, place):
         lease._renewed -= EXPIRES_S
         with pytest.raises(StoreError, match="could not be reached"):
             lease.require()
+
+
+@pytest.mark.parametrize("task", [SAVE, SWEEP])
+def test_who_died_on_this_machine_is_not_waited_for(place, task):
+    code = "import json; from dataclasses import asdict; from gsmap.types.holder import this_process as me\n"
+    code += "print(json.dumps(asdict(me('backup'))))"
+    dead = json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
+    elsewhere = dead | {"process": " ".join([*dead["process"].split()[:2], "another-machine"])}
+    leases = {}
+    for told in (json.dumps(dead), json.dumps(elsewhere), "{}", "nonsense", json.dumps(dead) + " " * 20_000):
+        name = f"leases/{task}-{len(leases):032x}.json"
+        place.put(name, [told.encode()], len(told))
+        leases[name] = told
+    with Lease(place, SAVE) as lease:
+        assert sorted(lease.others()) == sorted(leases)[1:]
+    assert {f"leases/{path.name}" for path in (place.root / "leases").iterdir()} == set(sorted(leases)[1:])
 
 
 def test_two_backups_at_once(filled, place, tmp_path):

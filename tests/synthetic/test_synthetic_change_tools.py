@@ -13,6 +13,7 @@ from gsmap.ingest import read_captures
 from gsmap.types import Gaussians, Sim3
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+import bench_change
 import change_scores as scores
 import make_change
 
@@ -235,6 +236,36 @@ def test_ghosts_stand_where_things_went_and_the_newest_has_none(truth):
 def test_rows_that_are_still_there_are_told(truth):
     means = truth.gaussians("t0").means
     np.testing.assert_array_equal(scores.kept_rows(means[:9], means[::2]), [True, False] * 4 + [True])
+
+
+def test_what_merging_drops_is_measured_under_given_poses(folder, tmp_path):
+    (row,) = bench_change.drops(bench_change.Place(folder, None, tmp_path, true_poses=True))
+    assert row["way"] == "drops of t0"
+    assert row["gone"] > row["false"]
+    assert row["n_gone"] > 50
+    assert not list(tmp_path.iterdir())
+
+
+def test_losses_are_the_worst_of_all_places():
+    def row(place, way, changed, held_same, old):
+        psnr = dict.fromkeys(("changed", "new", "recoloured", "vacated"), changed)
+        held = {"same": held_same}
+        return {
+            "part": "merge",
+            "place": place,
+            "way": way,
+            "psnr": psnr,
+            "held": held,
+            "old_mix_new": (old, 0, 1 - old),
+        }
+
+    rows = [row("a", "alone", 30, 24, 0), row("a", "dated", 20, 25, 0.3), row("a", "newest", 29.5, 24.9, 0.01)]
+    rows += [row("b", "alone", 28, 24, 0), row("b", "dated", 20, 26, 0.2), row("b", "newest", 28.5, 26.1, 0.02)]
+    lines = {line.split()[0]: line for line in bench_change.losses(rows)}
+    assert "changed +0.50 dB below alone" in lines["newest"]
+    assert "held same -0.10 dB against dated" in lines["newest"]
+    assert lines["newest"].endswith("old or mix 0.020")
+    assert "changed +10.00 dB below alone" in lines["dated"]
 
 
 def test_the_sets_never_share_a_place_and_say_what_is_false():

@@ -117,13 +117,13 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
 
 def _valid(current: Iterable[Comparison], asked: Wanted, settings: Settings) -> list[Comparison]:
     """The comparisons that are what would be found now."""
-    pairs = set(asked.pairs)
+    pairs, recipe = set(asked.pairs), recipe_key(settings.change)
     return [
         one
         for one in current
         if (one.older, one.newer) in pairs
         and one.whole
-        and one.key == _key(settings, one.older, one.newer).digest
+        and one.key == recipe.of(one.older, one.newer).digest
         and not has_moved(asked.visits[one.older], asked.visits[one.newer], one.S_newer_older, settings.visits)
     ]
 

@@ -42,7 +42,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
 
     Raises:
         ConfigError: neither days nor a budget, or negative ones.
-        NotFoundError: the map has no poses, or no dated captures.
+        NotFoundError: the map has no poses.
     """
     if request.keep_days is None and request.budget_bytes is None:
         raise ConfigError("say what to keep: days (--keep-days 365), a size (--budget 2GiB), or both")
@@ -53,8 +53,6 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         raise NotFoundError("the map has no poses yet, so nobody knows what supersedes what: run gsmap update first")
     living = {scene.id: scene for scene in store.scenes.list()}
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
-    if not dated:
-        raise NotFoundError("no capture has a date: gsmap edit MAP SCENE --captured-at DATE tells which is older")
     now = datetime.now(UTC) if request.now is None else datetime.fromisoformat(request.now)
     before = now - timedelta(days=request.keep_days or 0)
     old = [scene for scene in dated if _when(scene) < before and scene.thinning is None and scene.id in graph.poses]
@@ -110,6 +108,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     return ThinReport(
         dry_run=request.dry_run,
         scenes=tuple(rows),
+        num_undated=len(living) - len(dated),
         num_bytes=sum(sizes.values()),
         num_bytes_freed=freed,
         fits=request.budget_bytes is None or sum(sizes.values()) <= request.budget_bytes,
@@ -119,7 +118,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
 def _row(scene: Scene, before: int, after: int, seen: float, reason: str, fidelity: float | None = None) -> ThinRow:
     return ThinRow(
         scene=scene.id,
-        name=scene.name,
+        scene_name=scene.name,
         captured_at=scene.captured_at or "",
         thinned=not reason,
         num_bytes_before=before,

@@ -3,8 +3,8 @@
 Graph-GSReg's merging (voxelise the union, then minimise the difference to renders of the originals; no photographs
 needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
 shows least goes first, the newest capture wins where the place changed, and exposures can be balanced. With
-`owner_cells` off, both preferred, an `ssim_weight` and `min_weight` of 0 and a `keep` of 1 it is the published method: an L1 fit of
-all voxels of the union.
+`owner_cells` off, both preferred, an `ssim_weight` and `min_weight` of 0 and a `keep` of 1 it is the published method:
+an L1 fit of all voxels of the union.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 1
+VERSION = 2
 STEPS: str | None = "steps"
 RENDERS = True
 
@@ -186,7 +186,7 @@ def merge(
         lambda fraction, text: progress(0.2 * fraction, text),
         params.references,
     )
-    start, origin, changed = _start(scenes, wanted, settled.changed, params, bounds)
+    start, origin = _start(scenes, wanted, settled.changed, params, bounds)
     if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
@@ -206,10 +206,10 @@ def _start(
     changed: Sequence[np.ndarray],
     params: Params,
     bounds: np.ndarray | None,
-) -> tuple[Gaussians, np.ndarray, np.ndarray]:
+) -> tuple[Gaussians, np.ndarray]:
     """The voxelised originals within the halo, one capture per cell, and within the bounds only what shows most.
 
-    What stands where the place changed is taken as it is. Also the scene of each Gaussian, and which stood so.
+    What stands where the place changed is taken as it is. Also the scene of each Gaussian.
     """
     gaussians, origin = united(scenes)
     near = inside(gaussians.means, bounds, params.halo_m)
@@ -230,7 +230,7 @@ def _start(
     if params.keep < 1:
         count = int(params.keep * inside(gaussians.means, bounds).sum()) - int((new & mine).sum())
         stays &= ~mine | new | most_visible(visible, stays & mine & ~new, max(count, 0))
-    return merged[stays], origin[stays], new[stays]
+    return merged[stays], origin[stays]
 
 
 def _fit(

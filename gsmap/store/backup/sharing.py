@@ -2,23 +2,23 @@
 
 Everybody first says that he is there and then looks who else is. So of a saver and a sweeper that come at the same time
 at least one sees the other: a saver waits for the sweeper to be done, and a sweeper goes away and leaves everything as
-it is. A lease that is not renewed in time is nobody's; ages are by the clock of the place, never by ours.
+it is. A lease that is not renewed in time is nobody's, and one of a process of this machine that has ended; ages are by
+the clock of the place, never by ours.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
-import socket
 import threading
 import time
 import uuid
+from dataclasses import asdict
 from types import TracebackType
 
-from gsmap.errors import BusyError, GsmapError, StoreError
+from gsmap.errors import MALFORMED, BusyError, GsmapError, NotFoundError, StoreError
 from gsmap.store.backup.places import Place
-from gsmap.store.catalog import now
+from gsmap.types.holder import Holder, this_process
 
 LEASES = "leases/"
 SAVE = "save"
@@ -26,6 +26,7 @@ SWEEP = "sweep"
 RENEW_S = 60.0
 EXPIRES_S = 900.0  # a writer whose place did not answer for so long has stopped, or stops when it notices
 PATIENCE_S = 1800.0  # a saver waits so long for a sweeper; longer than a dead one's lease lives
+_MAX_BYTES = 10_000  # of a lease
 
 
 class Lease:
@@ -38,7 +39,7 @@ class Lease:
     def __init__(self, place: Place, task: str) -> None:
         self.name = f"{LEASES}{task}-{uuid.uuid4().hex}.json"
         self._place = place
-        self._since = now()
+        self._holder = this_process(f"backup {task}")
         self._renewed = 0.0
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._keep, name=self.name, daemon=True)
@@ -71,8 +72,26 @@ class Lease:
         if self.name not in listed:
             raise StoreError(f"{self._place.url}: our lease was taken away; run it again")
         oldest = listed[self.name].modified_s - EXPIRES_S
-        standing = [name for name, about in listed.items() if about.modified_s >= oldest and name != self.name]
-        return [name for name in standing if name.startswith(LEASES + task)]
+        del listed[self.name]
+        wanted = {name: about for name, about in listed.items() if name.startswith(LEASES + task)}
+        return [
+            name
+            for name, about in wanted.items()
+            if about.modified_s >= oldest and not (about.size_bytes <= _MAX_BYTES and self._is_gone(name))
+        ]
+
+    def _is_gone(self, name: str) -> bool:
+        """Whether who wrote a lease has ended, as far as this machine can tell; the lease goes with it then."""
+        try:
+            told = json.loads(b"".join(self._place.get(name)))
+            gone = Holder(**{key: str(told[key]) for key in ("task", "host", "process", "since")}).is_gone
+        except NotFoundError:
+            return True
+        except MALFORMED:
+            return False
+        if gone:
+            self._place.delete(name)
+        return gone
 
     def wait_for_sweepers(self) -> None:
         """Return when nobody deletes.
@@ -90,7 +109,7 @@ class Lease:
 
     def _renew(self) -> None:
         began = time.monotonic()
-        text = json.dumps({"host": socket.gethostname(), "process": os.getpid(), "since": self._since}).encode()
+        text = json.dumps(asdict(self._holder)).encode()
         self._place.put(self.name, [text], len(text))
         self._renewed = began
 

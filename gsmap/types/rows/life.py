@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from gsmap.types.rows.base import Row
+from gsmap.types.rows.scenes import SceneRef
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ThinRow(Row):
+class ThinRow(SceneRef):
     """A capture that was considered.
 
     Args:
-        scene: id.
-        name: of it.
         captured_at: ISO 8601 with zone.
         thinned: whether it is kept compact now, or would be.
         num_bytes_before: of its arrays and graphs.
@@ -27,7 +26,7 @@ class ThinRow(Row):
     """
 
     columns: ClassVar[Mapping[str, str]] = {
-        "name": "scene",
+        "scene_name": "scene",
         "captured_at": "captured",
         "thinned": "thinned",
         "num_bytes_before": "bytes",
@@ -37,8 +36,6 @@ class ThinRow(Row):
         "reason": "why not",
     }
 
-    scene: str
-    name: str
     captured_at: str
     thinned: bool
     num_bytes_before: int
@@ -55,6 +52,7 @@ class ThinReport(Row):
     Args:
         dry_run: whether nothing was changed.
         scenes: the captures that were old enough, oldest first.
+        num_undated: captures without a date, which stay as they are.
         num_bytes: of the arrays and graphs of all living scenes now.
         num_bytes_freed: on disk; 0 in a dry run, or where a branch or a tag still names what was there.
         fits: whether that is within the budget.
@@ -64,6 +62,7 @@ class ThinReport(Row):
 
     dry_run: bool
     scenes: tuple[ThinRow, ...]
+    num_undated: int
     num_bytes: int
     num_bytes_freed: int
     fits: bool

@@ -1,0 +1,157 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_changes import box, dated, patched, plain
+from synthetic_walls import cameras_facing, texture, wall
+
+from gsmap import compare
+from gsmap.merge import changes, default_params, merge
+from gsmap.merge.changes import settle
+from gsmap.merge.exposure import apply_gain
+from gsmap.merge.references import render_references
+from gsmap.render import render
+from gsmap.types import Gaussians
+
+Params = type(default_params("tto"))
+
+
+def quiet(fraction, text):
+    pass
+
+
+def standing(settled, index):
+    """How many Gaussians of a capture still stand before the wall."""
+    return int((settled.scenes[index].gaussians.means[:, 2] < -0.3).sum())
+
+
+def test_what_a_later_capture_looked_through_is_gone():
+    old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
+    settled = settle([old, new])
+    assert standing(settled, 0) == 0
+    assert len(box(5)) <= settled.lost[0] <= 1.05 * len(box(5))
+    assert settled.lost[1] == 0
+    # The other way round the box is new, and stays; so it does where nobody knows the time, or it is the same.
+    later = replace(old, captured_at="2022-01-01")
+    assert standing(settle([later, new]), 0) == len(box(5))
+    for when in (None, new.captured_at):
+        assert settle([replace(old, captured_at=when), new]).lost == [0, 0]
+
+
+def test_what_no_newer_capture_saw_stays():
+    away = dated("new", 2021, wall(1, -1.5, 1.5), cameras=cameras_facing(np.linspace(-3.6, -3.0, 7)))
+    old = dated("old", 2020, wall(0, -1.5, 1.5), box(5))
+    assert settle([old, away]).lost == [0, 0]
+
+
+def test_paint_is_told_from_exposure():
+    old = dated("old", 2020, wall(0, -1.5, 1.5, colour=plain))
+    painted = dated("new", 2021, wall(1, -1.5, 1.5, colour=patched))
+    settled = settle([old, painted])
+    left = settled.scenes[0].gaussians.means
+    in_patch = (np.abs(left[:, 0]) < 0.25) & (np.abs(left[:, 1]) < 0.2)
+    far = (np.abs(old.gaussians.means[:, 0]) > 0.4) | (np.abs(old.gaussians.means[:, 1]) > 0.35)
+    assert in_patch.sum() == 0
+    assert ((np.abs(left[:, 0]) > 0.4) | (np.abs(left[:, 1]) > 0.35)).sum() == far.sum()
+    # The same picture a stop and a half darker and in warmer light says nothing of paint ...
+    gain = np.array([0.5, 0.4, 0.3])
+    lit = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=plain), gain))
+    assert settle([old, lit]).lost == [0, 0]
+    # ... and hides none.
+    both = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=patched), gain))
+    left = settle([old, both]).scenes[0].gaussians.means
+    assert ((np.abs(left[:, 0]) < 0.25) & (np.abs(left[:, 1]) < 0.2)).sum() == 0
+
+
+def test_pictures_of_what_is_not_so_any_more_are_not_learnt():
+    bare, with_box = [wall(1, -1.5, 1.5)], [wall(0, -1.5, 1.5), box(5)]
+    for before, after in ((with_box, bare), (bare, with_box)):
+        old, new = dated("old", 2020, *before), dated("new", 2021, *after)
+        settled = settle([old, new])
+        plain_views = render_references([old, new], None, 0.0, 64, None, quiet)
+        views = render_references(settled.scenes, None, 0.0, 64, settled, quiet)
+        middle = 3  # looks straight at the box
+        assert plain_views.weights[middle][24, 32] > 250
+        assert views.weights[middle][24, 32] == 0
+        assert views.weights[middle][24, 4] > 250
+        np.testing.assert_array_equal(views.weights[middle + 7], plain_views.weights[middle + 7])
+
+
+@pytest.mark.parametrize("prefer", ["newest", "best", "both"])
+def test_who_is_preferred_is_shown(prefer):
+    # The newer capture looked once, from afar; the older seven times, from near by.
+    once = cameras_facing([0.0], distance=3.6)
+    old = dated("old", 2020, wall(0, -1.5, 1.5), box(5))
+    new = dated("new", 2021, wall(1, -1.5, 1.5), cameras=once)
+    stands = standing(settle([old, new], prefer), 0) > 0.9 * len(box(5))
+    assert stands == (prefer != "newest")
+    # And where it is the older one that looked through, the newer's box leaves for `best` alone.
+    bare, boxed = dated("old", 2020, wall(0, -1.5, 1.5)), dated("new", 2021, wall(1, -1.5, 1.5), box(5), cameras=once)
+    stands = standing(settle([bare, boxed], prefer), 1) > 0.9 * len(box(5))
+    assert stands == (prefer != "best")
+
+
+def test_merged_it_looks_like_the_newest():
+    blue = lambda x, y: np.tile([0.1, 0.2, 0.8], (len(x), 1))  # noqa: E731
+    old = dated("a", 2020, wall(0, -1.5, 1.5), box(5))
+    new = dated("b", 2021, wall(1, -1.5, 1.5, colour=lambda x, y: texture(x, y)), box(6, colour=blue))
+    camera = cameras_facing([0.0])
+    wanted = render(new.gaussians, camera).colour[0]
+    merged = render(merge([old, new], "tto", Params(steps=60)).gaussians, camera).colour[0]
+    assert np.abs(merged - wanted)[18:30, 26:38].mean() < 0.03
+    mixed = render(merge([old, new], "tto", Params(steps=60, prefer="both")).gaussians, camera).colour[0]
+    assert np.abs(mixed - wanted)[18:30, 26:38].mean() > 0.1
+
+
+def test_the_newest_who_looked_decides():
+    """A box that came, went, and came back: every capture is judged by the newest that knows better."""
+    first = dated("a", 2020, wall(0, -1.5, 1.5), box(5))
+    second = dated("b", 2021, wall(1, -1.5, 1.5))
+    third = dated("c", 2022, wall(2, -1.5, 1.5), box(7))
+    settled = settle([first, second, third])
+    assert standing(settled, 2) == len(box(7))
+    assert standing(settle([first, second]), 0) == 0
+    # What the newest never saw is decided by the one before.
+    aside = cameras_facing(np.linspace(-3.6, -3.0, 7))
+    assert standing(settle([first, second, dated("c", 2022, wall(2, -4.5, -2.5), cameras=aside)]), 0) == 0
+
+
+def test_captures_are_compared_in_linear_time(monkeypatch):
+    """Renders grow with the captures, not with their pairs."""
+    calls = []
+
+    def counted(gaussians, cameras, **options):
+        calls.append(len(cameras))
+        return render(gaussians, cameras, **options)
+
+    for module in (changes, compare.looks, compare.comparing):
+        monkeypatch.setattr(module, "render", counted)
+    spent = {}
+    for count in (4, 8, 16):
+        calls.clear()
+        scenes = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(count)]
+        settle(scenes, params=compare.Params(max_views=8))
+        spent[count] = sum(calls)
+    assert spent[16] - spent[8] == 2 * (spent[8] - spent[4])
+    assert spent[16] <= 16 * (7 + 7 + 2 * 8)
+
+
+def test_looks_of_many_captures_together_are_those_that_add_coverage():
+    many = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(6)]
+    looks = [compare.look(scene) for scene in many[::-1]]
+    stays = [np.ones(len(one.gaussians), dtype=bool) for one in looks]
+    joined = compare.joined(list(zip(looks, stays, strict=True)), many[0], compare.Params(max_views=6))
+    assert len(joined.views) == 6
+    assert len(joined.gaussians) == sum(len(scene.gaussians) for scene in many)
+    for view in joined.views:
+        inside = view.dominant_id >= 0
+        seen = joined.gaussians.means[view.dominant_id[inside]]
+        assert np.abs(seen[:, 2]).max() < 0.1
+
+
+def test_a_capture_of_another_place_costs_nothing(monkeypatch):
+    near, far = dated("a", 2020, wall(0, -1, 1)), dated("b", 2021, wall(1, 9, 11), cameras=cameras_facing([10.0]))
+    monkeypatch.setattr(compare, "compare", None)
+    settled = settle([near, far])
+    assert settled.lost == [0, 0]
+    assert isinstance(settled.rivals[0], Gaussians)
