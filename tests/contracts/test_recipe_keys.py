@@ -46,6 +46,7 @@ ALTERNATIVES: dict[str, Any] = {
 """Another value of a setting that takes only certain words."""
 
 NAMES_NOTHING = (
+    "objects.",  # made whenever they are asked for, and not kept
     "retrieve.",
     "visits.",
     "thin.",
