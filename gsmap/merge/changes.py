@@ -12,7 +12,7 @@ import numpy as np
 from gsmap import compare
 from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
 from gsmap.merge.exposure import apply_gain
-from gsmap.merge.placed import overlapping
+from gsmap.merge.placed import overlapping, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
@@ -52,20 +52,17 @@ class Settled:
 
     def overruled_pixels(self, scene: int, camera: Cameras, longest_side_px: int = 240) -> np.ndarray:
         """(H, W) bool, where a picture of a scene from a camera (1) shows what is not so, or does not show what is."""
-        own, losers, rivals = self.scenes[scene].gaussians, self.losers[scene], self.rivals[scene]
+        disputed = Gaussians.concatenate([self.losers[scene], self.rivals[scene]])
         width, height = (int(v) for v in camera.sizes_px[0])
-        if not len(losers) and not len(rivals):
-            return np.zeros((height, width), dtype=bool)
         small = camera.resized(longest_side_px)
-        disputed = np.zeros((int(small.sizes_px[0, 1]), int(small.sizes_px[0, 0])), dtype=bool)
-        for others in (losers, rivals):
-            if len(others):
-                disputed |= _share_of_pixels(others, own, small) > _SHOWS
+        if not len(disputed) or not share_in_view(small, disputed.means)[0]:
+            return np.zeros((height, width), dtype=bool)
+        shows = _share_of_pixels(disputed, self.scenes[scene].gaussians, small) > _SHOWS
         # A Gaussian's skirts reach beyond the pixels in which it shows.
-        disputed = compare.grown(disputed)
-        rows = ((np.arange(height) + 0.5) * disputed.shape[0] / height).astype(int)
-        columns = ((np.arange(width) + 0.5) * disputed.shape[1] / width).astype(int)
-        out: np.ndarray = disputed[np.ix_(rows, columns)]
+        shows = compare.grown(shows)
+        rows = ((np.arange(height) + 0.5) * shows.shape[0] / height).astype(int)
+        columns = ((np.arange(width) + 0.5) * shows.shape[1] / width).astype(int)
+        out: np.ndarray = shows[np.ix_(rows, columns)]
         return out
 
     def notes(self) -> list[str]:
@@ -175,13 +172,22 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
 def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict) -> np.ndarray:
     """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
 
-    A last look at what evidence of single Gaussians leaves: shards at edges, what is smaller than a tolerance.
+    A last look at what evidence of single Gaussians leaves beside a change: shards, and what is smaller than a pixel.
     """
+    from scipy.spatial import cKDTree
+
+    out = np.zeros(len(older), dtype=bool)
+    disputed = np.concatenate([older.means[verdict.lost], newer.gaussians.means[verdict.changed]])
+    if not len(disputed) or not stays.any():
+        return out
     rows = np.flatnonzero(stays)
+    rows = rows[np.isfinite(cKDTree(disputed).query(older.means[rows], distance_upper_bound=_NEAR_M)[0])]
     count = len(newer.gaussians)
     together = Gaussians.concatenate([newer.gaussians, older[rows]])
     good, bad = np.zeros(len(rows)), np.zeros(len(rows))
     for view in newer.views:
+        if not share_in_view(view.camera, older.means[rows])[0]:
+            continue
         seen = render(together, view.camera, depth=False)
         shown = seen.dominant_id[0]
         theirs = view.opaque & (shown >= count)
@@ -191,19 +197,7 @@ def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Compari
         shown = shown[theirs] - count
         bad += np.bincount(shown[worse], minlength=len(rows))
         good += np.bincount(shown[~worse], minlength=len(rows))
-    out = np.zeros(len(older), dtype=bool)
     out[rows[bad > good]] = True
-    from scipy.spatial import cKDTree
-
-    disputed = np.concatenate([older.means[verdict.lost], newer.gaussians.means[verdict.changed]])
-    at = np.flatnonzero(out)
-    if len(at):
-        reach = (
-            cKDTree(disputed).query(older.means[at], distance_upper_bound=_NEAR_M)[0]
-            if len(disputed)
-            else np.full(len(at), np.inf)
-        )
-        out[at[np.isinf(reach)]] = False
     return out
 
 
