@@ -43,9 +43,11 @@ def test_a_box_that_went_or_came(appears):
     means = scenes[0].gaussians.means
     inside = (np.abs(means - [0.9, 1.2, 0.33]) < [0.27, 0.22, 0.3]).all(1)
     # The Gaussians of the box, nearly all and nearly nothing else.
-    assert np.isin(np.flatnonzero(inside), rows).mean() > 0.85 and inside[rows].mean() > 0.9
+    assert np.isin(np.flatnonzero(inside), rows).mean() > 0.85
+    assert inside[rows].mean() > 0.9
     assert len(none) < 0.2 * len(rows)
-    assert found.confidence > 0.9 and 0.5 < report.seen_share <= 1
+    assert found.confidence > 0.9
+    assert 0.5 < report.seen_share <= 1
 
 
 @pytest.mark.parametrize(("yaw", "to"), [(0.0, (1.25, 1.2)), (1.2, (2.0, 1.0))])
@@ -56,11 +58,13 @@ def test_a_box_that_moved_is_one_change_with_its_pose(yaw, to):
         capture([*room, *box(*to, 0.6, 0.4, 0.5, 6, yaw=yaw)], 2),
     )
     (found,) = things(report)
-    assert found.kind == "moved" and found.symmetry == "none"
+    assert found.kind == "moved"
+    assert found.symmetry == "none"
     truth = moved_by(yaw, (0.9, 1.2), to)
     corners = np.array([[0.6, 1.0, 0], [1.2, 1.4, 0.5], [0.6, 1.4, 0.5]])
     assert np.linalg.norm(found.S_after_before.apply(corners) - truth.apply(corners), axis=1).max() < 0.05
-    assert found.S_after_before.is_rigid and found.S_after_before.rotation[2, 2] == pytest.approx(1)
+    assert found.S_after_before.is_rigid
+    assert found.S_after_before.rotation[2, 2] == pytest.approx(1)
     assert len(found.before) > 100 < len(found.after)
 
 
@@ -89,7 +93,8 @@ def test_paint_is_no_move_and_its_cells_are_the_wall_or_the_box():
     room = [*shell(), *STAYS, *box(*thing, 6)]
     older = capture(room, 1)
     (wall,) = things(change.compare(older, capture([*shell(plain(0.2, 0.3, 0.7)), *STAYS, *box(*thing, 6)], 2)))
-    assert wall.kind == "recoloured" and (wall.voxels[:, 1] > 2.8).mean() > 0.95
+    assert wall.kind == "recoloured"
+    assert (wall.voxels[:, 1] > 2.8).mean() > 0.95
     painted = [*shell(), *STAYS, *box(*thing, 6, paint=plain(0.9, 0.8, 0.1))]
     (repainted,) = things(change.compare(older, capture(painted, 2)))
     assert repainted.kind == "recoloured"
@@ -101,9 +106,11 @@ def test_what_one_capture_did_not_see_has_not_changed():
     room = [*shell(), *STAYS]
     newer = capture(room, 2, toward=(2.9, 2.9, 0.9), angles=(0.1, 0.5))
     away = change.compare(capture([*room, *box(0.5, 0.5, 0.4, 0.4, 0.5, 6)], 1), newer)
-    assert things(away) == [] and away.seen_share < 0.9
+    assert things(away) == []
+    assert away.seen_share < 0.9
     blind = change.compare(capture(room, 1), PlacedScene(capture(room, 2).gaussians, None, "b"))
-    assert blind.changes == () and "no cameras" in blind.notes[0]
+    assert blind.changes == ()
+    assert "no cameras" in blind.notes[0]
 
 
 def test_any_vertical_and_any_frame():
@@ -131,16 +138,21 @@ def test_crops_show_the_place_before_and_after():
     older, newer = capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6, paint=red)], 1), capture(room, 2)
     report = change.compare(older, newer)
     ((before, after),) = change.crops(report, older, newer, longest_side_px=128)
-    assert before.dtype == np.uint8 and before.ndim == 3 and before.shape[2] == 3
+    assert before.dtype == np.uint8
+    assert before.ndim == 3
+    assert before.shape[2] == 3
     # The older picture shows much of the red box; the newer one none of it, but for the lines of the box.
     red_share = [((p[..., 0] > 180) & (p[..., 1] < 70) & (p[..., 2] < 70)).mean() for p in (before, after)]
-    assert red_share[0] > 0.08 and red_share[1] < 0.01
+    assert red_share[0] > 0.08
+    assert red_share[1] < 0.01
     assert change.crops(report, older, PlacedScene(newer.gaussians, None), changes=[0])[0][1] is None
 
 
 def test_the_key_names_the_settings_and_the_code():
     key = change.recipe_key()
-    assert key.stage == "change" and key.version["change"] == change.VERSION and "compare" in key.version
+    assert key.stage == "change"
+    assert key.version["change"] == change.VERSION
+    assert "compare" in key.version
     assert key.recipe != change.recipe_key(change.Params(voxel_m=0.2)).recipe
     with pytest.raises(ConfigError, match="voxel_m must be positive"):
         change.Params(voxel_m=0.0)
