@@ -12,7 +12,7 @@ from gsmap.change.finding import find_changes
 from gsmap.change.params import Params
 from gsmap.change.reporting import change_of, lighting
 from gsmap.change.sides import sides
-from gsmap.change.things import judge
+from gsmap.change.things import judge, light
 from gsmap.errors import InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.methods import RecipeKey
@@ -69,11 +69,12 @@ def compare(
     report(0.7, "finding what changed")
     both = sides(looks_older, looks_newer, found, params)
     cells = judge(both, params)
-    ones = find_changes(both, cells, found.balance, (looks_older, looks_newer), params)
+    unlike = light(both)
+    ones = find_changes(both, cells, unlike, (looks_older, looks_newer), params)
     changes = [change_of(one, both, cells, params) for one in ones]
     changes = [c for c in changes if c.confidence >= params.min_confidence]
-    light = lighting(both, found.balance)
-    changes += [light] if light is not None else []
+    other_light = lighting(both, found.balance, unlike)
+    changes += [other_light] if other_light is not None else []
     changes.sort(key=lambda c: (-c.confidence, c.box.tolist()))
     if upright is not None:
         changes = [_back(change, upright.inverse()) for change in changes]

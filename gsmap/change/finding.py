@@ -13,7 +13,7 @@ from gsmap.change.moving import find_moves
 from gsmap.change.params import Params
 from gsmap.change.sides import Side
 from gsmap.change.things import Cells, Thing, behind, gathered, is_paint, joined, paints, parts, things_of, with_behind
-from gsmap.compare import Balance, Looks
+from gsmap.compare import Looks
 
 _IN_PLACE_M = 0.1  # cells of two captures so close to each other are of one place ...
 _IN_PLACE = 0.3  # ... and so are two things, if this share of the smaller one is
@@ -24,12 +24,16 @@ _FEWEST_OF_PART = 60
 def find_changes(
     both: tuple[Side, Side],
     cells: tuple[Cells, Cells],
-    line: Balance,
+    unlike: float,
     looks: tuple[Looks, Looks],
     params: Params,
 ) -> list[Found]:
-    """Everything that changed, one by one, before it is judged how sure it is."""
-    tints = [p for p in paints(both, cells, params) if is_paint(p, line, params)]
+    """Everything that changed, one by one, before it is judged how sure it is.
+
+    Args:
+        unlike: how unlike the light falls, see `gsmap.change.things.light`.
+    """
+    tints = [p for p in paints(both, cells, params) if is_paint(p, unlike, params)]
     clear = [np.zeros(len(side), dtype=bool) for side in both]
     for paint in tints:
         if not paint.is_shell:

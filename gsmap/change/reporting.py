@@ -64,15 +64,18 @@ def _confidence(one: Found, evidence: dict[str, float]) -> float:
     return sure * float(np.clip(evidence["fit"] / 0.8, 0, 1)) if one.kind == "moved" else sure
 
 
-def lighting(both: tuple[Side, Side], line: Balance) -> Change | None:
-    """The one change of a place whose light, or whose camera's exposure, is another; None where it is the same."""
+def lighting(both: tuple[Side, Side], line: Balance, spread: float) -> Change | None:
+    """The one change of a place whose light, or whose camera's exposure, is another; None where it is the same.
+
+    Args:
+        spread: how unlike the light falls, see `gsmap.change.things.light`.
+    """
     gains = np.abs(np.log(line.gains()))
-    spread = max(line.chroma_spread, line.lightness_spread)
     sure = float(1 - np.exp(-max(gains.max() / _GAIN, spread / LIT_OTHERWISE)))
     points = np.concatenate([side.points[side.looks > 0] for side in both])
     if not len(points) or (gains.max() < _GAIN and spread < LIT_OTHERWISE):
         return None
     none = np.zeros(0, dtype=np.int32)
-    evidence = {"gain": float(line.gains().mean()), "spread": float(spread)}
+    evidence = {"gain": float(line.gains().mean()), "spread": spread}
     box = np.stack([points.min(0), points.max(0)])
     return Change("lighting", box, np.zeros((0, 3), np.float32), none, none, confidence=sure, evidence=evidence)

@@ -11,7 +11,7 @@ from gsmap.change.components import components, groups
 from gsmap.change.params import Params
 from gsmap.change.sides import Side
 from gsmap.change.structure import planes
-from gsmap.compare import Balance
+from gsmap.geometry.cells import cell_labels
 
 _SMOOTH_M = 0.08  # neighbours that a cell asks
 _FEWEST_LOOKS = 3  # views through a neighbourhood, and pixels that compared its colour
@@ -23,6 +23,7 @@ _LINK_M = 0.08  # cells of one thing, where nothing but the room's shell is betw
 _RING_M = (0.04, 0.12)  # how far from a change of colour its surroundings begin and end
 _MOST = 0.35
 _MUCH, _MANY = 0.25, 100  # of a thing, and cells: so much of it does not change its colour by a shadow
+_PLACE_M = 0.5
 _DARK = 0.8  # a change that is lightness to this share may be a shadow, a lamp, or a window at night
 _COHERENT = 0.4  # one that agrees with itself less may be a texture that two trainings show differently
 _BEHIND_M = 0.2  # a change of colour on a wall, so close to a thing that came or went, is its back or its shadow
@@ -30,8 +31,8 @@ _BEHIND = 0.5  # ... if this share of it is
 _SPLINTER, _SPLINTER_M = 60, 0.15  # a thing of fewer cells, so close to a larger one, is a part of it
 
 
-LIT_OTHERWISE = 0.035
-"""Spread of the colours that agree, beyond which the whole place is lit otherwise."""
+LIT_OTHERWISE = 0.028
+"""What `light` says beyond which the whole place is lit otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,19 +186,33 @@ def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params)
     return found
 
 
-def is_paint(paint: Paint, line: Balance, params: Params) -> bool:
+def is_paint(paint: Paint, light: float, params: Params) -> bool:
     """Whether a change of colour is paint, and neither light nor a texture that two trainings show differently."""
     if not paint.is_shell and paint.share >= _MUCH and sum(map(len, paint.cells)) >= _MANY:
         less = 0.6 if paint.share >= _MOST and paint.coherence >= _COHERENT else 0.75
         return paint.strength >= less * params.min_paint and paint.leak <= 2.5 * params.most_leak
     least = params.min_paint
-    if max(line.chroma_spread, line.lightness_spread) > LIT_OTHERWISE:
+    if light > LIT_OTHERWISE:
         least *= 1.6
     if paint.darkening > _DARK and paint.is_shell:
         least *= 1.8
     if paint.coherence < _COHERENT:
         least *= 1.6
     return paint.strength >= least and paint.leak <= params.most_leak
+
+
+def light(sides: tuple[Side, Side]) -> float:
+    """How unlike the light of a place falls in two captures: the robust spread, over places of half a metre, of what is
+    left of the differences of colour once exposure is balanced."""
+    spreads = []
+    for side in sides:
+        label, counts = cell_labels(np.floor(side.points / _PLACE_M))
+        looks = np.bincount(label, side.looks, len(counts))
+        sums = np.stack([np.bincount(label, side.colour[:, k] * side.looks, len(counts)) for k in range(3)], axis=1)
+        mean = sums[looks > 0] / looks[looks > 0, None]
+        if len(mean):
+            spreads.append(1.4826 * np.median(np.abs(mean - np.median(mean, axis=0)), axis=0).max())
+    return float(max(spreads, default=0.0))
 
 
 def _share(cells: Cells, rows: np.ndarray) -> float:

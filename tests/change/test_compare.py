@@ -1,0 +1,158 @@
+"""Changes of a made room, against the truth: what came, went, moved, was painted; and what is no change at all."""
+
+import numpy as np
+import pytest
+from made_room import box, capture, moved_by, plain, shell, stripes
+
+from gsmap import change
+from gsmap.errors import ConfigError, InputError
+from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.types import PlacedScene, Sim3
+
+STAYS = box(2.2, 2.5, 0.6, 0.5, 0.7, 5)
+
+
+def things(report):
+    return [c for c in report.changes if c.kind != "lighting"]
+
+
+def share_near(points, middle, half):
+    return (np.abs(points - middle) <= np.asarray(half) + 0.1).all(1).mean()
+
+
+def test_the_same_room_again_and_at_another_exposure_has_not_changed():
+    room = [*shell(), *STAYS, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6)]
+    older = capture(room, 1)
+    assert change.compare(older, capture(room, 2)).changes == ()
+    darker = change.compare(older, capture(room, 2, gain=0.75))
+    assert [c.kind for c in darker.changes] == ["lighting"]
+    assert darker.gains == pytest.approx([0.75] * 3, abs=0.05)
+    assert len(darker.changes[0].before) == 0 == len(darker.changes[0].voxels)
+
+
+@pytest.mark.parametrize("appears", [False, True])
+def test_a_box_that_went_or_came(appears):
+    room = [*shell(), *STAYS]
+    scenes = [capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6)], 1), capture(room, 2)]
+    report = change.compare(*(reversed(scenes) if appears else scenes))
+    (found,) = things(report)
+    assert found.kind == ("appeared" if appears else "disappeared")
+    assert share_near(found.voxels, (0.9, 1.2, 0.3), (0.25, 0.2, 0.3)) > 0.95
+    assert np.abs(found.box - [[0.65, 1.0, 0.0], [1.15, 1.4, 0.6]]).max() < 0.12
+    rows, none = (found.after, found.before) if appears else (found.before, found.after)
+    means = scenes[0].gaussians.means
+    inside = (np.abs(means - [0.9, 1.2, 0.33]) < [0.27, 0.22, 0.3]).all(1)
+    # The Gaussians of the box, nearly all and nearly nothing else.
+    assert np.isin(np.flatnonzero(inside), rows).mean() > 0.85
+    assert inside[rows].mean() > 0.9
+    assert len(none) < 0.2 * len(rows)
+    assert found.confidence > 0.9
+    assert 0.5 < report.seen_share <= 1
+
+
+@pytest.mark.parametrize(("yaw", "to"), [(0.0, (1.25, 1.2)), (1.2, (2.0, 1.0))])
+def test_a_box_that_moved_is_one_change_with_its_pose(yaw, to):
+    room = [*shell(), *STAYS]
+    report = change.compare(
+        capture([*room, *box(0.9, 1.2, 0.6, 0.4, 0.5, 6)], 1),
+        capture([*room, *box(*to, 0.6, 0.4, 0.5, 6, yaw=yaw)], 2),
+    )
+    (found,) = things(report)
+    assert found.kind == "moved"
+    assert found.symmetry == "none"
+    truth = moved_by(yaw, (0.9, 1.2), to)
+    corners = np.array([[0.6, 1.0, 0], [1.2, 1.4, 0.5], [0.6, 1.4, 0.5]])
+    assert np.linalg.norm(found.S_after_before.apply(corners) - truth.apply(corners), axis=1).max() < 0.05
+    assert found.S_after_before.is_rigid
+    assert found.S_after_before.rotation[2, 2] == pytest.approx(1)
+    assert len(found.before) > 100 < len(found.after)
+
+
+def test_a_box_of_one_colour_says_that_half_a_turn_is_not_known():
+    room = [*shell(), *STAYS]
+    grey = plain(0.7, 0.3, 0.2)
+    report = change.compare(
+        capture([*room, *box(0.9, 1.2, 0.7, 0.35, 0.5, 6, paint=grey)], 1),
+        capture([*room, *box(1.9, 0.9, 0.7, 0.35, 0.5, 6, yaw=0.8, paint=grey)], 2),
+    )
+    (found,) = things(report)
+    assert (found.kind, found.symmetry) == ("moved", "half")
+
+
+def test_another_box_elsewhere_is_not_the_one_that_went():
+    room = [*shell(), *STAYS]
+    report = change.compare(
+        capture([*room, *box(0.9, 1.2, 0.6, 0.4, 0.5, 6)], 1),
+        capture([*room, *box(2.0, 1.0, 0.6, 0.4, 0.5, 9)], 2),
+    )
+    assert sorted(c.kind for c in things(report)) == ["appeared", "disappeared"]
+
+
+def test_paint_is_no_move_and_its_cells_are_the_wall_or_the_box():
+    thing = (0.9, 1.2, 0.5, 0.4, 0.6)
+    room = [*shell(), *STAYS, *box(*thing, 6)]
+    older = capture(room, 1)
+    (wall,) = things(change.compare(older, capture([*shell(plain(0.2, 0.3, 0.7)), *STAYS, *box(*thing, 6)], 2)))
+    assert wall.kind == "recoloured"
+    assert (wall.voxels[:, 1] > 2.8).mean() > 0.95
+    painted = [*shell(), *STAYS, *box(*thing, 6, paint=plain(0.9, 0.8, 0.1))]
+    (repainted,) = things(change.compare(older, capture(painted, 2)))
+    assert repainted.kind == "recoloured"
+    assert share_near(repainted.voxels, (0.9, 1.2, 0.3), (0.25, 0.2, 0.3)) > 0.95
+
+
+def test_what_one_capture_did_not_see_has_not_changed():
+    # The newer capture looks away from the box that is gone.
+    room = [*shell(), *STAYS]
+    newer = capture(room, 2, toward=(2.9, 2.9, 0.9), angles=(0.1, 0.5))
+    away = change.compare(capture([*room, *box(0.5, 0.5, 0.4, 0.4, 0.5, 6)], 1), newer)
+    assert things(away) == []
+    assert away.seen_share < 0.9
+    blind = change.compare(capture(room, 1), PlacedScene(capture(room, 2).gaussians, None, "b"))
+    assert blind.changes == ()
+    assert "no cameras" in blind.notes[0]
+
+
+def test_any_vertical_and_any_frame():
+    room = [*shell(), *STAYS]
+    scenes = [
+        capture([*room, *box(0.9, 1.2, 0.6, 0.4, 0.5, 6)], 1),
+        capture([*room, *box(1.9, 1.0, 0.6, 0.4, 0.5, 6, yaw=1.2)], 2),
+    ]
+    # y down, as many trainers have it.
+    S = Sim3(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([3.0, -2, 5]))
+    turned = [PlacedScene(transform_gaussians(s.gaussians, S), transform_cameras(s.cameras, S)) for s in scenes]
+    (found,) = things(change.compare(*turned, up=np.array([0, -2.0, 0])))
+    truth = S @ moved_by(1.2, (0.9, 1.2), (1.9, 1.0)) @ S.inverse()
+    middle = S.apply(np.array([[0.9, 1.2, 0.25]]))
+    assert np.linalg.norm(found.S_after_before.apply(middle) - truth.apply(middle)) < 0.05
+    means = S.apply(scenes[0].gaussians.means[found.before])
+    assert ((means > found.box[0] - 0.1) & (means < found.box[1] + 0.1)).all()
+    with pytest.raises(InputError, match="up must be"):
+        change.compare(*scenes, up=np.zeros(3))
+
+
+def test_crops_show_the_place_before_and_after():
+    room = [*shell(stripes(4)), *STAYS]
+    red = plain(0.9, 0.1, 0.1)
+    older, newer = capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6, paint=red)], 1), capture(room, 2)
+    report = change.compare(older, newer)
+    ((before, after),) = change.crops(report, older, newer, longest_side_px=128)
+    assert before.dtype == np.uint8
+    assert before.ndim == 3
+    assert before.shape[2] == 3
+    # The older picture shows much of the red box; the newer one none of it, but for the lines of the box.
+    red_share = [((p[..., 0] > 180) & (p[..., 1] < 70) & (p[..., 2] < 70)).mean() for p in (before, after)]
+    assert red_share[0] > 0.08
+    assert red_share[1] < 0.01
+    assert change.crops(report, older, PlacedScene(newer.gaussians, None), changes=[0])[0][1] is None
+
+
+def test_the_key_names_the_settings_and_the_code():
+    key = change.recipe_key()
+    assert key.stage == "change"
+    assert key.version["change"] == change.VERSION
+    assert "compare" in key.version
+    assert key.recipe != change.recipe_key(change.Params(voxel_m=0.2)).recipe
+    with pytest.raises(ConfigError, match="voxel_m must be positive"):
+        change.Params(voxel_m=0.0)
