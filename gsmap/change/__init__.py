@@ -1,7 +1,7 @@
 """What changed between two captures of one place.
 
-``compare(older, newer)`` is pure: two captures in one metric frame in, a report out. What is no change of a thing, other
-light or exposure or what one capture did not see, is not reported as one.
+``compare(older, newer)`` is pure: two captures in one metric frame in, a report out. Other light, another exposure, and
+what one of the captures did not see are no changes of things.
 """
 
 from __future__ import annotations

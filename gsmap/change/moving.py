@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from gsmap.change.components import components
 from gsmap.change.params import Params
-from gsmap.change.poses import about_up, features, settled, tints, voted
+from gsmap.change.poses import about_up, features, settled, voted
 from gsmap.change.sides import Side
 from gsmap.change.things import Cells, Thing, joined, parts
 from gsmap.compare import Looks
@@ -94,10 +94,13 @@ def find_moves(
     asked: set[bytes] = set()
     for _ in range(_ROUNDS):
         found = _moves_from(a, b, False, asked, params) + _moves_from(b, a, True, asked, params)
-        news = []
+        news: list[Move] = []
         for move in sorted(found, key=lambda m: -m.score):
             if not any(_overlap(move, other, a, b) for other in moves + news):
-                news.append(_completed(move, a, b, params))
+                whole = _completed(move, a, b, params)
+                if _is_panel(a.points(whole.older)) or _is_panel(b.points(whole.newer)):
+                    continue
+                news.append(whole)
                 a.things, b.things = _without(a.things, news[-1].older), _without(b.things, news[-1].newer)
         if not news:
             break
@@ -158,8 +161,7 @@ def _with_more(thing: Thing, here: _Capture, there: _Capture, pose: Sim3, params
     points = here.points(thing)
     low, high = points.min(0) - _BESIDE_M, points.max(0) + _BESIDE_M
     rows = np.flatnonzero(
-        np.isin(cells.thing, np.unique(cells.thing[thing.cells]))
-        & ((side.points > low) & (side.points < high)).all(1)
+        np.isin(cells.thing, np.unique(cells.thing[thing.cells])) & ((side.points > low) & (side.points < high)).all(1)
     )
     _, alike = _fits(rows, pose.apply(side.points[rows]), side, there.side, params)
     rows = rows[alike]

@@ -23,6 +23,7 @@ def features(points: np.ndarray, colours: np.ndarray) -> np.ndarray:
     """(N, 6) place and tint, both in metres."""
     return np.concatenate([points, tints(colours) * _TINT_M], axis=1)
 
+
 _VOTERS, _VOTED = 150, 900  # cells that vote, and that are voted for
 _LEVEL_M, _TINT = 0.06, 0.1  # a pair of cells votes if their heights and colours differ by less
 _SINK_M = 0.04
@@ -85,7 +86,7 @@ def _peaks(shift: np.ndarray, weight: np.ndarray) -> list[tuple[float, np.ndarra
     index = (cells[:, 0] - low[0]) * deep + cells[:, 1] - low[1]
     votes = np.bincount(index, weight, int(wide * deep)).reshape(wide, deep)
     padded = np.pad(votes, 1)
-    total = sum(padded[x : x + wide, y : y + deep] for x in range(3) for y in range(3))
+    total = np.sum([padded[x : x + wide, y : y + deep] for x in range(3) for y in range(3)], axis=0)
     found = []
     for _ in range(_PEAKS):
         x, y = np.unravel_index(int(np.argmax(total)), total.shape)

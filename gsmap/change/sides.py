@@ -153,7 +153,9 @@ def _add(
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
     """Differences of colour (H, W, 3), two of chroma and one of lightness, and how far they go beyond what a shift by
     a pixel explains (H, W), as multiples of the limits."""
-    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
+    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(
+        np.float32
+    )
     log_b = np.log(np.clip(b, 0, 1) + np.float32(FLOOR))
     bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
     plain = _opponent(log_b - log_a, bright)

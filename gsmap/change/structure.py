@@ -73,7 +73,7 @@ def _peaks(values: np.ndarray, fewest: float) -> list[float]:
     low = values.min() - _BIN_M
     counts = np.bincount(((values - low) / _BIN_M).astype(np.int64), minlength=3).astype(np.float64)
     wide = np.convolve(counts, np.ones(3), "same")
-    peaks = []
+    peaks: list[float] = []
     while len(peaks) < _MOST_PLANES:
         best = int(wide.argmax())
         if wide[best] < fewest:

@@ -23,12 +23,15 @@ _LINK_M = 0.08  # cells of one thing, where nothing but the room's shell is betw
 _RING_M = (0.04, 0.12)  # how far from a change of colour its surroundings begin and end
 _MOST = 0.35
 _MUCH, _MANY = 0.25, 100  # of a thing, and cells: so much of it does not change its colour by a shadow
-_LIT_OTHERWISE = 0.035  # spread of what agrees, beyond which the whole place is lit otherwise
 _DARK = 0.8  # a change that is lightness to this share may be a shadow, a lamp, or a window at night
 _COHERENT = 0.4  # one that agrees with itself less may be a texture that two trainings show differently
 _BEHIND_M = 0.2  # a change of colour on a wall, so close to a thing that came or went, is its back or its shadow
 _BEHIND = 0.5  # ... if this share of it is
 _SPLINTER, _SPLINTER_M = 60, 0.15  # a thing of fewer cells, so close to a larger one, is a part of it
+
+
+LIT_OTHERWISE = 0.035
+"""Spread of the colours that agree, beyond which the whole place is lit otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +115,7 @@ class Paint:
         darkening: share of it that is lightness, not hue.
         is_shell: on a wall, floor or ceiling.
         share: of the thing it is on, in the capture where that is smaller; 0 on the shell.
+        area_m2: of the surface.
     """
 
     cells: tuple[np.ndarray, np.ndarray]
@@ -121,6 +125,7 @@ class Paint:
     darkening: float
     is_shell: bool
     share: float
+    area_m2: float
 
 
 def things_of(side: Side, cells: Cells, painted: np.ndarray, params: Params) -> list[Thing]:
@@ -174,6 +179,7 @@ def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params)
                 float(light / max(light + hue, 1e-6)),
                 at >= 0,
                 0.0 if at >= 0 else min(_share(c, p) for c, p in zip(cells, parts, strict=True)),
+                len(group) / 2 * params.cell_m**2,
             )
         )
     return found
@@ -185,7 +191,7 @@ def is_paint(paint: Paint, line: Balance, params: Params) -> bool:
         less = 0.6 if paint.share >= _MOST and paint.coherence >= _COHERENT else 0.75
         return paint.strength >= less * params.min_paint and paint.leak <= 2.5 * params.most_leak
     least = params.min_paint
-    if max(line.chroma_spread, line.lightness_spread) > _LIT_OTHERWISE:
+    if max(line.chroma_spread, line.lightness_spread) > LIT_OTHERWISE:
         least *= 1.6
     if paint.darkening > _DARK and paint.is_shell:
         least *= 1.8

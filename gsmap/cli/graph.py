@@ -25,6 +25,7 @@ def command(
     Example: `gsmap graph site.gsmap site.graphml`
     """
     from gsmap.errors import ConfigError
+    from gsmap.types.rows import ObjectRow, RelationRow
 
     if format is not None and out is None:
         raise ConfigError(f"name a file to write as {format}: gsmap graph {map} OUT --format {format}")
@@ -39,8 +40,7 @@ def command(
     if json:
         print_rows("graph", report, json)
         return
-    if out is None and report.objects:
-        print_table("objects", report.objects[0].columns, report.objects)
-    if out is None and report.relations:
-        print_table("relations", report.relations[0].columns, report.relations)
+    if out is None:
+        print_table("objects", ObjectRow.columns, report.objects)
+        print_table("relations", RelationRow.columns, report.relations)
     say(f"{len(report.objects)} objects, {len(report.relations)} relations")

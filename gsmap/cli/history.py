@@ -27,6 +27,8 @@ def command(
 
     Example: `gsmap history site.gsmap 1.5,0.2,0.8`
     """
+    from gsmap.types.rows import ObjectRow, SightingRow
+
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.history(place, box=box)
     for note in report.notes:
@@ -34,6 +36,5 @@ def command(
     if json:
         print_rows("history", report, json)
         return
-    if report.objects:
-        print_table("objects", report.objects[0].columns, report.objects)
-        print_table("sightings", report.sightings[0].columns, report.sightings)
+    print_table("objects", ObjectRow.columns, report.objects)
+    print_table("sightings", SightingRow.columns, report.sightings)

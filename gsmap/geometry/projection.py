@@ -29,7 +29,8 @@ def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: f
     """(N,) bool: beyond ``near`` (the points' unit) and inside an image of ``size_px`` = ``width height``."""
     (column, row), (width, height) = pixels.T, np.asarray(size_px)
     with np.errstate(invalid="ignore"):
-        return (depth > near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside: np.ndarray = (depth > near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return inside
 
 
 def on_surface(

@@ -152,9 +152,11 @@ def recipe_key(method: str = "tto", params: Any = None) -> RecipeKey:
     Raises:
         ConfigError: unknown method, params of another method.
     """
-    settings = plain(checked_params(method, params))
-    backend = render.backend() if merger(method).RENDERS else ""
-    versions = {"merge": VERSION} | ({"compare": compare.VERSION} if merger(method).RENDERS else {})
+    how, params = merger(method), checked_params(method, params)
+    # A merger that tells captures apart by their dates renders them for it.
+    renders = how.RENDERS or how.uses_dates(params)
+    versions = {"merge": VERSION} | ({"compare": compare.VERSION} if renders else {})
+    backend, settings = render.backend() if renders else "", plain(params)
     return RecipeKey("merge", method, versions | family("merger").version(method), settings, backend)
 
 

@@ -19,9 +19,15 @@ from gsmap.types import Cameras, Gaussians, PlacedScene
 Prefer = Literal["newest", "best", "both"]
 """Who wins where captures disagree: the ``newest``, whoever saw it ``best``, or nobody, so that ``both`` show."""
 
-_SHOWS = 0.1  # share of a pixel from which on what is disputed shows in it
+LOOKING_M = 10.0
+"""How far around a tile captures and cameras are read where they are compared."""
+
+MIN_CAMERAS = 12
+"""Cameras of each capture that are read at least for that, the nearest, wherever they stand."""
+
+_SHOWS = 0.15  # share of a pixel from which on what is disputed shows in it
 _NEAR_M = 0.25  # of what changed, within which shards of it are looked for
-_NEGLIGIBLE_GAIN = 0.01
+_NEGLIGIBLE_GAIN = 0.02
 _INTRUDES = 0.15  # difference of colour, of [0, 1], by which a picture has become another
 
 
@@ -30,7 +36,7 @@ class Settled:
     """Captures after those that disagree have been told apart.
 
     Args:
-        scenes: without the Gaussians that are overruled, in the order they were given.
+        scenes: without the Gaussians that are overruled and in the newest's exposure, in the order they were given.
         lost: how many Gaussians each lost.
         changed: per scene (N,) bool, the Gaussians that stand where another capture was overruled: nothing of an older
             capture is left there to share the work with, so they stay as they are.
@@ -77,14 +83,16 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
     From the newest capture back, each older one is compared once with what all newer ones are sure of together: N
     captures cost N comparisons. A Gaussian leaves where that looked through it, or shows its surface in another colour
     (exposure apart); with ``best`` only if it also saw the place better, and otherwise the newer's Gaussians leave.
-    What no newer capture saw stays. Captures without a date, or of one date, overrule nothing.
+    What no newer capture saw stays. All of it is brought to the newest's exposure. Captures without a date, or of one
+    date, overrule nothing.
     """
     params = params or compare.Params()
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
     changed = [np.zeros(len(s.gaussians), dtype=bool) for s in scenes]
     rivals = [_none(s) for s in scenes]
+    gains = np.ones((len(scenes), 3))
     truth: list[_Standing] = []
-    for group in _newest_first(scenes) if prefer != "both" else []:
+    for group in _by_date(scenes) if prefer != "both" else []:
         added = []
         for i in group:
             looks = compare.look(scenes[i], params)
@@ -95,6 +103,7 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
             joined = compare.joined([(one.looks, one.shows) for one in parts], scenes[i], params)
             found = compare.compare(looks, joined, params)
             verdict = _verdict(looks, joined, found, prefer)
+            gains[i] = _gains(found)
             keeps[i] &= ~verdict.lost
             if prefer == "newest":
                 keeps[i] &= ~_intruders(scenes[i].gaussians, keeps[i], joined, found, verdict)
@@ -108,11 +117,11 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
                 first += len(rows)
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
             # Truth grows by what is new to it alone, so that it stays as large as the place.
-            shows = keeps[i] & np.isin(found.older.state, (UNSEEN, HIDDEN))
-            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), found), shows))
+            shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
+            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), gains[i]), shows))
         truth += added
     return Settled(
-        [replace(s, gaussians=s.gaussians[k]) if not k.all() else s for s, k in zip(scenes, keeps, strict=True)],
+        [_left(s, k, gain) for s, k, gain in zip(scenes, keeps, gains, strict=True)],
         [int((~k).sum()) for k in keeps],
         [c[k] for c, k in zip(changed, keeps, strict=True)],
         rivals,
@@ -198,11 +207,21 @@ def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Compari
     return out
 
 
-def _in_one_exposure(looks: Looks, found: Comparison) -> Looks:
+def _gains(found: Comparison) -> np.ndarray:
+    """(3,) by which the older's colours are multiplied, so that the place shows in one exposure: the newest's."""
     gains = found.balance.gains()
-    if np.abs(np.log(gains)).max() < _NEGLIGIBLE_GAIN:
-        return looks
-    return replace(looks, scene=replace(looks.scene, gaussians=apply_gain(looks.gaussians, gains)))
+    return gains if np.abs(np.log(gains)).max() > _NEGLIGIBLE_GAIN else np.ones(3)
+
+
+def _left(scene: PlacedScene, stays: np.ndarray, gains: np.ndarray) -> PlacedScene:
+    if stays.all() and (gains == 1).all():
+        return scene
+    gaussians = scene.gaussians[stays]
+    return replace(scene, gaussians=gaussians if (gains == 1).all() else apply_gain(gaussians, gains))
+
+
+def _in_one_exposure(looks: Looks, gains: np.ndarray) -> Looks:
+    return replace(looks, scene=_left(looks.scene, np.ones(len(looks.gaussians), dtype=bool), gains))
 
 
 def _share_of_pixels(these: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
@@ -218,12 +237,18 @@ def _none(scene: PlacedScene) -> Gaussians:
     return scene.gaussians[np.zeros(0, dtype=np.int64)]
 
 
-def _newest_first(scenes: Sequence[PlacedScene]) -> list[list[int]]:
+def _by_date(scenes: Sequence[PlacedScene]) -> list[list[int]]:
     """Indices of the scenes that have a date and meet another, by date, newest first; those of one date together."""
     times = {i: _time(scene.captured_at) for i, scene in enumerate(scenes)}
     dated = {i: time for i, time in times.items() if time is not None}
     groups = [[i for i, then in dated.items() if then == time] for time in sorted(set(dated.values()), reverse=True)]
     return groups if len(groups) > 1 else []
+
+
+def newest_first(scenes: Sequence[PlacedScene]) -> list[int]:
+    """Indices of all scenes, the newest first; those without a date last, in their order."""
+    times = [_time(scene.captured_at) for scene in scenes]
+    return sorted(range(len(scenes)), key=lambda i: (-t.timestamp() if (t := times[i]) else np.inf, i))
 
 
 def _time(text: str | None) -> datetime | None:

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.merge.changes import Settled
+from gsmap.errors import ConfigError
+from gsmap.geometry.projection import in_image, project
+from gsmap.merge.changes import Settled, newest_first
 from gsmap.merge.placed import inside, share_in_view
 from gsmap.render import Rendered, render
-from gsmap.types import Cameras, PlacedScene
+from gsmap.types import Cameras, Gaussians, PlacedScene
 from gsmap.types.progress import Progress
 
 WEIGHT_UNIT = 0.1  # of `References.visible_pixels`, for what dominates no pixel: always less than one pixel
@@ -25,11 +27,18 @@ class Params:
         enough_share: a view of which at least this share shows the tile is used once in every pass; one that shows
             less, now and then.
         margin_px: pictures are cropped to what counts and this much around it, for the windows of SSIM.
+        max_views: of more views than that, those are reproduced that together see the tile best, newer ones first; so
+            that neither memory (3 MB a view of 960 pixels) nor time grows with the captures of a place.
     """
 
     min_share: float = 0.02
     enough_share: float = 0.25
     margin_px: int = 6
+    max_views: int = 360
+
+    def __post_init__(self) -> None:
+        if self.max_views < 1:
+            raise ConfigError(f"max_views must be positive, got {self.max_views}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +93,15 @@ def render_references(
         if scene.cameras is not None
         for c in np.flatnonzero(share_in_view(scene.cameras, piece.means) > 0)
     ]
+    todo = _best_views(todo, scenes, pieces, params.max_views)
     cameras, images, weights, kept, shares = [], [], [], [], []
-    pixels = [np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes]
+    pixels, sure = ([np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes] for _ in range(2))
     largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
     for done, (i, camera) in enumerate(todo):
         progress(done / len(todo), "rendering the captures")
         seen = render(scenes[i].gaussians, camera, max_weight=True)
         disputed = None if settled is None else settled.overruled_pixels(i, camera)
-        _count(seen, disputed, pixels[i], largest[i])
+        _count(seen, disputed, pixels[i], sure[i], largest[i])
         whole = pieces[i] is scenes[i].gaussians
         local = seen if whole else render(pieces[i], camera, depth=False, dominant_id=False)
         weight = local.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, halo_m / 2)
@@ -112,15 +122,53 @@ def render_references(
         weights,
         scene=np.array(kept, dtype=np.int64),
         view_weights=np.minimum(1.0, np.array(shares) / params.enough_share),
-        visible_pixels=[_visible_pixels(p, w, whole=bounds is None) for p, w in zip(pixels, largest, strict=True)],
+        visible_pixels=[
+            _visible_pixels(np.where(s > 0, p, 0), w, whole=bounds is None)
+            for p, s, w in zip(pixels, sure, largest, strict=True)
+        ],
     )
 
 
-def _count(seen: Rendered, disputed: np.ndarray | None, pixels: np.ndarray, largest: np.ndarray) -> None:
+_SAMPLE = 600  # points by which views are chosen, where there are too many
+
+
+def _best_views(
+    todo: list[tuple[int, Cameras]], scenes: Sequence[PlacedScene], pieces: Sequence[Gaussians], count: int
+) -> list[tuple[int, Cameras]]:
+    """At most ``count`` of the views: one after another which adds most to what the others see, in their order.
+
+    A view adds to each point in its picture what it has in pixels a metre there, less for every view that has the point
+    already, and less for a capture the older it is.
+    """
+    if len(todo) <= count:
+        return todo
+    together = np.concatenate([piece.means for piece in pieces])
+    points = together[:: max(1, len(together) // _SAMPLE)].astype(np.float64)
+    age = {i: rank for rank, i in enumerate(newest_first(scenes))}
+    sharpness = np.zeros((len(todo), len(points)), dtype=np.float32)
+    for row, (i, camera) in enumerate(todo):
+        pixels, depth = project(points, camera.T_camera_frame[0], camera.intrinsics_px[0])
+        seen = in_image(pixels, depth, camera.sizes_px[0], near=0.1)
+        # What is nearer than a metre is not seen that much better.
+        sharpness[row, seen] = 1 / np.maximum(depth[seen], 1.0) / (1 + 0.1 * age[i])
+    often = np.zeros(len(points), dtype=np.float32)
+    chosen = []
+    for _ in range(count):
+        best = int(np.argmax(sharpness @ (1 / (1 + often))))
+        chosen.append(best)
+        often += sharpness[best] > 0
+        sharpness[best] = -1
+    return [todo[row] for row in sorted(chosen)]
+
+
+def _count(
+    seen: Rendered, disputed: np.ndarray | None, pixels: np.ndarray, sure: np.ndarray, largest: np.ndarray
+) -> None:
     """What shows where something was taken away was never seen there: it counts for nothing."""
-    shown = seen.dominant_id[0] if disputed is None else np.where(disputed, -1, seen.dominant_id[0])
-    dominant = shown[shown >= 0]
-    pixels += np.bincount(dominant, minlength=len(pixels))
+    shown = seen.dominant_id[0]
+    pixels += np.bincount(shown[shown >= 0], minlength=len(pixels))
+    undisputed = shown >= 0 if disputed is None else (shown >= 0) & ~disputed
+    sure += np.bincount(shown[undisputed], minlength=len(pixels))
     np.maximum(largest, seen.max_weight, out=largest)
 
 

@@ -45,6 +45,18 @@ def one_owner_per_cell(
     return stays
 
 
+def beside(means: np.ndarray, origin: np.ndarray, chosen: np.ndarray, distance_m: float) -> np.ndarray:
+    """(N,) which of the Gaussians that are not chosen lie within a distance of one of another capture that is."""
+    from scipy.spatial import cKDTree
+
+    near = np.zeros(len(means), dtype=bool)
+    for capture in np.unique(origin[chosen]):
+        tree = cKDTree(means[chosen & (origin == capture)])
+        others = np.flatnonzero(~chosen & (origin != capture))
+        near[others[np.isfinite(tree.query(means[others], distance_upper_bound=distance_m)[0])]] = True
+    return near
+
+
 def most_visible(visible_pixels: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
     """(N,) the ``count`` Gaussians of a mask that dominate most pixels; ties by row."""
     order = np.argsort(np.where(among, -visible_pixels, np.inf), kind="stable")

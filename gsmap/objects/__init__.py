@@ -3,7 +3,7 @@
 from gsmap.objects.fuse import Node, Placed, fuse
 from gsmap.objects.graph import graphml, object_graph
 from gsmap.objects.looks import Eyes, Glance, glance, judge, open_eyes
-from gsmap.objects.make import Capture, Params, make_objects, recipe_key
+from gsmap.objects.make import Capture, Params, make_objects
 from gsmap.objects.permanence import Permanence, permanence
 from gsmap.objects.relations import Relation, relations
 
@@ -24,6 +24,5 @@ __all__ = [
     "object_graph",
     "open_eyes",
     "permanence",
-    "recipe_key",
     "relations",
 ]

@@ -14,7 +14,7 @@ from gsmap.types import MapObject
 def object_graph(objects: Sequence[MapObject], dates: Mapping[str, str | None], metres: float = 1.0) -> Any:
     """A `networkx.MultiDiGraph`: a node per object, an edge per relation, whose attributes GraphML can say.
 
-    Nodes: ``kind`` (object), ``name``, ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
+    Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
     ``seen``, ``looks``, ``half_life_days`` (absent where unknown), ``there`` (the newest look shows it). Edges:
     ``kind`` (on, in, next to).
 
@@ -27,7 +27,7 @@ def object_graph(objects: Sequence[MapObject], dates: Mapping[str, str | None], 
     graph = nx.MultiDiGraph()
     for thing in objects:
         stays = permanence(thing, dates)
-        facts: dict[str, Any] = {"kind": "object", "name": thing.name, "component": thing.component}
+        facts: dict[str, Any] = {"kind": "object", "component": thing.component}
         facts |= {axis: float(value) for axis, value in zip("xyz", thing.position, strict=True)}
         facts |= {f"size_{axis}": float(v) for axis, v in zip("xyz", thing.box[1] - thing.box[0], strict=True)}
         facts |= {channel: float(value) for channel, value in zip("Lab", thing.colour, strict=True)}

@@ -7,16 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsmap.methods import RecipeKey, text_digest
+from gsmap.methods import text_digest
 from gsmap.objects.fuse import Node, Placed, fuse
 from gsmap.objects.fuse import Params as FuseParams
 from gsmap.objects.looks import Eyes, glance, judge
 from gsmap.objects.looks import Params as LookParams
 from gsmap.types import MapObject, Sighting, Sim3, Things
-from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
-
-VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -47,11 +44,6 @@ class Capture:
     scene: str
     S_map_scene: Sim3
     things: Things
-
-
-def recipe_key(params: Params | None = None) -> RecipeKey:
-    """What names the objects made with these parameters, but for the captures and where they lie."""
-    return RecipeKey("objects", "cells", {"objects": VERSION}, plain(params or Params()), "native")
 
 
 def make_objects(

@@ -10,6 +10,11 @@ import numpy as np
 
 from gsmap.types import MapObject
 
+_ON_M = 0.12  # what stands on a thing begins so near to its top: boxes are of Gaussians' centres
+_OVER = 0.5  # and so much of its footprint lies over it
+_INSIDE = 0.8  # what is in a thing has so much of its box in that of the thing
+_NEXT_M = 0.3  # things next to each other are no farther apart in plan
+
 RelationKind = Literal["on", "in", "next to"]
 
 
@@ -22,31 +27,13 @@ class Relation:
     target: str
 
 
-@dataclass(frozen=True)
-class Params:
-    """When a relation holds.
-
-    Args:
-        on_m: what stands on a thing begins so near to its top.
-        over: and so much of its footprint lies over it.
-        inside: what is in a thing has so much of its box in that of the thing.
-        next_m: things next to each other are no farther apart in plan.
-    """
-
-    on_m: float = 0.12
-    over: float = 0.5
-    inside: float = 0.8
-    next_m: float = 0.3
-
-
-def relations(objects: Sequence[MapObject], metres: float = 1.0, params: Params | None = None) -> list[Relation]:
+def relations(objects: Sequence[MapObject], metres: float = 1.0) -> list[Relation]:
     """``on``, ``in`` and ``next to`` of objects that are there together, by their boxes (z up).
 
     Args:
         objects: of any component; those of one component are related that are both there still, or both gone.
         metres: per unit of the map.
     """
-    params = params or Params()
     out = []
     boxes = np.array([thing.box for thing in objects]).reshape(-1, 2, 3) * metres
     size = np.maximum(boxes[:, 1] - boxes[:, 0], 1e-6)
@@ -55,15 +42,15 @@ def relations(objects: Sequence[MapObject], metres: float = 1.0, params: Params 
         overlap = np.clip(high - low, 0, None)
         inside, footprint = overlap.prod(1) / size[i].prod(), overlap[:, :2].prod(1)
         over = footprint / size[i, :2].prod()
-        apart = footprint < params.over * np.minimum(size[:, :2].prod(1), size[i, :2].prod())
+        apart = footprint < _OVER * np.minimum(size[:, :2].prod(1), size[i, :2].prod())
         gap = np.linalg.norm(np.clip(low - high, 0, None)[:, :2], axis=1)
         for j, other in enumerate(objects):
             if i == j or one.component != other.component or one.there != other.there:
                 continue
-            if inside[j] >= params.inside and size[j].prod() > size[i].prod():
+            if inside[j] >= _INSIDE and size[j].prod() > size[i].prod():
                 out.append(Relation(one.id, "in", other.id))
-            elif over[j] >= params.over and abs(boxes[i, 0, 2] - boxes[j, 1, 2]) < params.on_m:
+            elif over[j] >= _OVER and abs(boxes[i, 0, 2] - boxes[j, 1, 2]) < _ON_M:
                 out.append(Relation(one.id, "on", other.id))
-            elif i < j and gap[j] < params.next_m and overlap[j, 2] > 0 and apart[j]:
+            elif i < j and gap[j] < _NEXT_M and overlap[j, 2] > 0 and apart[j]:
                 out.append(Relation(one.id, "next to", other.id))
     return out

@@ -160,11 +160,15 @@ def accept(file: Path, handle: Handle) -> None:
     save(file, _of_file(handle))
 
 
-def fold(file: Path, handle: Handle, checkpoint: Callable[[], bool], *, accept: bool = False) -> None:
+def fold(
+    file: Path, handle: Handle, begin: Callable[[], int], finish: Callable[[], bool], *, accept: bool = False
+) -> None:
     """Fold the log in, and keep the digests true of the file at every moment; only under the writer lock.
 
     Args:
-        checkpoint: lets SQLite do it; False where readers kept it from getting to the end.
+        begin: lets SQLite do what it can at once; how many frames of the log it holds for committed;
+            below 0 where another process kept it from looking.
+        finish: lets it do the rest and empty the log; False where readers kept it from getting to the end.
         accept: take the pages that are there for what was written, whatever they are.
 
     Raises:
@@ -180,15 +184,25 @@ def fold(file: Path, handle: Handle, checkpoint: Callable[[], bool], *, accept: 
         found = _found(file, handle, noted, log, before)
         if found:
             raise CorruptError(damaged(file, found))
-    changed = {}
+    changed = _of_log(file, log, before.page_size)
+    save(file, Digests(before.page_size, before.pages, log.num_pages or before.count, changed))
+    num_frames = begin()
+    committed = read_log(log_of(file), handle.index, at_most=num_frames) if num_frames >= 0 else log
+    if committed != log:  # a commit could not be synchronised, and SQLite has taken it back
+        log, changed = committed, _of_log(file, committed, before.page_size)
+    if finish():
+        save(file, _after(handle, before, log, changed))
+
+
+def _of_log(file: Path, log: Log, page_size: int) -> dict[int, bytes]:
+    """The digests of the pages that a log holds."""
+    found = {}
     if log.frames:
         with open(log_of(file), "rb") as opened:
             for number, offset in log.frames.items():
                 opened.seek(offset)
-                changed[number] = _digest(opened.read(before.page_size))
-    save(file, Digests(before.page_size, before.pages, log.num_pages or before.count, changed))
-    if checkpoint():
-        save(file, _after(handle, before, log, changed))
+                found[number] = _digest(opened.read(page_size))
+    return found
 
 
 def damaged(file: Path, found: Iterable[str]) -> str:

@@ -234,7 +234,7 @@ def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
     if _log_bytes(file) >= at_bytes:
         if not digests.digests_of(file).exists() and (found := structure_damage(file)):
             raise CorruptError(digests.damaged(file, found))
-        digests.fold(file, handle(engine), lambda: _folded(engine))
+        digests.fold(file, handle(engine), lambda: _begun(engine), lambda: _folded(engine))
 
 
 def accept(engine: Engine, file: Path) -> None:
@@ -246,7 +246,7 @@ def accept(engine: Engine, file: Path) -> None:
         finally:
             connection.close()
     if _log_bytes(file):
-        digests.fold(file, handle(engine), lambda: _folded(engine), accept=True)
+        digests.fold(file, handle(engine), lambda: _begun(engine), lambda: _folded(engine), accept=True)
     else:
         digests.accept(file, handle(engine))
 
@@ -305,6 +305,15 @@ def backup(engine: Engine, target: Path) -> None:
     finally:
         connection.close()
     digests.note(target)
+
+
+def _begun(engine: Engine) -> int:
+    """Let SQLite fold in what no reader needs, without waiting; how many frames of the log are committed to it."""
+    connection = engine.raw_connection()
+    try:
+        return int(_driver(connection).execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()[1])
+    finally:
+        connection.close()
 
 
 def _folded(engine: Engine) -> bool:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from gsmap.durable import is_folder, remove_tree
 
-_STAGED = r"\.{name}\.[0-9a-f]{{8}}"
+# Twice where a map is made in a folder that is staged itself.
+_STAGED = r"\.{{1,2}}{name}(\.[0-9a-f]{{8}}){{1,2}}"
 # Files that are replaced in one step (`gsmap.durable.write_whole`), and how old one must be to be nobody's.
 _STAGED_FILE = re.compile(r"\.(settings\.toml|catalog\.url|map\.sqlite[a-z0-9.]*)\.[0-9a-f]{8}|\.map\.sqlite\.sha256")
 _ABANDONED_S = 60.0

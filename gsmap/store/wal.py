@@ -66,7 +66,7 @@ def index_note(file: Path) -> Noted | None:
     return Noted(content[32:40], num_frames) if version == _INDEX_VERSION and is_init else None
 
 
-def read_log(path: Path, noted: Noted | None = None) -> Log:
+def read_log(path: Path, noted: Noted | None = None, *, at_most: int | None = None) -> Log:
     """Read a log's every frame.
 
     A log has lost something where a commit beyond the first bad frame was followed by a later frame (which is written
@@ -74,15 +74,18 @@ def read_log(path: Path, noted: Noted | None = None) -> Log:
 
     Args:
         noted: what `index_note` said before anybody connected.
+        at_most: look at so many frames only. What follows them may be of a commit whose fsync failed: it is whole, and
+            taken back all the same.
     """
     try:
         with open(path, "rb", buffering=0) as opened:
-            return _read(opened.fileno(), os.fstat(opened.fileno()).st_size, noted)
+            size = os.fstat(opened.fileno()).st_size
+            return _read(opened.fileno(), size, noted, size if at_most is None else at_most)
     except FileNotFoundError:
         return Log()
 
 
-def _read(handle: int, size: int, noted: Noted | None) -> Log:
+def _read(handle: int, size: int, noted: Noted | None, at_most: int) -> Log:
     head = os.pread(handle, _HEADER, 0)
     if len(head) < _HEADER or not any(head):
         return Log()
@@ -111,6 +114,8 @@ def _read(handle: int, size: int, noted: Noted | None) -> Log:
         links = (sums == heads[:, 4:6]).all(1)
         ours = (heads[:, 2:4] == np.frombuffer(salt, ">u4")).all(1)
         for i, (page, after) in enumerate(heads[:, :2].tolist()):
+            if at + i >= at_most:
+                return Log(frames, num_pages)
             if not broken and links[i] and ours[i]:
                 ahead[page] = _HEADER + (at + i) * (_FRAME + page_size) + _FRAME
                 if after:

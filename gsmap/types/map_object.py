@@ -44,7 +44,6 @@ class MapObject:
         position: (3,) float64 mean of its Gaussians there.
         colour: (3,) float32 median, CIE L*a*b* (D65).
         sightings: one for each placed capture of the component, oldest first.
-        name: what a person calls it; empty where nobody said.
     """
 
     id: str
@@ -53,7 +52,6 @@ class MapObject:
     position: np.ndarray
     colour: np.ndarray
     sightings: tuple[Sighting, ...]
-    name: str = ""
 
     @property
     def seen(self) -> int:

@@ -54,6 +54,8 @@ RUNS = {
     "edge": "edge MAP left:right --pose TMP/pose.txt --sigma 0.5,0.02 --note tape",
     "prior": "prior MAP left --anchor",
     "changes": "changes MAP",
+    "graph": "graph MAP",
+    "history": "history MAP 0.5,0.5,0.5",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",
     "list scenes": "list MAP scenes",

@@ -32,7 +32,7 @@ ALTERNATIVES: dict[str, Any] = {
     "describe.object.segmenter": "builtin",
     "describe.object.embedder": "builtin",
     "merge.method": "voxel",
-    "merge.mergers.tto.prefer": "both",
+    **{f"merge.mergers.{name}.prefer": "best" for name in ("tto", "voxel", "union")},
     "describe.object.render_backend": "gsplat",
     "register.proposer": "kiss_matcher",
     "register.fallback_proposer": "graph",
@@ -46,6 +46,7 @@ ALTERNATIVES: dict[str, Any] = {
 """Another value of a setting that takes only certain words."""
 
 NAMES_NOTHING = (
+    "objects.",  # made whenever they are asked for, and not kept
     "retrieve.",
     "visits.",
     "thin.",

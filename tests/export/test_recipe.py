@@ -114,7 +114,7 @@ def test_a_setting_of_the_merger_counts_and_one_of_another_does_not(row):
     mine = changed(other, {"mergers.voxel.voxel_m": 0.02})
     assert row.export(mine).recomputed == len(first.tiles)
     assert row.export(mine).recomputed == 0
-    assert row.entries()[0]["recipe"]["settings"] == {"voxel_m": 0.02}
+    assert row.entries()[0]["recipe"]["settings"] == {"voxel_m": 0.02, "prefer": "both"}
 
 
 def test_every_setting_of_a_merger_is_in_its_recipe():

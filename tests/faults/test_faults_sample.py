@@ -17,6 +17,7 @@ POINTS = {
     "remove": [(0.3, "eio-once"), (0.5, "kill-after"), (0.7, "eio-ever")],
     "purge": [(0.3, "kill-before"), (0.6, "eio-once")],
     "models-add": [(0.4, "kill-after"), (0.6, "eio-once")],
+    "split": [(0.044, "kill-before")],
     "migrate": [(0.5, "kill-after"), (0.6, "enospc-once")],
 }
 CUTS = {"remove": 6, "purge": 4, "ingest": 5, "export": 4, "export-shrunk": 4, "models-add": 4}
@@ -52,6 +53,12 @@ def after(ops: list[str], *patterns: str) -> int:
 def test_a_tile_that_the_map_could_not_be_told_of_is_made_again(client, sound):
     n = after(client.ask("ops", verb="export"), *["rename out/.partial"] * 3, "write .*-wal")
     sound([client.ask("point", verb="export", n=n, mode=mode) for mode in ("enospc-once", "kill-before")])
+
+
+def test_a_commit_that_could_not_be_synchronised_is_not_folded_in(client, sound):
+    ops = client.ask("ops", verb="purge")
+    commits = [n for n, op in enumerate(ops[: after(ops, " out/")], 1) if op == "fsync site.gsmap/map.sqlite-wal"]
+    sound([client.ask("point", verb="purge", n=commits[-1], mode="eio-once")])
 
 
 def test_what_an_export_had_begun_is_gone_though_nothing_is_to_be_done(client, sound):

@@ -155,3 +155,30 @@ def test_a_capture_of_another_place_costs_nothing(monkeypatch):
     settled = settle([near, far])
     assert settled.lost == [0, 0]
     assert isinstance(settled.rivals[0], Gaussians)
+
+
+def test_truth_grows_by_what_is_new_to_it_alone(monkeypatch):
+    """Ten captures of one wall weigh, to the next, as much as one."""
+    weights = []
+
+    def weighed(older, newer, params=None):
+        weights.append(len(newer.gaussians))
+        return real(older, newer, params)
+
+    real = compare.compare
+    monkeypatch.setattr(compare, "compare", weighed)
+    scenes = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(6)]
+    settle(scenes)
+    assert weights[0] == len(scenes[-1].gaussians)
+    assert max(weights) < 1.5 * weights[0]
+
+
+def test_the_place_shows_in_the_newest_exposure():
+    gain = np.array([0.7, 0.6, 0.5])
+    old = dated("old", 2020, wall(0, -1.5, 1.5, colour=plain))
+    new = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=plain), gain))
+    camera = cameras_facing([0.0])
+    before, after = (render(s.gaussians, camera).colour[0] for s in (old, settle([old, new]).scenes[0]))
+    middle = np.s_[12:36, 16:48]
+    np.testing.assert_allclose((after[middle] / before[middle]).mean((0, 1)), gain, atol=0.03)
+    assert settle([old, new], "both").scenes[0] is old

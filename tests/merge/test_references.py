@@ -3,7 +3,7 @@ from synthetic_walls import cameras_facing, two_scenes, wall
 
 from gsmap.merge import PlacedScene
 from gsmap.merge.exposure import apply_gain, balance_exposure
-from gsmap.merge.references import render_references, surface_points, view_schedule
+from gsmap.merge.references import Params, render_references, surface_points, view_schedule
 from gsmap.render import render
 
 
@@ -65,3 +65,15 @@ def test_captures_that_do_not_meet_keep_their_exposure():
     a = PlacedScene(wall(0, -3, -2), cameras_facing([-2.5]), "a")
     b = PlacedScene(apply_gain(wall(1, 2, 3), np.full(3, 1.5)), cameras_facing([2.5]), "b")
     assert not balance_exposure([a, b])[1].any()
+
+
+def test_of_many_views_those_are_reproduced_that_add_most():
+    scene = wall(0, -1.5, 1.5)
+    crowd = PlacedScene(scene, cameras_facing(np.full(20, -0.9)), "a", "2020-01-01")
+    newer = PlacedScene(scene, cameras_facing(np.linspace(-0.9, 0.9, 5)), "b", "2021-01-01")
+    views = render_references([crowd, newer], None, 0.0, 64, None, quiet, Params(max_views=6))
+    assert len(views) == 6
+    # One place that twenty cameras look at needs few of them; the others each see what no other does.
+    assert (views.scene == 1).sum() >= 4
+    assert views.cameras.centers[:, 0].max() > 0.8
+    assert len(render_references([crowd, newer], None, 0.0, 64, None, quiet)) == 25

@@ -23,7 +23,7 @@ from gsmap.merge.changes import Prefer, settle
 from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import inside, pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
-from gsmap.merge.selection import most_visible, one_owner_per_cell
+from gsmap.merge.selection import beside, most_visible, one_owner_per_cell
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
@@ -31,6 +31,8 @@ from gsmap.types.progress import Progress
 VERSION = 2
 STEPS: str | None = "steps"
 RENDERS = True
+
+_BESIDE_M = 0.025  # of what changed, within which no other capture's Gaussians are laid over it
 
 
 @dataclass(frozen=True)
@@ -226,6 +228,7 @@ def _start(
         stays &= one_owner_per_cell(merged, origin, visible, params.cell_m, params.cover_m)
     stays &= visible >= WEIGHT_UNIT * params.min_weight
     stays |= new
+    stays[beside(merged.means, origin, new, _BESIDE_M)] = False
     mine = inside(merged.means, bounds)
     if params.keep < 1:
         count = int(params.keep * inside(gaussians.means, bounds).sum()) - int((new & mine).sum())

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, settle
 from gsmap.merge.placed import united
 from gsmap.types import MergeResult, PlacedScene
 from gsmap.types.progress import Progress
@@ -18,7 +19,13 @@ RENDERS = False
 
 @dataclass(frozen=True)
 class Params:
-    """Nothing to choose."""
+    """Concatenation.
+
+    Args:
+        prefer: who is shown where captures of other dates disagree: the ``newest``, who saw it ``best``, or ``both``.
+    """
+
+    prefer: Prefer = "both"
 
 
 def reach_m(params: Params) -> float:
@@ -26,15 +33,15 @@ def reach_m(params: Params) -> float:
 
 
 def reading_m(params: Params) -> float:
-    return 0.0
+    return LOOKING_M if uses_dates(params) else 0.0
 
 
 def min_cameras(params: Params) -> int:
-    return 0
+    return MIN_CAMERAS if uses_dates(params) else 0
 
 
 def uses_dates(params: Params) -> bool:
-    return False
+    return params.prefer != "both"
 
 
 def merge(
@@ -44,5 +51,6 @@ def merge(
     budget_s: float | None,
     progress: Progress,
 ) -> MergeResult:
-    """All Gaussians of all scenes."""
-    return MergeResult(*united(scenes))
+    """All Gaussians of all scenes that no preferred one overrules."""
+    settled = settle(scenes, params.prefer)
+    return MergeResult(*united(settled.scenes), notes=tuple(settled.notes()))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.voxels import merge_groups, voxel_labels
+from gsmap.merge.changes import LOOKING_M, MIN_CAMERAS, Prefer, settle
 from gsmap.merge.placed import united
 from gsmap.types import MergeResult, PlacedScene
 from gsmap.types.progress import Progress
@@ -23,9 +24,11 @@ class Params:
 
     Args:
         voxel_m: side of a voxel.
+        prefer: who is shown where captures of other dates disagree: the ``newest``, who saw it ``best``, or ``both``.
     """
 
     voxel_m: float = 0.01
+    prefer: Prefer = "both"
 
 
 def reach_m(params: Params) -> float:
@@ -34,15 +37,15 @@ def reach_m(params: Params) -> float:
 
 
 def reading_m(params: Params) -> float:
-    return params.voxel_m
+    return params.voxel_m + (LOOKING_M if uses_dates(params) else 0.0)
 
 
 def min_cameras(params: Params) -> int:
-    return 0
+    return MIN_CAMERAS if uses_dates(params) else 0
 
 
 def uses_dates(params: Params) -> bool:
-    return False
+    return params.prefer != "both"
 
 
 def merge(
@@ -53,6 +56,7 @@ def merge(
     progress: Progress,
 ) -> MergeResult:
     """One Gaussian per voxel of the map's grid; see `gsmap.geometry.voxels.merge_groups`."""
-    gaussians, origin = united(scenes)
+    settled = settle(scenes, params.prefer)
+    gaussians, origin = united(settled.scenes)
     merged, heaviest = merge_groups(gaussians, voxel_labels(gaussians.means, params.voxel_m))
-    return MergeResult(merged, origin[heaviest])
+    return MergeResult(merged, origin[heaviest], notes=tuple(settled.notes()))

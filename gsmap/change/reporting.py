@@ -1,0 +1,78 @@
+"""Changes as they are reported: where, of what, and how sure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.change.kinds import Found
+from gsmap.change.params import Params
+from gsmap.change.sides import Side
+from gsmap.change.things import LIT_OTHERWISE, Cells
+from gsmap.compare import Balance
+from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.types.change import Change
+
+_GAIN = 0.08  # logarithm of a gain from which the light is said to differ
+_SLIVER_M = 0.07  # what is thinner than this in two directions is an edge that two trainings put elsewhere
+
+
+def change_of(one: Found, both: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params) -> Change:
+    rows, seen = [], []
+    for k in (0, 1):
+        thing = one.things[k]
+        parts = [one.paint.cells[k]] if one.paint is not None else []
+        parts += [thing.cells, thing.behind] if thing is not None else []
+        rows.append(np.unique(np.concatenate(parts)) if parts else np.zeros(0, np.int64))
+        seen.append(rows[k][cells[k].judged[rows[k]]])
+    members = [side.rows[np.isin(side.label, r)] for side, r in zip(both, rows, strict=True)]
+    points = np.concatenate([side.points[r] for side, r in zip(both, seen, strict=True)])
+    grid = np.floor(points / params.voxel_m)
+    voxels = (group_means(grid, *cell_labels(grid)) + 0.5) * params.voxel_m
+    moved = [t.moved if t is not None else np.zeros(0, np.int64) for t in one.things]
+    through = sum(float(side.through[m].sum()) for side, m in zip(both, moved, strict=True))
+    count = sum(len(m) for m in moved)
+    evidence = {
+        "cells": float(len(points)),
+        "looked_through": float(count),
+        "views_through": through / max(count, 1),
+        "strength": float(np.mean(np.concatenate([c.strength[r] for c, r in zip(cells, rows, strict=True)]))),
+        "offset_m": float(np.median(np.r_[cells[0].offset_m[rows[0]], -cells[1].offset_m[rows[1]]])),
+    } | one.evidence
+    if one.paint is not None:
+        evidence |= {"strength": one.paint.strength, "leak": one.paint.leak}
+    evidence["slender"] = float(np.sort(np.ptp(points, axis=0))[1] < _SLIVER_M)
+    return Change(
+        one.kind,
+        np.stack([points.min(0), points.max(0)]),
+        voxels.astype(np.float32),
+        members[0].astype(np.int32),
+        members[1].astype(np.int32),
+        one.S_after_before,
+        one.symmetry,
+        _confidence(one, evidence),
+        evidence,
+    )
+
+
+def _confidence(one: Found, evidence: dict[str, float]) -> float:
+    """In [0, 1]: how much was looked through, how clear a change of colour is, and how well a moved thing fits."""
+    through = evidence["looked_through"] * min(evidence["views_through"], 6) / 6
+    paint = max(evidence["cells"] - evidence["looked_through"], 0) * np.clip(evidence["strength"] / 2 - 0.4, 0, 2)
+    sure = 1 - float(np.exp(-through / 10 - paint / 50))
+    if evidence["slender"]:
+        sure *= 0.5
+    return sure * float(np.clip(evidence["fit"] / 0.8, 0, 1)) if one.kind == "moved" else sure
+
+
+def lighting(both: tuple[Side, Side], line: Balance) -> Change | None:
+    """The one change of a place whose light, or whose camera's exposure, is another; None where it is the same."""
+    gains = np.abs(np.log(line.gains()))
+    spread = max(line.chroma_spread, line.lightness_spread)
+    sure = float(1 - np.exp(-max(gains.max() / _GAIN, spread / LIT_OTHERWISE)))
+    points = np.concatenate([side.points[side.looks > 0] for side in both])
+    if not len(points) or (gains.max() < _GAIN and spread < LIT_OTHERWISE):
+        return None
+    none = np.zeros(0, dtype=np.int32)
+    evidence = {"gain": float(line.gains().mean()), "spread": float(spread)}
+    box = np.stack([points.min(0), points.max(0)])
+    return Change("lighting", box, np.zeros((0, 3), np.float32), none, none, confidence=sure, evidence=evidence)
