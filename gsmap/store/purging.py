@@ -134,7 +134,8 @@ def listed(store: Store) -> list[Purge]:
 def note(store: Store, purge: Purge, target: str, num_files: int) -> Purge:
     """Write down how many files of tiles go in a folder, before they do: a crash may leave nothing to count."""
     pending = purge.receipt["pending"]
-    noted = {**pending["tiles"], target: max(num_files, pending["tiles"].get(target, 0))}
+    known = pending.get("tiles", {})  # an older gsmap began purges without
+    noted = {**known, target: max(num_files, known.get(target, 0))}
     return _save(store, purge, {**purge.receipt, "pending": {**pending, "tiles": noted}})
 
 
@@ -149,21 +150,22 @@ def finish(store: Store, purge: Purge, unreachable: Sequence[str]) -> Purge:
     """
     pending = purge.receipt["pending"]
     integrity.reclaim(store.catalog, store.arrays)
-    copies = sorted({*pending["copies"], *_copies(store)})
-    for name in copies:
+    there = _copies(store)  # a receipt may be a stranger's: what it names is told, and not deleted
+    copies = sorted({*pending.get("copies", ()), *there})
+    for name in there:
         remove_file(store.folder, name)
     for folder in (store.folder, *(store.arrays.root / kind for kind in KINDS), store.arrays.staging):
         if is_folder(folder):
             sync_folder(folder)  # or they are back when the power was gone
     left = {group for _, group in store.arrays.groups()}  # a branch has them, too
-    num_bytes = [size for group, size in pending["groups"].items() if group not in left]
+    num_bytes = [size for group, size in pending.get("groups", {}).items() if group not in left]
     receipt = {key: value for key, value in purge.receipt.items() if key != "pending"} | {
         "num_groups": len(num_bytes),
         "num_bytes": sum(num_bytes),
         "catalog_copies": copies,
         "branches": [place.location for place in holders(store, purge.scene)],
-        "tile_files": sum(pending["tiles"].values()),
-        "cleaned": sorted(pending["tiles"]),
+        "tile_files": sum(pending.get("tiles", {}).values()),
+        "cleaned": sorted(pending.get("tiles", {})),
         "unreachable": list(unreachable),
     }
     overwrite(store.catalog)

@@ -109,3 +109,10 @@ def a_purge_of_folders_of_others(w: World) -> None:
     w.set("UPDATE exports SET target = ?", str(w.home / "photos"))
     receipt = {"rows": {}, "pending": {"targets": [str(w.home), str(w.home / "photos")]}, "backups": []}
     w.set("INSERT INTO purges (scene, receipt, created_at) VALUES (?, ?, '2026')", w.id_of("b"), json.dumps(receipt))
+
+
+@case(verbs=("remove MAP a --purge", "check MAP"), works=("remove MAP a --purge", "check MAP"))
+def a_purge_that_takes_the_catalog_for_a_copy(w: World) -> None:
+    pending = {"targets": [], "copies": ["map.sqlite", "settings.toml"], "groups": {}, "tiles": {}}
+    receipt = {"rows": {}, "pending": pending, "backups": []}
+    w.set("INSERT INTO purges (scene, receipt, created_at) VALUES (?, ?, '2026')", w.id_of("b"), json.dumps(receipt))
