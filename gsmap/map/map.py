@@ -58,8 +58,6 @@ from gsmap.types.rows import (
 )
 
 if TYPE_CHECKING:
-    import networkx
-
     from gsmap.map.settings import Settings
     from gsmap.map.stages.register import Pairs
     from gsmap.view import ViewServer
@@ -419,7 +417,7 @@ class Map(AbstractContextManager["Map"]):
 
         return objects_report(known_objects(self.store, self.settings, self._progress))
 
-    def graph(self) -> networkx.MultiDiGraph:
+    def graph(self) -> Any:
         """The same as a `networkx.MultiDiGraph` (see `gsmap.objects.object_graph`)."""
         from gsmap.map.objects import as_networkx, known_objects
 

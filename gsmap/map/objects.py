@@ -17,7 +17,17 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map.dates import parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
-from gsmap.objects import Capture, Eyes, graphml, make_objects, object_graph, open_eyes, permanence, relations
+from gsmap.objects import (
+    Capture,
+    Eyes,
+    changed_thing,
+    graphml,
+    make_objects,
+    object_graph,
+    open_eyes,
+    permanence,
+    relations,
+)
 from gsmap.objects.fuse import Node
 from gsmap.store import Store
 from gsmap.types import MapObject, Scene
@@ -125,8 +135,8 @@ def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, N
         for change, kept in zip(found, comparison.changes, strict=True):
             if kept.status == "rejected" or kept.kind not in ("appeared", "disappeared", "replaced", "moved"):
                 continue
-            before = older, _thing(captures[older].things.members, change.before)
-            after = newer, _thing(captures[newer].things.members, change.after)
+            before = older, changed_thing(captures[older].things.members, change.before)
+            after = newer, changed_thing(captures[newer].things.members, change.after)
             if before[1] >= 0:
                 parted.append((before, newer))
             if after[1] >= 0:
@@ -134,15 +144,6 @@ def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, N
             if kept.kind == "moved" and before[1] >= 0 and after[1] >= 0:
                 moved.append((before, after))
     return moved, parted
-
-
-def _thing(members: np.ndarray, rows: np.ndarray) -> int:
-    """The thing that most of some Gaussians are of; -1 for none."""
-    if not len(rows) or rows.max() >= len(members):
-        return -1
-    mine = members[rows]
-    things, counts = np.unique(mine[mine >= 0], return_counts=True)
-    return int(things[np.argmax(counts)]) if len(counts) and 2 * counts.max() > len(mine) else -1
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
