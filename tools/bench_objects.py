@@ -11,7 +11,7 @@ Of the first two captures, of pieces that both show:
 
 kept      what stayed is one object of both captures.
 gone, new what left or came is absent where it was not.
-moved     what moved is absent from both places when it stood in the other (what no change joined yet).
+moved     what moved is one object, or absent from both places when it stood in the other.
 false     what stayed and is called absent, or was not seen and is.
 """
 
@@ -27,11 +27,12 @@ import numpy as np
 from change_truth import Truth, owners
 
 from gsmap import formats
+from gsmap.change import compare
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.objects.things import find_things
-from gsmap.objects import Capture, Eyes, make_objects, open_eyes
-from gsmap.types import MapObject, Things
+from gsmap.objects import Capture, Eyes, changed_thing, make_objects, open_eyes
+from gsmap.types import MapObject, PlacedScene, Things
 
 _SHOWN = 60  # Gaussians of a piece that a capture shows, or else it says little of it
 _MOVED_M = 0.02
@@ -41,15 +42,17 @@ _KINDS = {"furniture": "furniture", "small": "furniture", "picture": "pictures"}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path, nargs="+")
+    parser.add_argument("--changes", action="store_true", help="ask what changed, too, for what moved or left")
+    args = parser.parse_args()
     total: Counter[str] = Counter()
-    for folder in parser.parse_args().places:
-        counts = score(Truth(folder))
+    for folder in args.places:
+        counts = score(Truth(folder), args.changes)
         print(folder.name, _said(counts))
         total += counts
     print("all", _said(total))
 
 
-def score(truth: Truth) -> Counter[str]:
+def score(truth: Truth, with_changes: bool) -> Counter[str]:
     """Counts by what is scored; ``X`` of ``X of``."""
     counts: Counter[str] = Counter()
     captures, whose = [], []
@@ -72,11 +75,29 @@ def score(truth: Truth) -> Counter[str]:
         gaussians = formats.read(truth.folder / f"{capture.scene}.ply")
         return open_eyes(gaussians, formats.read_cameras(truth.folder / f"{capture.scene}.cameras.json"))
 
+    moved, parted = _told(truth, captures) if with_changes else ([], [])
     started = time.process_time()
-    objects = make_objects(captures, 0, eyes)
+    objects = make_objects(captures, 0, eyes, moved=moved, parted=parted)
     counts["objects ms"] += round(1000 * (time.process_time() - started))
     _followed(counts, truth, captures, whose, objects)
     return counts
+
+
+def _told(truth: Truth, captures: list[Capture]) -> tuple[list[Any], list[Any]]:
+    """What the changes between the first two captures say of their things, as `make_objects` takes it."""
+    sides = [
+        PlacedScene(truth.gaussians(when), truth.cameras(when), when, f"2026-01-0{i + 1}T00:00:00+00:00")
+        for i, when in enumerate(truth.times[:2])
+    ]
+    moved: list[Any] = []
+    parted: list[Any] = []
+    for change in compare(*sides).changes:
+        if change.kind in ("appeared", "disappeared", "replaced", "moved"):
+            before = 0, changed_thing(captures[0].things.members, change.before)
+            after = 1, changed_thing(captures[1].things.members, change.after)
+            parted += [(before, 1)] * (before[1] >= 0) + [(after, 0)] * (after[1] >= 0)
+            moved += [(before, after)] * (change.kind == "moved" and min(before[1], after[1]) >= 0)
+    return moved, parted
 
 
 def _pieces(counts: Counter[str], states: list[dict[str, Any]], things: Things, owner: np.ndarray) -> None:
@@ -109,7 +130,7 @@ def _followed(
         if was and is_ and min(shown) >= _SHOWN:
             T = [np.array(s[piece]["T_place_object"]) for s in (before, after)]
             if np.linalg.norm(T[0][:3, 3] - T[1][:3, 3]) > _MOVED_M:
-                what, right = "moved", left and came
+                what, right = "moved", (left and came) or bool({*older} & {*newer})
             else:
                 what, right = f"kept {_KINDS[kind]}", bool({*older} & {*newer})
                 counts["false"] += left or came

@@ -17,7 +17,17 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map.dates import parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
-from gsmap.objects import Capture, Eyes, graphml, make_objects, object_graph, open_eyes, permanence, relations
+from gsmap.objects import (
+    Capture,
+    Eyes,
+    changed_thing,
+    graphml,
+    make_objects,
+    object_graph,
+    open_eyes,
+    permanence,
+    relations,
+)
 from gsmap.objects.fuse import Node
 from gsmap.store import Store
 from gsmap.types import MapObject, Scene
@@ -93,8 +103,10 @@ def known_objects(store: Store, settings: Settings, progress: StageProgress) -> 
             progress("objects", (part + fraction) / len(captures), text)
 
         mine = captures[component]
-        moved = _moved(store, mine)
-        objects += make_objects(mine, component, eyes, moved=moved, params=settings.objects, progress=told)
+        moved, parted = _told(store, mine)
+        objects += make_objects(
+            mine, component, eyes, moved=moved, parted=parted, params=settings.objects, progress=told
+        )
     progress("objects", 1.0, f"{len(objects)} objects")
     return Known(objects, scenes, tuple(notes))
 
@@ -106,32 +118,32 @@ def _when(scene: Scene) -> tuple[bool, float, str]:
     return False, parsed(scene.captured_at).timestamp(), scene.ingested_at or ""
 
 
-def _moved(store: Store, captures: Sequence[Capture]) -> list[tuple[Node, Node]]:
-    """Things that a change of kind ``moved`` says are one, unless a person rejected it."""
+def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, Node]], list[tuple[Node, int]]]:
+    """What changes say of things, but for those that a person rejected.
+
+    Returns:
+        Things that are one though they moved; and things, each with a capture that does not show it where it stood.
+    """
     at = {capture.scene: i for i, capture in enumerate(captures)}
-    found = []
+    moved: list[tuple[Node, Node]] = []
+    parted: list[tuple[Node, int]] = []
     for comparison in store.changes.current():
-        if comparison.older not in at or comparison.newer not in at:
-            continue
-        kinds = [change.kind == "moved" and change.status != "rejected" for change in comparison.changes]
-        if not any(kinds):
+        if comparison.older not in at or comparison.newer not in at or not comparison.changes:
             continue
         older, newer = at[comparison.older], at[comparison.newer]
-        for change, wanted in zip(store.changes.load(comparison.number).changes, kinds, strict=True):
-            before = _thing(captures[older].things.members, change.before)
-            after = _thing(captures[newer].things.members, change.after)
-            if wanted and before >= 0 and after >= 0:
-                found.append(((older, before), (newer, after)))
-    return found
-
-
-def _thing(members: np.ndarray, rows: np.ndarray) -> int:
-    """The thing that most of some Gaussians are of; -1 for none."""
-    if not len(rows) or rows.max() >= len(members):
-        return -1
-    mine = members[rows]
-    things, counts = np.unique(mine[mine >= 0], return_counts=True)
-    return int(things[np.argmax(counts)]) if len(counts) and 2 * counts.max() > len(mine) else -1
+        found = store.changes.load(comparison.number).changes
+        for change, kept in zip(found, comparison.changes, strict=True):
+            if kept.status == "rejected" or kept.kind not in ("appeared", "disappeared", "replaced", "moved"):
+                continue
+            before = older, changed_thing(captures[older].things.members, change.before)
+            after = newer, changed_thing(captures[newer].things.members, change.after)
+            if before[1] >= 0:
+                parted.append((before, newer))
+            if after[1] >= 0:
+                parted.append((after, older))
+            if kept.kind == "moved" and before[1] >= 0 and after[1] >= 0:
+                moved.append((before, after))
+    return moved, parted
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Things of captures become objects of the map: fused, looked for in every capture, related, and counted."""
 
+from gsmap.objects.changed import changed_thing
 from gsmap.objects.fuse import Node, Placed, fuse
 from gsmap.objects.graph import graphml, object_graph
 from gsmap.objects.looks import Eyes, Glance, glance, judge, open_eyes
@@ -16,6 +17,7 @@ __all__ = [
     "Permanence",
     "Placed",
     "Relation",
+    "changed_thing",
     "fuse",
     "glance",
     "graphml",

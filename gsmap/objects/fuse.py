@@ -53,7 +53,10 @@ class Params:
 
 
 def fuse(
-    captures: Sequence[Placed], moved: Sequence[tuple[Node, Node]] = (), params: Params | None = None
+    captures: Sequence[Placed],
+    moved: Sequence[tuple[Node, Node]] = (),
+    parted: Sequence[tuple[Node, int]] = (),
+    params: Params | None = None,
 ) -> list[tuple[Node, ...]]:
     """Groups of things that are one object, at most one of each capture; each thing is in one.
 
@@ -64,6 +67,7 @@ def fuse(
     Args:
         captures: in order of time, one frame.
         moved: things that are known to be one though they stood elsewhere; these are taken first.
+        parted: things, each with a capture that is known not to show it where it stood.
 
     Returns:
         Groups by their first node; nodes within by capture.
@@ -82,7 +86,7 @@ def fuse(
     order = np.argsort(-score[best], kind="stable")
     edges = [(first[p[0]] + p[1], first[q[0]] + q[1]) for p, q in moved]
     edges += list(zip(a[best][order].tolist(), b[best][order].tolist(), strict=True))
-    groups = _joined(edges, home)
+    groups = _joined(edges, home, {(int(first[c] + t), other) for (c, t), other in parted}, len(moved))
     return [tuple((int(home[n]), int(n - first[home[n]])) for n in group) for group in groups]
 
 
@@ -133,11 +137,19 @@ def _mutual(a: np.ndarray, b: np.ndarray, score: np.ndarray, home: np.ndarray) -
     return np.array(mutual, np.int64)
 
 
-def _joined(edges: Sequence[tuple[int, int]], home: np.ndarray) -> list[list[int]]:
-    """Groups of nodes that edges join, in this order; an edge that would give a group two of one capture is left."""
+def _joined(
+    edges: Sequence[tuple[int, int]], home: np.ndarray, parted: set[tuple[int, int]], moved: int
+) -> list[list[int]]:
+    """Groups of nodes that edges join, in this order, the first of them of what moved.
+
+    An edge is left that would give a group two of one capture, or, of what stayed, one of a capture that does not show
+    another.
+    """
     group = {n: [n] for n in range(len(home))}
-    for p, q in edges:
+    for i, (p, q) in enumerate(edges):
         one, other = group[p], group[q]
+        if i >= moved and any((n, home[m]) in parted or (m, home[n]) in parted for n in one for m in other):
+            continue
         if one is other or {home[n] for n in one} & {home[n] for n in other}:
             continue
         both = sorted(one + other)

@@ -53,6 +53,7 @@ def make_objects(
     *,
     metres: float = 1.0,
     moved: Sequence[tuple[Node, Node]] = (),
+    parted: Sequence[tuple[Node, int]] = (),
     params: Params | None = None,
     progress: Progress = silent,
 ) -> list[MapObject]:
@@ -66,10 +67,12 @@ def make_objects(
         eyes: what a capture sees; asked once for each capture that lacks an object of others.
         metres: per unit of the map.
         moved: things (capture and thing by index) that are one though they stood elsewhere.
+        parted: things, each with the index of a capture that is known not to show it where it stood.
     """
     params = params or Params()
     placed = [_placed(capture, metres) for capture in captures]
-    groups = fuse(placed, moved, params.fuse)
+    groups = fuse(placed, moved, parted, params.fuse)
+    gone = set(parted)
     kept = []
     for group in groups:
         rows = {c: np.flatnonzero(placed[c].things == t) for c, t in group}
@@ -102,6 +105,8 @@ def make_objects(
             if c not in mine:
                 at, lab = own[i]
                 state, looked = judge(glances[i], at * metres, lab, shift, params.look)
+                if any((node, c) in gone for node in kept[i][0]):
+                    state = "absent"
                 box = np.array([at.min(0), at.max(0)]) if state == "seen" else None
                 mine[c] = Sighting(capture.scene, state, -1, box, looked)
     objects = []

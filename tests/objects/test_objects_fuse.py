@@ -72,6 +72,16 @@ def test_a_thing_that_is_known_to_have_moved_stays_one():
     assert fuse([before, after], [((0, 0), (1, 0))]) == [((0, 0), (1, 0))]
 
 
+def test_what_is_known_to_be_replaced_is_another_thing():
+    before, after, later = (capture(([0, 0, 0], GREY), seed=i) for i in (0, 2, 4))
+    assert fuse([before, after]) == [((0, 0), (1, 0))]
+    assert fuse([before, after], parted=[((0, 0), 1)]) == [((0, 0),), ((1, 0),)]
+    apart = [((0, 0), 1), ((0, 0), 2)]
+    assert fuse([before, after, later], parted=apart) == [((0, 0),), ((1, 0), (2, 0))]
+    # It moved by a little: it is not where it was, and it is the same.
+    assert fuse([before, after], [((0, 0), (1, 0))], [((0, 0), 1), ((1, 0), 0)]) == [((0, 0), (1, 0))]
+
+
 def test_an_object_has_one_thing_of_each_capture():
     """Two parts of it in one capture lie where the other has the whole: the larger one is it."""
     whole = capture(([0, 0, 0], GREY))

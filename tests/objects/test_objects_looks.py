@@ -64,7 +64,7 @@ def test_a_thing_behind_another_is_unseen():
 
 
 def test_another_thing_in_its_place_is_not_it_but_the_same_one_painted_is():
-    assert verdict(eyes((0.8, 0.2, 0.2), high=(3.7, 1.8, 0.6)))[0] == "absent"
+    assert verdict(eyes((0.8, 0.2, 0.2), high=(3.7, 1.8, 0.8)))[0] == "absent"
     assert verdict(eyes((0.8, 0.2, 0.2)))[0] == "seen"
 
 
