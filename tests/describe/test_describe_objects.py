@@ -281,7 +281,7 @@ def test_back_ends_without_their_model_say_what_to_add(name):
 def test_recipes_change_with_parameters_and_name_what_is_comparable():
     base = recipe_key()
     assert (base.stage, base.method) == ("describe", "graph")
-    assert set(base.settings["layers"]) == {"landmarks", "objects"}
+    assert set(base.settings["layers"]) == {"landmarks", "objects", "things"}
     assert recipe_key().digest == base.digest
     other = recipe_key(Params(object=ObjectParams(tau_asso=1.2)))
     assert other.settings["landmark"] == base.settings["landmark"]
