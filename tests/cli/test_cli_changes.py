@@ -68,5 +68,5 @@ def test_the_place_on_a_day(site: Path, cli: Run, tmp_path: Path) -> None:
     assert then.json["notes"]
     assert "odd:one has no date" in then.stderr
     assert cli(*out, "--as-of", "2020-01-01").code == 1
-    assert cli(*out, "--prefer", "newest").code == 2
+    assert cli(*out[:-1], "distance", "--prefer", "newest").code == 2
     assert cli(*out[:-2], "--prefer", "oldest").code == 2

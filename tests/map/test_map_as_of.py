@@ -94,8 +94,8 @@ def test_whom_to_believe_is_part_of_how_a_tile_is_made(site: Map, tmp_path: Path
     site.edit("may", captured_at="2026-08-01")
     assert export(prefer="both") == 0  # nobody wins, whatever the dates
     assert export() == 1
-    with pytest.raises(ConfigError, match="'union' prefers nobody: leave --prefer out"):
-        export(merge="union", prefer="newest")
+    with pytest.raises(ConfigError, match="'distance' prefers nobody: leave --prefer out"):
+        export(merge="distance", prefer="newest")
     with pytest.raises(ConfigError, match="prefer is one of newest, best, both, got 'oldest'"):
         export(prefer="oldest")
 
