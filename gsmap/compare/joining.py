@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmap.compare.comparing import AGREE, OTHER_BEHIND, UNSURE, Comparison
-from gsmap.compare.looks import Looks, View, place
+from gsmap.compare.looks import Looks, place
 from gsmap.compare.params import Params
 from gsmap.types import Gaussians, PlacedScene
 
@@ -49,7 +49,7 @@ def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, params: P
 
 
 def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
-    """The looks of the older capture of a comparison, sure of nothing where a newer one disagrees.
+    """The looks of the older capture of a comparison, which show nothing where a newer one disagrees.
 
     Its colours are brought to the newer's, so that captures before it are compared with one exposure.
 
@@ -61,13 +61,12 @@ def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
         shown = picture.own.dominant_id
         stands = (shown >= 0) & stays[shown]
         undisputed = (picture.outcome == AGREE) | (picture.outcome == UNSURE) | (picture.outcome == OTHER_BEHIND)
-        sure.append(own & stands & undisputed)
-        views.append(_balanced(picture.own, comparison))
+        so = stands & undisputed
+        sure.append(own & so)
+        view = picture.own
+        colour = comparison.balance.applied(view.colour)
+        views.append(replace(view, colour=colour, solid=view.solid & so, opaque=view.opaque & so))
     return replace(looks, views=tuple(views), sure=tuple(sure))
-
-
-def _balanced(view: View, comparison: Comparison) -> View:
-    return replace(view, colour=comparison.balance.applied(view.colour))
 
 
 def _chosen(captures: Sequence[Looks], of: PlacedScene, params: Params) -> list[list[int]]:

@@ -111,6 +111,9 @@ def test_the_newest_who_looked_decides():
     settled = settle([first, second, third])
     assert standing(settled, 2) == len(box(7))
     assert standing(settle([first, second]), 0) == 0
+    # What stood until the newest came is gone from all before it, however many saw it.
+    kept = settle([first, dated("b", 2021, wall(1, -1.5, 1.5), box(6)), dated("c", 2022, wall(2, -1.5, 1.5))])
+    assert standing(kept, 0) == standing(kept, 1) == 0
     # What the newest never saw is decided by the one before.
     aside = cameras_facing(np.linspace(-3.6, -3.0, 7))
     assert standing(settle([first, second, dated("c", 2022, wall(2, -4.5, -2.5), cameras=aside)]), 0) == 0
