@@ -71,7 +71,7 @@ def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
 
 
 def _chosen(captures: Sequence[Looks], of: PlacedScene, params: Params) -> list[list[int]]:
-    """Of each capture the views to take: at most twice ``max_views`` in all, one after another what adds most coverage."""
+    """Of each capture the views to take: at most twice ``max_views`` in all, one after another what adds most."""
     chosen: list[list[int]] = [[] for _ in captures]
     points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]
     names = [(c, v) for c, looks in enumerate(captures) for v in range(len(looks.views))]
