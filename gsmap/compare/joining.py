@@ -13,7 +13,8 @@ from gsmap.compare.params import Params
 from gsmap.types import Gaussians, PlacedScene
 
 _SAMPLE = 1500  # points of a capture by which views of others are chosen
-_ENOUGH = 5  # views of a point: more add little
+_ENOUGH = 8  # views of a point: more add little
+_VIEWS = 2  # times as many as of one capture: what several show together is larger than what one does
 
 
 def joined(parts: Sequence[tuple[Looks, np.ndarray]], of: PlacedScene, params: Params | None = None) -> Looks:
@@ -70,7 +71,7 @@ def outdated(looks: Looks, comparison: Comparison, stays: np.ndarray) -> Looks:
 
 
 def _chosen(captures: Sequence[Looks], of: PlacedScene, params: Params) -> list[list[int]]:
-    """Of each capture the views to take: at most ``max_views`` in all, one after another what adds most coverage."""
+    """Of each capture the views to take: at most twice ``max_views`` in all, one after another what adds most."""
     chosen: list[list[int]] = [[] for _ in captures]
     points = of.gaussians.means[:: max(1, len(of.gaussians) // _SAMPLE)]
     names = [(c, v) for c, looks in enumerate(captures) for v in range(len(looks.views))]
@@ -85,7 +86,7 @@ def _chosen(captures: Sequence[Looks], of: PlacedScene, params: Params) -> list[
         # Among views that see as much, the newest.
         sees[i, at.index[seen]] = 1 + 0.2 * (len(captures) - c) / len(captures)
     wanting = np.full(len(points), _ENOUGH, dtype=np.float32)
-    for _ in range(min(params.max_views, len(names))):
+    for _ in range(min(_VIEWS * params.max_views, len(names))):
         gain = sees @ np.minimum(wanting, 1)
         best = int(np.argmax(gain))
         if gain[best] <= 0:

@@ -143,7 +143,7 @@ def test_looks_of_many_captures_together_are_those_that_add_coverage():
     many = [dated(f"{i:02d}", 2000 + i, wall(i, -0.8, 0.8, spacing=0.08)) for i in range(6)]
     looks = [compare.look(scene) for scene in many[::-1]]
     stays = [np.ones(len(one.gaussians), dtype=bool) for one in looks]
-    joined = compare.joined(list(zip(looks, stays, strict=True)), many[0], compare.Params(max_views=6))
+    joined = compare.joined(list(zip(looks, stays, strict=True)), many[0], compare.Params(max_views=3))
     assert len(joined.views) == 6
     assert len(joined.gaussians) == sum(len(scene.gaussians) for scene in many)
     for view in joined.views:
