@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap.compare import UNSEEN, Looks, compare, look
+from gsmap.compare import HIDDEN, UNSEEN, Looks, compare, look
 from gsmap.compare import Params as CompareParams
 from gsmap.errors import ConfigError
 from gsmap.render import render
@@ -49,6 +49,8 @@ class Params:
 def seen_again(older: PlacedScene, newer: Sequence[Looks], params: CompareParams | None = None) -> float:
     """Share of a capture's surface that newer captures of the same frame looked at, whatever they found there.
 
+    What stands behind what they show, they did not look at.
+
     Args:
         older: in metres, with its cameras.
         newer: see `gsmap.compare.look`.
@@ -59,7 +61,7 @@ def seen_again(older: PlacedScene, newer: Sequence[Looks], params: CompareParams
         return 0.0
     seen = np.zeros(len(older.gaussians), dtype=bool)
     for other in newer:
-        seen |= compare(mine, other, params).older.state != UNSEEN
+        seen |= ~np.isin(compare(mine, other, params).older.state, (UNSEEN, HIDDEN))
     return float(seen[surface].mean())
 
 
