@@ -172,7 +172,8 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
 def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict) -> np.ndarray:
     """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
 
-    They are in the newer's exposure. A last look at what evidence of single Gaussians leaves beside a change: shards, and what is smaller than a pixel.
+    They are in the newer's exposure. A last look at what evidence of single Gaussians leaves beside a change: shards,
+    and what is smaller than a pixel.
     """
     from scipy.spatial import cKDTree
 
