@@ -52,7 +52,7 @@ class Side:
 
     @cached_property
     def tree(self) -> Any:
-        return cKDTree(self.points) if len(self.points) else cKDTree(np.full((1, 3), np.inf))
+        return cKDTree(self.points)
 
     @cached_property
     def tints(self) -> np.ndarray:

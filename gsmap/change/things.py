@@ -133,7 +133,7 @@ def things_of(side: Side, cells: Cells, painted: np.ndarray, params: Params) -> 
     """Things of one capture that changed, largest first; ``painted`` (M,) bool are the cells of clear paint."""
     fewest = max(2, round(params.min_area_m2 / params.cell_m**2))
     changed = (cells.moved | painted) & (cells.thing >= 0)
-    count = int(cells.thing.max(initial=-1)) + 1
+    count = max(int(cells.thing.max(initial=-1)) + 1, 1)  # one at least, for -1 to index: all may be shell
     total = np.bincount(cells.thing[cells.judged & (cells.thing >= 0)], minlength=count)
     share = np.bincount(cells.thing[changed], minlength=count) / np.maximum(total, 1)
     whole = (share >= _WHOLE)[cells.thing] & (cells.thing >= 0)

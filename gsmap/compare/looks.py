@@ -99,13 +99,13 @@ def look(scene: PlacedScene, params: Params | None = None) -> Looks:
         on = (at.z > view.near[at.row, at.column] - margin) & (at.z < view.far[at.row, at.column] + margin)
         times_seen[at.index[on]] += 1
         sharpness[at.index[on]] += view.pixels_a_metre(at.z[on]) ** 2
-    well = _best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
+    well = best_of_cell(scene.gaussians.means, times_seen, params.cell_m) >= params.min_views
     sure = tuple(v.solid & well[v.dominant_id] & (v.dominant_id >= 0) for v in views) if count else ()
     surface = largest >= params.min_weight if views else np.ones(count, dtype=bool)
     return Looks(scene, tuple(views), surface, times_seen, sharpness, sure, placed)
 
 
-def _best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
+def best_of_cell(points: np.ndarray, counts: np.ndarray, cell_m: float) -> np.ndarray:
     """(N,) the largest count in each point's cell: a place was seen as often as what shows it best."""
     if not len(points):
         return counts

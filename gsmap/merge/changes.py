@@ -103,7 +103,7 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
             gains[i] = _gains(found)
             keeps[i] &= ~verdict.lost
             if prefer == "newest":
-                keeps[i] &= ~_intruders(scenes[i].gaussians, keeps[i], joined, found, verdict)
+                keeps[i] &= ~_intruders(apply_gain(looks.gaussians, gains[i]), keeps[i], joined, found, verdict)
             first = 0
             for one in parts:
                 rows = np.flatnonzero(one.shows)
@@ -172,7 +172,8 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
 def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict) -> np.ndarray:
     """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
 
-    A last look at what evidence of single Gaussians leaves beside a change: shards, and what is smaller than a pixel.
+    They are in the newer's exposure. A last look at what evidence of single Gaussians leaves beside a change: shards,
+    and what is smaller than a pixel.
     """
     from scipy.spatial import cKDTree
 

@@ -44,7 +44,8 @@ def relations(objects: Sequence[MapObject], metres: float = 1.0) -> list[Relatio
         over = footprint / size[i, :2].prod()
         apart = footprint < _OVER * np.minimum(size[:, :2].prod(1), size[i, :2].prod())
         gap = np.linalg.norm(np.clip(low - high, 0, None)[:, :2], axis=1)
-        for j, other in enumerate(objects):
+        for j in np.flatnonzero(gap < _NEXT_M).tolist():  # Nothing farther away is related.
+            other = objects[j]
             if i == j or one.component != other.component or one.there != other.there:
                 continue
             if inside[j] >= _INSIDE and size[j].prod() > size[i].prod():

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap.compare import UNSEEN, Looks, compare, look
+from gsmap.compare import HIDDEN, UNSEEN, Looks, compare, look
 from gsmap.compare import Params as CompareParams
+from gsmap.compare.looks import best_of_cell
 from gsmap.errors import ConfigError
 from gsmap.render import render
 from gsmap.types import Gaussians, PlacedScene
@@ -49,17 +50,22 @@ class Params:
 def seen_again(older: PlacedScene, newer: Sequence[Looks], params: CompareParams | None = None) -> float:
     """Share of a capture's surface that newer captures of the same frame looked at, whatever they found there.
 
+    What stands behind what they show, they did not look at; what lies a little behind in a cell of which they saw the
+    rest is of the surface that they saw.
+
     Args:
         older: in metres, with its cameras.
         newer: see `gsmap.compare.look`.
     """
+    params = params or CompareParams()
     mine = look(older, params)
     surface = mine.surface & (mine.times_seen > 0)
     if not surface.any():
         return 0.0
     seen = np.zeros(len(older.gaussians), dtype=bool)
     for other in newer:
-        seen |= compare(mine, other, params).older.state != UNSEEN
+        seen |= ~np.isin(compare(mine, other, params).older.state, (UNSEEN, HIDDEN))
+    seen = best_of_cell(older.gaussians.means, seen, params.cell_m)
     return float(seen[surface].mean())
 
 

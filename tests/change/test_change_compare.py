@@ -113,6 +113,14 @@ def test_what_one_capture_did_not_see_has_not_changed():
     assert "no cameras" in blind.notes[0]
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_capture_that_shows_nothing_or_a_wall_alone_says_nothing(count):
+    whole = capture(shell(), 1)
+    none = PlacedScene(whole.gaussians[:count], whole.cameras, "b")
+    assert things(change.compare(whole, none)) == []
+    assert things(change.compare(none, whole)) == []
+
+
 def test_any_vertical_and_any_frame():
     room = [*shell(), *STAYS]
     scenes = [

@@ -38,6 +38,12 @@ def test_what_a_later_capture_looked_through_is_gone():
         assert settle([replace(old, captured_at=when), new]).lost == [0, 0]
 
 
+def test_an_older_capture_in_another_exposure_loses_no_more_beside_what_went():
+    scene = Gaussians.concatenate([wall(1, -1, 1, colour=plain), box(5)])
+    old = dated("old", 2020, apply_gain(scene, np.full(3, 0.6)))
+    assert settle([old, dated("new", 2021, wall(2, -1, 1, colour=plain))]).lost == [len(box(5)), 0]
+
+
 def test_what_no_newer_capture_saw_stays():
     away = dated("new", 2021, wall(1, -1.5, 1.5), cameras=cameras_facing(np.linspace(-3.6, -3.0, 7)))
     old = dated("old", 2020, wall(0, -1.5, 1.5), box(5))

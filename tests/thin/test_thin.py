@@ -1,14 +1,17 @@
 """What supersedes a capture, and what of it shows: against walls whose answers are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic_walls import cameras_facing, wall
 
 from gsmap.compare import Params as CompareParams
 from gsmap.errors import ConfigError
+from gsmap.geometry.transforms import transform_cameras
 from gsmap.render import render
 from gsmap.thin import Params, fidelity_db, look, seen_again, shown
-from gsmap.types import Gaussians, PlacedScene
+from gsmap.types import Gaussians, PlacedScene, Sim3
 
 
 @pytest.fixture
@@ -30,6 +33,22 @@ def test_captures_add_up_and_none_saw_nothing(older):
     alone = [seen_again(older, [look(half)]) for half in halves]
     assert seen_again(older, [look(half) for half in halves]) > max(alone) + 0.1
     assert seen_again(older, []) == 0.0
+
+
+def test_what_is_behind_a_wall_was_not_looked_at():
+    along = np.linspace(-1.5, 1.5, 9)
+    beyond = transform_cameras(cameras_facing(along), Sim3(np.eye(3), np.array([0, 0, 0.6])))
+    older = PlacedScene(wall(3, -2, 2, z=0.6), beyond, "the next room")
+    newer = PlacedScene(wall(2, -2, 2), cameras_facing(along), "before the wall")
+    assert seen_again(older, [look(newer)]) == 0.0
+
+
+def test_what_lies_a_little_behind_a_surface_that_was_seen_is_of_it(older):
+    means = older.gaussians.means.copy()
+    means[np.floor(means[:, 0] / 0.08) % 4 == 0, 2] += 0.05  # narrow grooves, that a newer training smoothed
+    rough = PlacedScene(replace(older.gaussians, means=means), older.cameras, "rough")
+    newer = PlacedScene(wall(2, -2, 2), older.cameras, "new")
+    assert seen_again(rough, [look(newer)]) > 0.9
 
 
 def test_what_no_picture_shows_goes_and_the_pictures_stay(older):
