@@ -154,7 +154,7 @@ def objects_report(known: Known) -> ObjectsReport:
     return ObjectsReport(
         objects=tuple(_row(thing, known) for thing in known.objects),
         relations=tuple(
-            RelationRow(source=one.source, relation=one.kind, target=one.target) for one in relations(known.objects)
+            RelationRow(subject=one.source, relation=one.kind, other=one.target) for one in relations(known.objects)
         ),
         notes=known.notes,
     )

@@ -74,14 +74,23 @@ class Settled:
         ]
 
 
-def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: compare.Params | None = None) -> Settled:
+def settle(
+    scenes: Sequence[PlacedScene],
+    prefer: Prefer = "newest",
+    params: compare.Params | None = None,
+    *,
+    one_exposure: bool = True,
+) -> Settled:
     """Drop what captures of other dates disprove.
 
     From the newest capture back, each older one is compared once with what all newer ones are sure of together: N
     captures cost N comparisons. A Gaussian leaves where that looked through it, or shows its surface in another colour
     (exposure apart); with ``best`` only if it also saw the place better, and otherwise the newer's Gaussians leave.
-    What no newer capture saw stays. All of it is brought to the newest's exposure. Captures without a date, or of one
-    date, overrule nothing.
+    What no newer capture saw stays. Captures without a date, or of one date, overrule nothing.
+
+    Args:
+        one_exposure: bring all of it to the newest's exposure. Not of a piece of a map, whose neighbours would show the
+            same capture in another one.
     """
     params = params or compare.Params()
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
@@ -118,7 +127,7 @@ def settle(scenes: Sequence[PlacedScene], prefer: Prefer = "newest", params: com
             added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), gains[i]), shows))
         truth += added
     return Settled(
-        [_left(s, k, gain) for s, k, gain in zip(scenes, keeps, gains, strict=True)],
+        [_left(s, k, gain if one_exposure else np.ones(3)) for s, k, gain in zip(scenes, keeps, gains, strict=True)],
         [int((~k).sum()) for k in keeps],
         [c[k] for c, k in zip(changed, keeps, strict=True)],
         rivals,

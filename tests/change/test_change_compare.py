@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made_room import box, capture, moved_by, plain, shell, stripes
+from change_room import box, capture, moved_by, plain, shell, stripes
 
 from gsmap import change
 from gsmap.errors import ConfigError, InputError

@@ -215,6 +215,8 @@ def test_other_settings_compare_again(site: Map, seen: Seen) -> None:
 
 def test_words_on_changes(site: Map, seen: Seen) -> None:
     site.changes()
+    assert {row.what: row.count for row in site.status().todo}["changes"] == 2  # those that are sure
+    site.with_settings({"change.min_confidence": 0.3})
     assert {row.what: row.count for row in site.status().todo}["changes"] == 4
     assert site.confirm("c1", "seen it").status == "confirmed"
     assert site.reject("c2").status == "rejected"

@@ -191,3 +191,23 @@ def test_the_place_shows_in_the_newest_exposure():
     middle = np.s_[12:36, 16:48]
     np.testing.assert_allclose((after[middle] / before[middle]).mean((0, 1)), gain, atol=0.03)
     assert settle([old, new], "both").scenes[0] is old
+
+
+def test_tiles_keep_each_capture_in_its_own_exposure():
+    """Neighbouring tiles would come to other gains, or to none."""
+    older, newer = two_dates()
+    darker = replace(older, gaussians=apply_gain(older.gaussians, np.full(3, 0.6)))
+    whole = settle([darker, newer])
+    piece = settle([darker, newer], one_exposure=False)
+    assert [len(s.gaussians) for s in piece.scenes] == [len(s.gaussians) for s in whole.scenes]
+    assert np.abs(whole.scenes[0].gaussians.sh - piece.scenes[0].gaussians.sh).max() > 0.05
+    kept = {tuple(m) for m in darker.gaussians.means.tolist()}
+    assert {tuple(m) for m in piece.scenes[0].gaussians.means.tolist()} <= kept
+    assert np.isin(piece.scenes[0].gaussians.sh[:, 0, 0], darker.gaussians.sh[:, 0, 0]).all()
+
+
+def test_cameras_that_nobody_held_saw_nothing():
+    older, newer = two_dates()
+    bare = replace(newer, cameras=replace(newer.cameras, synthesised=True))
+    assert settle([older, bare]).lost == [0, 0]
+    assert settle([older, newer]).lost[0] > 0

@@ -172,7 +172,7 @@ def merge(
     """Drop what is gone, balance exposures, render references, choose what to keep, and fit it to the references."""
     deadline = None if budget_s is None else time.monotonic() + budget_s
     notes: list[str] = []
-    settled = settle(scenes, params.prefer, params.compare)
+    settled = settle(scenes, params.prefer, params.compare, one_exposure=bounds is None)
     scenes = settled.scenes
     notes += settled.notes()
     if params.balance_exposure:

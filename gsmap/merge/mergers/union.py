@@ -52,5 +52,5 @@ def merge(
     progress: Progress,
 ) -> MergeResult:
     """All Gaussians of all scenes that no preferred one overrules."""
-    settled = settle(scenes, params.prefer)
+    settled = settle(scenes, params.prefer, one_exposure=bounds is None)
     return MergeResult(*united(settled.scenes), notes=tuple(settled.notes()))

@@ -56,7 +56,7 @@ def merge(
     progress: Progress,
 ) -> MergeResult:
     """One Gaussian per voxel of the map's grid; see `gsmap.geometry.voxels.merge_groups`."""
-    settled = settle(scenes, params.prefer)
+    settled = settle(scenes, params.prefer, one_exposure=bounds is None)
     gaussians, origin = united(settled.scenes)
     merged, heaviest = merge_groups(gaussians, voxel_labels(gaussians.means, params.voxel_m))
     return MergeResult(merged, origin[heaviest], notes=tuple(settled.notes()))

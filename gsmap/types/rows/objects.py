@@ -60,16 +60,16 @@ class RelationRow(Row):
     """How one object stands to another; both are there still, or neither is.
 
     Args:
-        source: id of an object.
+        subject: id of an object.
         relation: ``on``, ``in`` or ``next to``; the last holds both ways and is given once.
-        target: id of the other.
+        other: id of the object that it stands to so.
     """
 
-    columns: ClassVar[Mapping[str, str]] = {"source": "object", "relation": "is", "target": "object"}
+    columns: ClassVar[Mapping[str, str]] = {"subject": "object", "relation": "is", "other": "object"}
 
-    source: str
+    subject: str
     relation: str
-    target: str
+    other: str
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
