@@ -1,5 +1,7 @@
 """What supersedes a capture, and what of it shows: against walls whose answers are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic_walls import cameras_facing, wall
@@ -52,6 +54,12 @@ def test_without_cameras_all_stays_and_nothing_is_known():
     bare = PlacedScene(wall(1, -1, 1), None, "bare")
     assert shown(bare, Params()).all()
     assert np.isnan(fidelity_db(bare, bare.gaussians, Params()))
+
+
+def test_with_made_up_cameras_all_stays(older):
+    behind = Gaussians.concatenate([older.gaussians, wall(3, -2, 2, z=0.4)])
+    made_up = replace(older.cameras, synthesised=True)
+    assert shown(PlacedScene(behind, made_up, "both"), Params()).all()
 
 
 def test_settings_that_cannot_be():
