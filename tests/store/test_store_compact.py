@@ -12,6 +12,7 @@ from gsmap.geometry.morton import morton_order
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.store import Store, compact, purging
 from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.merging import merge
 from gsmap.types import Gaussians, SceneGraph
 
 
@@ -136,4 +137,18 @@ def test_a_graph_of_the_compact_gaussians_goes_when_the_scene_is_whole_again(sto
     store.graphs.save(SceneGraph(scene.id), key("describe", scene.id))
     store.scenes.add(g, make_cameras(), name="a")
     assert store.graphs.load("a") is None
+    assert store.check().ok
+
+
+def test_a_merge_that_makes_a_scene_whole_brings_its_graph_instead_of_the_compact_one(store, tmp_path):
+    g = make_gaussians(60)
+    with Store.create(tmp_path / "other.gsmap") as other:
+        for one in (store, other):
+            scene, _ = one.scenes.add(g, make_cameras(), name="a")
+        other.graphs.save(SceneGraph(scene.id, notes=("whole",)), key("describe", scene.id))
+        store.scenes.thin("a", np.arange(60) < 40)
+        store.graphs.save(SceneGraph(scene.id, notes=("compact",)), key("describe", scene.id))
+        merge(store, other)
+    assert store.scenes.get("a").thinning is None
+    assert store.graphs.load("a").notes == ("whole",)
     assert store.check().ok
