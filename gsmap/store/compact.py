@@ -23,6 +23,7 @@ _LEVELS_16, _LEVELS_10, _LEVELS_8 = 65535.0, 1023.0, 255.0
 _SIZE_STEP = 0.06  # of the logarithm: 6 percent
 _COLOUR_STEP = 0.02  # 0.006 of a colour in [0, 1]
 _GLOSS_STEP = 0.06  # of what depends on the direction
+_NOT_FINITE = "a compact scene holds numbers that are not finite: ingest its capture again"
 _VALUES = ("log_scales", "sh0", "sh_rest")
 
 
@@ -74,14 +75,18 @@ def unpack(arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> Gaussians:
     boxes = arrays["compact.boxes"]
     ranges = {name: arrays[f"compact.{name}_range"] for name in _VALUES}
     if not all(np.isfinite(a).all() for a in (boxes, *ranges.values())):
-        raise CorruptError("a compact scene holds boxes or ranges that are not finite: ingest its capture again")
+        raise CorruptError(_NOT_FINITE)
     chunk = rows // CHUNK_ROWS
-    size = boxes[:, 1] - boxes[:, 0]
-    means = boxes[chunk, 0] + _bytes_together(arrays["compact.means"]) / _LEVELS_16 * size[chunk]
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = boxes[:, 1] - boxes[:, 0]
+        means = boxes[chunk, 0] + _bytes_together(arrays["compact.means"]) / _LEVELS_16 * size[chunk]
+        value = {name: low + arrays[f"compact.{name}"] * step for name, (low, step) in ranges.items()}
+        found = [array.astype(np.float32) for array in (means, *value.values())]
+    if not all(np.isfinite(array).all() for array in found):
+        raise CorruptError(_NOT_FINITE)
     packed = arrays["compact.quats"]
     three = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
     quats = from_smallest_three(packed >> 30, (three / _LEVELS_10 - 0.5) * _SQRT2)
-    value = {name: low + arrays[f"compact.{name}"] * step for name, (low, step) in ranges.items()}
     sh = np.concatenate([value["sh0"], value["sh_rest"]], axis=1).reshape(len(rows), -1, 3)
     return Gaussians(means, quats, value["log_scales"], logits_of_bytes(arrays["compact.opacities"]), sh)
 

@@ -11,7 +11,7 @@ from gsmap.errors import CorruptError, NotFoundError
 from gsmap.store.arrays import Arrays, Staged, StoredFile
 from gsmap.store.branches import Others
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.schema import files, groups
+from gsmap.store.schema import files, graphs, groups
 
 
 def has_group(connection: Connection, group_id: str) -> bool:
@@ -44,6 +44,15 @@ def unname(connection: Connection, group_id: str) -> None:
     """Let a group count no longer; whoever claimed it is changed in the same transaction."""
     connection.execute(delete(files).where(files.c.group_id == group_id))
     connection.execute(delete(groups).where(groups.c.id == group_id))
+
+
+def drop_graphs(connection: Connection, scene: str) -> None:
+    """Forget the graphs of a scene whose Gaussians become others."""
+    made = graphs.c.scene == scene
+    old = list(connection.execute(select(graphs.c.group_id).where(made)).scalars())
+    connection.execute(delete(graphs).where(made))
+    for group in old:
+        unname(connection, group)
 
 
 @contextlib.contextmanager

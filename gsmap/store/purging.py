@@ -366,11 +366,11 @@ def _linked_files(store: Store, connection: Connection, scene: str) -> int:
     """How many of its files have other names on this disk: another map that it was merged or split into, a clone."""
     with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
     of_scene = {
+        "scenes": select(scenes.c.group_id).where(scenes.c.id == scene, scenes.c.group_id.is_not(None)),
         "graphs": select(graphs.c.group_id).where(graphs.c.scene == scene),
         "changes": select(comparisons.c.group_id).where(with_it, comparisons.c.group_id.is_not(None)),
     }
-    ids = [("scenes", scene)]
-    ids += [(kind, group) for kind, query in of_scene.items() for group in connection.execute(query).scalars()]
+    ids = [(kind, group) for kind, query in of_scene.items() for group in connection.execute(query).scalars()]
     found = (files_below(store.arrays.root / kind / name) for kind, name in ids)
     return sum(entry.st_nlink > 1 for group in found for entry in group.values())
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, insert, select, update
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.morton import morton_order
@@ -17,17 +17,15 @@ from gsmap.store.boxes import chunk_boxes, put_boxes, row_ranges, touching
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
-from gsmap.store.groups import has_group, manifest, num_bytes, publish, unless_pruned, unname
+from gsmap.store.groups import drop_graphs, has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.scene_content import GAUSSIANS, camera_arrays, scene_id, scene_of, shapes_of, to_arrays
 from gsmap.store.scene_refs import alive, by_id, find, find_removed, free_name, name_taken
-from gsmap.store.schema import graphs, scenes
+from gsmap.store.schema import scenes
 from gsmap.types import Cameras, Gaussians, Scene
 from gsmap.types.progress import Progress
 
 KIND = "scenes"
-
-
 _SIGMAS = 3.0
 
 
@@ -119,6 +117,8 @@ class Scenes:
             else:
                 scene = self._enter(connection, new_id, fields, rename, dated_by)
             publish(self._catalog, connection, self._arrays, staged, KIND, new_id)
+            if row is not None and row.thinned is not None:
+                drop_graphs(connection, new_id)  # made since of the compact Gaussians, which have other rows
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
             put_boxes(connection, number, boxes)
             whole = {"group_id": new_id, "num_gaussians": len(gaussians), "thinned": None}
@@ -284,11 +284,8 @@ class Scenes:
                 values = {"group_id": group_id, "num_gaussians": len(own), "thinned": about}
                 connection.execute(update(scenes).where(scenes.c.id == row.id).values(**values))
                 put_boxes(connection, row.number, boxes)
-                made = graphs.c.scene == row.id
-                old = [row.group_id, *connection.execute(select(graphs.c.group_id).where(made)).scalars()]
-                connection.execute(delete(graphs).where(made))
-                for group in old:
-                    unname(connection, group)
+                drop_graphs(connection, row.id)
+                unname(connection, row.group_id)
             return _with_tags(connection, find(connection, row.id))
 
     def num_bytes(self, ref: str) -> int:

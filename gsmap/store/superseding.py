@@ -50,6 +50,8 @@ def _inherit_facts(connection: Connection, old: str, new: str) -> None:
 def _inherit_comparisons(connection: Connection, old: str, new: str) -> None:
     of_old = (comparisons.c.older == old) | (comparisons.c.newer == old)
     for row in connection.execute(select(comparisons).where(of_old)).all():
+        if new in (row.older, row.newer):
+            continue  # of the two with each other, when both were in the map: it stays theirs
         older, newer = (new if scene == old else scene for scene in (row.older, row.newer))
         values = {"older": older, "newer": newer, "pair": pair_of(older, newer), "group_id": None}
         connection.execute(update(comparisons).where(comparisons.c.number == row.number).values(**values))

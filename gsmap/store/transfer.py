@@ -18,7 +18,7 @@ from gsmap.store.arrays import Staged, StoredFile, link_or_copy
 from gsmap.store.boxes import get_boxes, put_boxes
 from gsmap.store.change_rows import named_groups
 from gsmap.store.graphs import KIND as GRAPHS
-from gsmap.store.groups import has_group, manifest, name, publish
+from gsmap.store.groups import drop_graphs, has_group, manifest, name, publish
 from gsmap.store.models import model_path
 from gsmap.store.scene_refs import free_name
 from gsmap.store.scenes import KIND as SCENES
@@ -143,6 +143,7 @@ class Transfer:
         elif mine.thinned is not None and row.group_id is not None and row.thinned is None:
             values |= _kept(row)
             self._copy_boxes(row, mine.number)
+            drop_graphs(self.ours, mine.id)  # made of the compact Gaussians, which have other rows
             self.notes.append(f"scene {mine.name} is whole again: it was thinned here, and not there")
         returns = mine.removed_at is not None and row.removed_at is None and row.ingested_at > mine.removed_at
         leaves = mine.removed_at is None and row.removed_at is not None and row.removed_at > mine.ingested_at
@@ -352,7 +353,9 @@ def _missing_groups(
 ) -> dict[tuple[str, str], tuple[StoredFile, ...]]:
     """Manifests of the groups that wanted scenes need and this map lacks (or has damaged), by (kind, id)."""
     named = [(SCENES, row.id, row.group_id) for row in theirs.execute(select(scenes.c.id, scenes.c.group_id))]
-    known = {row.key: row.group_id for row in ours.execute(select(graphs.c.key, graphs.c.group_id))}
+    of_whole = graphs.join(scenes, scenes.c.id == graphs.c.scene)
+    kept = select(graphs.c.key, graphs.c.group_id).select_from(of_whole).where(scenes.c.thinned.is_(None))
+    known = {row.key: row.group_id for row in ours.execute(kept)}
     made = theirs.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id))
     named += [(GRAPHS, row.scene, row.group_id) for row in made if known.get(row.key, row.group_id) == row.group_id]
     named += named_groups(ours, theirs, only)

@@ -70,8 +70,8 @@ def seen_again(older: PlacedScene, newer: Sequence[Looks], params: CompareParams
 
 
 def shown(scene: PlacedScene, params: Params) -> np.ndarray:
-    """(N,) bool, which Gaussians show in any of a capture's own pictures; all where it has no cameras."""
-    if scene.cameras is None or not len(scene.cameras):
+    """(N,) bool, which Gaussians show in any of a capture's own pictures; all where its cameras are none or made up."""
+    if scene.cameras is None or not len(scene.cameras) or scene.cameras.synthesised:
         return np.ones(len(scene.gaussians), dtype=bool)
     largest = np.zeros(len(scene.gaussians), dtype=np.float32)
     small = scene.cameras.resized(params.longest_side_px)

@@ -11,6 +11,7 @@ from gsmap.store import Store
 from gsmap.store.backup import clone, restore, save
 from gsmap.store.backup.places import FolderPlace
 from gsmap.store.merging import merge, split
+from gsmap.store.superseding import inherit
 from gsmap.types import ChangeReport, PoseGraph, ScenePose, Sim3
 
 CHAIR = np.array([[0.0, 0, 0], [1, 1, 1]])
@@ -295,3 +296,15 @@ def test_what_both_maps_found_is_one_change(store, other, ids):
     (theirs,) = store.changes.current()
     assert (numbers(theirs)[0], theirs.changes[0].status) == (1, "confirmed")
     assert len(store.changes.load(theirs.number).changes) == 2
+
+
+def test_a_scene_that_supersedes_the_other_of_a_pair_is_not_compared_with_itself(store, ids):
+    older, newer = ids
+    save_comparison(store, older, newer, made_change(CHAIR))
+    store.scenes.remove(older)
+    inherit(store, older, newer)
+    assert store.changes.current() == []
+    store.scenes.restore(older)
+    (kept,) = store.changes.current()
+    assert (kept.older, kept.newer, numbers(kept)) == (older, newer, [1])
+    assert store.check().ok

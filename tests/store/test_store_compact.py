@@ -1,14 +1,18 @@
 """Scenes that are kept compact: what is read of them, what goes, and how they come back."""
 
+import os
+import shutil
+
 import numpy as np
 import pytest
 from store_samples import key, make_cameras, make_gaussians
 
-from gsmap.errors import InputError
+from gsmap.errors import CorruptError, InputError
 from gsmap.geometry.morton import morton_order
 from gsmap.geometry.rotations import quats_to_matrices
-from gsmap.store import Store, compact
+from gsmap.store import Store, compact, purging
 from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.merging import merge
 from gsmap.types import Gaussians, SceneGraph
 
 
@@ -107,3 +111,44 @@ def test_what_cannot_be_thinned_is_refused_and_nothing_changes(store):
     once = store.scenes.thin("a", np.arange(50) < 40)
     assert store.scenes.thin("a", np.ones(40, bool)).thinning == once.thinning
     assert store.scenes.get("a").num_gaussians == 40
+
+
+def test_numbers_that_make_no_gaussians_are_refused():
+    arrays = compact.pack(sorted_gaussians(20))
+    wide = {"compact.boxes": np.tile([[[-1e308], [1e308]]], (1, 1, 3))}
+    steep = {"compact.log_scales_range": np.array([[0.0, 0, 0], [1e300, 1, 1]])}
+    for wrong in (wide, steep):
+        with pytest.raises(CorruptError, match="not finite"):
+            compact.unpack(arrays | wrong, np.arange(20))
+
+
+def test_files_of_a_thinned_scene_that_a_copy_has_too_are_told_of(store, tmp_path):
+    scene, _ = store.scenes.add(make_gaussians(50), make_cameras(), name="a")
+    store.scenes.thin("a", np.arange(50) < 40)
+    store.reclaim()
+    shutil.copytree(store.folder, tmp_path / "linked", copy_function=os.link)
+    assert purging.begin(store, scene.id).receipt["linked_files"] > 5
+
+
+def test_a_graph_of_the_compact_gaussians_goes_when_the_scene_is_whole_again(store):
+    g = make_gaussians(60)
+    scene, _ = store.scenes.add(g, make_cameras(), name="a")
+    store.scenes.thin("a", np.arange(60) < 40)
+    store.graphs.save(SceneGraph(scene.id), key("describe", scene.id))
+    store.scenes.add(g, make_cameras(), name="a")
+    assert store.graphs.load("a") is None
+    assert store.check().ok
+
+
+def test_a_merge_that_makes_a_scene_whole_brings_its_graph_instead_of_the_compact_one(store, tmp_path):
+    g = make_gaussians(60)
+    with Store.create(tmp_path / "other.gsmap") as other:
+        for one in (store, other):
+            scene, _ = one.scenes.add(g, make_cameras(), name="a")
+        other.graphs.save(SceneGraph(scene.id, notes=("whole",)), key("describe", scene.id))
+        store.scenes.thin("a", np.arange(60) < 40)
+        store.graphs.save(SceneGraph(scene.id, notes=("compact",)), key("describe", scene.id))
+        merge(store, other)
+    assert store.scenes.get("a").thinning is None
+    assert store.graphs.load("a").notes == ("whole",)
+    assert store.check().ok

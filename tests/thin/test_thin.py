@@ -73,6 +73,12 @@ def test_without_cameras_all_stays_and_nothing_is_known():
     assert np.isnan(fidelity_db(bare, bare.gaussians, Params()))
 
 
+def test_with_made_up_cameras_all_stays(older):
+    behind = Gaussians.concatenate([older.gaussians, wall(3, -2, 2, z=0.4)])
+    made_up = replace(older.cameras, synthesised=True)
+    assert shown(PlacedScene(behind, made_up, "both"), Params()).all()
+
+
 def test_settings_that_cannot_be():
     with pytest.raises(ConfigError, match="min_seen_again"):
         Params(min_seen_again=2)

@@ -46,7 +46,7 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     """
     if request.keep_days is None and request.budget_bytes is None:
         raise ConfigError("say what to keep: days (--keep-days 365), a size (--budget 2GiB), or both")
-    if (request.keep_days or 0) < 0 or (request.budget_bytes or 0) < 0:
+    if not (request.keep_days or 0) >= 0 or (request.budget_bytes or 0) < 0:
         raise ConfigError("days and sizes must not be negative")
     graph = store.revisions.get()
     if graph is None:
@@ -54,7 +54,10 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
     living = {scene.id: scene for scene in store.scenes.list()}
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
     now = datetime.now(UTC) if request.now is None else datetime.fromisoformat(request.now)
-    before = now - timedelta(days=request.keep_days or 0)
+    try:
+        before = now - timedelta(days=request.keep_days or 0)
+    except OverflowError as error:
+        raise ConfigError(f"no date lies {request.keep_days:g} days before today: give fewer days") from error
     old = [scene for scene in dated if _when(scene) < before and scene.thinning is None and scene.id in graph.poses]
     sizes = {scene: _num_bytes(store, scene) for scene in living}
     whole = {scene.id for scene in dated if scene.thinning is None and scene.id in graph.poses}
