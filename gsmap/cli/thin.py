@@ -30,8 +30,8 @@ def command(
     """Keep old captures compact where newer ones looked at all they show; poses, edges and words stay.
 
     A thinned capture is exported, also as of its date, as before to within 0.1 dB, in about a sixth of the bytes. Its
-    graph goes: the newer captures stand for it when others are registered. This cannot be undone but by ingesting the
-    capture again.
+    graph goes, and with it its things in `gsmap graph`: the newer captures stand for it when others are registered.
+    This cannot be undone but by ingesting the capture again.
 
     Example: `gsmap thin site.gsmap --keep-days 365 --dry-run`
     """

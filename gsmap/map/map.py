@@ -675,7 +675,7 @@ class Map(AbstractContextManager["Map"]):
         scene = self.store.scenes.get(ref)
         graph, _ = self._graph_of(scene)
         if graph is None:
-            raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
+            raise NotFoundError(f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first")
         picture = Image.fromarray(draw_graph(*self.read(scene.id), graph))
         try:
             picture.save(path)

@@ -83,7 +83,9 @@ def known_objects(store: Store, settings: Settings, progress: StageProgress) -> 
     notes = []
     if without:
         shown = ", ".join(without[:5]) + (f" and {len(without) - 5} more" if len(without) > 5 else "")
-        notes.append(f"nobody knows the things of {shown}: gsmap describe tells them, where describe.things is on")
+        notes.append(
+            f"nobody knows the things of {shown}: gsmap describe MAP SCENE tells them, where describe.things is on"
+        )
     undated = [scene.name for scene in scenes.values() if scene.captured_at is None]
     if undated and len(scenes) > 1:
         notes.append(

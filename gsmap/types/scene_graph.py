@@ -78,7 +78,7 @@ class Things:
         colours: (M, 3) float32 median colour, CIE L*a*b* (D65).
         samples: (K, 3) float64 mean of the members in each small cell, scene frame and unit, thing after thing,
         sample_colours: (K, 3) float32 their mean colours,
-        sample_counts: (M,) int32 and how many there are of each: a thing is known by them when the capture is thinned.
+        sample_counts: (M,) int32 and how many there are of each.
         unit_m: metres per scene unit that they were found under.
 
     Raises:

@@ -195,19 +195,14 @@ def test_the_place_shows_in_the_newest_exposure():
 
 def test_tiles_keep_each_capture_in_its_own_exposure():
     """Neighbouring tiles would come to other gains, or to none."""
-    older, newer = two_dates()
-    darker = replace(older, gaussians=apply_gain(older.gaussians, np.full(3, 0.6)))
-    whole = settle([darker, newer])
-    piece = settle([darker, newer], one_exposure=False)
-    assert [len(s.gaussians) for s in piece.scenes] == [len(s.gaussians) for s in whole.scenes]
-    assert np.abs(whole.scenes[0].gaussians.sh - piece.scenes[0].gaussians.sh).max() > 0.05
-    kept = {tuple(m) for m in darker.gaussians.means.tolist()}
-    assert {tuple(m) for m in piece.scenes[0].gaussians.means.tolist()} <= kept
-    assert np.isin(piece.scenes[0].gaussians.sh[:, 0, 0], darker.gaussians.sh[:, 0, 0]).all()
+    old = dated("old", 2020, wall(0, -1.5, 1.5, colour=plain))
+    new = dated("new", 2021, apply_gain(wall(1, -1.5, 1.5, colour=plain), np.full(3, 0.6)))
+    piece = settle([old, new], one_exposure=False)
+    assert piece.scenes[0] is old or np.isin(piece.scenes[0].gaussians.sh, old.gaussians.sh).all()
 
 
 def test_cameras_that_nobody_held_saw_nothing():
-    older, newer = two_dates()
-    bare = replace(newer, cameras=replace(newer.cameras, synthesised=True))
-    assert settle([older, bare]).lost == [0, 0]
-    assert settle([older, newer]).lost[0] > 0
+    old, new = dated("old", 2020, wall(0, -1.5, 1.5), box(5)), dated("new", 2021, wall(1, -1.5, 1.5))
+    invented = replace(new, cameras=replace(new.cameras, synthesised=True))
+    assert settle([old, invented]).lost == [0, 0]
+    assert settle([old, new]).lost[0] > 0

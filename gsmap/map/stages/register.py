@@ -207,7 +207,7 @@ def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], setting
             if scene.id not in graphs:
                 raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
             if scene.id in lacking:
-                raise NotFoundError(f"scene {scene.name} has no graph yet: run gsmap describe first")
+                raise NotFoundError(f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first")
         chosen.append(_directed(a.id, b.id))
     return list(dict.fromkeys(chosen))
 

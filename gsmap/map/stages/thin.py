@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
@@ -12,7 +13,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.store import Store, compact
 from gsmap.thin import fidelity_db, look, seen_again, shown
-from gsmap.types import PlacedScene, Scene
+from gsmap.types import PlacedScene, PoseGraph, Scene
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import ThinReport, ThinRow
 
@@ -53,40 +54,23 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         raise NotFoundError("the map has no poses yet, so nobody knows what supersedes what: run gsmap update first")
     living = {scene.id: scene for scene in store.scenes.list()}
     dated = sorted((s for s in living.values() if s.captured_at is not None), key=_when)
-    now = datetime.now(UTC) if request.now is None else datetime.fromisoformat(request.now)
     try:
+        now = datetime.now(UTC) if request.now is None else _moment(request.now)
         before = now - timedelta(days=request.keep_days or 0)
     except OverflowError as error:
         raise ConfigError(f"no date lies {request.keep_days:g} days before today: give fewer days") from error
-    old = [scene for scene in dated if _when(scene) < before and scene.thinning is None and scene.id in graph.poses]
+    known = [scene for scene in dated if scene.id in graph.poses]
     sizes = {scene: _num_bytes(store, scene) for scene in living}
-    whole = {scene.id for scene in dated if scene.thinning is None and scene.id in graph.poses}
-    looks: dict[str, Looks] = {}
-
-    def placed(scene: Scene) -> PlacedScene:
-        S = graph.poses[scene.id].S_map_scene
-        gaussians = transform_gaussians(store.scenes.gaussians(scene.id), S)
-        return PlacedScene(gaussians, transform_cameras(store.scenes.cameras(scene.id), S), scene.id)
-
-    def looked(scene: Scene) -> Looks:
-        if scene.id not in looks:
-            looks[scene.id] = look(placed(scene), settings.thin.compare)
-        return looks[scene.id]
-
+    shares = _superseded(store, known, before, graph, settings, progress)
     rows: list[ThinRow] = []
     with noting(lambda: f"{sum(row.thinned for row in rows)} captures are thinned"):
-        for done, scene in enumerate(old):
+        for done, scene in enumerate(scene for scene in known if scene.id in shares):
             if request.budget_bytes is not None and sum(sizes.values()) <= request.budget_bytes:
                 break
-            progress("thin", done / len(old), scene.name)
-            component = graph.poses[scene.id].component
-            beside = [other for other in dated if other.id in whole and graph.poses[other.id].component == component]
-            newer = [other for other in beside if _when(other) > _when(scene)]
-            share = (
-                seen_again(placed(scene), [looked(other) for other in newer], settings.thin.compare) if newer else 0.0
-            )
+            progress("thin", 0.5 + 0.5 * done / len(shares), scene.name)
+            share = shares[scene.id]
             if share < settings.thin.min_seen_again:
-                why = f"newer captures saw {share:.0%} of it" if newer else "no newer capture lies beside it"
+                why = f"newer captures that stay whole saw {share:.0%} of it"
                 rows.append(_row(scene, sizes[scene.id], sizes[scene.id], share, why))
                 continue
             own = PlacedScene(store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id), scene.id)
@@ -104,8 +88,6 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
                 after = _num_bytes(store, scene.id)
             rows.append(_row(scene, sizes[scene.id], after, share, "", fidelity))
             sizes[scene.id] = after
-            whole.discard(scene.id)
-            looks.pop(scene.id, None)
     freed = 0 if request.dry_run else store.reclaim().num_bytes
     progress("thin", 1.0, f"{sum(row.thinned for row in rows)} thinned")
     return ThinReport(
@@ -116,6 +98,59 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         num_bytes_freed=freed,
         fits=request.budget_bytes is None or sum(sizes.values()) <= request.budget_bytes,
     )
+
+
+def _superseded(
+    store: Store,
+    known: Sequence[Scene],
+    before: datetime,
+    graph: PoseGraph,
+    settings: Settings,
+    progress: StageProgress,
+) -> dict[str, float]:
+    """What share of each old capture's surface newer ones looked at that stay whole, by scene id.
+
+    Decided from the newest back, so that no capture is superseded by one that is thinned itself. What was thinned
+    before needs others to stand for it still: where those that stay do not, further ones must.
+
+    Args:
+        known: scenes with a date and a pose, oldest first.
+        before: what was captured earlier is old.
+    """
+    bar, params = settings.thin.min_seen_again, settings.thin.compare
+    looks: dict[str, Looks] = {}
+    stay: list[Scene] = []
+    shares: dict[str, float] = {}
+
+    def placed(scene: Scene) -> PlacedScene:
+        S = graph.poses[scene.id].S_map_scene
+        gaussians = transform_gaussians(store.scenes.gaussians(scene.id), S)
+        return PlacedScene(gaussians, transform_cameras(store.scenes.cameras(scene.id), S), scene.id)
+
+    def share(scene: Scene) -> float:
+        component = graph.poses[scene.id].component
+        newer = [
+            other for other in stay if graph.poses[other.id].component == component and _when(other) > _when(scene)
+        ]
+        for other in newer:
+            if other.id not in looks:
+                looks[other.id] = look(placed(other), params)
+        return seen_again(placed(scene), [looks[other.id] for other in newer], params) if newer else 0.0
+
+    for done, scene in enumerate(reversed(known)):
+        progress("thin", 0.5 * done / len(known), f"looking at {scene.name}")
+        if scene.thinning is not None:
+            spare = [other for other in reversed(known) if shares.get(other.id, 0.0) >= bar]
+            while spare and share(scene) < bar:
+                stay.append(spare.pop(0))
+                shares[stay[-1].id] = 0.0
+        elif _when(scene) >= before:
+            stay.append(scene)
+        else:
+            shares[scene.id] = share(scene)
+            if shares[scene.id] < bar:
+                stay.append(scene)
+    return shares
 
 
 def _row(scene: Scene, before: int, after: int, seen: float, reason: str, fidelity: float | None = None) -> ThinRow:
@@ -138,4 +173,13 @@ def _num_bytes(store: Store, scene: str) -> int:
 
 
 def _when(scene: Scene) -> datetime:
-    return datetime.fromisoformat(scene.captured_at or "")
+    return _moment(scene.captured_at or "")
+
+
+def _moment(text: str) -> datetime:
+    """An ISO 8601 time; UTC where it has no zone."""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ConfigError(f"a time is ISO 8601 such as 2026-05-31T14:00:00+02:00, got {text!r}") from error
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)

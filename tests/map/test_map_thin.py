@@ -1,0 +1,73 @@
+"""Thinning through the door: which captures may go compact, and what a dry run changes."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsmap.map
+from gsmap.errors import ConfigError
+from gsmap.map import Map
+from gsmap.methods import RecipeKey
+from gsmap.types import PoseGraph, ScenePose, Sim3
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "merge"))
+
+from synthetic_walls import cameras_facing, wall
+
+NOW = "2030-01-01T00:00:00+00:00"
+
+
+def walls(path: Path, starts: list[float]) -> Map:
+    """A map of walls a year apart, each beginning somewhat further on than the one before."""
+    m = gsmap.map.create(path)
+    for i, start in enumerate(starts):
+        cameras = cameras_facing(np.linspace(start + 0.4, start + 2.6, 9), width=160, height=120)
+        m.ingest(wall(i, start, start + 3), cameras=cameras, name=f"w{i}", captured_at=f"{2020 + i}-06-01")
+    poses = {scene.id: ScenePose(scene.id, Sim3.identity(), 0, "placed") for scene in m.scenes()}
+    m.store.revisions.save(PoseGraph(poses, {}), RecipeKey("optimize", "test", {}, {}, ""))
+    return m
+
+
+def test_old_captures_that_newer_ones_saw_are_thinned_and_a_dry_run_changes_nothing(tmp_path):
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0, 0.0]) as m:
+        dry = m.thin(keep_days=3000, dry_run=True, now=NOW)
+        assert [row.scene_name for row in dry.scenes] == ["w0", "w1"][: len(dry.scenes)]
+        assert all(scene.thinning is None for scene in m.scenes())
+        report = m.thin(keep_days=2800, now=NOW)
+        assert {row.scene_name: row.thinned for row in report.scenes} == {"w0": True, "w1": True}
+        assert report.num_bytes_freed > 0
+        assert [scene.thinning is None for scene in m.scenes()] == [False, False, True]
+        assert m.check().ok
+        assert not m.thin(keep_days=2800, now=NOW).scenes
+
+
+def test_no_capture_stands_for_another_that_goes_itself(tmp_path):
+    """Each wall is nearly what the next one saw, but the last saw little of the first."""
+    starts = [0.0, 0.18, 0.36, 0.54, 0.72, 0.9]
+    with walls(tmp_path / "m.gsmap", starts) as m:
+        m.with_settings({"thin.min_seen_again": 0.85})
+        m.thin(keep_days=0, now=NOW)
+        whole = [float(s.name[1:]) for s in m.scenes() if s.thinning is None]
+        assert 5 in whole
+        for scene in m.scenes():
+            nearest = min(abs(starts[int(k)] - starts[int(scene.name[1:])]) for k in whole if k >= int(scene.name[1:]))
+            assert nearest <= 0.6, f"nothing stands for {scene.name}"
+        assert len(whole) > 1
+
+
+def test_a_budget_thins_no_more_than_it_takes(tmp_path):
+    with walls(tmp_path / "m.gsmap", [0.0, 0.0, 0.0]) as m:
+        size = sum(m.store.scenes.num_bytes(scene.id) for scene in m.scenes())
+        report = m.thin(budget_bytes=size - 1, now=NOW)
+        assert [row.scene_name for row in report.scenes if row.thinned] == ["w0"]
+        assert report.fits
+        assert not m.thin(budget_bytes=1, now=NOW).fits
+
+
+def test_what_makes_no_sense_is_refused(tmp_path):
+    with walls(tmp_path / "m.gsmap", [0.0]) as m:
+        for wrong in ({}, {"keep_days": -1}, {"keep_days": 1, "now": "yesterday"}, {"keep_days": 1e12}):
+            with pytest.raises(ConfigError):
+                m.thin(**wrong)
