@@ -489,3 +489,20 @@ def test_a_full_disk(filled, tmp_path):
         assert sorted(p.name for p in disk.iterdir()) == ["backup"]
     finally:
         subprocess.run(["umount", disk], check=True)
+
+
+def test_a_lease_that_a_sweeper_takes_for_a_leftover_is_written_again(place, monkeypatch):
+    import os
+
+    replace, swept = os.replace, []
+
+    def swept_first(staged, target):
+        if not swept:
+            swept.append(staged)
+            place.drop_leftovers()
+        replace(staged, target)
+
+    monkeypatch.setattr("gsmap.store.backup.places.os.replace", swept_first)
+    place.put("leases/save-1.json", [b"{}"], 2)
+    assert b"".join(place.get("leases/save-1.json")) == b"{}"
+    assert swept

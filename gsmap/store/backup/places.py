@@ -147,19 +147,28 @@ class FolderPlace:
     def put(self, name: str, chunks: Iterable[bytes], size_bytes: int) -> None:
         place = self._path(name)
         with self._explained():
-            staged = self.root / _STAGING / uuid.uuid4().hex
-            make_folder(staged.parent)
             try:
-                with open(staged, "xb") as file:
-                    for chunk in chunks:
-                        file.write(chunk)
-                    file.flush()
-                    os.fsync(file.fileno())
-                make_folder(place.parent)
-                os.replace(staged, place)
-            finally:
-                staged.unlink(missing_ok=True)
-            sync_folder(place.parent)
+                self._put(place, chunks)
+            except FileNotFoundError:
+                if not isinstance(chunks, list):
+                    raise
+                # Only leases are written by who has none yet: a sweeper took it for what a dead one left.
+                self._put(place, chunks)
+
+    def _put(self, place: Path, chunks: Iterable[bytes]) -> None:
+        staged = self.root / _STAGING / uuid.uuid4().hex
+        make_folder(staged.parent)
+        try:
+            with open(staged, "xb") as file:
+                for chunk in chunks:
+                    file.write(chunk)
+                file.flush()
+                os.fsync(file.fileno())
+            make_folder(place.parent)
+            os.replace(staged, place)
+        finally:
+            staged.unlink(missing_ok=True)
+        sync_folder(place.parent)
 
     def get(self, name: str) -> Iterator[bytes]:
         with self._explained():
