@@ -7,7 +7,6 @@ what one of the captures did not see are no changes of things.
 from __future__ import annotations
 
 from gsmap.change.comparing import VERSION, compare, recipe_key
-from gsmap.change.crops import crops
 from gsmap.change.params import Params
 
-__all__ = ["VERSION", "Params", "compare", "crops", "recipe_key"]
+__all__ = ["VERSION", "Params", "compare", "recipe_key"]

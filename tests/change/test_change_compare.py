@@ -8,6 +8,7 @@ from gsmap import change
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.types import PlacedScene, Sim3
+from gsmap.view.change_picture import draw_change
 
 STAYS = box(2.2, 2.5, 0.6, 0.5, 0.7, 5)
 
@@ -140,22 +141,6 @@ def test_any_vertical_and_any_frame():
         change.compare(*scenes, up=np.zeros(3))
 
 
-def test_crops_show_the_place_before_and_after():
-    room = [*shell(stripes(4)), *STAYS]
-    red = plain(0.9, 0.1, 0.1)
-    older, newer = capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6, paint=red)], 1), capture(room, 2)
-    report = change.compare(older, newer)
-    ((before, after),) = change.crops(report, older, newer, longest_side_px=128)
-    assert before.dtype == np.uint8
-    assert before.ndim == 3
-    assert before.shape[2] == 3
-    # The older picture shows much of the red box; the newer one none of it, but for the lines of the box.
-    red_share = [((p[..., 0] > 180) & (p[..., 1] < 70) & (p[..., 2] < 70)).mean() for p in (before, after)]
-    assert red_share[0] > 0.08
-    assert red_share[1] < 0.01
-    assert change.crops(report, older, PlacedScene(newer.gaussians, None), changes=[0])[0][1] is None
-
-
 def test_the_key_names_the_settings_and_the_code():
     key = change.recipe_key()
     assert key.stage == "change"
@@ -164,3 +149,20 @@ def test_the_key_names_the_settings_and_the_code():
     assert key.recipe != change.recipe_key(change.Params(voxel_m=0.2)).recipe
     with pytest.raises(ConfigError, match="voxel_m must be positive"):
         change.Params(voxel_m=0.0)
+
+
+def test_the_picture_of_a_change_shows_the_place_before_and_after():
+    room = [*shell(stripes(4)), *STAYS]
+    red = plain(0.9, 0.1, 0.1)
+    older, newer = capture([*room, *box(0.9, 1.2, 0.5, 0.4, 0.6, 6, paint=red)], 1), capture(room, 2)
+    (found,) = change.compare(older, newer).changes
+    picture = draw_change(older, newer, found.box, found.voxels, side_px=128)
+    assert picture.dtype == np.uint8
+    assert picture.ndim == 3
+    assert picture.shape[2] == 3
+    # The older half shows much of the red box; the newer none of it, but for the lines of the box.
+    width = picture.shape[1] // 2
+    lines = (picture == (255, 64, 64)).all(-1)
+    reddish = (picture[..., 0] > 180) & (picture[..., 1] < 70) & (picture[..., 2] < 70) & ~lines
+    assert reddish[:, :width].mean() > 0.08
+    assert reddish[:, width:].mean() < 0.01
