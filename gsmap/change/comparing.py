@@ -14,6 +14,7 @@ from gsmap.change.reporting import change_of, lighting
 from gsmap.change.sides import sides
 from gsmap.change.things import judge, light
 from gsmap.errors import InputError
+from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.methods import RecipeKey
 from gsmap.types import PlacedScene, Sim3
@@ -119,12 +120,10 @@ def _turned(scene: PlacedScene, S: Sim3) -> PlacedScene:
 
 def _back(change: Change, S: Sim3) -> Change:
     """A change in another frame; its box is the one around the turned box."""
-    corners = np.array([[change.box[i >> 2 & 1, 0], change.box[i >> 1 & 1, 1], change.box[i & 1, 2]] for i in range(8)])
-    corners = S.apply(corners)
     moved = change.S_after_before
     return replace(
         change,
-        box=np.stack([corners.min(0), corners.max(0)]),
+        box=moved_box(change.box, S),
         voxels=S.apply(change.voxels).astype(np.float32),
         S_after_before=None if moved is None else S @ moved @ S.inverse(),
     )

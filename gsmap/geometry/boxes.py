@@ -4,7 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap.types import Sim3
+
 
 def box_corners(bounds: np.ndarray) -> np.ndarray:
     """(8, 3) corners of a box; bit 0 of a corner's index tells whether its x is the high one, bit 1 y, bit 2 z."""
     return np.array([[bounds[i >> axis & 1][axis] for axis in range(3)] for i in range(8)], dtype=np.float64)
+
+
+def box_around(points: np.ndarray) -> np.ndarray:
+    """(2, 3) the smallest box around points (N, 3), of which there is one at least."""
+    return np.array([points.min(0), points.max(0)])
+
+
+def moved_box(bounds: np.ndarray, S_a_b: Sim3) -> np.ndarray:
+    """(2, 3) the box of frame a around a box of frame b."""
+    return box_around(S_a_b.apply(box_corners(bounds)))

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.boxes import moved_box
 from gsmap.map.dates import last_of, parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports import scenes_by_id
 from gsmap.map.settings import Settings
 from gsmap.map.stages.change import Wanted, lacking
 from gsmap.store import Store
-from gsmap.store.change_rows import Comparison, StoredChange, moved_box
+from gsmap.store.change_rows import Comparison, StoredChange
 from gsmap.types import Change, PoseGraph, Scene
 from gsmap.types.rows import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow, PairEventRow
 

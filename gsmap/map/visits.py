@@ -9,6 +9,7 @@ from datetime import datetime
 import numpy as np
 
 from gsmap.errors import ConfigError
+from gsmap.geometry.boxes import box_corners, moved_box
 from gsmap.types import Sim3
 
 _SAMPLES = 12  # points along each axis of a capture's box at which it is asked who was there before
@@ -59,9 +60,9 @@ class Visit:
     S_map_scene: Sim3
     bounds: np.ndarray
 
-    def corners(self) -> np.ndarray:
-        """(8, 3) of its box, map frame."""
-        return self.S_map_scene.apply(np.array(np.meshgrid(*np.asarray(self.bounds).T)).reshape(3, -1).T)
+    def box(self) -> np.ndarray:
+        """(2, 3) around its box, map frame."""
+        return moved_box(self.bounds, self.S_map_scene)
 
 
 def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, str]]:
@@ -72,7 +73,7 @@ def pairs_of_visits(visits: Sequence[Visit], params: Params) -> list[tuple[str, 
     """
     found: list[tuple[str, str]] = []
     ordered = sorted(visits, key=lambda visit: (visit.when, visit.scene))
-    boxes = {visit.scene: _around(visit.corners()) for visit in ordered}
+    boxes = {visit.scene: visit.box() for visit in ordered}
     for i, newer in enumerate(ordered):
         left = np.ones(_SAMPLES**3, dtype=bool)
         points, count = _samples(newer), 0
@@ -97,12 +98,11 @@ def has_moved(older: Visit, newer: Visit, S_newer_older: Sim3, params: Params) -
     sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     if np.degrees(np.arctan2(sine, (np.trace(turn) - 1) / 2)) > params.moved_deg:
         return True
-    a, b = _around(older.corners()), _around(newer.corners())
+    a, b = older.box(), newer.box()
     shared = np.array([np.maximum(a[0], b[0]), np.minimum(a[1], b[1])])
     if not (shared[1] >= shared[0]).all():
         shared = b
-    corners = np.array(np.meshgrid(*shared.T)).reshape(3, -1).T
-    in_newer = newer.S_map_scene.inverse().apply(corners)
+    in_newer = newer.S_map_scene.inverse().apply(box_corners(shared))
     off = S_newer_older.apply(now.inverse().apply(in_newer)) - in_newer
     return bool(np.linalg.norm(off, axis=1).max() * newer.S_map_scene.scale > params.moved_m)
 
@@ -119,10 +119,6 @@ def _inside(points: np.ndarray, visit: Visit) -> np.ndarray:
     low, high = visit.bounds
     local = visit.S_map_scene.inverse().apply(points)
     return np.asarray(((local >= low) & (local <= high)).all(1))
-
-
-def _around(corners: np.ndarray) -> np.ndarray:
-    return np.array([corners.min(0), corners.max(0)])
 
 
 def _touch(a: np.ndarray, b: np.ndarray) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.errors import InputError
+from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import checked_params, merge, merger
 from gsmap.merge.placed import inside, overlapping
@@ -106,7 +107,6 @@ def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarra
 
 def _box_in(S_b_a: Sim3, box: np.ndarray) -> np.ndarray:
     """The axis-aligned box (2, 3) in frame b around a box of frame a, a touch larger against rounding."""
-    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    moved = S_b_a.apply(corners)
+    moved = moved_box(box, S_b_a)
     pad = 1e-5 * (1 + np.abs(moved).max())
-    return np.array([moved.min(0) - pad, moved.max(0) + pad])
+    return np.array([moved[0] - pad, moved[1] + pad])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, select
 
+from gsmap.geometry.boxes import moved_box
 from gsmap.store.matrices import to_array, to_pose
 from gsmap.store.schema import change_reviews, changes, comparisons, scenes
 from gsmap.types import Sim3
@@ -151,12 +152,6 @@ def same_changes(
         if i not in same and number not in same.values():
             same[i] = number
     return same
-
-
-def moved_box(box: np.ndarray, S: Sim3) -> np.ndarray:
-    """(2, 3) box, along the axes, around a box that was moved."""
-    corners = S.apply(np.array(np.meshgrid(*np.asarray(box).T)).reshape(3, -1).T)
-    return np.array([corners.min(0), corners.max(0)])
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:

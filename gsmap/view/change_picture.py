@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
+from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
 from gsmap.types import Cameras, PlacedScene
@@ -48,7 +49,7 @@ def draw_change(
 def _picture(scene: PlacedScene, camera: Cameras, box: np.ndarray) -> np.ndarray:
     colour = render(scene.gaussians, camera).colour[0]
     picture = Image.fromarray((np.clip(np.nan_to_num(colour), 0, 1) * 255 + 0.5).astype(np.uint8))
-    corners = _corners(box)
+    corners = box_corners(box)
     pixels, depth = _project(corners, camera)
     draw = ImageDraw.Draw(picture)
     for a in range(8):
@@ -77,7 +78,7 @@ def _crop(camera: Cameras, box: np.ndarray, points: np.ndarray) -> _Crop | None:
     if not shown.any():
         return None
     size = camera.sizes_px[0].astype(np.float64)
-    at, deep = _project(_corners(box), camera)
+    at, deep = _project(box_corners(box), camera)
     at = at[deep > 0] if (deep > 0).any() else pixels[shown]
     low, high = np.clip(at.min(0), 0, size), np.clip(at.max(0), 0, size)
     half = np.maximum((high - low).max() * (0.5 + _MARGIN / 2), _LEAST_SHARE * size.max())
@@ -123,7 +124,3 @@ def _from_outside(box: np.ndarray) -> Cameras:
     pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], 1)
     pose[:3, 3] = middle - 1.5 * size * ahead
     return Cameras(pose[None], np.array([[300.0, 300, 160, 120]]), np.array([[320, 240]]), ("outside",))
-
-
-def _corners(box: np.ndarray) -> np.ndarray:
-    return np.array(np.meshgrid(*np.asarray(box, dtype=np.float64).T)).reshape(3, -1).T

@@ -14,10 +14,10 @@ from PIL import Image
 import gsmap.change
 import gsmap.map
 from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.rotations import exp_so3
 from gsmap.map import Map
 from gsmap.map.visits import Params, Visit, has_moved, pairs_of_visits
-from gsmap.store.change_rows import moved_box
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, PlacedScene, PoseGraph, ScenePose, Sim3
 
 DATES = {"may": "2026-05-31T15:00:00Z", "june": "2026-06-30", "july": "2026-07-31"}

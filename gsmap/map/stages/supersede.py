@@ -10,6 +10,7 @@ import numpy as np
 from gsmap import describe as describing
 from gsmap import register as registering
 from gsmap.errors import InputError
+from gsmap.geometry.boxes import box_corners
 from gsmap.ingest import Capture
 from gsmap.map import models
 from gsmap.map.settings import Settings
@@ -134,7 +135,7 @@ def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings:
     advice = "ingest it without --supersedes, and registration finds where it lies"
     if found.status != "accepted" or found.S_target_source is None:
         raise InputError(f"the capture does not lie where scene {old.name} lies ({found.reason}): {advice}")
-    corners = np.array(np.meshgrid(*np.asarray(old.bounds).T)).reshape(3, -1).T
+    corners = box_corners(old.bounds)
     off = np.linalg.norm(found.S_target_source.apply(corners) - corners, axis=1).max() * old_view.graph.unit_m
     if off > _SAME_FRAME_M:
         raise InputError(f"the capture lies {off:.2f} m off where scene {old.name} lies: {advice}")
