@@ -58,6 +58,11 @@ def check_pose(target: SceneView, source: SceneView, proposal: Proposal, params:
     return conclude(target, source, [judged], params, seconds=watch.seconds)
 
 
+def measured(target: SceneView, source: SceneView, proposal: Proposal, params: Params | None = None) -> Judged:
+    """A pose refined and all its evidence gathered, however hopeless it looks: what the verdict is fitted on."""
+    return _judge(proposal, target, source, params or Params(), Stopwatch(), prescreen=False)
+
+
 def _is_worth_judging(
     proposal: Proposal, judged: list[Judged], target: SceneView, source: SceneView, params: Params
 ) -> bool:
@@ -68,7 +73,15 @@ def _is_worth_judging(
     return not any(is_same_pose(S, j.proposal.S_target_source, centre, unit_m, params.same_pose) for j in judged)
 
 
-def _judge(proposal: Proposal, target: SceneView, source: SceneView, params: Params, watch: Stopwatch) -> Judged:
+def _judge(
+    proposal: Proposal,
+    target: SceneView,
+    source: SceneView,
+    params: Params,
+    watch: Stopwatch,
+    *,
+    prescreen: bool = True,
+) -> Judged:
     """Refine a proposal, gather the evidence for and against it, and decide."""
     if proposal.flaw:
         return Judged(proposal, PoseEvidence(), covariance=None, flaw=proposal.flaw)
@@ -81,7 +94,7 @@ def _judge(proposal: Proposal, target: SceneView, source: SceneView, params: Par
         seen = measure(*surfaces, pose, views, params.prescreen)
         # A clique that is significant by itself is worth a full look, whatever three cameras say of a rough pose.
         sure = verdict.is_significant(proposal, params.verdict)
-        flaw = "" if sure else verdict.fails_prescreen(seen, params.verdict)
+        flaw = "" if sure or not prescreen else verdict.fails_prescreen(seen, params.verdict)
     known = None
     if not flaw:
         with watch.step("refine"):
