@@ -67,9 +67,7 @@ def solve_batch(
     )
 
 
-def _grown(
-    m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress
-) -> tuple[State, Vote]:
+def _grown(m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress) -> tuple[State, Vote]:
     """Components grown from all edges of ``m``, parted where places look alike, and what the cycles say."""
     progress(0.05, "voting on cycles")
     votes = vote(m, params.gate_probability)

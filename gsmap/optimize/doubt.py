@@ -12,6 +12,8 @@ right as often as any. It fails where rooms are repeated entirely, their furnitu
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsmap.optimize.growing import close_loops, take_in
@@ -31,22 +33,35 @@ def find_doubtful(m: Measurements, params: Aliasing) -> np.ndarray:
 def take_in_doubtful(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> None:
     """Take in the doubtful edges that the map bears out, and by the others what nothing else ties, if this map's
     record allows it."""
+    most = params.aliasing.max_chance_alike
     if close_loops(m, state, params):
         refine(m, state, gate, 1.0, params)
-    labels = component_labels(m, np.flatnonzero(state.accepted))
-    inside = doubtful & (labels[m.targets] == labels[m.sources])
-    alike = chance_alike(int((inside & state.accepted).sum()), int((inside & ~state.accepted).sum()))
+    inside = doubtful & _within(m, state.accepted)
+    borne_out = int((inside & state.accepted).sum())
     tying = doubtful & ~inside
-    apart = tying & (m.same_visit | (alike > params.aliasing.max_chance_alike))
+    one_visit = tying & m.same_visit
+    state.undecided |= one_visit
+    if chance_alike(borne_out, int((inside & ~state.accepted).sum())) <= most:
+        before = replace(state, accepted=state.accepted.copy(), failures=state.failures.copy())
+        take_in(m, state, params)
+        refine(m, state, gate, 1.0, params)
+        # Look-alikes that are taken for one place contradict each other sooner or later: then none of them tie.
+        contradicted = int((doubtful & _within(m, state.accepted) & ~state.accepted).sum())
+        if chance_alike(borne_out, contradicted) > most:
+            state.accepted, state.failures, state.poses = before.accepted, before.failures, before.poses
+        state.doubted = tying & state.accepted
+    apart = tying & ~_within(m, state.accepted)
     state.undecided |= apart
-    known = state.accepted.copy()
-    take_in(m, state, params)
-    refine(m, state, gate, 1.0, params)
-    state.doubted = doubtful & state.accepted & ~known
     for row in np.flatnonzero(apart).tolist():
-        state.pending[row] = "a place that looks alike? " + (
-            "captured in one visit" if m.same_visit[row] else "other pairs of this map that disagree so are"
-        )
+        others = "captured in one visit" if one_visit[row] else "so are others of this map, or they contradict it"
+        state.pending[row] = f"places that look alike? ({others})"
+
+
+def _within(m: Measurements, accepted: np.ndarray) -> np.ndarray:
+    """(E,) bool: both scenes of the edge are in one component."""
+    labels = component_labels(m, np.flatnonzero(accepted))
+    found: np.ndarray = labels[m.targets] == labels[m.sources]
+    return found
 
 
 def chance_alike(borne_out: int, contradicted: int) -> float:

@@ -77,6 +77,8 @@ class Aliasing:
             look-alikes with the furniture standing elsewhere begin at .145. Doubtful edges tie nothing firmly.
         max_chance_alike: doubtful edges tie nothing at all where more than this share of the map's doubtful edges that
             others decide turned out to be of two places.
+        same_visit_h: captures dated less than this many hours apart show one state of a place: where they disagree,
+            they are of two.
         contested_ratio: scenes of which more than one edge in this many crosses a wrong link belong to neither side.
         link: how probable it is that a link is wrong.
     """
@@ -92,13 +94,14 @@ class Aliasing:
     group_lengths: float = 1.0
     max_disagreement: float = 0.1
     max_chance_alike: float = 0.5
+    same_visit_h: float = 6.0
     contested_ratio: int = 3
     link: LinkDensityParams = field(default_factory=LinkDensityParams)
 
     def __post_init__(self) -> None:
         _probability(self, "sure", "max_disagreement", "max_chance_alike")
         _at_least(self, 1, "spare_ratio", "cut_depth", "contested_ratio")
-        _at_least(self, 0, "max_suspects")
+        _at_least(self, 0, "max_suspects", "same_visit_h")
         _positive(self, "well_supported", "support_power", "prior_support_power", "min_motion_lengths", "group_lengths")
 
 
