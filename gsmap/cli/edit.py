@@ -1,4 +1,4 @@
-"""gsmap edit: a scene's name, date, note and tags."""
+"""gsmap edit: a scene's name, date, note, tags and unit."""
 
 from __future__ import annotations
 
@@ -19,6 +19,15 @@ def command(
     note: Annotated[str | None, typer.Option("--note", help="What people should know of it.")] = None,
     tag: Annotated[list[str] | None, typer.Option("--tag", help="Give it this tag; may be repeated.")] = None,
     untag: Annotated[list[str] | None, typer.Option("--untag", help="Take this tag away; may be repeated.")] = None,
+    metres_per_unit: Annotated[
+        str | None,
+        typer.Option(
+            "--metres-per-unit",
+            metavar="X",
+            help="One unit of its own frame is so many metres: a measured distance by the same in the capture; "
+            "`none` takes it back.",
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Change what is said of a scene; what was said before stays in its history.
@@ -27,8 +36,31 @@ def command(
     """
     from gsmap.errors import ConfigError
 
-    if name is None and captured_at is None and note is None and not tag and not untag:
-        raise ConfigError("say what to change: --name, --captured-at, --note, --tag or --untag")
+    said = (name, captured_at, note, metres_per_unit)
+    if all(one is None for one in said) and not tag and not untag:
+        raise ConfigError("say what to change: --name, --captured-at, --note, --tag, --untag or --metres-per-unit")
+    metres = None if metres_per_unit is None else _metres(metres_per_unit)
     with opened(map) as m:
-        row = m.edit(scene, name=name, captured_at=captured_at, note=note, tags=tag or (), untag=untag or ())
+        row = m.edit(
+            scene,
+            name=name,
+            captured_at=captured_at,
+            note=note,
+            tags=tag or (),
+            untag=untag or (),
+            metres_per_unit=metres,
+        )
     print_rows("edit", row, json, "scene")
+
+
+def _metres(text: str) -> float:
+    """A positive number; 0 for `none`."""
+    from gsmap.errors import ConfigError
+
+    try:
+        metres = 0.0 if text.strip().lower() == "none" else float(text)
+    except ValueError as error:
+        raise ConfigError(f"--metres-per-unit is a number such as 0.3, or none, got {text!r}") from error
+    if metres == 0.0 and text.strip().lower() != "none":
+        raise ConfigError("--metres-per-unit must be positive; none takes back what was said")
+    return metres

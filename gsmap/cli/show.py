@@ -11,6 +11,7 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, 
 if TYPE_CHECKING:
     from gsmap.map import Map
     from gsmap.types import Sim3
+    from gsmap.types.metre import Metre
     from gsmap.types.rows import ChangeDetail, PairReport, SceneReport
 
 _SHOWN = 8  # edges, notes and events shown of many, so that everything fits a screen
@@ -69,8 +70,9 @@ def _report(m: Map, thing: str) -> SceneReport | PairReport | ChangeDetail:
 
 def _print_scene(scene: SceneReport, nodes: bool) -> None:
     size, prior, sigmas = scene.bounds[1] - scene.bounds[0], scene.prior, None
+    metre = _metre(scene)
     if scene.rotation_sigma_deg is not None:
-        sigmas = f"{text(scene.rotation_sigma_deg)} deg, {text(scene.translation_sigma_m)} map units"
+        sigmas = f"{text(scene.rotation_sigma_deg)} deg, {text(scene.translation_sigma_m)} m"
     facts = {
         "id": scene.id,
         "status": scene.status,
@@ -87,6 +89,8 @@ def _print_scene(scene: SceneReport, nodes: bool) -> None:
         "cameras": f"{scene.num_cameras}" + ", synthesised" * scene.cameras_synthesised,
         "size": f"{text(size)} units",
         "scale": scene.scale_policy + ("" if scene.unit_m is None else f", about {text(scene.unit_m)} m a unit"),
+        "map": None if metre is None else metre.text(),
+        "note on the metre": scene.metre_note or None,
         "up": scene.up,
         "nodes": None if scene.num_nodes is None else _layers(scene),
         **{f"note {i}": note for i, note in enumerate(scene.notes[:_SHOWN], 1)},
@@ -169,6 +173,15 @@ def _captured(scene: SceneReport) -> str | None:
         return None
     said = [fact.author for fact in scene.history if fact.fact == "captured_at"]
     return f"{scene.captured_at}, said by {(said and said[-1]) or 'a person'}"
+
+
+def _metre(scene: SceneReport) -> Metre | None:
+    """Of the frame that it is placed in."""
+    from gsmap.types.metre import Metre
+
+    if not scene.metre_known_by:
+        return None
+    return Metre(scene.metres_per_unit or 1.0, scene.metre_sigma or float("inf"), scene.metre_known_by)
 
 
 def _layers(scene: SceneReport) -> str:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table
 
+_SHOWN = 4  # components whose metre is told: the largest
+
 
 def command(map: MapPath, json: AsJson = False) -> None:
     """Show what is missing, stale or wants a person, each with the command that helps.
 
     Example: `gsmap status site.gsmap`
     """
+    from gsmap.types.metre import Metre
+
     with opened(map) as m:
         report = m.status()
     if json:
@@ -28,3 +32,8 @@ def command(map: MapPath, json: AsJson = False) -> None:
         + ("no revision yet" if report.revision is None else f"revision {report.revision}")
         + ("" if report.todo else "; nothing to do")
     )
+    for row in report.metres[:_SHOWN]:
+        metre = Metre(row.metres_per_unit, row.metre_sigma or float("inf"), row.metre_known_by)
+        print(f"component {row.component}: {metre.text()}" + (f" ({row.metre_note})" if row.metre_note else ""))
+    if len(report.metres) > _SHOWN:
+        print(f"... and {len(report.metres) - _SHOWN} more components: gsmap status MAP --json")

@@ -14,6 +14,7 @@ from gsmap.evaluate import overlap
 from gsmap.evaluate.calibration import Nees, nees_of_edge, nees_of_pose, nees_rows, relative_covariance
 from gsmap.evaluate.registration import absolute_trajectory_error, pose_error
 from gsmap.types import PoseGraph, Sim3
+from gsmap.types.metre import Metre
 from gsmap.types.rows import (
     BandRow,
     ComponentErrorRow,
@@ -75,6 +76,7 @@ def judge(
     graph: PoseGraph | None,
     overlaps: Mapping[frozenset[str], float],
     params: Params | None = None,
+    metres: Mapping[int, Metre] | None = None,
 ) -> EvaluationReport:
     """Everything that the truth says of a map's edges and newest poses.
 
@@ -83,8 +85,9 @@ def judge(
         edges: the current edge of every pair that was tried.
         graph: the newest poses; None before the first.
         overlaps: true overlap by pair, of all pairs of scenes that have a truth.
+        metres: what the map takes for a metre, by component; not judged where None.
     """
-    return _Judge(scenes, edges, graph, overlaps, params or Params()).report()
+    return _Judge(scenes, edges, graph, overlaps, params or Params(), metres or {}).report()
 
 
 class _Judge:
@@ -95,6 +98,7 @@ class _Judge:
         graph: PoseGraph | None,
         overlaps: Mapping[frozenset[str], float],
         params: Params,
+        metres: Mapping[int, Metre],
     ) -> None:
         self.scenes = {scene.id: scene for scene in scenes}
         self.truth = {scene.id: scene.S_scene_world for scene in scenes if scene.S_scene_world is not None}
@@ -102,6 +106,7 @@ class _Judge:
         self.graph = graph
         self.overlaps = overlaps
         self.params = params
+        self.metres = metres
         poses = {} if graph is None else {s: pose for s, pose in graph.poses.items() if s in self.scenes}
         sizes: dict[int, int] = {}
         for pose in poses.values():
@@ -221,6 +226,8 @@ class _Judge:
         metric = all(abs(self.truth[s].scale - 1) < _METRIC for s in known)
         alignment = "rigid" if metric else "similarity"
         reason, ate_m = "", None
+        metre = self.metres.get(component)
+        true_logs = [-float(np.log(self.truth[s].scale * self.tied[s].S_map_scene.scale)) for s in known]
         count = sum(len(self.scenes[s].centers) for s in known)
         if len(known) < 2:
             reason = f"{len(known)} of its {len(members)} scenes has a truth: two are needed"
@@ -237,6 +244,10 @@ class _Judge:
             alignment=alignment,
             ate_m=ate_m,
             ate_reason=reason,
+            metres_per_unit=metre.metres_per_unit if metre else None,
+            metre_sigma=metre.sigma if metre else None,
+            metre_known_by=metre.known_by if metre else "",
+            true_metres_per_unit=float(np.exp(np.median(true_logs))) if true_logs else None,
         )
 
     def _ate(self, components: Sequence[ComponentErrorRow]) -> tuple[float | None, str]:

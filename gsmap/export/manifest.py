@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import time
@@ -17,6 +18,7 @@ from gsmap.durable import is_file, open_file, write_text_whole
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.texts import control_characters
 from gsmap.types import Sim3, Tile
+from gsmap.types.metre import Metre
 from gsmap.types.plain import plain
 
 FILE_NAME = "tiles.json"
@@ -37,6 +39,7 @@ class Manifest:
         num_bytes: size of each tile's file, by path.
         notes: what a person should know about the folder as it was found.
         doomed: paths of files that are no longer a tile's and are still to be deleted.
+        metres: how long a metre is in the frame of each component, as the tiles were made.
     """
 
     map_id: str
@@ -44,6 +47,7 @@ class Manifest:
     num_bytes: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     doomed: set[str] = field(default_factory=set)
+    metres: dict[int, Metre] = field(default_factory=dict)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
 
     @classmethod
@@ -72,6 +76,7 @@ class Manifest:
                 )
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
             doomed = {_checked_path(p) for p in content.get("doomed", ())}
+            metres = {int(c["component"]): _metre(c) for c in content.get("components", ())}
         except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
@@ -89,7 +94,12 @@ class Manifest:
             {tile.path: size for _, tile, size in entries},
             notes,
             doomed,
+            metres,
         )
+
+    def metres_per_unit(self, component: int) -> float:
+        """Of a component's frame; 1 where nothing is known."""
+        return self.metres[component].metres_per_unit if component in self.metres else 1.0
 
     def has_file(self, folder: Path, tile: Tile) -> bool:
         """Whether the tile's file lies there with the size it was written with; a tile without Gaussians has none."""
@@ -109,22 +119,46 @@ class Manifest:
     def save(self, folder: Path) -> None:
         """Replace the folder's manifest in one step."""
         entries = [
-            _entry(name, tile, self.num_bytes.get(tile.path, 0)) for (_, name), tile in sorted(self.tiles.items())
+            _entry(name, tile, self.num_bytes.get(tile.path, 0), self.metres_per_unit(tile.component))
+            for (_, name), tile in sorted(self.tiles.items())
         ]
         content = {"version": _VERSION, "map_id": self.map_id, "tiles": entries}
+        if self.metres:
+            content["components"] = [_component(c, self.metres[c]) for c in sorted(self.metres)]
         if self.doomed:
             content["doomed"] = sorted(self.doomed)
         write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
         self._saved_at = time.monotonic()
 
 
-def _entry(name: str, tile: Tile, num_bytes: int) -> dict[str, object]:
+def _component(component: int, metre: Metre) -> dict[str, object]:
+    return {
+        "component": component,
+        "metres_per_unit": metre.metres_per_unit,
+        "metre_sigma": metre.sigma if math.isfinite(metre.sigma) else None,
+        "metre_known_by": metre.known_by,
+        "metre_note": metre.note,
+    }
+
+
+def _metre(entry: Mapping[str, Any]) -> Metre:
+    sigma = entry["metre_sigma"]
+    return Metre(
+        float(entry["metres_per_unit"]),
+        math.inf if sigma is None else float(sigma),
+        str(entry["metre_known_by"]),
+        str(entry["metre_note"]),
+    )
+
+
+def _entry(name: str, tile: Tile, num_bytes: int, metres_per_unit: float) -> dict[str, object]:
     """A tile as ``tiles.json`` has it; docs/storage.md explains every field."""
     return {
         "name": name,
         "component": tile.component,
         "path": tile.path,
-        "bounds_m": tile.bounds.tolist(),
+        "bounds": tile.bounds.tolist(),
+        "bounds_m": (tile.bounds * metres_per_unit).tolist(),
         "num_gaussians": tile.num_gaussians,
         "num_bytes": num_bytes,
         "sha256": tile.sha256,
@@ -157,7 +191,7 @@ def _tile(entry: Mapping[str, Any], version: int) -> Tile:
     return Tile(
         key=str(entry["key"]) if known else "",
         component=int(entry["component"]),
-        bounds=np.array(entry["bounds_m"], dtype=np.float64),
+        bounds=np.array(entry.get("bounds", entry["bounds_m"]), dtype=np.float64),
         poses={scene: Sim3.from_matrix(np.array(matrix)) for scene, matrix in entry["S_map_scene"].items()},
         num_gaussians=int(entry["num_gaussians"]),
         recipe=dict(entry["recipe"]) if known else {},

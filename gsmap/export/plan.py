@@ -43,6 +43,7 @@ class PlannedTile:
         bounds: (2, 3) float64 box in the component's map frame.
         poses: ``S_map_scene`` by scene id, of every scene that may reach into it.
         extent: text that says which part of the map it is, however the scenes move.
+        metres_per_unit: of the component's map frame.
     """
 
     component: int
@@ -50,6 +51,7 @@ class PlannedTile:
     bounds: np.ndarray
     poses: dict[str, Sim3]
     extent: str
+    metres_per_unit: float = 1.0
 
 
 def plan_tiles(
@@ -60,6 +62,7 @@ def plan_tiles(
     components: Mapping[str, int] | None = None,
     bbox: np.ndarray | None = None,
     reach_m: float = 0.0,
+    metres_per_unit: Mapping[int, float] | None = None,
     max_tiles: int = Params.max_tiles,
 ) -> list[PlannedTile]:
     """Tiles of a grid through the map's origin that scenes reach into, in a fixed order.
@@ -69,8 +72,9 @@ def plan_tiles(
         scene_bounds: (2, 3) box of each scene's Gaussians in the scene's frame.
         tile_size_m: edge of a tile; 0 makes one tile of each component.
         components: component of each scene; all 0 if None.
-        bbox: (2, 3) only this box of the map; tiles are cut by it.
+        bbox: (2, 3) only this box of the map, in its unit as poses are; tiles are cut by it.
         reach_m: how far beyond its bounds a tile's content depends on scenes.
+        metres_per_unit: of each component's frame; all 1 if None.
         max_tiles: more tiles than this are refused.
 
     Raises:
@@ -91,24 +95,26 @@ def plan_tiles(
             extent = np.array([np.maximum(extent[0], bbox[0]), np.minimum(extent[1], bbox[1])])
             if not (extent[1] > extent[0]).all():
                 continue
+        metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
+        edge, reach = tile_size_m / metres, reach_m / metres
         cells: Sequence[tuple[int, int, int] | None] = [None]
         if tile_size_m:
-            cells = _cells(extent, tile_size_m, max_tiles)
+            cells = _cells(extent * metres, tile_size_m, max_tiles)
         for cell in cells:
             if cell is None:
                 bounds = extent if bbox is None else bbox
                 name = "map"
             else:
-                bounds = np.array([np.multiply(cell, tile_size_m), np.multiply(np.add(cell, 1), tile_size_m)])
+                bounds = np.array([np.multiply(cell, edge), np.multiply(np.add(cell, 1), edge)])
                 name = "tile_" + "_".join(f"{c:+04d}" for c in cell)
                 if bbox is not None:
                     bounds = np.array([np.maximum(bounds[0], bbox[0]), np.minimum(bounds[1], bbox[1])])
             if not any(box.touches(bounds) for box in members.values()):
                 continue
-            near = np.array([bounds[0] - reach_m, bounds[1] + reach_m])
+            near = np.array([bounds[0] - reach, bounds[1] + reach])
             touching = {s: poses[s] for s, box in members.items() if box.touches(near)}
             place = json.dumps([tile_size_m, cell, None if bbox is None else bbox.tolist()])
-            tiles.append(PlannedTile(component, name, bounds, touching, place))
+            tiles.append(PlannedTile(component, name, bounds, touching, place, metres))
     if not tiles and bbox is not None:
         whole = _around([_Box(poses[s], scene_bounds[s]).map_bounds for s in poses])
         raise InputError(

@@ -76,6 +76,8 @@ class TileRecipe:
             f"extent {planned.extent}",
             *(f"scene {scene}" for scene in scenes),
         ]
+        if planned.metres_per_unit != 1.0:  # left out of a map in metres, whose tiles had the same key without it
+            inputs.append(f"metres_per_unit {planned.metres_per_unit!r}")
         if self.dates is not None:
             inputs += [f"captured_at {scene} {self.dates.get(scene)}" for scene in scenes]
         return self.merge.of(*inputs).digest
@@ -96,7 +98,7 @@ def dirty_reason(planned: PlannedTile, tile: Tile | None, recipe: TileRecipe, mo
     for scene, pose in planned.poses.items():
         # How far the scene's content at the tile's corners has moved.
         then = tile.poses[scene] @ pose.inverse()
-        moved = np.linalg.norm(then.apply(corners) - corners, axis=1).max()
+        moved = np.linalg.norm(then.apply(corners) - corners, axis=1).max() * planned.metres_per_unit
         if moved > moved_m:
             return f"scene {scene[:12]} moved by {moved:.3g} m"
     return ""
@@ -112,7 +114,7 @@ def _what_changed(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
             return f"another {part} of the merge method: {_difference(before.get(part), now[part])}"
     if set(tile.poses) != set(planned.poses):
         return "other scenes"
-    return "another date of a scene, format, budget, extent or provenance"
+    return "another date of a scene, format, budget, extent, metre or provenance"
 
 
 def _difference(before: Any, now: Any) -> str:

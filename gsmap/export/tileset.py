@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -54,38 +54,44 @@ def is_stale(out: Path, tiles: Sequence[Tile]) -> bool:
     return False
 
 
-def write_tilesets(out: Path, tiles: Sequence[Tile], tile_size_m: float) -> list[Path]:
+def write_tilesets(
+    out: Path, tiles: Sequence[Tile], tile_size_m: float, metres_per_unit: Mapping[int, float] | None = None
+) -> list[Path]:
     """Write ``tileset.json`` into each component's folder, with coarser levels made by merging, never by dropping.
 
     Levels are named by what they were made from, so those whose tiles did not change are not made again. Memory is
-    bounded by eight tiles.
+    bounded by eight tiles. 3D Tiles are in metres: the root's transform makes the map's unit one, its geometric errors
+    with it.
 
     Args:
         out: the export's folder; the tiles' ``.glb`` lie in it.
         tile_size_m: edge of the grid's tiles, > 0.
+        metres_per_unit: of each component's frame; all 1 if None.
     """
     by_component: dict[int, list[Tile]] = defaultdict(list)
     for tile in tiles:
         if tile.path:
             by_component[tile.component].append(tile)
     written = []
-    for members in by_component.values():
+    for component, members in by_component.items():
+        metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
         folder = (out / members[0].path).parent
         refuse_links(out, folder.name, LEVELS_FOLDER)
         known = _known_boxes(folder)
-        cells = {_cell(tile, tile_size_m): _leaf(folder, tile) for tile in members}
+        cells = {_cell(tile, tile_size_m / metres): _leaf(folder, tile) for tile in members}
         while len(cells) > 1:
             cells = _one_level_up(folder, cells, known)
         (root,) = cells.values()
         # The map's z is up where gsmap could tell.
-        write_whole(folder / FILE_NAME, partial(tiles3d.write_tileset, root=root.node, transform=np.eye(4)))
+        transform = np.diag([metres, metres, metres, 1.0])
+        write_whole(folder / FILE_NAME, partial(tiles3d.write_tileset, root=root.node, transform=transform))
         _remove_unnamed(folder, root.node)
         written.append(folder / FILE_NAME)
     return written
 
 
-def _cell(tile: Tile, tile_size_m: float) -> _Cell:
-    x, y, z = np.floor(tile.bounds.mean(0) / tile_size_m).astype(int).tolist()
+def _cell(tile: Tile, edge: float) -> _Cell:
+    x, y, z = np.floor(tile.bounds.mean(0) / edge).astype(int).tolist()
     return x, y, z
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -29,6 +29,7 @@ from gsmap.export.plan import Params, PlannedTile
 from gsmap.export.recipe import TileRecipe, dirty_reason
 from gsmap.formats import tiles3d
 from gsmap.types import MergeResult, Tile
+from gsmap.types.metre import Metre
 from gsmap.types.progress import Progress, silent
 
 _STAGING = ".partial"
@@ -62,6 +63,7 @@ def export_tiles(
     *,
     map_id: str,
     recipe: TileRecipe,
+    metres: Mapping[int, Metre] | None = None,
     params: Params | None = None,
     made: Callable[[Tile], None] | None = None,
     progress: Progress | None = None,
@@ -78,6 +80,7 @@ def export_tiles(
         out: folder; made if missing; one folder per component inside.
         map_id: a folder keeps to one map.
         recipe: how tiles are made and written; where it differs from a tile's, that tile is made again.
+        metres: how long a metre is in each component's frame, to be told in the manifest.
         params: from which movement on a tile is made again, and how many are made at once.
         made: told each new tile once its file is in place; called from the calling thread.
         progress: told the fraction of tiles done and what is being done; called from several threads, one at a time.
@@ -97,10 +100,11 @@ def export_tiles(
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
+    retold, manifest.metres = manifest.metres != dict(metres or {}), dict(metres or {})
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     try:
-        if not todo and not gone and not manifest.doomed and out.exists():
+        if not (todo or gone or retold or manifest.doomed) and out.exists():
             return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
         make_folder(out)
         if not (out / FILE_NAME).exists():

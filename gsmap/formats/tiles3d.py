@@ -125,11 +125,13 @@ def write_tileset(path: str | os.PathLike[str], root: TileNode, *, transform: np
         transform: (4, 4) from the root's frame to the viewer's world; upright for right-down-front if None.
     """
     tile = _tile_json(root) | {"refine": "REPLACE"}
-    tile["transform"] = (_UPRIGHT if transform is None else np.asarray(transform, float)).T.ravel().tolist()
+    matrix = _UPRIGHT if transform is None else np.asarray(transform, float)
+    tile["transform"] = matrix.T.ravel().tolist()
     diagonal = float(np.linalg.norm(root.box[1] - root.box[0]))
+    scale = float(np.linalg.norm(matrix[:3, :3], axis=0).max())  # a tile's own transform scales its error, not this one
     tileset = {
         "asset": {"version": "1.1", "generator": "gsmap"},
-        "geometricError": max(diagonal, root.error_m),  # of drawing nothing at all
+        "geometricError": scale * max(diagonal, root.error_m),  # of drawing nothing at all
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": {"extensionsUsed": [glb.EXTENSION]}},
         "root": tile,

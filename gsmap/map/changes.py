@@ -13,6 +13,7 @@ import numpy as np
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.geometry.boxes import moved_box
 from gsmap.map.dates import last_of, parsed
+from gsmap.map.metres import map_metres, metre_notes
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports import scenes_by_id
 from gsmap.map.settings import Settings
@@ -85,8 +86,13 @@ def changes_report(
         notes.append(f"{len(stale)} pairs were compared by another recipe or at other poses: {_WRITE}")
     if never:
         notes.append(f"{len(never)} pairs are not compared yet: {_WRITE}")
-    if chosen and not any(scene.scale_policy == "known" for scene in known.values()):
-        notes.append("no scene's scale is known, so lengths are in the map's own unit")
+    if chosen and placed is not None:
+        metres = map_metres(store, settings, placed)
+        mine = {placed.poses[one.newer].component for one in chosen if one.newer in placed.poses}
+        notes += metre_notes({component: metre for component, metre in metres.items() if component in mine})
+        odd = sorted({metres[c].metres_per_unit for c in mine} - {1.0})
+        if odd:
+            notes.append(f"boxes are in the map's unit, of {', '.join(f'{one:.4g}' for one in odd)} m")
     rows = [_row(one, change, known, placed) for one in chosen for change in one.changes]
     return ChangesReport(
         changes=tuple(ChangeRow(**row) for row in rows if row["confidence"] >= min_confidence),

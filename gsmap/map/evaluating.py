@@ -25,6 +25,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, Scene, ScenePose, Sim3, Tile
+from gsmap.types.metre import Metre
 from gsmap.types.model import ModelLimits
 from gsmap.types.progress import Progress
 from gsmap.types.rows import EvaluationReport, ImageErrorRow
@@ -32,12 +33,18 @@ from gsmap.types.rows import EvaluationReport, ImageErrorRow
 _TILES_KEPT = 8  # in memory at once, for the scene that has a part in them and the next one
 
 
-def poses(store: Store, truth: str | os.PathLike[str], params: Params | None = None) -> EvaluationReport:
+def poses(
+    store: Store,
+    truth: str | os.PathLike[str],
+    params: Params | None = None,
+    metres: Mapping[int, Metre] | None = None,
+) -> EvaluationReport:
     """Every accepted edge and the newest poses against the truth.
 
     Args:
         truth: folder of ``NAME.json``, each with ``T_scene_world`` (4x4, a similarity): where the scene's frame lies;
             the world is in metres.
+        metres: of every component of the newest poses; not judged where None.
 
     Raises:
         NotFoundError, InputError: no truth for any scene, or a file that holds none.
@@ -56,7 +63,8 @@ def poses(store: Store, truth: str | os.PathLike[str], params: Params | None = N
     params = params or Params()
     solid = partial(_solid, store, S_scene_world, params)
     overlaps = true_overlaps(list(S_scene_world), solid, params.overlap)
-    return judge([judged(s) for s in scenes], reports.edge_rows(store), store.revisions.get(), overlaps, params)
+    of_scenes, edges, graph = [judged(s) for s in scenes], reports.edge_rows(store), store.revisions.get()
+    return judge(of_scenes, edges, graph, overlaps, params, metres)
 
 
 def _solid(store: Store, S_scene_world: Mapping[str, Sim3], params: Params, scene: str) -> np.ndarray:

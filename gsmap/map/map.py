@@ -17,9 +17,11 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.map import values as as_values
 from gsmap.map.logs import logged
+from gsmap.map.metres import map_metres
 from gsmap.map.sharing import at_work
 from gsmap.store import Store
 from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
+from gsmap.types.metre import Metre
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
     BackupReport,
@@ -382,7 +384,7 @@ class Map(AbstractContextManager["Map"]):
             return report
         from gsmap.map.pictures import draw
 
-        files = draw(self.store, Path(pictures), report.changes, self._progress)
+        files = draw(self.store, Path(pictures), report.changes, self.settings, self._progress)
         return replace(report, changes=tuple(replace(row, picture=files.get(row.id)) for row in report.changes))
 
     def show_change(self, name: str) -> ChangeDetail:
@@ -516,6 +518,10 @@ class Map(AbstractContextManager["Map"]):
         """The living scenes in the order they came."""
         return self.store.scenes.list()
 
+    def metres(self, revision: int | None = None) -> dict[int, Metre]:
+        """How long a metre is in the frame of each component of a revision, by default the newest."""
+        return map_metres(self.store, self.settings, self.pose_graph(revision))
+
     def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
         """The poses of a revision, of the newest one by default; None before the first optimize."""
         return self.store.revisions.get(revision)
@@ -550,7 +556,8 @@ class Map(AbstractContextManager["Map"]):
     ) -> list[SceneRow]:
         """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date or at or before
         one, or with a tag."""
-        return reports.scene_rows(self.store, component=component, status=status, after=after, tag=tag, as_of=as_of)
+        chosen: dict[str, Any] = {"component": component, "status": status, "after": after, "tag": tag, "as_of": as_of}
+        return reports.scene_rows(self.store, **chosen, metres=self.metres())
 
     def edge_rows(
         self,
@@ -589,7 +596,7 @@ class Map(AbstractContextManager["Map"]):
     def show_scene(self, ref: str) -> SceneReport:
         """``gsmap show MAP SCENE``: facts, nodes and edges of one scene."""
         scene = self.store.scenes.get(ref)
-        return reports.scene_report(self.store, scene, *self._graph_of(scene))
+        return reports.scene_report(self.store, scene, *self._graph_of(scene), self.metres())
 
     def show_pair(self, pair: str) -> PairReport:
         """``gsmap show MAP A:B``: the pair's edge, its evidence, and its history."""
@@ -611,7 +618,7 @@ class Map(AbstractContextManager["Map"]):
 
     def diff(self, before: int, after: int) -> list[PoseChangeRow]:
         """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""
-        return reports.pose_change_rows(self.store, before, after)
+        return reports.pose_change_rows(self.store, before, after, self.settings)
 
     def evaluate(
         self,
@@ -646,7 +653,7 @@ class Map(AbstractContextManager["Map"]):
             params = replace(params, max_rre_deg=max_rre_deg)
         if max_rte_m is not None:
             params = replace(params, max_rte_m=max_rte_m)
-        report = evaluating.poses(self.store, truth, params)
+        report = evaluating.poses(self.store, truth, params, self.metres())
         if images is None:
             return report
         rows = evaluating.images(
@@ -664,7 +671,7 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.viewing import view_of
         from gsmap.view import ViewServer
 
-        return ViewServer(view_of(self.store), port=port)
+        return ViewServer(view_of(self.store, self.settings), port=port)
 
     def draw_graph(self, ref: str, path: str | os.PathLike[str]) -> None:
         """``gsmap show MAP SCENE --picture``: the scene's graph over a render, for a person to judge."""
@@ -699,11 +706,13 @@ class Map(AbstractContextManager["Map"]):
         note: str | None = None,
         tags: Sequence[str] = (),
         untag: Sequence[str] = (),
+        metres_per_unit: float | None = None,
     ) -> SceneRow:
         """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history.
 
         Args:
             captured_at: ISO 8601, UTC where it has no zone; ``none`` takes the date back.
+            metres_per_unit: of the scene's own frame; 0 takes it back.
         """
         from gsmap.ingest import parse_date
 
@@ -716,6 +725,7 @@ class Map(AbstractContextManager["Map"]):
             note=note,
             tags_add=tuple(tags),
             tags_remove=tuple(untag),
+            metres_per_unit=metres_per_unit,
         )
         return reports.scene_row(self.store, scene)
 

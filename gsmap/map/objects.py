@@ -15,6 +15,7 @@ import numpy as np
 from gsmap.durable import write_text_whole
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map.dates import parsed
+from gsmap.map.metres import map_metres
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.objects import (
@@ -48,11 +49,13 @@ class Known:
         objects: of all components.
         scenes: the placed captures by id.
         notes: who tells nothing, and why.
+        metres: per unit of the map, by component.
     """
 
     objects: list[MapObject]
     scenes: dict[str, Scene]
     notes: tuple[str, ...]
+    metres: dict[int, float]
 
     @property
     def dates(self) -> dict[str, str | None]:
@@ -98,6 +101,7 @@ def known_objects(store: Store, settings: Settings, progress: StageProgress) -> 
         gaussians, cameras = store.scenes.gaussians(capture.scene), store.scenes.cameras(capture.scene)
         return open_eyes(gaussians, cameras, settings.objects.look)
 
+    metres = {component: one.metres_per_unit for component, one in map_metres(store, settings, placed).items()}
     objects: list[MapObject] = []
     for i, component in enumerate(sorted(captures)):
 
@@ -107,10 +111,17 @@ def known_objects(store: Store, settings: Settings, progress: StageProgress) -> 
         mine = captures[component]
         moved, parted = _told(store, mine)
         objects += make_objects(
-            mine, component, eyes, moved=moved, parted=parted, params=settings.objects, progress=told
+            mine,
+            component,
+            eyes,
+            metres=metres[component],
+            moved=moved,
+            parted=parted,
+            params=settings.objects,
+            progress=told,
         )
     progress("objects", 1.0, f"{len(objects)} objects")
-    return Known(objects, scenes, tuple(notes))
+    return Known(objects, scenes, tuple(notes), metres)
 
 
 def _when(scene: Scene) -> tuple[bool, float, str]:
@@ -156,7 +167,8 @@ def objects_report(known: Known) -> ObjectsReport:
     return ObjectsReport(
         objects=tuple(_row(thing, known) for thing in known.objects),
         relations=tuple(
-            RelationRow(subject=one.source, relation=one.kind, other=one.target) for one in relations(known.objects)
+            RelationRow(subject=one.source, relation=one.kind, other=one.target)
+            for one in relations(known.objects, known.metres)
         ),
         notes=known.notes,
     )
@@ -182,7 +194,11 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
             raise NotFoundError(f"{place}: {many}; gsmap graph MAP lists them")
     else:
         area = _area(place, box)
-        chosen = [thing for thing in known.objects if any(_meets(s.box, area) for s in thing.sightings)]
+        chosen = [
+            thing
+            for thing in known.objects
+            if any(_meets(s.box, area, _NEAR_M / known.metres[thing.component]) for s in thing.sightings)
+        ]
     rows = [
         SightingRow(
             object=thing.id,
@@ -213,11 +229,11 @@ def _area(place: str | None, box: Sequence[float] | None) -> np.ndarray:
     corners = np.array(numbers).reshape(-1, 3)
     if (corners[0] > corners[-1]).any():
         raise ConfigError("a box is its lowest corner, then its highest")
-    return np.array([corners[0] - _NEAR_M, corners[-1] + _NEAR_M])
+    return np.array([corners[0], corners[-1]])
 
 
-def _meets(box: np.ndarray | None, area: np.ndarray) -> bool:
-    return box is not None and bool((box[0] <= area[1]).all() and (box[1] >= area[0]).all())
+def _meets(box: np.ndarray | None, area: np.ndarray, near: float) -> bool:
+    return box is not None and bool((box[0] <= area[1] + near).all() and (box[1] >= area[0] - near).all())
 
 
 def _row(thing: MapObject, known: Known) -> ObjectRow:
@@ -243,7 +259,7 @@ def _row(thing: MapObject, known: Known) -> ObjectRow:
 
 def as_networkx(known: Known) -> Any:
     """A `networkx.MultiDiGraph`, see `gsmap.objects.object_graph`."""
-    return object_graph(known.objects, known.dates)
+    return object_graph(known.objects, known.dates, known.metres)
 
 
 def write_graph(known: Known, out: str | os.PathLike[str], format: str) -> Path:

@@ -13,8 +13,11 @@ from pathlib import Path
 
 from gsmap.durable import make_folder, open_file, remove_file, write_text_whole, write_whole
 from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
+from gsmap.geometry.metres import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes import change_arrays, named
+from gsmap.map.metres import metres_of_scenes
+from gsmap.map.settings import Settings
 from gsmap.store import Store
 from gsmap.types import PlacedScene, Sim3
 from gsmap.types.progress import StageProgress
@@ -73,7 +76,9 @@ class Pictures:
         return len(gone)
 
 
-def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageProgress) -> dict[str, str]:
+def draw(
+    store: Store, folder: Path, rows: Sequence[ChangeRow], settings: Settings, progress: StageProgress
+) -> dict[str, str]:
     """Draw each change before and after; the files by id of change.
 
     Args:
@@ -90,7 +95,7 @@ def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageP
     known.save(folder)  # first: what an interrupted run leaves is known to a purge
     files: dict[str, str] = {}
     for pair in dict.fromkeys((row.older, row.newer) for row in rows):
-        drawer = _Drawer(store, *pair)
+        drawer = _Drawer(store, *pair, settings)
         for row in rows:
             if (row.older, row.newer) == pair:
                 progress("pictures", len(files) / len(rows), row.id)
@@ -103,12 +108,13 @@ def draw(store: Store, folder: Path, rows: Sequence[ChangeRow], progress: StageP
 class _Drawer:
     """Two captures, read once for all their changes."""
 
-    def __init__(self, store: Store, older: str, newer: str) -> None:
+    def __init__(self, store: Store, older: str, newer: str, settings: Settings) -> None:
         graph = store.revisions.get()
         assert graph is not None
         self._store = store
-        self._older = _placed(store, older, graph.poses[older].S_map_scene)
-        self._newer = _placed(store, newer, graph.poses[newer].S_map_scene)
+        self._metres = metres = metres_of_scenes(store, settings, graph)[newer]
+        self._older = _placed(store, older, in_metres(graph.poses[older].S_map_scene, metres))
+        self._newer = _placed(store, newer, in_metres(graph.poses[newer].S_map_scene, metres))
 
     def draw(self, row: ChangeRow, path: Path) -> None:
         from PIL import Image
@@ -116,7 +122,8 @@ class _Drawer:
         from gsmap.view.change_picture import draw_change
 
         change = change_arrays(self._store, named(row.id))
-        drawn = draw_change(self._older, self._newer, change.box, change.voxels)
+        box, voxels = change.box * self._metres, change.voxels * self._metres
+        drawn = draw_change(self._older, self._newer, box, voxels)
         Image.fromarray(drawn).save(path, format="PNG")
 
 

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Sequence
 
 from gsmap.map.changes import num_open
+from gsmap.map.metres import map_metres
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
@@ -14,8 +15,8 @@ from gsmap.map.stages.optimize import pose_inputs
 from gsmap.map.stages.register import stale
 from gsmap.store import Store
 from gsmap.store.leases import Lease
-from gsmap.types import Scene
-from gsmap.types.rows import AtWorkRow, MapStatus, TodoRow
+from gsmap.types.metre import Metre
+from gsmap.types.rows import AtWorkRow, MapStatus, MetreRow, TodoRow
 
 
 @of_one_state
@@ -66,6 +67,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes that nothing ties to others")
+    metres = map_metres(store, settings, graph)
     components = len({pose.component for pose in poses})
     return MapStatus(
         todo=tuple(todo),
@@ -74,7 +76,8 @@ def status(store: Store, settings: Settings) -> MapStatus:
         islands=components,
         tentative=len(tentative),
         revision=store.revisions.current(),
-        metres_per_unit=_metres_per_unit(scenes),
+        metres_per_unit=next((one.metres_per_unit for one in metres.values() if one.is_known), None),
+        metres=tuple(metre_row(component, one) for component, one in metres.items()),
         at_work=at_work_rows(store.leases.others()),
     )
 
@@ -98,6 +101,12 @@ def _add_unsolved(store: Store, settings: Settings, add: Callable[[str, int, str
         add("unsolved", 1, verb, "scenes, edges, reviews or priors newer than the poses")
 
 
-def _metres_per_unit(scenes: Sequence[Scene]) -> float | None:
-    """1 where some scene is known to be in metres, since known scales fix the map's; else nobody knows."""
-    return 1.0 if any(scene.scale_policy == "known" for scene in scenes) else None
+def metre_row(component: int, metre: Metre) -> MetreRow:
+    """The metre of a component as a row."""
+    return MetreRow(
+        component=component,
+        metres_per_unit=metre.metres_per_unit,
+        metre_sigma=metre.sigma if metre.is_known else None,
+        metre_known_by=metre.known_by,
+        metre_note=metre.note,
+    )

@@ -6,16 +6,19 @@ from functools import partial
 from pathlib import Path
 
 from gsmap.map import reports
+from gsmap.map.metres import metres_of_scenes
 from gsmap.map.one_state import of_one_state
+from gsmap.map.settings import Settings
 from gsmap.store import Store
 from gsmap.view import ViewEdge, ViewMap, ViewScene
 
 
 @of_one_state
-def view_of(store: Store) -> ViewMap:
+def view_of(store: Store, settings: Settings) -> ViewMap:
     """The living scenes, each with its newest graph, and the edges between them."""
     placed = store.revisions.get()
     poses = placed.poses if placed else {}
+    metres = metres_of_scenes(store, settings, placed) if placed else {}
     scenes = [
         ViewScene(
             scene,
@@ -23,6 +26,7 @@ def view_of(store: Store) -> ViewMap:
             partial(store.scenes.gaussians, scene.id),
             partial(store.graphs.load, scene.id),
             partial(store.scenes.cameras, scene.id),
+            metres.get(scene.id, 1.0),
         )
         for scene in store.scenes.list()
     ]

@@ -50,8 +50,9 @@ class Visit:
         scene: its id.
         when: it was captured.
         component: whose frame it is placed in.
-        S_map_scene: where it lies.
+        S_map_scene: where it lies, the unit of that frame made the metre.
         bounds: (2, 3) box of its Gaussians, scene frame.
+        metres_per_unit: of that frame.
     """
 
     scene: str
@@ -59,6 +60,7 @@ class Visit:
     component: int
     S_map_scene: Sim3
     bounds: np.ndarray
+    metres_per_unit: float = 1.0
 
     def box(self) -> np.ndarray:
         """(2, 3) around its box, map frame."""

@@ -11,7 +11,9 @@ from gsmap.objects.relations import relations
 from gsmap.types import MapObject
 
 
-def object_graph(objects: Sequence[MapObject], dates: Mapping[str, str | None], metres: float = 1.0) -> Any:
+def object_graph(
+    objects: Sequence[MapObject], dates: Mapping[str, str | None], metres: float | Mapping[int, float] = 1.0
+) -> Any:
     """A `networkx.MultiDiGraph`: a node per object, an edge per relation, whose attributes GraphML can say.
 
     Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
@@ -20,7 +22,7 @@ def object_graph(objects: Sequence[MapObject], dates: Mapping[str, str | None], 
 
     Args:
         dates: as for `permanence`.
-        metres: per unit of the map.
+        metres: per unit of the map; by component, or for all.
     """
     import networkx as nx
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,15 +27,16 @@ class Relation:
     target: str
 
 
-def relations(objects: Sequence[MapObject], metres: float = 1.0) -> list[Relation]:
+def relations(objects: Sequence[MapObject], metres: float | Mapping[int, float] = 1.0) -> list[Relation]:
     """``on``, ``in`` and ``next to`` of objects that are there together, by their boxes (z up).
 
     Args:
         objects: of any component; those of one component are related that are both there still, or both gone.
-        metres: per unit of the map.
+        metres: per unit of the map; by component, or for all.
     """
     out = []
-    boxes = np.array([thing.box for thing in objects]).reshape(-1, 2, 3) * metres
+    of = metres if isinstance(metres, Mapping) else dict.fromkeys((thing.component for thing in objects), metres)
+    boxes = np.array([thing.box * of[thing.component] for thing in objects]).reshape(-1, 2, 3)
     size = np.maximum(boxes[:, 1] - boxes[:, 0], 1e-6)
     for i, one in enumerate(objects):
         low, high = np.maximum(boxes[:, 0], boxes[i, 0]), np.minimum(boxes[:, 1], boxes[i, 1])

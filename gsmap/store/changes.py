@@ -57,7 +57,7 @@ class Changes:
         """Keep what a comparison found; the same again mends damaged bytes.
 
         Args:
-            key: its recipe; its inputs are the two scenes, the older one first.
+            key: its recipe; its inputs begin with the two scenes, the older one first.
             older, newer: scene ids.
             S_newer_older, S_frame_newer: see `Comparison`.
 
@@ -65,8 +65,8 @@ class Changes:
             InputError: the key is of other scenes, or a scene with itself.
             NotFoundError: a scene that is not in the map.
         """
-        if key.inputs != (older, newer) or older == newer:
-            raise InputError(f"the key of a comparison must have its two scenes {older} and {newer} as its inputs")
+        if key.inputs[:2] != (older, newer) or older == newer:
+            raise InputError(f"the key of a comparison must have its two scenes {older} and {newer} as its first inputs")
         arrays = _to_arrays(report.changes)
         text = f"{key.digest}{from_pose(S_newer_older)}{from_pose(S_frame_newer)}"
         group_id = digest(*arrays.values(), text=text) if report.changes else None

@@ -35,6 +35,7 @@ class StoredGraph:
         key: `RecipeKey.digest`; the keys of registrations name it.
         scene: scene id.
         layers: number of nodes by layer.
+        unit_m: metres per scene unit that were guessed.
         up: (3,) against gravity in the scene's frame, or None.
         recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in maps that schema 0001 wrote.
     """
@@ -43,6 +44,7 @@ class StoredGraph:
     scene: str
     layers: dict[str, int]
     created_at: str
+    unit_m: float = 1.0
     up: tuple[float, ...] | None = None
     recipe: str | None = None
 
@@ -181,4 +183,4 @@ def _stored(row: Row[Any]) -> StoredGraph:
     counts = {name: layer["count"] for name, layer in row.about["layers"].items()}
     up = row.about["up"]
     known_up = None if up is None else tuple(up)
-    return StoredGraph(row.key, row.scene, counts, row.created_at, known_up, row.recipe)
+    return StoredGraph(row.key, row.scene, counts, row.created_at, float(row.about["unit_m"]), known_up, row.recipe)

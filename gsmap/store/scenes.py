@@ -152,6 +152,7 @@ class Scenes:
         note: str | None = None,
         tags_add: Iterable[str] = (),
         tags_remove: Iterable[str] = (),
+        metres_per_unit: float | None = None,
         author: str = "",
     ) -> Scene:
         """Change what is said of a living scene; what was said before stays in its `facts`.
@@ -161,17 +162,14 @@ class Scenes:
             captured_at: ISO 8601, UTC where it has no zone; empty to take the date back.
             note: added to the notes that there are.
             tags_add, tags_remove: single words or short phrases.
+            metres_per_unit: metres in a unit of its frame; 0 to take that back.
             author: who says so.
 
         Raises:
             NotFoundError: no such scene, it was removed, or it lacks a tag that is to go.
-            InputError: an empty text, one with control characters, no date, or a name that is taken.
+            InputError: an empty text, one with control characters, no date, no length, or a name that is taken.
         """
-        new = [] if name is None else [("name", facts.checked_text("the name of a scene", name))]
-        if captured_at is not None:
-            new.append(("captured_at", captured_at and facts.checked_date(captured_at)))
-        if note is not None:
-            new.append(("note", facts.checked_text("a note", note, lines=True)))
+        new = facts.checked(name, captured_at, note, metres_per_unit)
         new += [("tag", facts.checked_text("a tag", tag).strip()) for tag in tags_add]
         new += [("untag", facts.checked_text("a tag", tag).strip()) for tag in tags_remove]
         if author:
@@ -180,6 +178,7 @@ class Scenes:
             row = alive(connection, ref)
             tags = set(facts.tags(connection, row.id).get(row.id, ()))
             same = {("name", row.name), ("captured_at", row.captured_at or ""), *(("tag", tag) for tag in tags)}
+            same |= {("metres_per_unit", facts.told_metres(connection).get(row.id, ""))}
             new = [fact for fact in dict.fromkeys(new) if fact not in same]
             for kind, value in new:
                 if kind == "name" and name_taken(connection, value):
@@ -196,6 +195,11 @@ class Scenes:
         """Everything people said of a scene since it was ingested, oldest first."""
         with self._catalog.read() as connection:
             return facts.said(connection, find(connection, ref).id)
+
+    def told_metres(self) -> dict[str, float]:
+        """Metres per unit that people gave of scenes, by id; scenes of which nobody said any are left out."""
+        with self._catalog.read() as connection:
+            return {scene: float(value) for scene, value in facts.told_metres(connection).items()}
 
     def latest_notes(self) -> dict[str, str]:
         """The last note that people made of each scene, by its id; scenes without one are left out."""

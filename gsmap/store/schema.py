@@ -44,7 +44,7 @@ from gsmap.store.columns import (
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 
-HEAD = "0005"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0006"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
@@ -135,10 +135,10 @@ scene_facts = _table(
     Column("number", Integer, primary_key=True),
     _scene("scene", index=True),
     Column("kind", Text, nullable=False),
-    Column("value", Lines, nullable=False),  # empty: a date that was taken back
+    Column("value", Lines, nullable=False),  # empty: a date, or metres per unit, that was taken back
     Column("author", Line, nullable=False),
     Column("created_at", Text, nullable=False),
-    CheckConstraint("kind in ('name', 'captured_at', 'note', 'tag', 'untag')", name="kind"),
+    CheckConstraint("kind in ('name', 'captured_at', 'note', 'tag', 'untag', 'metres_per_unit')", name="kind"),
 )
 
 # `chunk_boxes` is an R*Tree on SQLite and a plain table elsewhere, so the migration makes it:

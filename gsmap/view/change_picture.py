@@ -14,7 +14,7 @@ from gsmap.types import Cameras, PlacedScene
 
 _TRIED = 6  # cameras that are looked through before one is chosen
 _TRIED_PX = 120
-_NEAR = 0.15  # metres (of the map) within which a surface is the one that changed
+_NEAR = 0.15  # metres within which a surface is the one that changed
 _MARGIN = 1.0  # around the box, as a share of it
 _LEAST_SHARE = 0.15  # of the camera's picture: a small thing is shown with what is around it
 _GAP_PX = 4
@@ -35,7 +35,7 @@ def draw_change(
     """Before on the left, after on the right, (H, W, 3) uint8; the box of the change is outlined.
 
     Args:
-        older, newer: both captures, in one frame.
+        older, newer: both captures, in one metric frame.
         box: (2, 3) around what changed.
         points: (K, 3) where it changed; the view is chosen that shows most of them.
         side_px: of each of the two pictures, the longer side.

@@ -28,6 +28,7 @@ class ViewScene:
 
     Args:
         pose: None where nothing placed it; it is then a component of its own.
+        metres_per_unit: of the map's frame; cameras are drawn a decimetre long.
         gaussians, graph, cameras: called from the server's threads; graph and cameras may give None.
     """
 
@@ -36,6 +37,7 @@ class ViewScene:
     gaussians: Callable[[], Gaussians]
     graph: Callable[[], SceneGraph | None] = lambda: None
     cameras: Callable[[], Cameras | None] = lambda: None
+    metres_per_unit: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,8 @@ class ViewMap:
                 rays = [
                     [(u - cx) / fx, (v - cy) / fy, 1] for u, v in ((0, 0), (width, 0), (width, height), (0, height))
                 ]
-                local = np.vstack([np.zeros((1, 3)), np.array(rays) * 0.1 / S_map_scene.scale])
+                long = 0.1 / (S_map_scene.scale * entry.metres_per_unit)
+                local = np.vstack([np.zeros((1, 3)), np.array(rays) * long])
                 frusta.append(S_map_scene.apply(local @ pose[:3, :3].T + pose[:3, 3]).tolist())
         return {"layers": layers, "cameras": frusta}
 

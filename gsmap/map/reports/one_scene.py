@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from gsmap.map.one_state import of_one_state
@@ -10,24 +12,33 @@ from gsmap.map.reports.scenes import row_of_scene
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
 from gsmap.types import Scene, SceneGraph, ScenePose
+from gsmap.types.metre import Metre
 from gsmap.types.rows import FactRow, GraphRow, LayerRow, NodeRow, PriorRow, SceneEdgeRow, SceneReport
 
 
 @of_one_state
-def scene_report(store: Store, scene: Scene, graph: SceneGraph | None, graph_note: str = "") -> SceneReport:
+def scene_report(
+    store: Store,
+    scene: Scene,
+    graph: SceneGraph | None,
+    graph_note: str = "",
+    metres: Mapping[int, Metre] | None = None,
+) -> SceneReport:
     """Everything known of one scene.
 
     Args:
         graph: its graph; None where there is none.
         graph_note: what is to be known of which graph that is.
+        metres: of every component of the newest poses; not told where None.
     """
     placed = store.revisions.get()
     pose = placed.poses.get(scene.id) if placed else None
     known = pose is not None and pose.covariance is not None
     facts = store.scenes.facts(scene.id)
+    metre = (metres or {}).get(pose.component, Metre()) if pose else None
     noted = next((fact.value for fact in reversed(facts) if fact.kind == "note"), "")
     return SceneReport(
-        **vars(row_of_scene(scene, placed, graph.num_nodes if graph else None, noted)),
+        **vars(row_of_scene(scene, placed, graph.num_nodes if graph else None, noted, metres)),
         origin=scene.source,
         sh_degree=scene.sh_degree,
         num_cameras=scene.num_cameras,
@@ -36,11 +47,14 @@ def scene_report(store: Store, scene: Scene, graph: SceneGraph | None, graph_not
         bounds=scene.bounds,
         notes=(*store.scenes.notes(scene.id), *(graph.notes if graph else ()), *([graph_note] if graph_note else ())),
         rotation_sigma_deg=_rotation_sigma_deg(pose) if pose and known else None,
-        translation_sigma_m=_translation_sigma(pose) if pose and known else None,
+        translation_sigma_m=_translation_sigma(pose) * metre.metres_per_unit if pose and metre and known else None,
         covariance=pose.covariance if pose else None,
         prior=prior_row(store, scene),
         up=graph.up if graph else None,
         unit_m=graph.unit_m if graph else None,
+        metre_sigma=metre.sigma if metre and metre.is_known else None,
+        metre_known_by=metre.known_by if metre else "",
+        metre_note=metre.note if metre else "",
         layers=_layer_rows(graph) if graph else (),
         edges=_edges_of(store, scene),
         nodes=_node_rows(graph) if graph else (),

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from gsmap.map.dates import is_after, parsed
+from gsmap.map.metres import metres_of_scenes
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import names, refs, scenes_by_id
 from gsmap.map.reports.pairs import edge_rows
 from gsmap.map.reports.scenes import scene_rows
+from gsmap.map.settings import Settings
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
 from gsmap.types import PoseGraph
@@ -66,7 +68,7 @@ def _revision_row(revision: Revision, graph: PoseGraph | None, name_of: Mapping[
 
 
 @of_one_state
-def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRow]:
+def pose_change_rows(store: Store, before: int, after: int, settings: Settings) -> list[PoseChangeRow]:
     """How each scene differs between two revisions, measured at its middle.
 
     Raises:
@@ -77,7 +79,7 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
     old, new = store.revisions.get(before), store.revisions.get(after)
     assert old is not None
     assert new is not None
-    known = scenes_by_id(store)
+    known, metres = scenes_by_id(store), metres_of_scenes(store, settings, new)
     changes = diff(old, new, {scene.id: scene.bounds.mean(0) for scene in known.values()})
     return [
         PoseChangeRow(
@@ -85,7 +87,7 @@ def pose_change_rows(store: Store, before: int, after: int) -> list[PoseChangeRo
             scene_name=known[change.scene].name,
             change=change.kind,
             rotation_deg=change.rotation_deg,
-            translation_m=change.translation,
+            translation_m=None if change.translation is None else change.translation * metres[change.scene],
             scale_ratio=change.scale_ratio,
             component_before=change.components[0],
             component_after=change.components[1],

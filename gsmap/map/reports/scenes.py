@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from gsmap.map.dates import is_after, is_until, last_of, parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import one_of
 from gsmap.store import Store
 from gsmap.types import PoseGraph, Scene
+from gsmap.types.metre import Metre
 from gsmap.types.rows import IngestRow, PoseRow, SceneRow
 
 SCENE_STATUSES = ("ingested", "described", "placed", "tentative", "isolated")
@@ -23,6 +24,7 @@ def scene_rows(
     after: str | None = None,
     tag: str | None = None,
     as_of: str | None = None,
+    metres: Mapping[int, Metre] | None = None,
 ) -> list[SceneRow]:
     """The living scenes, oldest first.
 
@@ -32,6 +34,7 @@ def scene_rows(
         after: ISO 8601; only those captured (or else ingested) after it.
         tag: only those that have it.
         as_of: ISO 8601; only those dated at or before it, those without a date left out.
+        metres: of every component of the newest poses; not told where None.
 
     Raises:
         ConfigError: no such status, or a date that is none.
@@ -42,7 +45,10 @@ def scene_rows(
     placed = store.revisions.get()
     nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
     said = store.scenes.latest_notes()
-    rows = [row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, "")) for scene in store.scenes.list()]
+    rows = [
+        row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres)
+        for scene in store.scenes.list()
+    ]
     return [
         row
         for row in rows
@@ -63,8 +69,15 @@ def scene_row(store: Store, scene: Scene) -> SceneRow:
     )
 
 
-def row_of_scene(scene: Scene, placed: PoseGraph | None, num_nodes: int | None, note: str) -> SceneRow:
+def row_of_scene(
+    scene: Scene,
+    placed: PoseGraph | None,
+    num_nodes: int | None,
+    note: str,
+    metres: Mapping[int, Metre] | None = None,
+) -> SceneRow:
     pose = placed.poses.get(scene.id) if placed else None
+    metre = metres.get(pose.component) if metres and pose else None
     return SceneRow(
         name=scene.name,
         id=scene.id,
@@ -78,6 +91,7 @@ def row_of_scene(scene: Scene, placed: PoseGraph | None, num_nodes: int | None, 
         scale_policy=scene.scale_policy,
         tags=scene.tags,
         note=note,
+        metres_per_unit=metre.metres_per_unit if metre and metre.is_known else None,
     )
 
 

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from gsmap.change import recipe_key
 from gsmap.engine import run_jobs
 from gsmap.errors import InputError, NotFoundError
+from gsmap.geometry.metres import in_metres
 from gsmap.map.dates import NO_DATE, parsed
 from gsmap.map.jobs import compare_scenes
+from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import SharedJobs, noting
 from gsmap.map.visits import Visit, has_moved, pairs_of_visits
@@ -50,8 +52,16 @@ def wanted(store: Store, settings: Settings, pair: tuple[Scene, Scene] | None = 
         raise NotFoundError("the map has no poses yet, so that nothing can be compared: run gsmap update first")
     scenes = store.scenes.list() if pair is None else list(pair)
     undated = [scene.name for scene in scenes if scene.captured_at is None]
+    metres = metres_of_scenes(store, settings, graph)
     visits = {
-        scene.id: Visit(scene.id, parsed(scene.captured_at), pose.component, pose.S_map_scene, scene.bounds)
+        scene.id: Visit(
+            scene.id,
+            parsed(scene.captured_at),
+            pose.component,
+            in_metres(pose.S_map_scene, metres[scene.id]),
+            scene.bounds,
+            metres[scene.id],
+        )
         for scene in scenes
         if scene.captured_at is not None and (pose := graph.poses.get(scene.id)) is not None
     }
@@ -86,7 +96,7 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
     Args:
         verify: read the arrays of the comparisons that are there, and make those again that are damaged.
     """
-    keys = {_key(settings, *pair).digest: pair for pair in asked.pairs}
+    keys = {_key(settings, asked, *pair).digest: pair for pair in asked.pairs}
 
     def done(wanted_keys: Collection[str]) -> set[str]:
         valid = {one.key: one.number for one in _valid(store.changes.current(), asked, settings)}
@@ -105,7 +115,7 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
             older, newer = (asked.visits[scene] for scene in keys[key])
             found = store.changes.save(
                 report,
-                _key(settings, older.scene, newer.scene),
+                _key(settings, asked, older.scene, newer.scene),
                 older=older.scene,
                 newer=newer.scene,
                 S_newer_older=newer.S_map_scene.inverse() @ older.S_map_scene,
@@ -117,19 +127,21 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
 
 def _valid(current: Iterable[Comparison], asked: Wanted, settings: Settings) -> list[Comparison]:
     """The comparisons that are what would be found now."""
-    pairs, recipe = set(asked.pairs), recipe_key(settings.change)
+    pairs = set(asked.pairs)
     return [
         one
         for one in current
         if (one.older, one.newer) in pairs
         and one.whole
-        and one.key == recipe.of(one.older, one.newer).digest
+        and one.key == _key(settings, asked, one.older, one.newer).digest
         and not has_moved(asked.visits[one.older], asked.visits[one.newer], one.S_newer_older, settings.visits)
     ]
 
 
-def _key(settings: Settings, older: str, newer: str) -> RecipeKey:
-    return recipe_key(settings.change).of(older, newer)
+def _key(settings: Settings, asked: Wanted, older: str, newer: str) -> RecipeKey:
+    """Of the report of a pair: captures are compared in metres, so that another metre is another report."""
+    metres = asked.visits[newer].metres_per_unit
+    return recipe_key(settings.change).of(older, newer, *([] if metres == 1.0 else [f"metres_per_unit {metres!r}"]))
 
 
 def _job(store: Store, asked: Wanted, settings: Settings, pair: tuple[str, str]) -> tuple[object, ...]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,17 @@ from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, Not
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
 from gsmap.export.tileset import is_stale, write_tilesets
+from gsmap.geometry.metres import in_metres, resized
 from gsmap.map.dates import is_until, last_of, undated_note
+from gsmap.map.metres import map_metres, metre_notes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_prefer, with_steps
+from gsmap.merge.placed import pulled_inside
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.store import Store
-from gsmap.types import MergeResult, Scene, ScenePose, Tile
+from gsmap.types import MergeResult, PoseGraph, Scene, ScenePose, Tile
+from gsmap.types.metre import Metre
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress
 
@@ -90,6 +94,7 @@ class Planned:
         recipe: how every tile is made.
         tiles: what the folder is to hold.
         notes: what a person should know of what takes part.
+        metres: how long a metre is in the frame of each component of the poses.
     """
 
     revision: int | None
@@ -99,6 +104,7 @@ class Planned:
     recipe: TileRecipe
     tiles: list[PlannedTile]
     notes: tuple[str, ...] = ()
+    metres: Mapping[int, Metre] = field(default_factory=dict)
 
 
 def plan(store: Store, request: Request, settings: Settings) -> Planned:
@@ -112,7 +118,8 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
     recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
     _check(request, recipe)
     revision = store.revisions.current() if request.revision is None else request.revision
-    placed = _placed(store, revision, request.component)
+    graph, placed = _placed(store, revision, request.component)
+    metres = map_metres(store, settings, graph)
     scenes = {scene: store.scenes.get(scene) for scene in placed}
     notes: tuple[str, ...] = ()
     if request.as_of is not None:
@@ -120,6 +127,9 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         placed = {scene: placed[scene] for scene in scenes}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
+    exported = {pose.component for pose in placed.values()}
+    metres = {component: metre for component, metre in metres.items() if component in exported}
+    notes += metre_notes(metres)
     tiles = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
         {scene: found.bounds for scene, found in scenes.items()},
@@ -127,9 +137,10 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         components={scene: pose.component for scene, pose in placed.items()},
         bbox=None if request.bbox is None else np.reshape(np.asarray(request.bbox, float), (2, 3)),
         reach_m=reach_m(method, params),
+        metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         max_tiles=settings.export.max_tiles,
     )
-    return Planned(revision, scenes, method, params, recipe, tiles, notes)
+    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres)
 
 
 def export(
@@ -194,12 +205,14 @@ def _export(
             out,
             map_id=store.id,
             recipe=planned.recipe,
+            metres=planned.metres,
             params=settings.export,
             made=noted,
             progress=progress,
         )
     if planned.recipe.is_tileset and is_stale(out, result.tiles):
-        write_tilesets(out, result.tiles, request.tile_size_m)
+        in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
+        write_tilesets(out, result.tiles, request.tile_size_m, in_metres_of)
     if store.catalog.writable:
         refused = ""
         try:  # what an interrupted export, or one that could not be noted, left untold is told now
@@ -225,7 +238,7 @@ def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Reques
     """
     newest = {export.target: export for export in store.exports.list()}
     found: dict[str, tuple[int, Request]] = {}
-    known = {field.name for field in fields(Request)}
+    known = {one.name for one in fields(Request)}
     for target in store.exports.targets():
         request = Request(**{key: value for key, value in newest[target].settings.items() if key in known})
         try:
@@ -253,8 +266,8 @@ def _check(request: Request, recipe: TileRecipe) -> None:
         raise ConfigError("3dtiles is a tree of tiles: give --tile-size in metres, or use glb for one file")
 
 
-def _placed(store: Store, revision: int | None, component: int | None) -> dict[str, ScenePose]:
-    """The poses of the scenes to export."""
+def _placed(store: Store, revision: int | None, component: int | None) -> tuple[PoseGraph, dict[str, ScenePose]]:
+    """A revision, and of it the poses of the scenes to export."""
     graph = store.revisions.get(revision)
     if graph is None:
         raise NotFoundError("the map has no poses yet: run gsmap update or gsmap optimize first")
@@ -267,7 +280,7 @@ def _placed(store: Store, revision: int | None, component: int | None) -> dict[s
             raise NotFoundError(f"revision {revision} has no component {component}: it has {known}")
     if not placed:
         raise InputError("nothing to export: no scene has a place in the map yet; run gsmap update first")
-    return placed
+    return graph, placed
 
 
 def _as_of(scenes: dict[str, Scene], as_of: str) -> tuple[dict[str, Scene], tuple[str, ...]]:
@@ -281,11 +294,12 @@ def _as_of(scenes: dict[str, Scene], as_of: str) -> tuple[dict[str, Scene], tupl
 
 
 def _make(store: Store, planned: Planned, request: Request, tile: PlannedTile, progress: Progress) -> MergeResult:
-    """The merged content of one tile."""
+    """The merged content of one tile: merged in metres, in the map's unit when it is done."""
+    metres = tile.metres_per_unit
     lazy = [
         LazyScene(
             scene,
-            pose,
+            in_metres(pose, metres),
             partial(store.scenes.gaussians, scene),
             store.scenes.cameras(scene),
             planned.scenes[scene].captured_at,
@@ -293,4 +307,15 @@ def _make(store: Store, planned: Planned, request: Request, tile: PlannedTile, p
         for scene, pose in tile.poses.items()
     ]
     bounds = None if request.tile_size_m == 0 and request.bbox is None else tile.bounds
-    return merge_tile(lazy, planned.method, planned.params, bounds=bounds, budget_s=request.budget_s, progress=progress)
+    found = merge_tile(
+        lazy,
+        planned.method,
+        planned.params,
+        bounds=None if bounds is None else bounds * metres,
+        budget_s=request.budget_s,
+        progress=progress,
+    )
+    if metres == 1.0:
+        return found
+    merged = resized(found.gaussians, 1 / metres)
+    return replace(found, gaussians=replace(merged, means=pulled_inside(merged.means, bounds)))

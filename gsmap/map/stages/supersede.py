@@ -17,6 +17,7 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView, recipe_key
+from gsmap.register.metric import target_unit_m
 from gsmap.render import backend
 from gsmap.store import Store, scene_id
 from gsmap.store.registrations import StoredRegistration
@@ -136,7 +137,8 @@ def _check_frame(old: Scene, old_view: SceneView, new_view: SceneView, settings:
     if found.status != "accepted" or found.S_target_source is None:
         raise InputError(f"the capture does not lie where scene {old.name} lies ({found.reason}): {advice}")
     corners = box_corners(old.bounds)
-    off = np.linalg.norm(found.S_target_source.apply(corners) - corners, axis=1).max() * old_view.graph.unit_m
+    unit_m = target_unit_m(old_view, with_scale=False)
+    off = np.linalg.norm(found.S_target_source.apply(corners) - corners, axis=1).max() * unit_m
     if off > _SAME_FRAME_M:
         raise InputError(f"the capture lies {off:.2f} m off where scene {old.name} lies: {advice}")
 

@@ -8,7 +8,9 @@ from datetime import UTC, datetime, timedelta
 
 from gsmap.compare import Looks
 from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.metres import in_metres
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.store import Store, compact
@@ -118,12 +120,13 @@ def _superseded(
         before: what was captured earlier is old.
     """
     bar, params = settings.thin.min_seen_again, settings.thin.compare
+    metres = metres_of_scenes(store, settings, graph)
     looks: dict[str, Looks] = {}
     stay: list[Scene] = []
     shares: dict[str, float] = {}
 
     def placed(scene: Scene) -> PlacedScene:
-        S = graph.poses[scene.id].S_map_scene
+        S = in_metres(graph.poses[scene.id].S_map_scene, metres[scene.id])
         gaussians = transform_gaussians(store.scenes.gaussians(scene.id), S)
         return PlacedScene(gaussians, transform_cameras(store.scenes.cameras(scene.id), S), scene.id)
 

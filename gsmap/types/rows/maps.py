@@ -37,6 +37,35 @@ class TodoRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class MetreRow(Row):
+    """How long a metre is in the frame of a component, how that is known, and how well.
+
+    Args:
+        component: its index.
+        metres_per_unit: metres in a unit of its frame: of its poses and of its tiles.
+        metre_sigma: standard deviation of its logarithm (0.01 is one percent); null where it is unknown.
+        metre_known_by: ``measured`` (by captures that are said to be in metres), ``told`` (a person gave metres per
+            unit of a capture), ``assumed`` (nobody said so, but the captures' own unit may well be the metre),
+            ``guessed`` (from how far cameras stand from what they see), ``unknown`` (1 is taken).
+        metre_note: what a person should know of it; empty where nothing.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "component": "component",
+        "metres_per_unit": "m a unit",
+        "metre_known_by": "known by",
+        "metre_sigma": "sigma",
+        "metre_note": "note",
+    }
+
+    component: int
+    metres_per_unit: float
+    metre_sigma: float | None
+    metre_known_by: str
+    metre_note: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MapStatus(Row):
     """What is stale or wants a person, most urgent first.
 
@@ -47,7 +76,8 @@ class MapStatus(Row):
         islands: the same number under an older name.
         tentative: scenes that rest on edges which no cycle confirms.
         revision: number of the newest revision; null before the first.
-        metres_per_unit: metres in a unit of the map; null where no scene's scale is known.
+        metres_per_unit: metres in a unit of the largest component; null where nothing tells.
+        metres: the same of every component, with how it is known and how well.
         at_work: what processes are at work on now, this one left out; what one that died was at work on is no more.
     """
 
@@ -66,6 +96,7 @@ class MapStatus(Row):
     tentative: int
     revision: int | None
     metres_per_unit: float | None
+    metres: tuple[MetreRow, ...] = ()
     at_work: tuple[AtWorkRow, ...] = ()
 
 

@@ -70,7 +70,7 @@ class PoseChangeRow(Row):
         scene_name: name.
         change: ``added``, ``removed``, ``moved`` or ``same``.
         rotation_deg: angle turned; null where the scene is in only one of the two.
-        translation_m: how far the scene's middle went, map unit; null as above.
+        translation_m: how far the scene's middle went, by the metre of the later revision; null as above.
         scale_ratio: new scale by old; null as above.
         component_before: its component in the older revision; null where it is absent.
         component_after: its component in the newer revision; null where it is absent.

@@ -45,6 +45,7 @@ class SceneRow(Row):
         scale_policy: ``known`` (its unit is the metre), ``unknown`` or ``auto``.
         tags: labels that people gave it.
         note: what people noted of it.
+        metres_per_unit: metres in a unit of the frame it is placed in, see ``gsmap status``; null where nothing tells.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -56,6 +57,7 @@ class SceneRow(Row):
         "num_nodes": "nodes",
         "captured_at": "captured",
         "tags": "tags",
+        "metres_per_unit": "m a unit",
     }
 
     name: str
@@ -70,6 +72,7 @@ class SceneRow(Row):
     scale_policy: str = "auto"
     tags: tuple[str, ...] = ()
     note: str = ""
+    metres_per_unit: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -219,12 +222,15 @@ class SceneReport(SceneRow):
         bounds: (2, 3) lowest and highest corner of the Gaussians' centres, scene frame.
         notes: what a person should know of how it was read and described.
         rotation_sigma_deg: largest standard deviation of its rotation; null where it is not known.
-        translation_sigma_m: largest standard deviation of its translation, map unit; null where it is not known.
+        translation_sigma_m: largest standard deviation of its translation; null where it is not known.
         covariance: (7, 7) covariance of its pose over [rotation (3, rad), translation (3), log scale] on the scene
             side; null where it is not known.
         prior: what is known of its pose from outside; null where nothing is.
         up: (3,) direction against gravity in its frame; null where it could not be told.
         unit_m: guess of metres per scene unit, good to a factor of about 2; null before it is described.
+        metre_sigma: standard deviation of the logarithm of ``metres_per_unit``; null where nothing tells.
+        metre_known_by: how it is known, see ``gsmap status``; empty before the first optimize.
+        metre_note: what a person should know of it; empty where nothing.
         layers: the layers of its graph.
         edges: its current edges.
         nodes: the nodes of its graph that people browse: its objects, and its landmarks in its own unit.
@@ -246,6 +252,9 @@ class SceneReport(SceneRow):
     prior: PriorRow | None = None
     up: np.ndarray | None = None
     unit_m: float | None = None
+    metre_sigma: float | None = None
+    metre_known_by: str = ""
+    metre_note: str = ""
     layers: tuple[LayerRow, ...] = ()
     edges: tuple[SceneEdgeRow, ...] = ()
     nodes: tuple[NodeRow, ...] = ()

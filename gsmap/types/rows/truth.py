@@ -117,6 +117,10 @@ class ComponentErrorRow(Row):
         alignment: ``rigid`` where the truth says that the scenes are in metres, else ``similarity``.
         ate_m: root mean square error of the camera centres after one alignment; null where it would say nothing.
         ate_reason: why it is null; empty where it is not.
+        metres_per_unit: what the map takes for the metre of its frame; null where it does not say.
+        metre_sigma: standard deviation of its logarithm; null as above.
+        metre_known_by: see ``gsmap status``.
+        true_metres_per_unit: by the truth of its scenes; null where none has any.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -126,6 +130,8 @@ class ComponentErrorRow(Row):
         "alignment": "alignment",
         "ate_m": "ATE, m",
         "ate_reason": "why none",
+        "metres_per_unit": "m a unit",
+        "true_metres_per_unit": "truly",
     }
 
     component: int
@@ -134,6 +140,10 @@ class ComponentErrorRow(Row):
     alignment: str
     ate_m: float | None
     ate_reason: str = ""
+    metres_per_unit: float | None = None
+    metre_sigma: float | None = None
+    metre_known_by: str = ""
+    true_metres_per_unit: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,0 +1,64 @@
+"""The metre of a map: read from its catalog, by component of its poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from gsmap.errors import NotFoundError
+from gsmap.geometry.metres import SceneUnit, metre_of
+from gsmap.map.settings import Settings
+from gsmap.store import Store
+from gsmap.types import PoseGraph, ScenePose
+from gsmap.types.metre import Metre
+
+
+def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dict[int, Metre]:
+    """The metre of every component of some poses, the largest first; no array is read.
+
+    What is known of a scene that was removed since still counts, as long as the poses are those it took part in.
+    """
+    told, scenes = store.scenes.told_metres(), {scene.id: scene for scene in store.scenes.list()}
+    guesses = {stored.scene: stored.unit_m for stored in store.graphs.list()}  # oldest first: the newest stays
+    components: dict[int, list[tuple[SceneUnit, ScenePose]]] = {}
+    low, high = settings.describe.unit.plausible_m
+    for pose in graph.poses.values() if graph else ():
+        scene = scenes.get(pose.scene)
+        if scene is None:
+            try:
+                scene = store.scenes.get(pose.scene)
+            except NotFoundError:
+                continue  # forgotten, and all that was said of it
+        policy, guess = scene.scale_policy, guesses.get(scene.id)
+        if guess is not None and not (math.isfinite(guess) and guess > 0):
+            guess = None
+        unit = SceneUnit(
+            told=told.get(scene.id),
+            in_metres=policy == "known",
+            # As registration takes it (`gsmap.describe.unit.landmark_units`): metres, where that is plausible.
+            may_be_metres=policy == "auto" and guess is not None and low < guess < high,
+            guess_m=None if policy == "known" else guess,
+        )
+        components.setdefault(pose.component, []).append((unit, pose))
+    return {component: metre_of(components[component]) for component in sorted(components)}
+
+
+def metres_of_scenes(store: Store, settings: Settings, graph: PoseGraph) -> dict[str, float]:
+    """Metres per unit of the frame that each scene is placed in, by scene id."""
+    metres = map_metres(store, settings, graph)
+    return {
+        scene: metres[pose.component].metres_per_unit if pose.component in metres else 1.0
+        for scene, pose in graph.poses.items()
+    }
+
+
+def metre_notes(metres: Mapping[int, Metre]) -> tuple[str, ...]:
+    """What a person should know of the metres of components before they rely on a length, each remark once."""
+    components: dict[str, list[int]] = {}
+    for component, metre in metres.items():
+        if metre.note:
+            components.setdefault(metre.note, []).append(component)
+    return tuple(
+        f"component{'s' * (len(of) > 1)} {', '.join(map(str, of[:5]))}{' and more' * (len(of) > 5)}: {note}"
+        for note, of in components.items()
+    )

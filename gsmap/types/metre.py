@@ -1,0 +1,48 @@
+"""How long a metre is in a frame of the map, how that is known, and how well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import InputError
+
+KNOWN_BY = ("measured", "told", "assumed", "guessed", "unknown")
+
+
+@dataclass(frozen=True)
+class Metre:
+    """The metre of a component of the map: each has a frame, and so a unit, of its own.
+
+    Args:
+        metres_per_unit: metres in a unit of the component's frame.
+        sigma: standard deviation of its logarithm: 0.01 is one percent; infinite where it is unknown.
+        known_by: ``measured`` (by captures that are said to be in metres), ``told`` (a person gave metres per unit of a
+            capture), ``assumed`` (nobody said so, but the captures' own unit may well be the metre), ``guessed`` (from
+            how far cameras stand from what they see: good to a factor of about two), ``unknown`` (1 is taken).
+        note: what a person should know of it; empty where nothing.
+    """
+
+    metres_per_unit: float = 1.0
+    sigma: float = float("inf")
+    known_by: str = "unknown"
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.metres_per_unit) and self.metres_per_unit > 0):
+            raise InputError(f"metres per unit must be positive, got {self.metres_per_unit}")
+        if self.known_by not in KNOWN_BY:
+            raise InputError(f"a metre is known by one of {', '.join(KNOWN_BY)}, got {self.known_by!r}")
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything at all tells, be it a guess."""
+        return self.known_by != "unknown"
+
+    def text(self) -> str:
+        """As people read it: ``0.3 m a unit, told, to 1 %``."""
+        if not self.is_known:
+            return "not known, 1 m a unit is taken"
+        how_well = f"a factor of {np.exp(self.sigma):.2g}" if self.sigma > 0.2 else f"{100 * self.sigma:.2g} %"
+        return f"{self.metres_per_unit:.4g} m a unit, {self.known_by}, to {how_well}"
