@@ -31,7 +31,8 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-import gsmap.map
+from gsmap.describe import Params as DescribeParams
+from gsmap.describe import describe
 from gsmap.evaluate.overlap import solid_centres, true_overlaps
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
@@ -56,6 +57,7 @@ KNOTS = {
     "colour_correlation": (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.7),
     "colour_t": tuple(np.log10(np.array([1.0, 2, 3, 5, 8, 12, 20, 40]))),
 }
+KNOTS["disagreement"] = KNOTS["free_space_violation"]
 RISES = {"overlap", "num_coinciding", "colour_correlation", "colour_t"}
 
 
@@ -108,17 +110,17 @@ def collect(folder: Path, cache: Path, apart: int | None, seed: int = 0) -> list
 def read(folder: Path, cache: Path) -> tuple[dict[str, SceneView], dict[str, Sim3], dict[str, str]]:
     """Captures with their graphs, truth and place, by name."""
     views, truths, places = {}, {}, {}
-    with gsmap.map.open_or_create(cache / f"{folder.name}.gsmap") as m:
-        for place in sorted(p for p in folder.iterdir() if p.is_dir()):
-            for capture in read_captures(place):
-                name = f"{place.name}-{capture.name}"
-                truth = json.loads((place / "truth" / f"{capture.name}.json").read_text())["T_scene_world"]
-                scene, _ = m.store.scenes.add(capture.gaussians, capture.cameras, name=name)
-                m.describe(scene.id)
-                graph = m.store.graphs.load(scene.id)
-                gaussians, cameras = m.store.scenes.gaussians(scene.id), m.store.scenes.cameras(scene.id)
-                views[name] = SceneView(scene.id, gaussians, cameras, graph)
-                truths[name], places[name] = Sim3.from_matrix(np.array(truth)), place.name
+    (cache / "graphs").mkdir(exist_ok=True)
+    for place in sorted(p.parent for p in folder.glob("*/done")):
+        for capture in read_captures(place):
+            name = f"{place.name}-{capture.name}"
+            kept = cache / "graphs" / f"{name}.pickle"
+            if not kept.exists():
+                graph = describe(name, capture.gaussians, capture.cameras, DescribeParams(things=False))
+                kept.write_bytes(pickle.dumps(graph))
+            views[name] = SceneView(name, capture.gaussians, capture.cameras, pickle.loads(kept.read_bytes()))
+            truth = json.loads((place / "truth" / f"{capture.name}.json").read_text())["T_scene_world"]
+            truths[name], places[name] = Sim3.from_matrix(np.array(truth)), place.name
     return views, truths, places
 
 

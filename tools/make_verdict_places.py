@@ -28,7 +28,7 @@ from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import Place
 from gsmap_synthetic.script import random_edits
 
-SETS = {"fit": range(20_000, 20_036), "test": range(30_000, 30_020)}
+SETS = {"fit": range(20_000, 20_030), "test": range(30_000, 30_015)}
 SIZE_PX = (240, 180)
 
 

@@ -82,6 +82,7 @@ def evidence_of(proposal: Proposal, evidence: PoseEvidence) -> dict[str, float]:
         "log_nfa": float("nan") if np.isnan(nfa) else float(np.clip(nfa, -300, 30)),
         "runner_up": proposal.runner_up,
         "free_space_violation": float(np.log10(evidence.free_space_violation + 1e-3)),
+        "disagreement": float(np.log10(evidence.disagreement + 1e-3)),
         "overlap": float(np.log10(evidence.overlap + 1e-2)),
         "num_coinciding": float(np.log10(evidence.num_coinciding + 10)),
         "colour_correlation": evidence.colour_correlation if through_cameras else float("nan"),
