@@ -28,7 +28,7 @@ from gsmap.types.progress import Progress, silent
 from gsmap.types.scene import SCALE_POLICIES
 from gsmap.types.views import SceneContext
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def describe(
     if len(cloud) == 0:
         notes.append("no opaque Gaussians: nothing to describe")
     elif up is None:
-        notes.append("up is unknown (no cameras, no clear floor): landmarks are matched without it")
+        notes.append("up is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it")
     if params.landmarks:
         units = landmark_units(unit_m, scale_policy, params.unit)
         for i, (name, layer_unit_m) in enumerate(units.items()):

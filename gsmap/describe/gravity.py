@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.describe.cloud import downsample, local_planes
+from gsmap.describe.heading import Held, turned_about
 from gsmap.geometry.directions import fibonacci_sphere, level_frame
 from gsmap.types import Cameras
 
@@ -30,46 +31,59 @@ class Params:
     min_imbalance: float = 1.15
 
 
+_COMMON_DEG = 15.0  # directions nearer than this may be one
+
+
 def estimate_up(points: np.ndarray, cameras: Cameras | None, params: Params | None = None) -> np.ndarray | None:
     """Unit vector against gravity (3,) in the points' frame, or None where it cannot be told.
 
-    Cameras are held upright: the mean up of the images is right to some 35 degrees (they may all look down), and where
-    the images turn about the vertical, the axis most nearly perpendicular to all image rows is right to a few degrees.
-    Within that cone the direction is taken that most surface normals are parallel to (floors, tables, ceilings) or
-    perpendicular to (walls). Without cameras, or with cameras that gsmap made up, see `_up_of_room`.
+    Cameras that turn about the vertical tell it by themselves, whatever their pitch (see
+    `gsmap.describe.heading.turned_about`); within a cone around what they say the direction is taken that most surface
+    normals are parallel to (floors, tables, ceilings) or perpendicular to (walls). Cameras on one heading leave the
+    pitch open: what is a wall to one that looks ahead is the ground to one that looks down. There a second witness must
+    name the same axis of the scene: the cameras' way, a small turn, or the room (`_up_of_room`). Without cameras, or with cameras
+    that gsmap made up, the room alone decides.
 
     Args:
         points: (N, 3) surface points, any unit.
         cameras: in the points' frame.
     """
     params = params or Params()
-    up, cone_deg = _up_of_cameras(cameras)
+    held = None if cameras is None or cameras.synthesised or not len(cameras) else Held.of(cameras)
+    turned = None if held is None else turned_about(held)
     if len(points) < 200:
-        return up
+        return turned.up if turned and turned.sure else None
     normals, weights, sample = _planes(points, params.max_normals)
     if weights.sum() <= 0:
-        return up
+        return turned.up if turned and turned.sure else None
     directions = fibonacci_sphere(8000)
-    if up is None:
-        return _up_of_room(sample, normals, weights, directions[directions[:, 2] >= 0], params)
-    near = directions[directions @ up > np.cos(np.radians(cone_deg))]
-    return _refine(near[np.argmax(_uprightness(near, normals, weights, params.kernel_deg))], normals, weights)
+    if turned is not None:
+        near = directions[directions @ turned.up > np.cos(np.radians(turned.cone_deg))]
+        up = _refine(near[np.argmax(_uprightness(near, normals, weights, params.kernel_deg))], normals, weights)
+        return up if turned.sure or _side(sample, up, params) > 0 else None
+    axes = _plane_axes(normals, weights, directions[directions[:, 2] >= 0], params)
+    room = _up_of_room(sample, axes, params)
+    if held is None or held.at_all_angles:
+        return room
+    up = _confirmed(held, sample, axes, room)
+    return up if up is None or held.is_upright(up) or _side(sample, up, params) > 0 else None
 
 
-def _up_of_cameras(cameras: Cameras | None) -> tuple[np.ndarray | None, float]:
-    """Rough up and the cone in degrees it is good to."""
-    if cameras is None or cameras.synthesised or len(cameras) == 0:
-        return None, 180.0
-    rotation = cameras.T_frame_camera[:, :3, :3]
-    rows, mean_up = rotation[:, :, 0], -rotation[:, :, 1].mean(0)
-    if np.linalg.norm(mean_up) < 0.3:  # cameras at all angles, as around an object
-        return None, 180.0
-    mean_up /= np.linalg.norm(mean_up)
-    values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    axis = vectors[:, 0] * (np.sign(vectors[:, 0] @ mean_up) or 1.0)
-    if values[1] > 0.1 and values[0] < 0.25 * values[1] and axis @ mean_up > 0.7:
-        return axis, 15.0
-    return mean_up, 45.0
+def _confirmed(held: Held, points: np.ndarray, axes: list[np.ndarray], room: np.ndarray | None) -> np.ndarray | None:
+    """The vertical of cameras on one heading: an axis of the scene's planes that the cameras' holding allows and a
+    second witness names; None where two are named, or none."""
+    named = [] if room is None else [room]
+    for witness in (held.across_the_way(points), held.across_the_rows()):
+        # What is known roughly, as the planes know it exactly. Along a facade by drone, or over the ground: where the
+        # cameras look along the axis that a witness names, it bears none.
+        of_planes = [] if witness is None else [a for a in axes if abs(a @ witness) > np.cos(np.radians(_COMMON_DEG))]
+        if of_planes:
+            axis = max(of_planes, key=lambda a: abs(a @ witness))
+            if not held.looks_along(axis):
+                named.append(axis if held.is_allowed(axis) else -axis)
+    if not named or any(n @ named[0] < np.cos(np.radians(_COMMON_DEG)) for n in named):
+        return None
+    return named[0] if held.is_allowed(named[0]) else None
 
 
 def _planes(points: np.ndarray, max_normals: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -101,16 +115,8 @@ def _refine(up: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndar
     return up
 
 
-def _up_of_room(
-    points: np.ndarray, normals: np.ndarray, weights: np.ndarray, directions: np.ndarray, params: Params
-) -> np.ndarray | None:
-    """The vertical of a room that came without cameras, or None.
-
-    Candidates are the axes of the strongest heaps of normals. A vertical has what no horizontal axis has: nearly every
-    cell of the plan seen along it lies over a floor or under a ceiling, and the plan is large. Its sign: between floor
-    and ceiling there is more surface in the lower half. None when floor and ceiling together cover too little of the
-    plan (a part of a room), the best axis does not clearly beat the next, or the halves balance.
-    """
+def _plane_axes(normals: np.ndarray, weights: np.ndarray, directions: np.ndarray, params: Params) -> list[np.ndarray]:
+    """The axes of the strongest heaps of normals, strongest first, six at most."""
     score = _uprightness(directions, normals, weights, params.kernel_deg)
     axes: list[np.ndarray] = []
     for i in np.argsort(-score):
@@ -118,7 +124,16 @@ def _up_of_room(
             axes.append(directions[i])
         if len(axes) == 6:
             break
-    axes = [_refine(a, normals, weights) for a in axes]
+    return [_refine(a, normals, weights) for a in axes]
+
+
+def _up_of_room(points: np.ndarray, axes: list[np.ndarray], params: Params) -> np.ndarray | None:
+    """The vertical of a room by its shape alone, or None.
+
+    A vertical has what no horizontal axis has: nearly every cell of the plan seen along it lies over a floor or under a
+    ceiling, and the plan is large. None when floor and ceiling together cover too little of the plan (a part of a
+    room), the best axis does not clearly beat the next, or the halves balance.
+    """
     covers, shares = np.array([_plan_cover(points, a) for a in axes]).T
     best = int(np.argmax(covers))
     if shares[best] < params.min_plan_cover:
@@ -126,13 +141,20 @@ def _up_of_room(
     others = [c for a, c in zip(axes, covers, strict=True) if abs(a @ axes[best]) < np.cos(np.radians(10))]
     if others and covers[best] < params.min_lead * max(others):
         return None
-    height = points @ axes[best]
+    side = _side(points, axes[best], params)
+    return side * axes[best] if side else None
+
+
+def _side(points: np.ndarray, axis: np.ndarray, params: Params) -> int:
+    """1 where ``axis`` points up, -1 where down, 0 where that cannot be told: between floor and ceiling there is more
+    surface in the lower half."""
+    height = points @ axis
     low, high = np.percentile(height, [2, 98])
     t = (height - low) / max(high - low, 1e-12)
     below, above = np.sum((t > 0.1) & (t < 0.5)), np.sum((t > 0.5) & (t < 0.9))
     if max(below, above) < params.min_imbalance * min(below, above):
-        return None
-    return axes[best] if below > above else -axes[best]
+        return 0
+    return 1 if below > above else -1
 
 
 def _plan_cover(points: np.ndarray, axis: np.ndarray) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import Vote, vote
+from gsmap.optimize.doubt import find_doubtful, take_in_doubtful
 from gsmap.optimize.final import solve_components
 from gsmap.optimize.fingerprint import fingerprint
 from gsmap.optimize.growing import attach_singles, close_through_singles, cut_weak_bridges, take_in_agreeing
@@ -41,20 +42,16 @@ def solve_batch(
     m = measurements(sorted(scene_ids), edges, rigid=all_rigid(edges, priors, previous))
     gate = float(chi2.ppf(params.gate_probability, m.dim))
 
-    progress(0.05, "voting on cycles")
-    votes = vote(m, params.gate_probability)
-    state = initial_state(m, votes, PriorTerms.stack(m.scene_ids, priors), params)
-    refine(m, state, gate, params.gnc_start, params)
-    for turn in range(params.max_rounds):
-        progress(0.1 + 0.6 * turn / params.max_rounds, "growing components")
-        if take_in_agreeing(m, state, params):
-            cut_weak_bridges(m, state, params)
-            refine(m, state, gate, 1.0, params)
-        elif close_through_singles(m, state, params):
-            refine(m, state, gate, 1.0, params)
-        elif not _part_aliased(m, votes, state, gate, params):
-            break
-    attach_singles(m, state, params)
+    terms = PriorTerms.stack(m.scene_ids, priors)
+    doubtful = find_doubtful(m, params.aliasing)
+    if doubtful.any():
+        # What can be believed makes the map; only then is what may be of other places held against it.
+        rows = np.flatnonzero(~doubtful)
+        known, said = _grown(m[rows], terms, gate, params, progress)
+        state, votes = known.spread(rows, len(m)), said.spread(rows, len(m))
+        take_in_doubtful(m, state, doubtful, gate, params)
+    else:
+        state, votes = _grown(m, terms, gate, params, progress)
     _reconsider(m, state, gate)
     _check_confirmed(m, state, gate, params)
 
@@ -68,6 +65,25 @@ def solve_batch(
         provenance=_provenance(m, edges, priors, state, params),
         notes=solved.notes,
     )
+
+
+def _grown(m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress) -> tuple[State, Vote]:
+    """Components grown from all edges of ``m``, parted where places look alike, and what the cycles say."""
+    progress(0.05, "voting on cycles")
+    votes = vote(m, params.gate_probability)
+    state = initial_state(m, votes, terms, params)
+    refine(m, state, gate, params.gnc_start, params)
+    for turn in range(params.max_rounds):
+        progress(0.1 + 0.6 * turn / params.max_rounds, "growing components")
+        if take_in_agreeing(m, state, params):
+            cut_weak_bridges(m, state, params)
+            refine(m, state, gate, 1.0, params)
+        elif close_through_singles(m, state, params):
+            refine(m, state, gate, 1.0, params)
+        elif not _part_aliased(m, votes, state, gate, params):
+            break
+    attach_singles(m, state, params)
+    return state, votes
 
 
 def _ages(m: Measurements, scene_ids: Sequence[str]) -> np.ndarray:

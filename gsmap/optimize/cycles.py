@@ -28,6 +28,12 @@ class Vote:
     agree: np.ndarray
     support: np.ndarray
 
+    def spread(self, rows: np.ndarray, count: int) -> Vote:
+        """The vote on the edges at ``rows`` as one on all ``count``; on the others nothing was said."""
+        agree, support = np.zeros(count, dtype=self.agree.dtype), np.zeros(count)
+        agree[rows], support[rows] = self.agree, self.support
+        return Vote(agree, support)
+
     @classmethod
     def of(cls, edges: Measurements, agree: np.ndarray) -> Vote:
         n, a, b = edges.num_scenes, edges.targets, edges.sources

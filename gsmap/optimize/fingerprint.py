@@ -16,7 +16,7 @@ def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = ()) -> int:
     Independent of their order, and that of two sets is the sum of both (modulo 2^64). Meant to notice change, not to
     resist an attacker.
     """
-    flat = [(e.S_target_source, e.information, f"{e.target}\0{e.source}", 2 + e.confirmed) for e in edges]
+    flat = [(e.S_target_source, e.information, _named(e), 2 + e.confirmed) for e in edges]
     flat += [(p.S_map_scene, np.diag(p.sigmas), f"{p.scene}\0{p.up!r}{p.up_sigma_rad!r}", 4) for p in priors]
     n = len(flat)
     values = np.empty((n, 64))
@@ -30,3 +30,8 @@ def fingerprint(edges: Sequence[Edge], priors: Sequence[Prior] = ()) -> int:
     mixed = ((values.view(np.uint64) ^ (values.view(np.uint64) >> np.uint64(29))) * factors).sum(1)
     mixed = (mixed ^ (mixed >> np.uint64(32))) * factors[0]
     return int((mixed ^ (mixed >> np.uint64(29))).sum())
+
+
+def _named(edge: Edge) -> str:
+    """What is hashed of an edge besides its numbers."""
+    return f"{edge.target}\0{edge.source}\0{edge.disagreement!r}{edge.same_visit!r}"

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import Vote
+from gsmap.optimize.doubt import find_doubtful
 from gsmap.optimize.fingerprint import fingerprint
 from gsmap.optimize.growing import take_in
 from gsmap.optimize.measurements import Measurements, all_rigid, measurements
@@ -33,7 +34,7 @@ def place_new(
     """The previous answer with the new scenes placed in it, or None where only a full solve will do.
 
     A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
-    ``params.growth`` since the last one, or when a new scene ties components together or closes a long loop. Poses
+    ``params.growth`` since the last one, or when a new scene ties components together, closes a long loop or comes with edges that are in doubt. Poses
     placed here are provisional: only the surroundings of a new scene give way to it.
     """
     if previous.provenance.recipe != recipe_key(params).recipe:
@@ -73,7 +74,7 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     m = measurements([*near, scene], around + own, rigid=all_rigid([*around, *own], (), previous))
     poses = Similarities.stack([previous.poses[s].S_map_scene for s in near] + [Sim3.identity()])
     accepted = np.r_[np.ones(len(around), dtype=bool), m.confirmed[len(around) :]]
-    if m.confirmed[len(around) :].any():
+    if m.confirmed[len(around) :].any() or find_doubtful(m[np.arange(len(around), len(m))], params.aliasing).any():
         return None
     before = component_labels(m, np.flatnonzero(accepted))
     nothing = np.zeros(len(m), dtype=np.int64)

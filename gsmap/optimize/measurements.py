@@ -23,6 +23,8 @@ class Measurements:
         measured: E measured ``S_target_source``.
         information: (E, D, D); D is 6 where every edge is rigid (a stiff scale row says nothing then), else 7.
         confirmed: (E,) bool.
+        disagreement: (E,) share of the surface seen twice that is not the same, NaN where unknown.
+        same_visit: (E,) bool, next to nothing can have changed between the two captures.
     """
 
     scene_ids: tuple[str, ...]
@@ -31,6 +33,8 @@ class Measurements:
     measured: Similarities
     information: np.ndarray
     confirmed: np.ndarray
+    disagreement: np.ndarray
+    same_visit: np.ndarray
 
     @property
     def num_scenes(self) -> int:
@@ -63,6 +67,8 @@ class Measurements:
             self.measured[rows],
             self.information[rows],
             self.confirmed[rows],
+            self.disagreement[rows],
+            self.same_visit[rows],
         )
 
 
@@ -109,6 +115,8 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
         measured,
         np.ascontiguousarray(information),
         np.array([e.confirmed for e in edges], dtype=bool),
+        np.array([e.disagreement for e in edges], dtype=np.float64),
+        np.array([e.same_visit for e in edges], dtype=bool),
     )
 
 

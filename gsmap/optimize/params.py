@@ -72,6 +72,13 @@ class Aliasing:
         prior_support_power: the same where contradicting priors are cut apart.
         min_motion_lengths: a group matters if it asks for a motion of more than this many typical edges.
         group_lengths: edges that ask for motions within this many typical edges may be one group.
+        max_disagreement: of the surface that both captures of an edge saw, the share that may disagree without doubt:
+            places captured twice without change reach .064 where doors were shut between (made ones; .007 otherwise),
+            look-alikes with the furniture standing elsewhere begin at .145. Doubtful edges tie nothing firmly.
+        max_chance_alike: doubtful edges tie nothing at all where more than this share of the map's doubtful edges that
+            others decide turned out to be of two places.
+        same_visit_h: captures dated less than this many hours apart show one state of a place: where they disagree,
+            they are of two.
         contested_ratio: scenes of which more than one edge in this many crosses a wrong link belong to neither side.
         link: how probable it is that a link is wrong.
     """
@@ -85,13 +92,16 @@ class Aliasing:
     prior_support_power: float = 2.0
     min_motion_lengths: float = 2.0
     group_lengths: float = 1.0
+    max_disagreement: float = 0.1
+    max_chance_alike: float = 0.5
+    same_visit_h: float = 6.0
     contested_ratio: int = 3
     link: LinkDensityParams = field(default_factory=LinkDensityParams)
 
     def __post_init__(self) -> None:
-        _probability(self, "sure")
+        _probability(self, "sure", "max_disagreement", "max_chance_alike")
         _at_least(self, 1, "spare_ratio", "cut_depth", "contested_ratio")
-        _at_least(self, 0, "max_suspects")
+        _at_least(self, 0, "max_suspects", "same_visit_h")
         _positive(self, "well_supported", "support_power", "prior_support_power", "min_motion_lengths", "group_lengths")
 
 

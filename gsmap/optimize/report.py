@@ -7,6 +7,7 @@ from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import Vote
+from gsmap.optimize.doubt import find_doubtful
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.robust import chi_squares
@@ -26,7 +27,8 @@ def pose_graph(
     params: Params,
 ) -> PoseGraph:
     """Scenes and edges by id; its provenance is left to the caller."""
-    firm = state.accepted & (~bridges(m, state.accepted) | m.confirmed)
+    sure = state.accepted & ~state.doubted
+    firm = sure & (~bridges(m, sure) | m.confirmed)
     status = _statuses(m, state.accepted, firm)
     return PoseGraph(
         poses={
@@ -62,21 +64,31 @@ def _outcomes(
         residual = float(chi[k]) if together[k] else None
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
+        elif state.doubted[k]:
+            out[key] = EdgeOutcome("tentative", residual, f"{_unlike(m, k)}: the place changed, or it is another")
         elif state.accepted[k]:
             out[key] = EdgeOutcome("tentative", residual, "in no agreeing cycle: rests on its own verdict alone")
         elif not together[k]:
             reason = state.pending.get(k, "contradicts what else is known of the two components")
-            if state.undecided[k]:
+            if find_doubtful(m[np.array([k])], params.aliasing)[0]:
+                reason = f"{_unlike(m, k)}; {reason}"
+            elif state.undecided[k]:
                 reason = "edges that agree among themselves contradict each other here: places that look alike?"
             out[key] = EdgeOutcome("unused", None, reason, undecided=True)
         else:
             reason = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
             if votes.agree[k] > 0:
                 reason += "; it agrees with others that do too (a place that looks alike?)"
+            if find_doubtful(m[np.array([k])], params.aliasing)[0]:
+                reason += f"; {_unlike(m, k)}: another place that looks alike"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
             undecided = bool(votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
             out[key] = EdgeOutcome("unused", residual, reason, undecided)
     return out
+
+
+def _unlike(m: Measurements, row: int) -> str:
+    return f"{m.disagreement[row]:.0%} of what both saw is not the same in both"
 
 
 def _statuses(m: Measurements, accepted: np.ndarray, firm: np.ndarray) -> np.ndarray:

@@ -110,6 +110,8 @@ def _figures(judged: Judged) -> dict[str, float]:
         "num_coinciding": float(e.num_coinciding),
         "colour_correlation": e.colour_correlation,
         "colour_t": e.colour_t,
+        "disagreement": e.disagreement,
+        "seen_m2": e.seen_m2,
     }
 
 

@@ -23,6 +23,9 @@ class Params:
         depth_tolerance: ... and this share of the depth disagree (the two tolerances are added).
         min_alpha: a pixel fainter than this shows nothing.
         num_cameras: cameras of each scene that are asked, chosen to see most of the other scene.
+        pattern_px: patterns are compared within patches of this size ...
+        min_pattern: ... where both show one: local colours vary by this (standard deviation, RGB in [0, 1]) ...
+        pattern_correlation: ... and are not the same where they correlate by less than this.
         patch_px: colours are compared after their mean over patches of this size is removed.
         cell_m: the same for the surface cells of scenes without cameras.
         min_seen: cameras of a scene that can judge fewer Gaussians of the other are not counted.
@@ -34,6 +37,9 @@ class Params:
     depth_tolerance: float = 0.02
     min_alpha: float = 0.5
     num_cameras: int = 6
+    pattern_px: int = 8
+    min_pattern: float = 0.05
+    pattern_correlation: float = 0.1
     patch_px: int = 16
     cell_m: float = 0.4
     min_seen: int = 100
@@ -56,6 +62,11 @@ class PoseEvidence:
             and two chromas, the smaller of both directions that could be asked. Where neither scene has cameras, that
             of coinciding cells.
         colour_t: its significance, in standard deviations over patches.
+        disagreement: of the surface that both scenes saw, as area, the share that is not the same in both: one has it
+            where the other looked through, or the two show another pattern on it. Both directions together; NaN where
+            no cameras could judge. One place captured twice within the hour has next to none, whatever the overlap; a
+            place that changed and a place that looks alike have some.
+        seen_m2: that surface, in square metres.
     """
 
     overlap: float = 0.0
@@ -64,6 +75,8 @@ class PoseEvidence:
     num_seen: int = 0
     colour_correlation: float = 0.0
     colour_t: float = 0.0
+    disagreement: float = float("nan")
+    seen_m2: float = 0.0
 
 
 Views = tuple[ViewCache, float] | None
@@ -108,6 +121,7 @@ def measure(
         camera_free = CrossViewStats.of(0)
         camera_free.compare(target.coarse[1][row[hit]], source.coarse[1][rows_s[hit]], cell)
         colours = [camera_free.colour()]
+    areas = np.sum([stats.areas_m2() for stats in judges], axis=0) if judges else np.zeros(2)
     return PoseEvidence(
         overlap=overlap,
         num_coinciding=int(hit.sum()),
@@ -115,6 +129,8 @@ def measure(
         num_seen=min(stats.num_seen for stats in judges) if len(judges) == 2 else 0,
         colour_correlation=min((correlation for correlation, _ in colours), default=0.0),
         colour_t=min((t for _, t in colours), default=0.0),
+        disagreement=float(areas[0] / areas[1]) if areas[1] > 0 else float("nan"),
+        seen_m2=float(areas[1]),
     )
 
 
@@ -126,10 +142,12 @@ class CrossViewStats:
     agrees: np.ndarray
     products: list[np.ndarray] = field(default_factory=list)  # (patches, 3) each
     squares: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
+    area_m2: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of each Gaussian, where it was seen best
+    unlike_m2: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of that, what shows another pattern
 
     @classmethod
     def of(cls, count: int) -> CrossViewStats:
-        return cls(np.zeros(count, bool), np.zeros(count, bool))
+        return cls(np.zeros(count, bool), np.zeros(count, bool), area_m2=np.zeros(count), unlike_m2=np.zeros(count))
 
     @property
     def num_seen(self) -> int:
@@ -138,6 +156,18 @@ class CrossViewStats:
     @property
     def free_space_violation(self) -> float:
         return float((self.in_front & ~self.agrees).sum()) / self.num_seen
+
+    def areas_m2(self) -> np.ndarray:
+        """(2,) surface that disagrees, and all that could be judged."""
+        through = self.in_front & ~self.agrees
+        disagrees = self.area_m2[through].sum() + np.minimum(self.unlike_m2, self.area_m2)[self.agrees].sum()
+        return np.array([disagrees, self.area_m2[self.in_front | self.agrees].sum()])
+
+    def see(self, gaussian: np.ndarray, area_m2: np.ndarray, unlike: np.ndarray) -> None:
+        """Take the pixels of one view into account: whose they are, how much surface they show, whether unlike."""
+        count = len(self.area_m2)
+        self.area_m2 = np.maximum(self.area_m2, np.bincount(gaussian, area_m2, minlength=count))
+        self.unlike_m2 = np.maximum(self.unlike_m2, np.bincount(gaussian, area_m2 * unlike, minlength=count))
 
     def compare(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
         """Take colours (N, 3) of the same places into account, which lie in the patches of index ``patch`` (N,)."""
@@ -167,12 +197,19 @@ def _cross_view(
     for row in views.select_views(points / unit_m, params.num_cameras):
         camera = transform_cameras(views.cameras[[row]], into_other)
         seen = render(other.splats, camera, backend="native")  # as in `ViewCache`
-        _compare(stats, views.render(row), unit_m, seen, pose.scale, params)
+        focal_px = float(np.sqrt(camera.intrinsics_px[0, :2].prod()))
+        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, params)
     return stats
 
 
 def _compare(
-    stats: CrossViewStats, own: Rendered, unit_m: float, other: Rendered, scale: float, params: Params
+    stats: CrossViewStats,
+    own: Rendered,
+    unit_m: float,
+    other: Rendered,
+    scale: float,
+    focal_px: float,
+    params: Params,
 ) -> None:
     """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres."""
     depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
@@ -188,6 +225,25 @@ def _compare(
     rows, columns = np.nonzero(agrees)
     patch = rows // params.patch_px * -(-agrees.shape[1] // params.patch_px) + columns // params.patch_px
     stats.compare(own.colour[0][agrees], other.colour[0][agrees], patch)
+    unlike = np.zeros(agrees.shape, bool)
+    patch = rows // params.pattern_px * -(-agrees.shape[1] // params.pattern_px) + columns // params.pattern_px
+    unlike[agrees] = _unlike(own.colour[0][agrees], other.colour[0][agrees], patch, params)
+    judged = in_front | agrees
+    area_m2 = (other_depth[judged] / focal_px) ** 2
+    stats.see(other.dominant_id[0][judged], area_m2, unlike[judged])
+
+
+def _unlike(a: np.ndarray, b: np.ndarray, patch: np.ndarray, params: Params) -> np.ndarray:
+    """(N,) bool: the patch of the pixel shows a pattern in ``a`` or ``b`` that the other does not."""
+    if not len(a):
+        return np.zeros(0, bool)
+    count = np.bincount(patch)
+    a, b = _local(a, patch), _local(b, patch)
+    aa, bb, ab = (_sums(x * y, patch).sum(1) for x, y in ((a, a), (b, b), (a, b)))
+    patterned = np.minimum(aa, bb) > count * params.min_pattern**2
+    alike = ab > params.pattern_correlation * np.sqrt(aa * bb)
+    out: np.ndarray = (patterned & ~alike & (count > params.pattern_px**2 // 2))[patch]
+    return out
 
 
 def _local(colours: np.ndarray, patch: np.ndarray) -> np.ndarray:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gsmap.errors import MissingDependencyError
 from gsmap.methods import family
+from gsmap.register import verdict
 from gsmap.register.metric import MetricScene, target_unit_m
 from gsmap.register.params import Params, Snap
 from gsmap.register.scene_view import SceneView
@@ -31,13 +32,15 @@ class Proposing:
 
     def rounds(self) -> Iterator[list[Proposal]]:
         """Rigid poses, unless a scene's unit is unknown; then poses with a voted scale, unless both scenes are known
-        to be in metres; then, where the graphs are poor, what the fallback proposes."""
+        to be in metres; then what rests on no vertical, should one be wrong; then, where the graphs are poor, what the
+        fallback proposes."""
         params = self.params
         if "unknown" not in self.policies:
             yield self._asked(params.proposer, "match", with_scale=False)
         if self.policies != {"known"} and family("proposer").get(params.proposer).SCALES:
             proposals = self._asked(params.proposer, "match", with_scale=True)
             yield proposals if "unknown" in self.policies else [snapped(p, params.snap) for p in proposals]
+        yield self._unlevelled()
         if self._wants_fallback():
             yield self._asked(params.fallback_proposer, "fallback", with_scale=False)
 
@@ -46,9 +49,21 @@ class Proposing:
         wanted = {"never": False, "always": True, "auto": poor}[self.params.fallback]
         return wanted and "unknown" not in self.policies
 
-    def _asked(self, name: str, step: str, *, with_scale: bool) -> list[Proposal]:
+    def _unlevelled(self) -> list[Proposal]:
+        """What the landmarks of two scenes propose when neither vertical is believed: only significant cliques, for
+        most pairs that come so far share nothing. Empty where a vertical is unknown, for then none was used."""
+        views = [unlevelled(view) for view in (self.target, self.source)]
+        if None in views:
+            return []
+        with_scale = "unknown" in self.policies
+        found = self._asked(self.params.proposer, "match", with_scale=with_scale, views=views)
+        return [p for p in found if verdict.is_significant(p, self.params.verdict)]
+
+    def _asked(
+        self, name: str, step: str, *, with_scale: bool, views: Sequence[SceneView] | None = None
+    ) -> list[Proposal]:
         unit_m = target_unit_m(self.target, with_scale=with_scale)
-        target, source = (MetricScene(view, unit_m, self.params) for view in (self.target, self.source))
+        target, source = (MetricScene(view, unit_m, self.params) for view in views or (self.target, self.source))
         with self.watch.step(step):
             try:
                 found: list[Proposal] = (
@@ -60,6 +75,18 @@ class Proposing:
                 self.notes.append(f"{error}: the proposer {name} was to be asked, and could not be")
                 return []
         return found
+
+
+def unlevelled(view: SceneView) -> SceneView | None:
+    """A scene by its gravity-free landmarks alone, as if its vertical were unknown; None where it is, or has none."""
+    free = {
+        name.replace("landmarks_gravity_free", "landmarks"): layer
+        for name, layer in view.graph.layers.items()
+        if name.startswith("landmarks_gravity_free")
+    }
+    return (
+        replace(view, graph=replace(view.graph, layers=free, up=None)) if free and view.graph.up is not None else None
+    )
 
 
 def snapped(proposal: Proposal, snap: Snap) -> Proposal:

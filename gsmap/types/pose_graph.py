@@ -22,6 +22,9 @@ class Edge:
             ``S = S_hat * Exp(xi)`` with the exact Sim(3) exponential (`gsmap.geometry.similarities`), translation in
             the source's unit; a rigid edge carries a stiff scale row.
         confirmed: a person vouches for it: it joins components by itself and is never voted out.
+        disagreement: of the surface that both scenes saw under this pose, the share that is not the same in both (a
+            place that changed, or two that look alike); NaN where nobody looked.
+        same_visit: both were captured so shortly after each other that next to nothing can have changed.
     """
 
     target: str
@@ -29,6 +32,8 @@ class Edge:
     S_target_source: Sim3
     information: np.ndarray
     confirmed: bool = False
+    disagreement: float = float("nan")
+    same_visit: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ Place frame: metres, z up, floor at z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,8 +70,20 @@ def make_place(
     plan, doors = make_plan(np.random.default_rng([seed, 1]), rooms)
     if twin:
         plan, doors = with_twin(plan, doors, seed)
+    return build_place(seed, plan, doors, texel_m=texel_m, progress=progress)
+
+
+def build_place(
+    seed: int,
+    plan: Sequence[Room],
+    doors: Sequence[Door],
+    *,
+    texel_m: float = 0.008,
+    progress: Callable[[float, str], None] | None = None,
+) -> Place:
+    """Build the rooms of a plan and the doors between them; ``seed`` decides the look of the doors."""
     surfaces = Surfaces()
-    built = [build_room(surfaces, room, i, doors) for i, room in enumerate(plan)]
+    built = [build_room(surfaces, room, i, list(doors)) for i, room in enumerate(plan)]
     for index, door in enumerate(doors):
         build_door(surfaces, door, index, seed)
     skin = bake(surfaces, texel_m=texel_m, progress=progress)

@@ -17,6 +17,7 @@ class Room:
         kind: what it is furnished as.
         rect_m: (4,) x0 y0 x1 y1 of its inner walls.
         seed: decides everything in it; twins share it.
+        layout_seed: decides where the furniture stands, where ``seed`` is to decide the rest alone.
         obstacles_m: (n, 4) footprints of what stands higher than a person's shoulder.
     """
 
@@ -24,6 +25,7 @@ class Room:
     rect_m: np.ndarray
     seed: int
     obstacles_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    layout_seed: int | None = None
 
     @property
     def center(self) -> np.ndarray:

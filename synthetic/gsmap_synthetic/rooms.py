@@ -26,8 +26,13 @@ def build_room(surfaces: Surfaces, room: Room, index: int, doors: list[Door]) ->
     taken = [list(span) for span in spans]
     outside = [all(not span for span in spans) or _is_outer(room, wall, index, doors) for wall in range(4)]
     _place_windows(s, rng, room, taken, outside)
-    obstacles = _place_furniture(s, rng, room, spans, taken)
-    _place_pictures(s, rng, room, taken)
+    if room.layout_seed is None:
+        obstacles = _place_furniture(s, rng, room, spans, taken)
+        _place_pictures(s, rng, room, taken)
+    else:  # The pictures hang where they do in every room so decorated, whatever comes to stand before them.
+        beside = [list(spans) for spans in taken]
+        _place_pictures(s, rng, room, taken)
+        obstacles = _place_furniture(s, np.random.default_rng([room.layout_seed, 4]), room, spans, beside)
     return replace(room, obstacles_m=obstacles)
 
 
@@ -175,13 +180,18 @@ def _place_furniture(s: Surfaces, rng, room: Room, spans, taken) -> np.ndarray:
     used = door_clearance(room, spans)
     obstacles = []
     names = ROOMS.get(room.kind, ["drawers", "plant", "bookshelf", "floor lamp", "armchair"])
-    for name in names:
-        piece = PIECES[name]
-        width, depth = rng.uniform(*piece.width_m), rng.uniform(*piece.depth_m)
+
+    def look(k: int) -> np.random.Generator:
+        """What decides the look of the k-th piece."""
+        return rng if room.layout_seed is None else np.random.default_rng([room.seed, 5, k])
+
+    for k, name in enumerate(names):
+        piece, built = PIECES[name], look(k)
+        width, depth = built.uniform(*piece.width_m), built.uniform(*piece.depth_m)
         spot = find_spot(rng, room, piece, (width, depth), used, taken)
         if spot is None:
             continue
-        add_piece(spot.frame(s), name, piece, rng, (width, depth))
+        add_piece(spot.frame(s), name, piece, built, (width, depth))
         used.append(spot.rect_m)
         if piece.covers_wall:
             taken[spot.wall].append((spot.dx - width / 2, spot.dx + width / 2))
@@ -189,8 +199,9 @@ def _place_furniture(s: Surfaces, rng, room: Room, spans, taken) -> np.ndarray:
             obstacles.append(spot.rect_m + np.tile(room.rect_m[:2], 2))
     rw, rd = rng.uniform(0.4, 0.6) * w, rng.uniform(0.4, 0.6) * d
     cx, cy = rng.uniform(0.42, 0.58) * w, rng.uniform(0.42, 0.58) * d
-    s = s.object("rug", "rug")
-    s.box(cx, cy, 0.001, rw, rd, 0.012, tx.plain(np.full(3, 0.3)), top=tx.rug(palette(rng), int(rng.integers(1 << 20))))
+    s, woven = s.object("rug", "rug"), look(len(names))
+    top = tx.rug(palette(woven), int(woven.integers(1 << 20)))
+    s.box(cx, cy, 0.001, rw, rd, 0.012, tx.plain(np.full(3, 0.3)), top=top)
     return np.array(obstacles).reshape(-1, 4)
 
 

@@ -88,6 +88,7 @@ BASES = {
         ),
     ),
     "compared": ("visited", ("*compared",)),
+    "seen-again": ("visited", ("settings MAP --set thin.min_seen_again=0.5 --set thin.min_fidelity_db=0",)),
     "two": ("placed", ("init HERE/other.gsmap", "ingest HERE/other.gsmap IN/a.ply IN/c.ply")),
 }
 """Maps by name: the one that each is made from, and the lines that make it (``*`` calls a function of this module)."""
@@ -123,6 +124,8 @@ VERBS = {
         Verb("confirm", "placed", "confirm MAP a:b"),
         Verb("reject", "placed", "reject MAP a:b"),
         Verb("changes", "visited", "changes MAP"),
+        Verb("thin", "seen-again", "thin MAP --keep-days 0"),
+        Verb("supersede", "visited", "ingest MAP IN/again.ply --supersedes now", done_says="is in the map already"),
         Verb("confirm-change", "compared", "confirm MAP c1 --note seen"),
         Verb("edge", "placed", "edge MAP a:b --pose IN/pose2.txt --sigma 1,0.1"),
         Verb("prior", "placed", "prior MAP a --anchor"),
@@ -198,8 +201,8 @@ def write_samples(folder: Path) -> None:
     for seed, name in enumerate("abc"):
         formats.write(folder / f"{name}.ply", capture(seed))
         (folder / f"{name}.cameras.json").write_text(json.dumps(_frames(name)))
-    for name, box in (("then", True), ("now", False)):
-        formats.write(folder / f"{name}.ply", room(box))
+    for name, gaussians in (("then", room(True)), ("now", room(False)), ("again", room(False, opacity=4.5))):
+        formats.write(folder / f"{name}.ply", gaussians)
         (folder / f"{name}.cameras.json").write_text(json.dumps(_looks()))
     for name, x in (("pose", 5.0), ("pose2", 5.1), ("same", 0.0)):
         pose = np.eye(4)
@@ -221,8 +224,8 @@ def capture(seed: int, count: int = 400) -> Gaussians:
     return Gaussians(points, np.tile([1.0, 0, 0, 0], (count, 1)), flat, np.full(count, 3.0), colours)
 
 
-def room(with_box: bool) -> Gaussians:
-    """The same box from the inside, closed, and in it one to be missed."""
+def room(with_box: bool, opacity: float = 5.0) -> Gaussians:
+    """The same box from the inside, closed, in it one to be missed; ``opacity`` is the logit of each."""
     points, sizes = [_sides((0, 0, 0), (4, 3, 2), 0.2)], [0.09]
     if with_box:
         points.append(_sides((2, 1.2, 0), (2.6, 1.8, 1), 0.1))
@@ -230,7 +233,7 @@ def room(with_box: bool) -> Gaussians:
     scales = np.concatenate([np.full((len(part), 3), np.log(size)) for part, size in zip(points, sizes, strict=True)])
     every = np.concatenate(points)
     count, colours = len(every), np.sin(every * [3.0, 4.0, 5.0])[:, None]
-    return Gaussians(every, np.tile([1.0, 0, 0, 0], (count, 1)), scales, np.full(count, 5.0), colours)
+    return Gaussians(every, np.tile([1.0, 0, 0, 0], (count, 1)), scales, np.full(count, opacity), colours)
 
 
 def _sides(low: tuple[float, ...], high: tuple[float, ...], step: float) -> np.ndarray:

@@ -14,7 +14,9 @@ def test_bridges_are_networkx_bridges():
         b = (a + rng.integers(1, n, e)) % n
         accepted = rng.random(e) < 0.8
         ids, flags = tuple(map(str, range(n))), np.zeros(e, dtype=bool)
-        m = Measurements(ids, a, b, Similarities.identity(e), np.tile(np.eye(6), (e, 1, 1)), flags)
+        m = Measurements(
+            ids, a, b, Similarities.identity(e), np.tile(np.eye(6), (e, 1, 1)), flags, np.full(e, np.nan), flags
+        )
         graph = networkx.MultiGraph()
         graph.add_edges_from([(x, y) for x, y, k in zip(a, b, accepted, strict=True) if k])
         found = {frozenset(pair) for pair in networkx.bridges(networkx.Graph(graph))}

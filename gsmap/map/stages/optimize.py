@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap import optimize as solver
+from gsmap.map.dates import parsed
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import POLL_S
 from gsmap.map.stages.describe import graph_keys
@@ -43,6 +44,7 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
     living, priors = store.scenes.list(), store.priors.list()
     scenes = [scene.id for scene in living]
     edges, named = [], []
+    captured = {scene.id: scene.captured_at for scene in living}
     # By id, not in the order in which workers happened to finish: the same key whenever they were made.
     current = store.registrations.current()
     for stored in sorted(current, key=lambda r: (r.registration.target, r.registration.source)):
@@ -57,13 +59,26 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
                 S_target_source=registration.S_target_source,
                 information=registration.information,
                 confirmed=stored.review == "confirm",
+                disagreement=registration.evidence.get("disagreement", float("nan")),
+                same_visit=_is_same_visit(
+                    captured[registration.target],
+                    captured[registration.source],
+                    settings.optimize.aliasing.same_visit_h,
+                ),
             )
         )
-        named.append(f"{stored.key or stored.number} {stored.review}")
+        named.append(f"{stored.key or stored.number} {stored.review}" + " same visit" * edges[-1].same_visit)
     ups = _ups(store, living, {key.digest for key in graph_keys(store, living, settings).values()})
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
     key = solver.recipe_key(settings.optimize).of(*scenes, *named, canonical(told), canonical(ups))
     return PoseInputs(scenes, edges, priors, ups, key)
+
+
+def _is_same_visit(a: str | None, b: str | None, hours: float) -> bool:
+    """Whether two captures are known to be of about one time."""
+    if a is None or b is None:
+        return False
+    return abs(parsed(a) - parsed(b)).total_seconds() < 3600 * hours
 
 
 def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dict[str, np.ndarray]:
