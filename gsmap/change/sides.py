@@ -12,12 +12,12 @@ from scipy.spatial import cKDTree
 from gsmap.change.params import Params
 from gsmap.change.poses import tints
 from gsmap.compare import Comparison, Looks, Pictured, View
-from gsmap.compare.colours import Balance
+from gsmap.compare.colours import FLOOR, Balance
+from gsmap.compare.neighbourhoods import ranges
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.sh import rgb_of_sh0
 
 _CLIP_M = 0.15  # offsets beyond are other surfaces, not noise
-FLOOR = 0.03  # as in `gsmap.compare.colours`
 _STEEPEST = 0.2  # cosine below which a surface is seen too flat to measure an offset
 
 
@@ -28,7 +28,7 @@ class Side:
     Args:
         rows: (R,) Gaussians of the capture that are surface, and ``label`` (R,) the cell of each.
         points, colours: (M, 3) means.
-        through, on, hidden: (M,) views of the other capture, summed over the cell's Gaussians.
+        through, on: (M,) views of the other capture, summed over the cell's Gaussians.
         offset_m: (M,) mean by which the other's surface lies behind this one, along its normal.
         colour: (M, 3) mean difference to the other's colour, two of chroma and one of lightness: newer less older.
         strength: (M,) the same as a multiple of what counts, texture that is off by a pixel forgiven.
@@ -41,7 +41,6 @@ class Side:
     colours: np.ndarray
     through: np.ndarray
     on: np.ndarray
-    hidden: np.ndarray
     offset_m: np.ndarray
     colour: np.ndarray
     strength: np.ndarray
@@ -162,7 +161,7 @@ def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, fl
     # A texture that is off by a pixel, or blurred in one of the captures, stays within what the other shows around.
     strengths = []
     for x, y in ((log_a, log_b), (log_b, log_a)):
-        low, high = _over_3x3(x, np.minimum), _over_3x3(x, np.maximum)
+        low, high = ranges(x)
         beyond = _opponent(y - np.clip(y, low, high), bright)
         strengths.append(np.maximum(np.abs(beyond[..., :2]).max(-1) / limits[0], np.abs(beyond[..., 2]) / limits[1]))
     return plain, np.minimum(*strengths)
@@ -173,14 +172,6 @@ def _opponent(ratio: np.ndarray, bright: np.ndarray) -> np.ndarray:
     green = ratio[..., 1]
     parts = [ratio[..., 0] - green, ratio[..., 2] - green, ratio.mean(-1)]
     return np.stack(parts, axis=-1) * bright[..., None]
-
-
-def _over_3x3(values: np.ndarray, pick: np.ufunc) -> np.ndarray:
-    """The ufunc over the 3 x 3 neighbours of each pixel (H, W, K); the border repeats."""
-    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    rows = pick(pick(padded[:-2], padded[1:-1]), padded[2:])
-    out: np.ndarray = pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
-    return out
 
 
 def _along_normal(view: Any) -> np.ndarray:
@@ -207,7 +198,7 @@ def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None, params
     label, counts = cell_labels(np.floor(points / params.cell_m))
     colours = np.clip(rgb_of_sh0(gaussians.sh[rows, 0]).astype(np.float64), 0, 1)
     if line is not None:
-        colours = np.clip(np.exp(np.log(colours + 0.03) * line.slope + line.offset) - 0.03, 0, 1)
+        colours = np.clip(np.exp(np.log(colours + FLOOR) * line.slope + line.offset) - FLOOR, 0, 1)
     total = lambda values: np.bincount(label, values[rows], len(counts))  # noqa: E731
     looked = total(sums.looks)
     return Side(
@@ -217,7 +208,6 @@ def _side(looks: Looks, evidence: Any, sums: _Sums, line: Balance | None, params
         group_means(colours, label, counts),
         total(evidence.through.astype(np.float64)),
         total(evidence.on_surface.astype(np.float64)),
-        total(evidence.hidden.astype(np.float64)),
         total(sums.offset) / np.maximum(looked, 1),
         np.stack([total(sums.colour[:, k]) for k in range(3)], axis=1) / np.maximum(looked, 1)[:, None],
         total(sums.strength) / np.maximum(looked, 1),

@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.compare.neighbourhoods import over_3x3
 from gsmap.compare.params import Params
 
-_FLOOR = 0.03  # added before logarithms: what is darker is noise
+FLOOR = 0.03  # added before logarithms: what is darker is noise
 _SAMPLES = 40_000  # pixels that a line is fitted to
 _ROUNDS = 6
 _FEWEST = 200  # pixels with which a line is fitted at all
@@ -40,8 +40,8 @@ class Balance:
 
     def applied(self, colour: np.ndarray) -> np.ndarray:
         """Colours (..., 3) of the first as the second would show them."""
-        logs = np.log(np.clip(colour, 0, 1) + np.float32(_FLOOR))
-        out = np.exp(logs * self.slope.astype(np.float32) + self.offset.astype(np.float32)) - np.float32(_FLOOR)
+        logs = np.log(np.clip(colour, 0, 1) + np.float32(FLOOR))
+        out = np.exp(logs * self.slope.astype(np.float32) + self.offset.astype(np.float32)) - np.float32(FLOOR)
         return np.clip(out, 0, 1).astype(np.float32)
 
     def differences(self, a: np.ndarray, b: np.ndarray, both: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +53,7 @@ class Balance:
         Args:
             both: (H, W) bool, pixels that show one surface; others explain nothing.
         """
-        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(FLOOR)) for v in (a, b))
         log_a = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
         bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
         apart = [_apart(x, y, both) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True)]
@@ -61,7 +61,7 @@ class Balance:
 
     def left_over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Differences of single colours (K, 3): chroma (K, 2) and lightness (K,)."""
-        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(_FLOOR)) for v in (a, b))
+        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(FLOOR)) for v in (a, b))
         log_a = log_a * self.slope + self.offset
         bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
         red, blue, light = ((y - x) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True))
@@ -97,7 +97,7 @@ def balance(a: np.ndarray, b: np.ndarray) -> Balance:
     if len(a) < _FEWEST:
         return IDENTITY
     step = max(1, len(a) // _SAMPLES)
-    x, y = (np.log(np.clip(v[::step], 0, 1).astype(np.float64) + _FLOOR) for v in (a, b))
+    x, y = (np.log(np.clip(v[::step], 0, 1).astype(np.float64) + FLOOR) for v in (a, b))
     slope, offset = np.ones(3), np.median(y - x, axis=0)
     for channel in range(3):
         for _ in range(_ROUNDS):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -201,9 +200,3 @@ def _add_colour(tally: Tally, at: Placed, on: np.ndarray, picture: Pictured) -> 
     tally.colour_seen[index] += 1
     tally.chroma[index] += picture.chroma[row, column]
     tally.lightness[index] += picture.lightness[row, column]
-
-
-def pictures(comparison: Comparison) -> Iterator[Pictured]:
-    """All views of both."""
-    yield from comparison.older_views
-    yield from comparison.newer_views

@@ -120,8 +120,7 @@ def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
     """At most ``max_views`` cameras of a capture, evenly along its path, small; none where nobody knows what it saw."""
     if scene.cameras is None or scene.cameras.synthesised or not len(scene.cameras) or not len(scene.gaussians):
         return []
-    rows = np.unique(np.linspace(0, len(scene.cameras) - 1, min(params.max_views, len(scene.cameras))).round())
-    small = scene.cameras[rows.astype(np.int64)].resized(params.longest_side_px)
+    small = scene.cameras.evenly(params.max_views).resized(params.longest_side_px)
     return [small[i] for i in range(len(small))]
 
 

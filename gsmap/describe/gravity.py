@@ -115,9 +115,7 @@ def _refine(up: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndar
     return up
 
 
-def _plane_axes(
-    normals: np.ndarray, weights: np.ndarray, directions: np.ndarray, params: Params
-) -> list[np.ndarray]:
+def _plane_axes(normals: np.ndarray, weights: np.ndarray, directions: np.ndarray, params: Params) -> list[np.ndarray]:
     """The axes of the strongest heaps of normals, strongest first, six at most."""
     score = _uprightness(directions, normals, weights, params.kernel_deg)
     axes: list[np.ndarray] = []

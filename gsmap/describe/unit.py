@@ -70,9 +70,10 @@ def estimate_unit_m(
 def _view_distance(points: np.ndarray, cameras: Cameras, max_cameras: int = 32, max_points: int = 30000) -> float:
     points = points[:: max(1, len(points) // max_points)]
     nearest = []
-    for i in np.unique(np.linspace(0, len(cameras) - 1, min(max_cameras, len(cameras))).round().astype(int)):
-        at, z = project(points, cameras.T_camera_frame[i], cameras.intrinsics_px[i])
-        at /= cameras.sizes_px[i]
+    some = cameras.evenly(max_cameras)
+    for i in range(len(some)):
+        at, z = project(points, some.T_camera_frame[i], some.intrinsics_px[i])
+        at /= some.sizes_px[i]
         seen = in_image(at, z, np.ones(2), 1e-9 * np.abs(z).max(initial=1))
         part = (at[seen, 0] * 16).astype(int) * 12 + (at[seen, 1] * 12).astype(int)
         depth = np.full(16 * 12, np.inf)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from typing import Any
@@ -21,6 +21,7 @@ from gsmap.map.stages.change import Wanted, lacking
 from gsmap.store import Store
 from gsmap.store.change_rows import Comparison, StoredChange
 from gsmap.types import Change, PoseGraph, Scene
+from gsmap.types.metre import Metre
 from gsmap.types.rows import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow, PairEventRow
 
 _ID = re.compile(r"c(\d{1,9})")
@@ -74,7 +75,7 @@ def changes_report(
     min_confidence: float,
 ) -> ChangesReport:
     """What is known of the pairs asked for."""
-    known, placed = scenes_by_id(store), store.revisions.get()
+    known, (placed, metres) = scenes_by_id(store), _placed(store, settings)
     missing = set(lacking(store, asked, settings))
     pairs = set(asked.pairs)
     chosen = [one for one in store.changes.current() if (one.older, one.newer) in pairs]
@@ -87,13 +88,9 @@ def changes_report(
     if never:
         notes.append(f"{len(never)} pairs are not compared yet: {_WRITE}")
     if chosen and placed is not None:
-        metres = map_metres(store, settings, placed)
         mine = {placed.poses[one.newer].component for one in chosen if one.newer in placed.poses}
         notes += metre_notes({component: metre for component, metre in metres.items() if component in mine})
-        odd = sorted({metres[c].metres_per_unit for c in mine} - {1.0})
-        if odd:
-            notes.append(f"boxes are in the map's unit, of {', '.join(f'{one:.4g}' for one in odd)} m")
-    rows = [_row(one, change, known, placed) for one in chosen for change in one.changes]
+    rows = [_row(one, change, known, placed, metres) for one in chosen for change in one.changes]
     return ChangesReport(
         changes=tuple(ChangeRow(**row) for row in rows if row["confidence"] >= min_confidence),
         pairs=tuple(_comparison_row(one, known) for one in chosen),
@@ -105,10 +102,10 @@ _WRITE = "gsmap changes does where the map can be written"
 
 
 @of_one_state
-def change_row(store: Store, number: int) -> ChangeRow:
+def change_row(store: Store, settings: Settings, number: int) -> ChangeRow:
     """One change, as it is now."""
     comparison, change = _find(store, number)
-    return ChangeRow(**_row(comparison, change, scenes_by_id(store), store.revisions.get()))
+    return ChangeRow(**_row(comparison, change, scenes_by_id(store), *_placed(store, settings)))
 
 
 def change_arrays(store: Store, number: int) -> Change:
@@ -134,12 +131,12 @@ def change_arrays(store: Store, number: int) -> Change:
 
 
 @of_one_state
-def change_detail(store: Store, number: int) -> ChangeDetail:
+def change_detail(store: Store, settings: Settings, number: int) -> ChangeDetail:
     """Everything known of one change."""
     comparison, change = _find(store, number)
     words = [PairEventRow(at=one.created_at, what=one.review, reason=one.note) for one in store.changes.reviews(number)]
     return ChangeDetail(
-        **_row(comparison, change, scenes_by_id(store), store.revisions.get()),
+        **_row(comparison, change, scenes_by_id(store), *_placed(store, settings)),
         num_voxels=change.num_voxels,
         compared_at=comparison.created_at,
         notes=comparison.notes,
@@ -170,10 +167,23 @@ def _pair(one: Comparison, known: dict[str, Scene]) -> dict[str, Any]:
     }
 
 
-def _row(one: Comparison, change: StoredChange, known: dict[str, Scene], placed: PoseGraph | None) -> dict[str, Any]:
+def _placed(store: Store, settings: Settings) -> tuple[PoseGraph | None, dict[int, Metre]]:
+    """The newest poses, and the metre of each component."""
+    graph = store.revisions.get()
+    return graph, map_metres(store, settings, graph)
+
+
+def _row(
+    one: Comparison,
+    change: StoredChange,
+    known: dict[str, Scene],
+    placed: PoseGraph | None,
+    metres: Mapping[int, Metre],
+) -> dict[str, Any]:
     """The fields of a `ChangeRow`; what was found in the map's frame of then, in that of today."""
     pose = placed.poses.get(one.newer) if placed is not None else None
     S_map_frame = None if pose is None else pose.S_map_scene @ one.S_frame_newer.inverse()
+    box = None if S_map_frame is None else moved_box(change.box, S_map_frame)
     moved = None
     if S_map_frame is not None and change.S_after_before is not None:
         moved = S_map_frame @ change.S_after_before @ S_map_frame.inverse()
@@ -182,7 +192,8 @@ def _row(one: Comparison, change: StoredChange, known: dict[str, Scene], placed:
         "id": f"c{change.number}",
         "kind": change.kind,
         "component": None if pose is None else pose.component,
-        "box_m": None if S_map_frame is None else moved_box(change.box, S_map_frame),
+        "box": box,
+        "box_m": None if box is None or pose is None else box * metres[pose.component].metres_per_unit,
         "before": change.num_before,
         "after": change.num_after,
         "S_after_before": moved,

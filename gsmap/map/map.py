@@ -287,7 +287,7 @@ class Map(AbstractContextManager["Map"]):
 
         if (number := changes.number_of(what)) is not None:
             self.store.changes.review(number, review, note)
-            return changes.change_row(self.store, number)
+            return changes.change_row(self.store, self.settings, number)
         a, b = self._pair(what)
         self.store.registrations.review(a.id, b.id, review, note)
         return reports.edge_row(self.store, a, b)
@@ -395,7 +395,7 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map import changes
 
-        return changes.change_detail(self.store, changes.named(name))
+        return changes.change_detail(self.store, self.settings, changes.named(name))
 
     def read_change(self, name: str) -> Change:
         """A change (``c12``) with its arrays, map frame: voxels, and rows of the Gaussians of either capture.

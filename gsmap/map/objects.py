@@ -206,7 +206,8 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
             scene_name=known.scenes[sighting.scene].name,
             captured_at=known.scenes[sighting.scene].captured_at,
             state=sighting.state,
-            box_m=sighting.box,
+            box=sighting.box,
+            box_m=None if sighting.box is None else sighting.box * known.metres[thing.component],
             looked=sighting.looked,
         )
         for thing in chosen

@@ -11,6 +11,7 @@ import numpy as np
 
 from gsmap import compare
 from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
+from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.placed import overlapping, share_in_view
 from gsmap.render import render
@@ -230,8 +231,8 @@ def _in_one_exposure(looks: Looks, gains: np.ndarray) -> Looks:
 
 def _share_of_pixels(these: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
     """(H, W) share of each pixel's light that comes from some Gaussians, seen among others."""
-    flag = np.full((len(these), 1, 3), 0.5 / 0.28209479177387814, dtype=np.float32)
-    dark = np.full((len(others), 1, 3), -0.5 / 0.28209479177387814, dtype=np.float32)
+    flag = sh0_of_rgb(np.ones((len(these), 1, 3), np.float32))
+    dark = sh0_of_rgb(np.zeros((len(others), 1, 3), np.float32))
     together = Gaussians.concatenate([replace(these, sh=flag), replace(others, sh=dark)])
     out: np.ndarray = render(together, camera, depth=False, dominant_id=False).colour[0, ..., 0]
     return out

@@ -75,8 +75,7 @@ def open_eyes(gaussians: Gaussians, cameras: Cameras | None, params: Params | No
     params = params or Params()
     if cameras is None or not len(cameras) or cameras.synthesised:
         return Eyes((), (), ())
-    rows = np.unique(np.linspace(0, len(cameras) - 1, min(params.max_views, len(cameras))).round().astype(int))
-    small = cameras[rows].resized(params.longest_side_px)
+    small = cameras.evenly(params.max_views).resized(params.longest_side_px)
     views = tuple(small[i] for i in range(len(small)))
     seen = [render(gaussians, view, dominant_id=False) for view in views]
     return Eyes(

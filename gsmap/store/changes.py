@@ -66,7 +66,9 @@ class Changes:
             NotFoundError: a scene that is not in the map.
         """
         if key.inputs[:2] != (older, newer) or older == newer:
-            raise InputError(f"the key of a comparison must have its two scenes {older} and {newer} as its first inputs")
+            raise InputError(
+                f"the key of a comparison must have its two scenes {older} and {newer} as its first inputs"
+            )
         arrays = _to_arrays(report.changes)
         text = f"{key.digest}{from_pose(S_newer_older)}{from_pose(S_frame_newer)}"
         group_id = digest(*arrays.values(), text=text) if report.changes else None

@@ -89,8 +89,7 @@ def fidelity_db(scene: PlacedScene, kept: Gaussians, params: Params) -> float:
     """
     if scene.cameras is None or not len(scene.cameras):
         return float("nan")
-    rows = np.unique(np.linspace(0, len(scene.cameras) - 1, min(params.pictures, len(scene.cameras))).round())
-    small = scene.cameras[rows.astype(np.int64)].resized(params.longest_side_px)
+    small = scene.cameras.evenly(params.pictures).resized(params.longest_side_px)
     squares = []
     for i in range(len(small)):
         before, after = (

@@ -96,6 +96,12 @@ class Cameras:
             self.T_frame_camera[rows], self.intrinsics_px[rows], self.sizes_px[rows], names, self.synthesised
         )
 
+    def evenly(self, count: int) -> Cameras:
+        """At most ``count`` of them, evenly along the capture, in its order."""
+        if len(self) <= count:
+            return self
+        return self[np.linspace(0, len(self) - 1, count).round().astype(int)]
+
     def resized(self, longest_side_px: int) -> Cameras:
         """The same views with images shrunk so that the longer side has at most ``longest_side_px`` pixels."""
         factor = np.minimum(1.0, longest_side_px / self.sizes_px.max(1))

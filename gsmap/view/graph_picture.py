@@ -64,7 +64,7 @@ def draw_graph(
 def _best_view(gaussians: Gaussians, cameras: Cameras, graph: SceneGraph, width_px: int) -> View:
     """Of a few sampled views, the one with most nodes on its visible surface."""
     nodes = np.concatenate([layer.positions for layer in graph.layers.values()] or [np.zeros((0, 3))])
-    some = cameras[np.unique(np.linspace(0, len(cameras) - 1, 12).round().astype(int))]
+    some = cameras.evenly(12)
     seen = [_visible(nodes, _render(gaussians, some[i], 240), 0.1).sum() for i in range(len(some))]
     return _render(gaussians, _wide(some[int(np.argmax(seen))], width_px), 4 * width_px)
 

@@ -17,7 +17,6 @@ from gsmap.describe.objects.context import context_histograms, neighbourhood
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import descriptor_id
 from gsmap.describe.objects.lift import visible
-from gsmap.describe.objects.views import sample_cameras
 from gsmap.describe.onnx.check import check_model
 from gsmap.describe.segmenters.builtin import felzenszwalb
 from gsmap.errors import ConfigError
@@ -293,8 +292,8 @@ def test_recipes_change_with_parameters_and_name_what_is_comparable():
 
 def test_sampled_cameras_are_spread():
     cameras = room()[1]
-    assert sample_cameras(cameras, 5).names == ("0", "6", "12", "17", "23")
-    assert len(sample_cameras(cameras, 100)) == 24
+    assert cameras.evenly(5).names == ("0", "6", "12", "17", "23")
+    assert len(cameras.evenly(100)) == 24
 
 
 def test_models_that_are_given_are_used(tmp_path):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,3 +104,21 @@ def test_slow_drift_is_noticed_in_the_end():
         reasons.append(dirty_reason(now, tile, VOXEL))
     assert reasons[0] == reasons[1] == ""
     assert "moved" in reasons[-1]
+
+
+@pytest.mark.parametrize("unit", [0.1, 0.3, 10.0])
+def test_a_plan_is_that_of_metres_whatever_the_unit(unit):
+    """``unit`` metres a unit: the same tiles, scenes within the same reach, and a move counts by its metres."""
+    metric = {"a": at(0), "b": at(4.5), "c": at(-7.3, 2.0)}
+    poses = {s: Sim3(S.rotation, S.translation / unit, S.scale / unit) for s, S in metric.items()}
+    options = {"tile_size_m": 2.0, "reach_m": 1.1}
+    one = plan_tiles(metric, dict.fromkeys(metric, BOX), **options)
+    two = plan_tiles(poses, dict.fromkeys(poses, BOX), **options, metres_per_unit={0: unit})
+    assert [(t.name, sorted(t.poses)) for t in two] == [(t.name, sorted(t.poses)) for t in one]
+    np.testing.assert_allclose([unit * t.bounds for t in two], [t.bounds for t in one], atol=1e-9)
+    planned = two[0]
+    made = tile_of(planned)
+    for moved_m, dirty in ((0.004, False), (0.006, True)):
+        moved = replace(planned, poses={s: at(moved_m / unit) @ S for s, S in planned.poses.items()})
+        assert bool(dirty_reason(moved, made, VOXEL, 0.005)) == dirty
+    assert dirty_reason(replace(planned, metres_per_unit=2 * unit), made, VOXEL)

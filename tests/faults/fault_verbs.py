@@ -225,7 +225,7 @@ def capture(seed: int, count: int = 400) -> Gaussians:
 
 
 def room(with_box: bool, opacity: float = 5.0) -> Gaussians:
-    """The same box from the inside, closed, and in it one to be missed; ``opacity`` is the logit of every Gaussian's."""
+    """The same box from the inside, closed, in it one to be missed; ``opacity`` is the logit of each."""
     points, sizes = [_sides((0, 0, 0), (4, 3, 2), 0.2)], [0.09]
     if with_box:
         points.append(_sides((2, 1.2, 0), (2.6, 1.8, 1), 0.1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import networkx as nx
@@ -173,6 +174,25 @@ def test_a_change_of_kind_moved_makes_two_places_one_object(site: Map) -> None:
     number = site.store.changes.current()[0].changes[0].number
     site.store.changes.review(number, "reject")
     assert site.history(at(TABLE)).objects[0].seen == 1
+
+
+def test_objects_are_the_same_whatever_the_unit_of_the_map(site: Map) -> None:
+    one, graph = site.objects(), site.pose_graph()
+    assert graph is not None
+    smaller = Sim3(np.eye(3), np.zeros(3), 0.1)
+    poses = {s: replace(pose, S_map_scene=smaller @ pose.S_map_scene) for s, pose in graph.poses.items()}
+    site.store.revisions.save(PoseGraph(poses))
+    try:
+        two, seen = site.objects(), states(site, [v / 10 for v in CUPBOARD])
+        (box, box_m), *_ = [(row.box, row.box_m) for row in site.history(at([v / 10 for v in CUPBOARD])).sightings]
+    finally:
+        site.store.revisions.save(graph)
+    assert [(a.seen, a.looks, a.there) for a in two.objects] == [(a.seen, a.looks, a.there) for a in one.objects]
+    assert len(two.relations) == len(one.relations)
+    for a, b in zip(one.objects, two.objects, strict=True):
+        np.testing.assert_allclose(10 * b.position, a.position, atol=1e-5)
+    assert seen == states(site, CUPBOARD)
+    np.testing.assert_allclose(box_m, 10 * box)
 
 
 def test_captures_without_things_are_named(site: Map) -> None:

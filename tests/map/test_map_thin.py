@@ -19,13 +19,14 @@ from synthetic_walls import cameras_facing, wall
 NOW = "2030-01-01T00:00:00+00:00"
 
 
-def walls(path: Path, starts: list[float]) -> Map:
-    """A map of walls a year apart, each beginning somewhat further on than the one before."""
+def walls(path: Path, starts: list[float], unit: float = 1.0) -> Map:
+    """A map of walls a year apart, each beginning somewhat further on than the one before; in a unit of metres."""
     m = gsmap.map.create(path)
     for i, start in enumerate(starts):
         cameras = cameras_facing(np.linspace(start + 0.4, start + 2.6, 9), width=160, height=120)
         m.ingest(wall(i, start, start + 3), cameras=cameras, name=f"w{i}", captured_at=f"{2020 + i}-06-01")
-    poses = {scene.id: ScenePose(scene.id, Sim3.identity(), 0, "placed") for scene in m.scenes()}
+    S_map_scene = Sim3(np.eye(3), np.zeros(3), 1 / unit)
+    poses = {scene.id: ScenePose(scene.id, S_map_scene, 0, "placed") for scene in m.scenes()}
     m.store.revisions.save(PoseGraph(poses, {}), RecipeKey("optimize", "test", {}, {}, ""))
     return m
 
@@ -55,6 +56,15 @@ def test_no_capture_stands_for_another_that_goes_itself(tmp_path):
             nearest = min(abs(starts[int(k)] - starts[int(scene.name[1:])]) for k in whole if k >= int(scene.name[1:]))
             assert nearest <= 0.6, f"nothing stands for {scene.name}"
         assert len(whole) > 1
+
+
+@pytest.mark.parametrize("unit", [0.1, 10.0])
+def test_what_supersedes_a_capture_is_the_same_in_another_unit(tmp_path, unit):
+    with walls(tmp_path / "one.gsmap", [0.0, 1.0]) as one, walls(tmp_path / "two.gsmap", [0.0, 1.0], unit) as two:
+        two.edit("w0", metres_per_unit=1.0)
+        (a,), (b,) = (m.thin(keep_days=3200, dry_run=True, now=NOW).scenes for m in (one, two))
+        assert 0.3 < a.seen_again < 0.9
+        assert b.seen_again == pytest.approx(a.seen_again, abs=0.005)
 
 
 def test_a_budget_thins_no_more_than_it_takes(tmp_path):

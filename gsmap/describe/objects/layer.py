@@ -11,7 +11,7 @@ import numpy as np
 from gsmap.describe.objects.associate import Node, associate, region
 from gsmap.describe.objects.context import context_histograms
 from gsmap.describe.objects.lift import visible
-from gsmap.describe.objects.views import is_blocked, render_views, sample_cameras
+from gsmap.describe.objects.views import is_blocked, render_views
 from gsmap.errors import ConfigError
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import Family, MethodParams, RecipeKey, family
@@ -191,7 +191,7 @@ def object_layer(
         return NodeLayer.empty(descriptor, sum(embedder.codebook.shape), unit_m), (
             ["no cameras: no objects"] if len(cloud) else []
         )
-    sampled = sample_cameras(cameras, params.num_cameras)
+    sampled = cameras.evenly(params.num_cameras)
     for i, view in enumerate(render_views(gaussians, sampled, params.longest_side_px, params.render_backend)):
         progress(i / len(sampled), f"objects, view {i + 1} of {len(sampled)}")
         if is_blocked(view, params.near_m / unit_m, params.min_seen):

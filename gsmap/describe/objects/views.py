@@ -11,13 +11,6 @@ from gsmap.types import Cameras, Gaussians
 from gsmap.types.views import View
 
 
-def sample_cameras(cameras: Cameras, count: int) -> Cameras:
-    """``count`` cameras evenly spread over the capture, in its order; all where there are fewer."""
-    if len(cameras) <= count:
-        return cameras
-    return cameras[np.linspace(0, len(cameras) - 1, count).round().astype(int)]
-
-
 def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, backend: str = "auto") -> Iterator[View]:
     """Yield a view per camera, each at its own aspect ratio.
 

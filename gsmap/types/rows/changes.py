@@ -50,7 +50,8 @@ class ChangeRow(VisitPairRef):
         kind: ``appeared``, ``disappeared``, ``moved``, ``recoloured``, ``replaced`` (another thing in its place) or
             ``lighting`` (the same surfaces, lit otherwise).
         component: in whose frame the box lies; null where the newer capture has no place now.
-        box_m: (2, 3) lowest and highest corner around all that changed, map frame; null as above.
+        box: (2, 3) lowest and highest corner around all that changed, map frame and unit; null as above.
+        box_m: the same in metres.
         before: how many Gaussians of the older capture are no longer there, or no longer look so.
         after: how many of the newer capture were not there, or did not look so.
         S_after_before: of a thing that moved: takes a point of it from where it stood to where it stands, map frame.
@@ -75,6 +76,7 @@ class ChangeRow(VisitPairRef):
     id: str
     kind: str
     component: int | None
+    box: np.ndarray | None
     box_m: np.ndarray | None
     before: int
     after: int

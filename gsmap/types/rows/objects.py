@@ -100,7 +100,8 @@ class SightingRow(Row):
         captured_at: when it was captured, ISO 8601; null where nobody knows.
         state: ``seen``; ``absent`` (the capture looked at or through its place, and it is not there); ``unseen`` (the
             capture did not look there, which says nothing).
-        box_m: lowest and highest corner around it; null where it was not seen.
+        box: lowest and highest corner around it, map frame and unit; null where it was not seen.
+        box_m: the same in metres.
         looked: share of its place that the capture looked at.
     """
 
@@ -118,6 +119,7 @@ class SightingRow(Row):
     scene_name: str
     captured_at: str | None
     state: str
+    box: np.ndarray | None
     box_m: np.ndarray | None
     looked: float
 
