@@ -235,7 +235,7 @@ def test_what_disagrees_is_measured_as_area_however_it_was_seen():
     screened = Gaussians.concatenate([bare, _wall(2.0, width=0.6, height=1.0, seed=5)])
     found, back = _measured(bare, screened), _measured(screened, bare)
     for evidence in (found, back):
-        assert evidence.disagreement * evidence.seen_m2 == pytest.approx(0.7, rel=0.2)  # the rim of its Gaussians included
+        assert evidence.disagreement * evidence.seen_m2 == pytest.approx(0.7, rel=0.2)  # with its rim
     assert found.disagreement == pytest.approx(back.disagreement, rel=0.1)
     # Gaussians half as wide and four times as many are no more surface.
     dense = Gaussians.concatenate([bare, _wall(2.0, width=0.6, height=1.0, step=0.015, seed=5)])
