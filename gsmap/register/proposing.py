@@ -84,7 +84,9 @@ def unlevelled(view: SceneView) -> SceneView | None:
         for name, layer in view.graph.layers.items()
         if name.startswith("landmarks_gravity_free")
     }
-    return replace(view, graph=replace(view.graph, layers=free, up=None)) if free and view.graph.up is not None else None
+    return (
+        replace(view, graph=replace(view.graph, layers=free, up=None)) if free and view.graph.up is not None else None
+    )
 
 
 def snapped(proposal: Proposal, snap: Snap) -> Proposal:
