@@ -9,6 +9,7 @@ from register_worlds import splat_world
 from gsmap.errors import ConfigError
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
+from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.register import Params, SceneView, register_pair
 from gsmap.register.proposers import graph
 from gsmap.types import Cameras, Gaussians, NodeLayer, Proposal, SceneGraph, Sim3
@@ -54,6 +55,45 @@ def test_a_scene_whose_vertical_is_unknown_registers_with_one_that_knows_it():
     for pair in ((target, source), (source, target)):
         assert register_pair(*pair).status == "accepted"
     assert register_pair(target, world.source, Params(fallback="never")).status == "no_match"
+
+
+def test_a_wrong_vertical_does_not_keep_scenes_apart():
+    world = splat_world(0, policy="known")
+    views = []
+    for view, up in ((world.target, world.target.graph.up), (world.source, np.roll(world.source.graph.up, 1))):
+        layer = view.graph.layers["landmarks"]
+        levelled = replace(layer, embeddings=layer.embeddings[::-1])
+        layers = {"landmarks": levelled, "landmarks_gravity_free": replace(layer, descriptor_id="free")}
+        views.append(replace(view, graph=replace(view.graph, layers=layers, up=up)))
+    found = register_pair(*views)
+    assert found.status == "accepted"
+    assert _error(world, found).centroid_m < 0.02
+
+
+@pytest.mark.parametrize("which", ["few", "none"])
+def test_cameras_that_do_not_see_the_overlap_are_helped_by_made_ones(which):
+    world = splat_world(0)
+    S, views = world.S_target_source, []
+    for view, other in (
+        (world.target, S.apply(world.source.centre)),
+        (world.source, S.inverse().apply(world.target.centre)),
+    ):
+        # The two of the twelve that look away from the other half of the room the most.
+        towards = view.cameras.T_frame_camera[:, :3, 2] @ (other - view.centre)
+        few, made = view.cameras[np.argsort(towards)[:2]], synthesise_cameras(view.gaussians)
+        views.append(replace(view, cameras=few if which == "few" else made))
+    found, whole = register_pair(*views), register_pair(world.target, world.source)
+    assert found.status == whole.status == "accepted"
+    assert found.evidence["num_seen"] > 0.5 * whole.evidence["num_seen"]
+    assert found.evidence["colour_correlation"] > 0.5
+    assert found.evidence["free_space_violation"] < 0.08
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_made_cameras_accept_no_different_places(seed):
+    world = splat_world(seed, place=(20 + seed, 40 + seed))
+    views = [replace(view, cameras=synthesise_cameras(view.gaussians)) for view in (world.target, world.source)]
+    assert register_pair(*views).status != "accepted"
 
 
 def test_the_answer_is_the_same_both_ways_and_twice():
