@@ -28,7 +28,8 @@ from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import Place
 from gsmap_synthetic.script import random_edits
 
-SETS = {"fit": range(20_000, 20_030), "test": range(30_000, 30_015)}
+SETS = {"fit": range(20_000, 20_044), "test": range(30_000, 30_020)}
+SENSED = {*range(20_032, 20_044), *range(30_015, 30_020)}  # places that are filmed with a depth sensor
 SIZE_PX = (240, 180)
 
 
@@ -86,6 +87,8 @@ def visit(place: Place, seed: int, k: int, rng: np.random.Generator) -> tuple[sy
     frames = synthetic.film(
         place, synthetic.walk(place, route, int(rng.integers(30, 50)), seed=k), size_px=SIZE_PX, shut=shut, name=f"c{k}"
     )
+    if seed in SENSED and has("sensed", 1.0, strength := rng.uniform(0.5, 2.0)):
+        frames = perturb.sensed(frames, rng, strength)
     gaussians = fit_frames(frames, steps=steps, num_gaussians=int(rng.integers(15_000, 32_000)), seed=k)
     cameras = frames.cameras
     gain = rng.uniform(0.75, 1.2) * rng.uniform(0.92, 1.08, 3)

@@ -13,6 +13,7 @@ import numpy as np
 from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.geometry.umeyama import umeyama
 from gsmap.types import Cameras, Gaussians
+from gsmap_synthetic.capture import Frames
 
 
 def tinted(gaussians: Gaussians, gain: np.ndarray, gamma: float) -> Gaussians:
@@ -73,3 +74,29 @@ def cut(gaussians: Gaussians, cameras: Cameras, rng: np.random.Generator, share:
     if len(stands) < 6:  # Too few stand on this side: those nearest to it stay.
         stands = np.sort(np.argsort((cameras.centers - middle) @ directions)[:6])
     return gaussians[np.flatnonzero(along <= bar)], cameras[stands]
+
+
+def sensed(frames: Frames, rng: np.random.Generator, strength: float) -> Frames:
+    """Frames as a hand-held depth sensor delivers them; ``strength`` 1 is a structured-light camera of the first years.
+
+    Depth is off by noise that grows with its square (Khoshelham and Elberink 2012: 1.5 mm at 1 m) and smoothly over the
+    image (a lens that nobody calibrated), colour lies up to some pixels beside it, is blurred by motion, and changes
+    its exposure from frame to frame.
+    """
+    from scipy.ndimage import gaussian_filter, shift
+
+    assert frames.depths_m is not None
+    count, height, width = frames.depths_m.shape
+    v, u = np.mgrid[0:height, 0:width] / [[[height]], [[width]]] - 0.5
+    lens = 1 + strength * 0.02 * (rng.normal() * (u**2 + v**2) + rng.normal() * u + rng.normal() * v)
+    beside = rng.uniform(-3, 3, 2) * strength * width / 320
+    images, depths = np.empty_like(frames.images), np.empty_like(frames.depths_m)
+    for i in range(count):
+        depth = frames.depths_m[i]
+        coarse = gaussian_filter(rng.normal(size=depth.shape), 1.0)
+        noise = coarse / coarse.std() * 0.0015 * strength * depth**2
+        depths[i] = np.where(depth > 0, depth * lens + noise, 0)
+        colour = shift(frames.images[i].astype(np.float32), (*beside, 0), order=1, mode="nearest")
+        colour = gaussian_filter(colour, (0.5 * strength, 0.5 * strength, 0)) * rng.normal(1, 0.05 * strength)
+        images[i] = np.clip(colour + rng.normal(0, 4 * strength, colour.shape), 0, 255).astype(np.uint8)
+    return Frames(images, frames.cameras, depths)
