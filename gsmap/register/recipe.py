@@ -11,7 +11,7 @@ from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
-VERSION = 7
+VERSION = 8
 
 _RENDER_BACKEND = "native"  # the one that all renders of this room are pinned to
 
