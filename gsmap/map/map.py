@@ -472,7 +472,7 @@ class Map(AbstractContextManager["Map"]):
         Args:
             format: suffix of the tiles' files, or ``3dtiles``.
             tile_size_m: edge of a tile; 0 is one file per component.
-            bbox: ``x0 y0 z0 x1 y1 z1`` only this box of the map.
+            bbox: ``x0 y0 z0 x1 y1 z1`` only this box of the map, in its unit, as poses are.
             merge: ``tto``, ``voxel``, ``union``, ``distance``, or one that another package adds; by default what the
                 setting ``merge.method`` says.
             revision: poses of this revision, the newest by default.
