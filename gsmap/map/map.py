@@ -324,7 +324,7 @@ class Map(AbstractContextManager["Map"]):
             while solve(self.store, self.settings, self._progress):
                 # Scenes that now turn out to be neighbours.
                 register(self.store, "auto", self.settings, self._progress)
-        return reports.update_report(self.store, ingested)
+        return reports.update_report(self.store, ingested, self.metres())
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
@@ -727,11 +727,11 @@ class Map(AbstractContextManager["Map"]):
             tags_remove=tuple(untag),
             metres_per_unit=metres_per_unit,
         )
-        return reports.scene_row(self.store, scene)
+        return reports.scene_row(self.store, scene, self.metres())
 
     def remove(self, ref: str) -> SceneRow:
         """Take a scene out; older revisions keep it."""
-        row = reports.scene_row(self.store, self.store.scenes.get(ref))
+        row = reports.scene_row(self.store, self.store.scenes.get(ref), self.metres())
         self.store.scenes.remove(ref)
         return row
 
@@ -796,7 +796,7 @@ class Map(AbstractContextManager["Map"]):
 
         With ``source``, arrays of it that are here and damaged are mended.
         """
-        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source))
+        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source), self.metres())
 
     def check(self) -> CheckReport:
         """Read every byte of the map and compare it with what was written."""
