@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from gsmap.register import covariance, refinement, verdict
 from gsmap.register.conclusion import Judged, conclude, is_same_pose
+from gsmap.register.duplicate import same_capture
 from gsmap.register.evidence import PoseEvidence, measure
 from gsmap.register.metric import MetricPair
 from gsmap.register.params import Params
@@ -45,7 +46,9 @@ def register_pair(
         if any(not j.flaw for j in judged):
             break
     report(1.0, "done")
-    return conclude(target, source, judged, params, seconds=watch.seconds, notes=proposing.notes)
+    found = conclude(target, source, judged, params, seconds=watch.seconds, notes=proposing.notes)
+    same = same_capture(target, source, found)
+    return replace(found, notes=(*found.notes, same)) if same else found
 
 
 def check_pose(target: SceneView, source: SceneView, proposal: Proposal, params: Params | None = None) -> Registration:
