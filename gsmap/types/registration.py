@@ -76,7 +76,7 @@ class Registration:
             ``disagreement``: of the surface that both saw, as area, the share that is not the same in both: one looked
             through it, or shows another pattern on it; NaN without cameras.
             ``seen_m2``: that surface, in square metres.
-            ``log_scale``: natural logarithm of the scale as the surfaces measure it, which is that of the pose only where
+            ``log_scale``: natural logarithm of the scale as the surfaces measure it: that of the pose only where
             the pose is not rigid; NaN where too little coincides to measure it.
             ``log_scale_sigma``: its standard deviation.
         notes: what a person should know of how it was computed (a package that is missing, ...).

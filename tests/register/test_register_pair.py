@@ -9,8 +9,8 @@ from register_worlds import splat_world
 from gsmap.errors import ConfigError
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
-from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.geometry.similarities import Similarities
+from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.register import Params, SceneView, register_pair
 from gsmap.register.proposers import graph
 from gsmap.types import Cameras, Gaussians, NodeLayer, Proposal, SceneGraph, Sim3

@@ -163,7 +163,7 @@ def test_covariance_moves_with_the_source_frame(world, surfaces):
 
 
 def _walls(rng, blocks: int = 150) -> error_field.Blocks:
-    """Blocks on the walls, the floor and the ceiling of a room of 6 x 4 x 2.5 m, and how residuals there follow a pose."""
+    """Blocks on the sides of a room of 6 x 4 x 2.5 m, and how residuals there follow a pose."""
     size = np.array([6.0, 4.0, 2.5])
     positions, axis = rng.uniform(0, 1, (blocks, 3)) * size, rng.integers(0, 3, blocks)
     positions[np.arange(blocks), axis] = size[axis] * rng.integers(0, 2, blocks)
