@@ -74,8 +74,7 @@ def main() -> None:
 
 
 def _made(seed: int):
-    made = {"steps": 200, "num_frames": 24, "num_gaussians": 20_000, "size_px": (240, 180)}
-    return make_captures(seed, 2, routes=[[0], [0]], **made)
+    return make_captures(seed, 2, steps=200, num_frames=24, num_gaussians=20_000, size_px=(240, 180), routes=[[0], [0]])
 
 
 def read(folder: Path, scenes: Sequence[str] | None) -> Place:
@@ -92,7 +91,7 @@ def read(folder: Path, scenes: Sequence[str] | None) -> Place:
 def run(place: Place, folder: Path, options: argparse.Namespace) -> list[dict]:
     """Every row, printed as it comes."""
     rows = []
-    first = {}
+    first: dict[str, dict] = {}
     print(f"{'':22}{'the map says':34}{'':10}{'PSNR':>7}{'dB':>8}{'Gaussians':>11}{'%':>8}{'CPU s':>8}")
     for unit, how in [(1.0, "metric"), *((unit, how) for unit in options.units for how in options.how)]:
         with make(place, unit, how, folder / f"{unit:g}_{how}.gsmap") as m:

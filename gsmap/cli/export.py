@@ -16,7 +16,9 @@ def command(
     tile_size: Annotated[float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")] = 10.0,
     bbox: Annotated[
         tuple[float, float, float, float, float, float] | None,
-        typer.Option("--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only this box of the map."),
+        typer.Option(
+            "--bbox", metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only this box of the map, in its unit, as poses are."
+        ),
     ] = None,
     merge: Annotated[
         str | None,

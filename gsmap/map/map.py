@@ -325,7 +325,7 @@ class Map(AbstractContextManager["Map"]):
             while solve(self.store, self.settings, self._progress):
                 # Scenes that now turn out to be neighbours.
                 register(self.store, "auto", self.settings, self._progress)
-        return reports.update_report(self.store, ingested)
+        return reports.update_report(self.store, ingested, self.metres())
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.
@@ -473,7 +473,7 @@ class Map(AbstractContextManager["Map"]):
         Args:
             format: suffix of the tiles' files, or ``3dtiles``.
             tile_size_m: edge of a tile; 0 is one file per component.
-            bbox: ``x0 y0 z0 x1 y1 z1`` only this box of the map.
+            bbox: ``x0 y0 z0 x1 y1 z1`` only this box of the map, in its unit, as poses are.
             merge: ``tto``, ``voxel``, ``union``, ``distance``, or one that another package adds; by default what the
                 setting ``merge.method`` says.
             revision: poses of this revision, the newest by default.
@@ -745,11 +745,11 @@ class Map(AbstractContextManager["Map"]):
             tags_remove=tuple(untag),
             metres_per_unit=metres_per_unit,
         )
-        return reports.scene_row(self.store, scene)
+        return reports.scene_row(self.store, scene, self.metres())
 
     def remove(self, ref: str) -> SceneRow:
         """Take a scene out; older revisions keep it."""
-        row = reports.scene_row(self.store, self.store.scenes.get(ref))
+        row = reports.scene_row(self.store, self.store.scenes.get(ref), self.metres())
         self.store.scenes.remove(ref)
         return row
 
@@ -814,7 +814,7 @@ class Map(AbstractContextManager["Map"]):
 
         With ``source``, arrays of it that are here and damaged are mended.
         """
-        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source))
+        return reports.scene_row(self.store, as_values.restore_scene(self.store, ref, source), self.metres())
 
     def check(self) -> CheckReport:
         """Read every byte of the map and compare it with what was written."""

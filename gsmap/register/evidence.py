@@ -21,6 +21,8 @@ class Params:
         radius_m: surfaces closer than this coincide.
         depth_tolerance_m: depths that differ by more than this ...
         depth_tolerance: ... and this share of the depth disagree (the two tolerances are added).
+        made_reach_m: what a made view looks through counts as free this far in front of the surface it sees: farther
+            from that, no camera of the capture need have looked.
         min_alpha: a pixel fainter than this shows nothing.
         num_cameras: cameras of each scene that are asked, chosen to see most of the other scene.
         pattern_px: patterns are compared within patches of this size ...
@@ -36,6 +38,7 @@ class Params:
     radius_m: float = 0.08
     depth_tolerance_m: float = 0.10
     depth_tolerance: float = 0.02
+    made_reach_m: float = 1.0
     min_alpha: float = 0.5
     num_cameras: int = 6
     pattern_px: int = 8
@@ -221,7 +224,8 @@ def _cross_view(
         camera = transform_cameras(views.cameras[[row]], into_other)
         seen = render(other.splats, camera, backend="native")  # as in `ViewCache`
         focal_px = float(np.sqrt(camera.intrinsics_px[0, :2].prod()))
-        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, params)
+        reach_m = np.inf if row < views.num_own else params.made_reach_m
+        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, params, reach_m)
     return stats
 
 
@@ -233,8 +237,13 @@ def _compare(
     scale: float,
     focal_px: float,
     params: Params,
+    reach_m: float,
 ) -> None:
-    """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres."""
+    """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres.
+
+    Args:
+        reach_m: what lies farther than this in front of the surface seen proves nothing.
+    """
     depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
     solid = own.alpha[0] > params.min_alpha
     near, far = _extremes(depth, solid)
@@ -242,6 +251,7 @@ def _compare(
     both = solid & (other.alpha[0] > params.min_alpha)
     in_front = both & (other_depth < near - tolerance)
     agrees = both & ~in_front & (other_depth <= far + tolerance)
+    in_front &= other_depth > near - reach_m
     assert other.dominant_id is not None
     stats.in_front[other.dominant_id[0][in_front]] = True
     stats.agrees[other.dominant_id[0][agrees]] = True

@@ -52,6 +52,7 @@ class ViewCache:
         # The mean colour alone: the rest was fitted to directions from which the other scene's cameras do not look.
         self.gaussians = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1])
         self.cameras = self._with_made(cameras).resized(self.params.image_size_px)
+        self.num_own = 0 if cameras.synthesised else len(cameras)  # the first; those that follow are made
         self._renders: OrderedDict[int, Rendered] = OrderedDict()
 
     def _with_made(self, cameras: Cameras) -> Cameras:

@@ -44,5 +44,6 @@ class Metre:
         """As people read it: ``0.3 m a unit, told, to 1 %``."""
         if not self.is_known:
             return "not known, 1 m a unit is taken"
-        how_well = f"a factor of {np.exp(self.sigma):.2g}" if self.sigma > 0.2 else f"{100 * self.sigma:.2g} %"
-        return f"{self.metres_per_unit:.4g} m a unit, {self.known_by}, to {how_well}"
+        if self.sigma > 0.2:
+            return f"{self.metres_per_unit:.2g} m a unit, {self.known_by}, to a factor of {np.exp(self.sigma):.2g}"
+        return f"{self.metres_per_unit:.4g} m a unit, {self.known_by}, to {100 * self.sigma:.2g} %"

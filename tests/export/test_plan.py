@@ -122,3 +122,9 @@ def test_a_plan_is_that_of_metres_whatever_the_unit(unit):
         moved = replace(planned, poses={s: at(moved_m / unit) @ S for s, S in planned.poses.items()})
         assert bool(dirty_reason(moved, made, VOXEL, 0.005)) == dirty
     assert dirty_reason(replace(planned, metres_per_unit=2 * unit), made, VOXEL)
+
+
+def test_a_tile_of_a_map_in_metres_is_named_as_it_always_was():
+    (planned,) = plan_tiles({"a": at(0)}, {"a": BOX}, tile_size_m=0, metres_per_unit={0: 1.0})
+    inputs = ["export 1", "format ply", "provenance False", "budget_s None", "component 0"]
+    assert VOXEL.key(planned) == VOXEL.merge.of(*inputs, "extent [0, null, null]", "scene a").digest

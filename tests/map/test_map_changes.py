@@ -279,7 +279,8 @@ def test_without_poses_there_is_nothing_to_compare(tmp_path: Path, seen: Seen) -
         with pytest.raises(NotFoundError, match="b has no place in the map yet"):
             m.changes("a:b")
         place(m)
-        assert m.changes().notes == ("no scene's scale is known, so lengths are in the map's own unit",)
+        tells = "gsmap edit MAP SCENE --metres-per-unit X tells"
+        assert m.changes().notes == (f"component 0: nothing tells how long a metre is in it: {tells}",)
 
 
 # -- which captures are compared

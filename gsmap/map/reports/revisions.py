@@ -14,6 +14,7 @@ from gsmap.map.settings import Settings
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
 from gsmap.types import PoseGraph
+from gsmap.types.metre import Metre
 from gsmap.types.rows import IngestRow, PairRef, PoseChangeRow, RevisionRow, UpdateReport
 
 
@@ -99,12 +100,12 @@ def pose_change_rows(store: Store, before: int, after: int, settings: Settings) 
 
 
 @of_one_state
-def update_report(store: Store, ingested: Sequence[IngestRow]) -> UpdateReport:
+def update_report(store: Store, ingested: Sequence[IngestRow], metres: Mapping[int, Metre]) -> UpdateReport:
     """What an update took in, and the map as it is now."""
     revisions = store.revisions.list()
     return UpdateReport(
         ingested=tuple(ingested),
-        scenes=tuple(scene_rows(store)),
+        scenes=tuple(scene_rows(store, metres=metres)),
         edges=tuple(edge_rows(store)),
         revision=revision_row(store, revisions[-1].number) if revisions else None,
     )

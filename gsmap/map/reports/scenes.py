@@ -61,11 +61,11 @@ def scene_rows(
 
 
 @of_one_state
-def scene_row(store: Store, scene: Scene) -> SceneRow:
+def scene_row(store: Store, scene: Scene, metres: Mapping[int, Metre]) -> SceneRow:
     """The row of one scene."""
     nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
     return row_of_scene(
-        scene, store.revisions.get(), nodes.get(scene.id), store.scenes.latest_notes().get(scene.id, "")
+        scene, store.revisions.get(), nodes.get(scene.id), store.scenes.latest_notes().get(scene.id, ""), metres
     )
 
 
