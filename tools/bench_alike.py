@@ -114,10 +114,8 @@ def report(street: Street, left_out: set[str]) -> None:
     print(f"{len(kept)} captures, {len(edges)} accepted edges")
     for name, wanted in (("right", True), ("wrong", False)):
         rows = [e for e in edges if street.is_right(e.target, e.source) == wanted]
-        overlap = [overlaps[e.target, e.source] for e in rows]
-        print(
-            f"  {name} {len(rows):3d}   overlap {spread(overlap)}   disagreement {spread([e.disagreement for e in rows])}"
-        )
+        overlap, disagreement = [overlaps[e.target, e.source] for e in rows], [e.disagreement for e in rows]
+        print(f"  {name} {len(rows):3d}   overlap {spread(overlap)}   disagreement {spread(disagreement)}")
     neighbours = [(a, b) for i, a in enumerate(kept) for b in kept[i + 1 :] if street.is_right(a, b)]
     found = {frozenset((e.target, e.source)) for e in edges}
     print(

@@ -42,6 +42,7 @@ from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid, s
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import read_captures
+from gsmap.map.stages.describe import graph_keys
 from gsmap.optimize.cycles import cycle_chi2, list_triangles
 from gsmap.optimize.measurements import measurements
 from gsmap.register import SceneView
@@ -118,7 +119,8 @@ def described(m, name: str, place: str, gaussians: Gaussians, cameras: Cameras, 
     """The capture with the scene graph that a map keeps of it, made where the map does not know it yet."""
     scene, new = m.store.scenes.add(gaussians, cameras, name=f"{place}-{name}", scale_policy=policy)
     start = time.process_time()
-    (graph,) = m.describe(scene.id)
+    m.describe(scene.id)
+    graph = m.store.graphs.load(scene.id, graph_keys(m.store, [scene], m.settings)[scene.id])
     _say(f"{name}: {graph.num_nodes} nodes" + (f", {time.process_time() - start:.1f} CPU s" if new else ""))
     gaussians, cameras = m.store.scenes.gaussians(scene.id), m.store.scenes.cameras(scene.id)
     return Capture(name, place, SceneView(scene.id, gaussians, cameras, graph, policy), S)

@@ -35,6 +35,7 @@ VERBS = (
     "export",
     "list",
     "show",
+    "why",
     "diff",
     "poses",
     "settings",

@@ -41,8 +41,8 @@ def estimate_up(points: np.ndarray, cameras: Cameras | None, params: Params | No
     `gsmap.describe.heading.turned_about`); within a cone around what they say the direction is taken that most surface
     normals are parallel to (floors, tables, ceilings) or perpendicular to (walls). Cameras on one heading leave the
     pitch open: what is a wall to one that looks ahead is the ground to one that looks down. There a second witness must
-    name the same axis of the scene: the cameras' way, a small turn, or the room (`_up_of_room`). Without cameras, or with cameras
-    that gsmap made up, the room alone decides.
+    name the same axis of the scene: the cameras' way, a small turn, or the room (`_up_of_room`). Without cameras, or
+    with cameras that gsmap made up, the room alone decides.
 
     Args:
         points: (N, 3) surface points, any unit.

@@ -58,14 +58,14 @@ class Held:
         return bool(np.linalg.norm(self.mean, axis=0).max() < 0.3)
 
     def is_allowed(self, up: np.ndarray) -> bool:
-        """Whether cameras on one heading may be held so: not upside down, not looking up, no edge of the image askew."""
+        """Whether cameras on one heading may be held so: not upside down, not looking up, no edge askew."""
         right, down, forward = self.mean.T
         level = min(abs(right @ up), abs(down @ up)) < _ROLL
         # Held upright; or on its side or straight down, where the image's up is level itself.
         return bool(level and down @ up < _ROLL and forward @ up < _UPWARD)
 
     def is_upright(self, up: np.ndarray) -> bool:
-        """Whether the images' own up tells the sign of a vertical: not where they are on their side or straight down."""
+        """Whether the images' own up tells the sign of a vertical: not where they lie or look straight down."""
         return bool(-self.mean[:, 1] @ up > 0.25)
 
     def looks_along(self, axis: np.ndarray) -> bool:

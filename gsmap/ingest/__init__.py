@@ -1,9 +1,9 @@
 """Captures the way people have them -> Gaussians and cameras, checked."""
 
+from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest.capture import Capture, read_capture, read_captures, take_capture
 from gsmap.ingest.dates import CaptureDate, find_date, given_date, parse_date
 from gsmap.ingest.find import Found, find_captures
-from gsmap.ingest.synthesise import synthesise_cameras
 from gsmap.ingest.validate import validate
 
 __all__ = [

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from gsmap import formats
 from gsmap.errors import ConfigError
+from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.find import Found, find_captures
-from gsmap.ingest.synthesise import synthesise_cameras
 from gsmap.ingest.validate import validate
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.progress import Progress

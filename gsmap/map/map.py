@@ -57,6 +57,7 @@ from gsmap.types.rows import (
     ThinReport,
     TileRow,
     UpdateReport,
+    WhyReport,
 )
 
 if TYPE_CHECKING:
@@ -601,6 +602,23 @@ class Map(AbstractContextManager["Map"]):
     def show_pair(self, pair: str) -> PairReport:
         """``gsmap show MAP A:B``: the pair's edge, its evidence, and its history."""
         return reports.pair_report(self.store, *self._pair(pair))
+
+    def why(self, pair: str, *, pictures: str | os.PathLike[str] | None = None) -> WhyReport:
+        """What was asked of a pair on the way from retrieval to its place in the map, and what would settle it.
+
+        Args:
+            pictures: a folder to draw both captures in, from the same cameras, under the pose that was found; an empty
+                or new one, or one of this map.
+        """
+        from gsmap.map.why import why
+
+        scenes = self._pair(pair)
+        report = why(self.store, self.settings, *scenes)
+        if pictures is None:
+            return report
+        from gsmap.map.pictures import draw_pair
+
+        return replace(report, picture=draw_pair(self.store, Path(pictures), *scenes))
 
     def _graph_of(self, scene: Scene) -> tuple[SceneGraph | None, str]:
         """A scene's graph under the settings in force, else its newest one; and what is to be known of that choice."""

@@ -1,4 +1,4 @@
-"""Pictures of changes in a folder, and which scenes each shows: what a purge has to find again."""
+"""Pictures of changes and of pairs in a folder, and which scenes each shows: what a purge has to find again."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from gsmap.durable import make_folder, open_file, remove_file, write_text_whole, write_whole
 from gsmap.errors import MALFORMED, ConfigError, DiskFullError, InputError, ReadOnlyError
 from gsmap.geometry.metres import in_metres
@@ -18,15 +20,17 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes import change_arrays, named
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
+from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
-from gsmap.types import PlacedScene, Sim3
+from gsmap.types import PlacedScene, Scene, SceneGraph, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import ChangeRow
 
 _log = logging.getLogger("gsmap.map")
 FILE_NAME = "changes.json"
 _VERSION = 1
-_PICTURE = re.compile(r"c\d+\.png")
+_PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png")
+_LOOKS = 2  # cameras of each capture that a picture of a pair is drawn from
 _MAX_BYTES = 1 << 26
 
 
@@ -103,6 +107,45 @@ def draw(
                 write_whole(folder / f"{row.id}.png", partial(drawer.draw, row))
     progress("pictures", 1.0, f"{len(files)} pictures")
     return files
+
+
+def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
+    """Draw both captures of a pair from the same cameras under the pose of its edge; None where it has none.
+
+    Raises:
+        ConfigError, InputError: see `Pictures.load`.
+    """
+    known, stored = Pictures.load(folder, store.id), store.registrations.get(a.id, b.id)
+    if stored is None or stored.registration.S_target_source is None:
+        return None
+    edge, S = stored.registration, stored.registration.S_target_source
+    name = f"why-{edge.target[:8]}-{edge.source[:8]}.png"
+    make_folder(folder)
+    _note(store, folder)
+    known.scenes[name] = [edge.target, edge.source]
+    known.save(folder)
+    target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, S)
+    drawn = _side_by_side(target, source, store.graphs.load(edge.target))
+    write_whole(folder / name, partial(_save, drawn))
+    return str(folder / name)
+
+
+def _side_by_side(target: PlacedScene, source: PlacedScene, graph: SceneGraph | None) -> np.ndarray:
+    """The picture of two captures in one frame, from those of their cameras that see most of the other."""
+    from gsmap.view.pair_picture import draw_pair
+
+    chosen = []
+    for one, other in ((target, source), (source, target)):
+        if one.cameras is not None and len(one.cameras):
+            rows = ViewCache(one.gaussians, one.cameras).select_views(other.gaussians.means, _LOOKS)
+            chosen += [one.cameras[[row]] for row in rows]
+    return draw_pair(target, source, chosen, unit_m=1.0 if graph is None else graph.unit_m)
+
+
+def _save(drawn: np.ndarray, path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(drawn).save(path, format="PNG")
 
 
 class _Drawer:

@@ -13,6 +13,7 @@ from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
 from gsmap.map.stages.export import dirty_tiles
 from gsmap.map.stages.optimize import pose_inputs
 from gsmap.map.stages.register import stale
+from gsmap.register.duplicate import SAME_CAPTURE
 from gsmap.store import Store
 from gsmap.store.leases import Lease
 from gsmap.types.metre import Metre
@@ -65,6 +66,8 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
+    twice = [stored for stored in current if any(n.startswith(SAME_CAPTURE) for n in stored.registration.notes)]
+    add("duplicates", len(twice), f"gsmap list {at} edges", "pairs that are the same capture twice: remove one of each")
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes that nothing ties to others")
     metres = map_metres(store, settings, graph)

@@ -34,8 +34,8 @@ def place_new(
     """The previous answer with the new scenes placed in it, or None where only a full solve will do.
 
     A full solve is due when scenes, measurements between old scenes or the recipe changed, when the map grew by
-    ``params.growth`` since the last one, or when a new scene ties components together, closes a long loop or comes with edges that are in doubt. Poses
-    placed here are provisional: only the surroundings of a new scene give way to it.
+    ``params.growth`` since the last one, or when a new scene ties components together, closes a long loop or comes with
+    edges that are in doubt. Poses placed here are provisional: only the surroundings of a new scene give way to it.
     """
     if previous.provenance.recipe != recipe_key(params).recipe:
         return None

@@ -11,6 +11,7 @@ import numpy as np
 from gsmap.geometry.rotations import angle_between
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
+from gsmap.register.metres import Belief
 from gsmap.register.params import Params, SamePose
 from gsmap.register.proposing import num_nodes
 from gsmap.register.scene_view import SceneView
@@ -27,12 +28,14 @@ class Judged:
         evidence: under that pose.
         covariance: (7, 7) of the pose, translations in the source's unit; None where it was not computed.
         flaw: why the pose is not accepted; empty where it is.
+        belief: what was measured of its scale; None where that was not, or where a source's unit is unknown.
     """
 
     proposal: Proposal
     evidence: PoseEvidence
     covariance: np.ndarray | None
     flaw: str
+    belief: Belief | None = None
 
 
 def conclude(
@@ -45,11 +48,11 @@ def conclude(
     notes: Sequence[str] = (),
 ) -> Registration:
     """The answer: one accepted pose, the best one with what speaks against it, or nothing."""
-    common: dict[str, Any] = {"target": target.id, "source": source.id, "seconds": seconds, "notes": tuple(notes)}
+    common: dict[str, Any] = {"target": target.id, "source": source.id, "seconds": seconds}
     if not judged:
         poorer = num_nodes(target, source)
         reason = f"no pose proposed that the background model does not explain (the poorer graph has {poorer} nodes)"
-        return Registration(status="no_match", reason=reason, **common)
+        return Registration(status="no_match", reason=reason, notes=tuple(notes), **common)
     accepted = [j for j in judged if not j.flaw]
     best = accepted[0] if accepted else min(judged, key=_rank)
     status, reason = ("accepted", "") if accepted else ("rejected", best.flaw)
@@ -62,6 +65,8 @@ def conclude(
     if status == "accepted" and best.covariance is not None:
         information = np.linalg.inv(best.covariance)
         information = 0.5 * (information + information.T)
+        if best.belief is not None and best.belief.note:
+            notes = (*notes, best.belief.note)
     return Registration(
         status=status,
         reason=reason,
@@ -73,6 +78,7 @@ def conclude(
         proposer=best.proposal.proposer,
         exact=best.proposal.exact,
         evidence=_figures(best),
+        notes=tuple(notes),
         **common,
     )
 
@@ -102,6 +108,11 @@ def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
 def _figures(judged: Judged) -> dict[str, float]:
     """The evidence as it is stored; `gsmap.types.Registration` explains each name."""
     p, e = judged.proposal, judged.evidence
+    log_scale = log_scale_sigma = float("nan")
+    if judged.belief is not None:
+        log_scale, log_scale_sigma = judged.belief.log_scale, judged.belief.measured_sigma
+    elif judged.covariance is not None:
+        log_scale, log_scale_sigma = float(np.log(p.S_target_source.scale)), float(np.sqrt(judged.covariance[6, 6]))
     return {
         "log_nfa": p.log_nfa,
         "runner_up": p.runner_up,
@@ -112,6 +123,8 @@ def _figures(judged: Judged) -> dict[str, float]:
         "colour_t": e.colour_t,
         "disagreement": e.disagreement,
         "seen_m2": e.seen_m2,
+        "log_scale": log_scale,
+        "log_scale_sigma": log_scale_sigma,
     }
 
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap.geometry.rotations import skew
+from gsmap.geometry.rotations import retract, skew
+from gsmap.register import error_field
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
+
+_FEWEST = 20  # cells that coincide
+_FEWEST_OF_A_BLOCK = 3.0
+_LEAST_LOG_SCALE_SIGMA = 1e-6  # keeps the matrix regular
+_CLIP = 3.0  # standard deviations: what moved between captures is no error of the surfaces
 
 
 @dataclass(frozen=True)
@@ -16,82 +22,122 @@ class Params:
     """How well a refined pose is known.
 
     Args:
-        radius_m: pairs farther apart than this are not counted.
-        cell_m: residuals within a cell of this size are taken to share their error; cells are independent.
-        floor_m: error of a cell that no residual shows (a trainer's bias, a sensor's distortion): many cells average
-            it out, and over the overlap's radius it turns and scales the pose.
-        factor: on the sandwich, from measured normalised errors and triangles (``tools/bench_register.py`` prints
-            them).
-        scale_factor: on the scale's own variance, from measured errors of scales: those of a real sensor's captures
-            differ by up to a percent of themselves, which leaves no residual.
+        radius_m: pairs farther apart than this are not counted, and from a third of it on they count less, as in
+            refining.
+        block_m: residuals within a cell of this size, on surfaces that face one way, are one measurement ...
+        max_blocks: ... or of a larger cell, where there would be more of them than this.
+        field: which errors of the surfaces are thought possible.
+        hidden_turn_m: standard deviation of what leaves no residual, by a trainer's bias or a sensor that bends what it
+            measures: rotations are this uncertain over the overlap's radius, where ``field_m`` is the errors that
+            residuals do show beyond a block. A model, fitted on made places by ``tools/fit_covariance.py``.
+        hidden_shift_m: the same of translations.
+        hidden_swell_m: the same of the logarithm of the scale, over the overlap's radius.
+        field_m: errors that residuals show, at which these three hold ...
+        field_power: ... and they grow with this power of them.
+        most_swell: no sensor's metre is off by more than about this (logarithm of a scale): what is hidden of the scale
+            is bounded by it.
     """
 
     radius_m: float = 0.08
-    cell_m: float = 1.0
-    floor_m: float = 0.01
-    factor: float = 2.0
-    scale_factor: float = 4.0
+    block_m: float = 0.3
+    max_blocks: int = 200
+    field: error_field.Params = field(default_factory=error_field.Params)
+    hidden_turn_m: float = 0.0017
+    hidden_shift_m: float = 0.0037
+    hidden_swell_m: float = 0.0058
+    field_m: float = 0.002
+    field_power: float = 2.0
+    most_swell: float = 0.02
 
 
-# A rigid edge knows its scale: a row this stiff keeps the matrix 7 x 7 without letting the scale move.
-_RIGID_LOG_SCALE_SIGMA = 1e-6
+@dataclass(frozen=True, eq=False)
+class Known:
+    """How well a pose is known.
+
+    Args:
+        covariance: (7, 7) over [rot_rad, trans_m, log_scale] applied on the source side.
+        sigmas: standard deviations (rad, metres, log scale) of the least known rotation, translation and scale at the
+            overlap's centroid.
+    """
+
+    covariance: np.ndarray
+    sigmas: tuple[float, float, float]
 
 
-def pose_covariance(
-    target: Surface, source: Surface, pose: Sim3, params: Params | None = None, *, with_scale: bool = False
-) -> tuple[np.ndarray, tuple[float, float, float]] | None:
-    """Covariance of a refined pose, in metres; None where too little overlaps.
+@dataclass(frozen=True, eq=False)
+class Conditioning:
+    """How a pose that was refined with its scale hangs on the errors of the surfaces, and on its scale.
 
-    An ICP Hessian is overconfident 10 to 900 times on splats, for neighbouring points share their error. So: the
-    sandwich ``H^-1 (sum over cells of g g^T) H^-1`` of the point-to-plane problem, where each cell's gradient g counts
-    once, times a factor, plus a floor at the overlap's centroid moved to the source's frame. C cells that fit D
-    parameters show too little of their error: ``C / (C - D)`` makes up for it, as with residuals of any regression.
+    Args:
+        scaled: (7, 7) covariance about the overlap's centroid of the pose whose scale was refined along.
+        rigid: (6, 6) the same of the pose that has the right scale.
+        tied: (7,) what a change of the scale by 1 (its logarithm) moves of a pose that is refined to it.
+        centroid: (3,) of the overlap, in the source's frame, metres.
+        field_m: standard deviation of the surfaces' errors that are alike beyond a block.
+    """
 
-    Returns:
-        The (7, 7) matrix over [rot_rad, trans, log_scale] applied on the source side, and the standard deviations
-        (rad, metres, log scale) of the least known rotation, translation and scale at the overlap's centroid.
+    scaled: np.ndarray
+    rigid: np.ndarray
+    tied: np.ndarray
+    centroid: np.ndarray
+    field_m: float
+
+    @property
+    def log_scale_sigma(self) -> float:
+        """Standard deviation of the scale that was refined along."""
+        return float(np.sqrt(self.scaled[6, 6]))
+
+    def known(self, pose: Sim3, log_scale_sigma: float | None = None) -> Known:
+        """How well a pose (metres) is known: the scaled one, or a rigid one whose scale is known so well."""
+        covariance = self.scaled
+        if log_scale_sigma is not None:
+            covariance = np.zeros((7, 7))
+            covariance[:6, :6] = self.rigid
+            covariance += np.outer(self.tied, self.tied) * max(log_scale_sigma, _LEAST_LOG_SCALE_SIGMA) ** 2
+        sigmas = (
+            float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+            float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * pose.scale,
+            float(np.sqrt(covariance[6, 6])),
+        )
+        back = np.linalg.inv(_shift(self.centroid))
+        covariance = back @ covariance @ back.T
+        return Known(0.5 * (covariance + covariance.T), sigmas)
+
+    def rescaled(self, pose: Sim3, scale: float) -> Sim3:
+        """The pose with another scale, and moved as that moves it."""
+        step = np.log(scale / pose.scale) * self.tied
+        centre = Sim3(np.eye(3), self.centroid)
+        return retract(pose @ centre, step) @ centre.inverse()
+
+
+def condition(target: Surface, source: Surface, pose: Sim3, params: Params | None = None) -> Conditioning | None:
+    """How well a refined pose (metres) is known with its scale and without; None where too little overlaps to tell.
+
+    An ICP Hessian is overconfident 10 to 900 times on splats, for neighbouring points share their error. So the
+    point-to-plane residuals are averaged over blocks, `error_field` learns from them how far errors are alike, and the
+    covariance is that of the pose under such errors: ``A K A^T``, where A is the pose's change by each block's error.
+    What leaves no residual is added by a model (`hidden_sigmas`).
     """
     params = params or Params()
-    points, _ = source.coarse
-    moved = pose.apply(points)
-    distance, row = target.nearest(moved, params.radius_m)
-    hit = np.flatnonzero(np.isfinite(distance))
-    if len(hit) < 20:
+    blocks = _Blocks.of(target, source, pose, params)
+    if blocks is None:
         return None
-    normals = target.normals[row[hit]]
-    residual = (normals * (moved[hit] - target.coarse[0][row[hit]])).sum(1)
-    jacobian = point_to_plane_jacobian(pose, points[hit], normals)
-    dim = 7 if with_scale else 6
-    jacobian = jacobian[:, :dim]
-    # Work about the overlap's centroid: rotation and translation then hardly mix and the matrices are well scaled.
-    centroid = points[hit].mean(0)
-    to_centroid = _shift(centroid)[:dim, :dim]
-    jacobian = jacobian @ np.linalg.inv(to_centroid)
-    hessian = jacobian.T @ jacobian + 1e-9 * np.trace(jacobian.T @ jacobian) / dim * np.eye(dim)
-    _, cell = np.unique(np.floor(moved[hit] / params.cell_m).astype(int), axis=0, return_inverse=True)
-    cells = int(cell.max()) + 1
-    gradient = np.zeros((cells, dim))
-    np.add.at(gradient, cell.ravel(), jacobian * residual[:, None])
-    inverse = np.linalg.inv(hessian)
-    sandwich = inverse @ (gradient.T @ gradient) @ inverse * (cells / max(cells - dim, 1))
-    spread = points[hit] - points[hit].mean(0)
-    radius = float(np.sqrt((spread**2).sum(1).mean()))
-    shift = params.floor_m / np.sqrt(cells)
-    turn = shift / max(radius * pose.scale, 1e-6)
-    floor = np.r_[np.full(3, turn), np.full(3, shift / pose.scale), turn]
-    covariance = np.diag(np.r_[floor[:6], _RIGID_LOG_SCALE_SIGMA] ** 2)
-    covariance[:dim, :dim] = params.factor * sandwich + np.diag(floor[:dim] ** 2)
-    if with_scale:
-        covariance[6, 6] *= params.scale_factor
-    sigmas = (
-        float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
-        float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * pose.scale,
-        float(np.sqrt(covariance[6, 6])),
+    hessian = blocks.hessian + 1e-9 * np.trace(blocks.hessian) / 7 * np.eye(7)
+    pull = (blocks.jacobian * blocks.weights[:, None]).T
+    influence = np.concatenate([np.linalg.solve(hessian, pull), np.linalg.solve(hessian[:6, :6], pull[:6])])
+    seen = error_field.Blocks(blocks.jacobian, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
+    errors = error_field.judge_errors(seen, influence, params.field)
+    if errors is None:
+        return None
+    hidden = hidden_sigmas(errors.field_m, blocks.radius_m, params) ** 2
+    hidden[3:6] /= pose.scale**2  # translations are the source's
+    return Conditioning(
+        scaled=errors.covariance[:7, :7] + np.diag(hidden),
+        rigid=errors.covariance[7:, 7:] + np.diag(hidden[:6]),
+        tied=np.r_[-np.linalg.solve(hessian[:6, :6], hessian[:6, 6]), 1.0],
+        centroid=blocks.centroid,
+        field_m=errors.field_m,
     )
-    back = np.eye(7)
-    back[:dim, :dim] = np.linalg.inv(to_centroid)
-    covariance = back @ covariance @ back.T
-    return 0.5 * (covariance + covariance.T), sigmas
 
 
 def in_scene_units(covariance: np.ndarray, source_unit_m: float) -> np.ndarray:
@@ -104,6 +150,85 @@ def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray)
     """(N, 7) derivative of ``n . (S Exp(xi) p)`` at xi = 0; points in the source's frame, normals in the target's."""
     local = pose.scale * normals @ pose.rotation
     return np.concatenate([np.cross(points, local), local, (local * points).sum(1, keepdims=True)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Weighted means over B blocks of the pairs that a pose makes, and the problem's (7, 7) Hessian.
+
+    ``radius_m`` is that of the overlap. Derivatives are about ``centroid``: rotation and translation then hardly mix,
+    and the matrices are well scaled.
+    """
+
+    jacobian: np.ndarray
+    residual: np.ndarray
+    positions: np.ndarray
+    directions: np.ndarray
+    counts: np.ndarray
+    weights: np.ndarray
+    hessian: np.ndarray
+    centroid: np.ndarray
+    radius_m: float
+
+    @classmethod
+    def of(cls, target: Surface, source: Surface, pose: Sim3, params: Params) -> _Blocks | None:
+        points, _ = source.coarse
+        moved = pose.apply(points)
+        distance, row = target.nearest(moved, params.radius_m)
+        hit = np.flatnonzero(np.isfinite(distance))
+        if len(hit) < _FEWEST:
+            return None
+        points, moved, normals = points[hit], moved[hit], target.normals[row[hit]]
+        # Signs of normals mean nothing: those of a block are turned to face one way.
+        axis = np.abs(normals).argmax(1)
+        normals = normals * np.sign(normals[np.arange(len(normals)), axis])[:, None]
+        residual = (normals * (moved - target.coarse[0][row[hit]])).sum(1)
+        weights = 1.0 / (1.0 + (residual / (0.3 * params.radius_m)) ** 2) ** 2
+        centroid = points.mean(0)
+        jacobian = point_to_plane_jacobian(pose, points, normals) @ np.linalg.inv(_shift(centroid))
+        size, labels = params.block_m, _labels(moved, axis, params.block_m)
+        while labels.max() >= params.max_blocks:
+            size *= 1.2
+            labels = _labels(moved, axis, size)
+        total = np.bincount(labels, weights)
+        counts = total**2 / np.bincount(labels, weights**2)
+
+        def means(values: np.ndarray) -> np.ndarray:
+            return np.stack([np.bincount(labels, weights * v) for v in values.T], axis=1) / total[:, None]
+
+        kept = counts >= _FEWEST_OF_A_BLOCK
+        if not kept.any():
+            return None
+        directions = means(normals)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        mean = means(residual[:, None])[:, 0]
+        bar = _CLIP * 1.4826 * np.median(np.abs(mean[kept]))
+        return cls(
+            jacobian=means(jacobian)[kept],
+            residual=np.clip(mean, -bar, bar)[kept],
+            positions=means(moved)[kept],
+            directions=directions[kept],
+            counts=counts[kept],
+            weights=total[kept],
+            hessian=(jacobian * weights[:, None]).T @ jacobian,
+            centroid=centroid,
+            radius_m=float(np.sqrt(((moved - moved.mean(0)) ** 2).sum(1).mean())),
+        )
+
+
+def hidden_sigmas(field_m: float, radius_m: float, params: Params) -> np.ndarray:
+    """(7,) standard deviations (rad, metres, log scale) about the overlap's centroid of what leaves no residual."""
+    growth = (field_m / params.field_m) ** params.field_power
+    turn, shift, swell = (growth * h for h in (params.hidden_turn_m, params.hidden_shift_m, params.hidden_swell_m))
+    radius = max(radius_m, 1e-6)
+    bounded = swell / np.hypot(radius, swell / params.most_swell)
+    return np.r_[np.full(3, turn / radius), np.full(3, shift), bounded]
+
+
+def _labels(points: np.ndarray, axis: np.ndarray, size_m: float) -> np.ndarray:
+    cells = np.c_[np.floor(points / size_m).astype(np.int64), axis]
+    labels: np.ndarray = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    return labels
 
 
 def _shift(centroid: np.ndarray) -> np.ndarray:

@@ -21,11 +21,14 @@ class Params:
         radius_m: surfaces closer than this coincide.
         depth_tolerance_m: depths that differ by more than this ...
         depth_tolerance: ... and this share of the depth disagree (the two tolerances are added).
+        made_reach_m: what a made view looks through counts as free this far in front of the surface it sees: farther
+            from that, no camera of the capture need have looked.
         min_alpha: a pixel fainter than this shows nothing.
         num_cameras: cameras of each scene that are asked, chosen to see most of the other scene.
         pattern_px: patterns are compared within patches of this size ...
         min_pattern: ... where both show one: local colours vary by this (standard deviation, RGB in [0, 1]) ...
-        pattern_correlation: ... and are not the same where they correlate by less than this.
+        pattern_correlation: ... and are not the same where they correlate by less than this, and by much less than
+            the patterns of the two scenes do on the whole.
         patch_px: colours are compared after their mean over patches of this size is removed.
         cell_m: the same for the surface cells of scenes without cameras.
         min_seen: cameras of a scene that can judge fewer Gaussians of the other are not counted.
@@ -35,6 +38,7 @@ class Params:
     radius_m: float = 0.08
     depth_tolerance_m: float = 0.10
     depth_tolerance: float = 0.02
+    made_reach_m: float = 1.0
     min_alpha: float = 0.5
     num_cameras: int = 6
     pattern_px: int = 8
@@ -121,7 +125,7 @@ def measure(
         camera_free = CrossViewStats.of(0)
         camera_free.compare(target.coarse[1][row[hit]], source.coarse[1][rows_s[hit]], cell)
         colours = [camera_free.colour()]
-    areas = np.sum([stats.areas_m2() for stats in judges], axis=0) if judges else np.zeros(2)
+    areas = np.sum([stats.areas_m2(params.pattern_correlation) for stats in judges], axis=0) if judges else np.zeros(3)
     return PoseEvidence(
         overlap=overlap,
         num_coinciding=int(hit.sum()),
@@ -129,8 +133,8 @@ def measure(
         num_seen=min(stats.num_seen for stats in judges) if len(judges) == 2 else 0,
         colour_correlation=min((correlation for correlation, _ in colours), default=0.0),
         colour_t=min((t for _, t in colours), default=0.0),
-        disagreement=float(areas[0] / areas[1]) if areas[1] > 0 else float("nan"),
-        seen_m2=float(areas[1]),
+        disagreement=float(areas[:2].sum() / areas[2]) if areas[2] > 0 else float("nan"),
+        seen_m2=float(areas[2]),
     )
 
 
@@ -143,11 +147,11 @@ class CrossViewStats:
     products: list[np.ndarray] = field(default_factory=list)  # (patches, 3) each
     squares: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
     area_m2: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of each Gaussian, where it was seen best
-    unlike_m2: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of that, what shows another pattern
+    patterns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)  # as in `see`, a view each
 
     @classmethod
     def of(cls, count: int) -> CrossViewStats:
-        return cls(np.zeros(count, bool), np.zeros(count, bool), area_m2=np.zeros(count), unlike_m2=np.zeros(count))
+        return cls(np.zeros(count, bool), np.zeros(count, bool), area_m2=np.zeros(count))
 
     @property
     def num_seen(self) -> int:
@@ -157,17 +161,39 @@ class CrossViewStats:
     def free_space_violation(self) -> float:
         return float((self.in_front & ~self.agrees).sum()) / self.num_seen
 
-    def areas_m2(self) -> np.ndarray:
-        """(2,) surface that disagrees, and all that could be judged."""
-        through = self.in_front & ~self.agrees
-        disagrees = self.area_m2[through].sum() + np.minimum(self.unlike_m2, self.area_m2)[self.agrees].sum()
-        return np.array([disagrees, self.area_m2[self.in_front | self.agrees].sum()])
+    def areas_m2(self, pattern_correlation: float) -> np.ndarray:
+        """(3,) surface that was seen through, that shows another pattern, and all that could be judged."""
+        through = self.area_m2[self.in_front & ~self.agrees].sum()
+        judged = self.area_m2[self.in_front | self.agrees].sum()
+        if not self.patterns:
+            return np.array([through, 0.0, judged])
+        gaussian, area_m2, correlation = (np.concatenate(rows) for rows in zip(*self.patterns, strict=True))
+        # A noisy capture's patterns correlate badly everywhere; only what does worse than that noise is another one.
+        middle, upper = np.quantile(correlation, [0.5, 0.75])
+        unlike = correlation < min(pattern_correlation, middle - 3 * (upper - middle))
+        other = np.zeros(len(self.area_m2))
+        np.maximum.at(other, gaussian[unlike], area_m2[unlike])
+        return np.array([through, np.minimum(other, self.area_m2)[self.agrees].sum(), judged])
 
-    def see(self, gaussian: np.ndarray, area_m2: np.ndarray, unlike: np.ndarray) -> None:
-        """Take the pixels of one view into account: whose they are, how much surface they show, whether unlike."""
-        count = len(self.area_m2)
-        self.area_m2 = np.maximum(self.area_m2, np.bincount(gaussian, area_m2, minlength=count))
-        self.unlike_m2 = np.maximum(self.unlike_m2, np.bincount(gaussian, area_m2 * unlike, minlength=count))
+    def see(self, gaussian: np.ndarray, area_m2: np.ndarray, correlation: np.ndarray) -> None:
+        """Take the pixels of one view into account.
+
+        Args:
+            gaussian: (N,) whose they are.
+            area_m2: (N,) how much surface they show.
+            correlation: (N,) of the pattern around them with that of the other scene; NaN where there is none.
+        """
+        rows, which = np.unique(gaussian, return_inverse=True)
+        shown = np.bincount(which, area_m2)
+        self.area_m2[rows] = np.maximum(self.area_m2[rows], shown)
+        told = np.isfinite(correlation)
+        if told.any():
+            count = np.bincount(which[told], minlength=len(rows))
+            sums = np.bincount(which[told], correlation[told], minlength=len(rows))
+            has = count > 0
+            self.patterns.append(
+                (rows[has], np.bincount(which[told], area_m2[told], len(rows))[has], (sums[has] / count[has]))
+            )
 
     def compare(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
         """Take colours (N, 3) of the same places into account, which lie in the patches of index ``patch`` (N,)."""
@@ -198,7 +224,8 @@ def _cross_view(
         camera = transform_cameras(views.cameras[[row]], into_other)
         seen = render(other.splats, camera, backend="native")  # as in `ViewCache`
         focal_px = float(np.sqrt(camera.intrinsics_px[0, :2].prod()))
-        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, params)
+        reach_m = np.inf if row < views.num_own else params.made_reach_m
+        _compare(stats, views.render(row), unit_m, seen, pose.scale, focal_px, params, reach_m)
     return stats
 
 
@@ -210,8 +237,13 @@ def _compare(
     scale: float,
     focal_px: float,
     params: Params,
+    reach_m: float,
 ) -> None:
-    """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres."""
+    """Take one view into account; ``unit_m`` and ``scale`` bring the two depths to the same metres.
+
+    Args:
+        reach_m: what lies farther than this in front of the surface seen proves nothing.
+    """
     depth, other_depth = own.depth[0] * unit_m, other.depth[0] * scale
     solid = own.alpha[0] > params.min_alpha
     near, far = _extremes(depth, solid)
@@ -219,30 +251,30 @@ def _compare(
     both = solid & (other.alpha[0] > params.min_alpha)
     in_front = both & (other_depth < near - tolerance)
     agrees = both & ~in_front & (other_depth <= far + tolerance)
+    in_front &= other_depth > near - reach_m
     assert other.dominant_id is not None
     stats.in_front[other.dominant_id[0][in_front]] = True
     stats.agrees[other.dominant_id[0][agrees]] = True
     rows, columns = np.nonzero(agrees)
     patch = rows // params.patch_px * -(-agrees.shape[1] // params.patch_px) + columns // params.patch_px
     stats.compare(own.colour[0][agrees], other.colour[0][agrees], patch)
-    unlike = np.zeros(agrees.shape, bool)
+    pattern = np.full(agrees.shape, np.nan)
     patch = rows // params.pattern_px * -(-agrees.shape[1] // params.pattern_px) + columns // params.pattern_px
-    unlike[agrees] = _unlike(own.colour[0][agrees], other.colour[0][agrees], patch, params)
+    pattern[agrees] = _pattern_correlation(own.colour[0][agrees], other.colour[0][agrees], patch, params)
     judged = in_front | agrees
     area_m2 = (other_depth[judged] / focal_px) ** 2
-    stats.see(other.dominant_id[0][judged], area_m2, unlike[judged])
+    stats.see(other.dominant_id[0][judged], area_m2, pattern[judged])
 
 
-def _unlike(a: np.ndarray, b: np.ndarray, patch: np.ndarray, params: Params) -> np.ndarray:
-    """(N,) bool: the patch of the pixel shows a pattern in ``a`` or ``b`` that the other does not."""
+def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray, params: Params) -> np.ndarray:
+    """(N,) correlation of local colours within the patch of each pixel; NaN where not both show a pattern."""
     if not len(a):
-        return np.zeros(0, bool)
+        return np.zeros(0)
     count = np.bincount(patch)
     a, b = _local(a, patch), _local(b, patch)
     aa, bb, ab = (_sums(x * y, patch).sum(1) for x, y in ((a, a), (b, b), (a, b)))
-    patterned = np.minimum(aa, bb) > count * params.min_pattern**2
-    alike = ab > params.pattern_correlation * np.sqrt(aa * bb)
-    out: np.ndarray = (patterned & ~alike & (count > params.pattern_px**2 // 2))[patch]
+    patterned = (np.minimum(aa, bb) > count * params.min_pattern**2) & (count > params.pattern_px**2 // 2)
+    out: np.ndarray = np.where(patterned, ab / np.sqrt(np.maximum(aa * bb, 1e-12)), np.nan)[patch]
     return out
 
 

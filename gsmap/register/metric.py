@@ -51,6 +51,11 @@ class MetricPair:
             unit_m = 1.0 / scale  # the source knows what a metre is, the target only guesses
         return cls(MetricScene(target, unit_m, params), MetricScene(source, unit_m * scale, params), scale)
 
+    @property
+    def policies(self) -> set[str]:
+        """How the units of both are known: `SceneView.scale_policy`."""
+        return {self.target.view.scale_policy, self.source.view.scale_policy}
+
     def to_metres(self, S_target_source: Sim3) -> Sim3:
         """A pose of the proposed scale, between the scenes' own units, as one between metres."""
         return Sim3(S_target_source.rotation, S_target_source.translation * self.target.unit_m)

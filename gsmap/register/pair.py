@@ -6,13 +6,15 @@ from dataclasses import replace
 
 from gsmap.register import covariance, refinement, verdict
 from gsmap.register.conclusion import Judged, conclude, is_same_pose
+from gsmap.register.duplicate import same_capture
 from gsmap.register.evidence import PoseEvidence, measure
 from gsmap.register.metric import MetricPair
 from gsmap.register.params import Params
 from gsmap.register.proposing import Proposing
+from gsmap.register.scaling import scaled_or_rigid
 from gsmap.register.scene_view import SceneView
 from gsmap.register.stopwatch import Stopwatch
-from gsmap.types import Registration
+from gsmap.types import Registration, Sim3
 from gsmap.types.progress import Progress, silent
 from gsmap.types.registration import Proposal
 
@@ -44,7 +46,9 @@ def register_pair(
         if any(not j.flaw for j in judged):
             break
     report(1.0, "done")
-    return conclude(target, source, judged, params, seconds=watch.seconds, notes=proposing.notes)
+    found = conclude(target, source, judged, params, seconds=watch.seconds, notes=proposing.notes)
+    same = same_capture(target, source, found)
+    return replace(found, notes=(*found.notes, same)) if same else found
 
 
 def check_pose(target: SceneView, source: SceneView, proposal: Proposal, params: Params | None = None) -> Registration:
@@ -72,31 +76,32 @@ def _judge(proposal: Proposal, target: SceneView, source: SceneView, params: Par
     """Refine a proposal, gather the evidence for and against it, and decide."""
     if proposal.flaw:
         return Judged(proposal, PoseEvidence(), covariance=None, flaw=proposal.flaw)
-    pair, scaled = MetricPair.of(target, source, proposal, params), proposal.with_scale
+    pair = MetricPair.of(target, source, proposal, params)
     with watch.step("refine"):
         surfaces = pair.target.surface(), pair.source.surface()
-        pose = refinement.coarse(pair, pair.to_metres(proposal.S_target_source), params, with_scale=scaled)
+        pose = refinement.coarse(pair, pair.to_metres(proposal.S_target_source), params, with_scale=proposal.with_scale)
     with watch.step("verdict"):
         views = pair.target.views(), pair.source.views()
         seen = measure(*surfaces, pose, views, params.prescreen)
         # A clique that is significant by itself is worth a full look, whatever three cameras say of a rough pose.
         sure = verdict.is_significant(proposal, params.verdict)
         flaw = "" if sure else verdict.fails_prescreen(seen, params.verdict)
-    known = None
+    known, belief = None, None
     if not flaw:
         with watch.step("refine"):
-            pose = refinement.fine(pair, pose, params, with_scale=scaled)
+            pose, known, belief = scaled_or_rigid(pair, pose, params, with_scale=proposal.with_scale)
         with watch.step("verdict"):
             seen = measure(*surfaces, pose, views, params.evidence)
         with watch.step("polish"):
-            polished = refinement.polished(pair, pose, params, with_scale=scaled)
+            polished = refinement.polished(pair, pose, params, with_scale=belief is None or not belief.rigid)
             if polished is not pose:
                 better = measure(*surfaces, polished, views, params.evidence)
                 if better.colour_correlation > seen.colour_correlation:
                     pose, seen = polished, better
-        with watch.step("verdict"):
-            known = covariance.pose_covariance(*surfaces, pose, params.covariance, with_scale=scaled)
-    proposal = replace(proposal, S_target_source=pair.to_scene_units(pose))
-    flaw = flaw or verdict.judge(proposal, seen, None if known is None else known[1], params.verdict)
-    in_units = None if known is None else covariance.in_scene_units(known[0], pair.source.unit_m)
-    return Judged(proposal, seen, covariance=in_units, flaw=flaw)
+    S = pair.to_scene_units(pose)
+    if belief is not None and belief.rigid:
+        S = Sim3(S.rotation, S.translation)
+    proposal = replace(proposal, S_target_source=S, with_scale=belief is None or not belief.rigid)
+    flaw = flaw or verdict.judge(proposal, seen, None if known is None else known.sigmas, params.verdict)
+    in_units = None if known is None else covariance.in_scene_units(known.covariance, pair.source.unit_m)
+    return Judged(proposal, seen, in_units, flaw, belief)

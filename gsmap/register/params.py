@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from gsmap.errors import ConfigError
 from gsmap.methods import MethodParams, family
-from gsmap.register import covariance, evidence, surface, verdict, view_cache
+from gsmap.register import covariance, evidence, metres, surface, verdict, view_cache
 from gsmap.register.refiners import colored_icp
 
 Fallback = Literal["auto", "never", "always"]
@@ -30,10 +30,10 @@ class SamePose:
 
 @dataclass(frozen=True)
 class Snap:
-    """When a voted scale is taken for 1, for scenes that may be in metres.
+    """When a voted scale is near enough 1 for two scenes that may be in metres to be taken so while they are refined.
 
     Args:
-        log_scale: logarithms of scales smaller than this are taken for 0 ...
+        log_scale: logarithms of scales smaller than this are near enough ...
         log_scale_spread: ... plus this over the square root of the number of correspondences.
     """
 
@@ -46,7 +46,7 @@ def _coarse() -> MethodParams:
 
 
 def _fine() -> MethodParams:
-    return MethodParams("refiner", (("colored_icp", colored_icp.Params((0.06,), max_points=(20_000,))),))
+    return MethodParams("refiner", (("colored_icp", colored_icp.Params((0.06, 0.03), max_points=(20_000, 20_000))),))
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,13 @@ class Params:
         polisher: a refiner whose pose is kept only where local colours then agree better; ``photometric`` lays renders
             over each other, which wins nothing where scenes share most views, and misleads where they share few.
         same_pose: which poses count as one.
-        snap: when a voted scale is taken for 1.
+        snap: when a pair with a voted scale is refined in the scenes' own metres, not in guessed ones.
         surface: which Gaussians are surface.
         views: how scenes are seen through their cameras.
         prescreen: the comparison under the roughly refined pose that decides whether to go on.
         evidence: the comparison under the refined pose.
         covariance: how well the pose is known.
+        metres: what a measured scale says of two sources that may both be in metres.
         verdict: the bars that a pose must clear.
     """
 
@@ -100,6 +101,7 @@ class Params:
     prescreen: evidence.Params = field(default_factory=lambda: evidence.Params(num_cameras=3, max_points=4000))
     evidence: evidence.Params = field(default_factory=evidence.Params)
     covariance: covariance.Params = field(default_factory=covariance.Params)
+    metres: metres.Params = field(default_factory=metres.Params)
     verdict: verdict.Params = field(default_factory=verdict.Params)
 
     def __post_init__(self) -> None:

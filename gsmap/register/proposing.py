@@ -14,7 +14,6 @@ from gsmap.register.metric import MetricScene, target_unit_m
 from gsmap.register.params import Params, Snap
 from gsmap.register.scene_view import SceneView
 from gsmap.register.stopwatch import Stopwatch
-from gsmap.types import Sim3
 from gsmap.types.registration import Proposal
 
 
@@ -39,7 +38,7 @@ class Proposing:
             yield self._asked(params.proposer, "match", with_scale=False)
         if self.policies != {"known"} and family("proposer").get(params.proposer).SCALES:
             proposals = self._asked(params.proposer, "match", with_scale=True)
-            yield proposals if "unknown" in self.policies else [snapped(p, params.snap) for p in proposals]
+            yield proposals if "unknown" in self.policies else [in_metres(p, params.snap) for p in proposals]
         yield self._unlevelled()
         if self._wants_fallback():
             yield self._asked(params.fallback_proposer, "fallback", with_scale=False)
@@ -89,13 +88,12 @@ def unlevelled(view: SceneView) -> SceneView | None:
     )
 
 
-def snapped(proposal: Proposal, snap: Snap) -> Proposal:
-    """The proposal made rigid where its scale is 1 within what its correspondences can tell."""
-    S = proposal.S_target_source
+def in_metres(proposal: Proposal, snap: Snap) -> Proposal:
+    """The proposal as one between two scenes in metres, where its scale is 1 within what its correspondences can tell;
+    what the scale is remains to be measured."""
     spread = snap.log_scale + snap.log_scale_spread / np.sqrt(max(proposal.num_inliers, 1))
-    if abs(np.log(S.scale)) > spread:
-        return proposal
-    return replace(proposal, S_target_source=Sim3(S.rotation, S.translation), with_scale=False)
+    near = abs(np.log(proposal.S_target_source.scale)) <= spread
+    return replace(proposal, with_scale=False) if near else proposal
 
 
 def num_nodes(*views: SceneView) -> int:

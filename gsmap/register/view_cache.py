@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
 
@@ -25,18 +27,23 @@ class Params:
         selection_points: opaque centres, at most, that stand for a scene when cameras are chosen.
         selection_margin: share of the depth by which a point may lie behind what a coarse pixel shows and still count
             as visible: half a coarse pixel of a slanted wall.
+        own_share: where a scene's own cameras see less than this share of it, as a few of many do, views that are made
+            in its free space see the rest.
     """
 
     image_size_px: int = 128
     selection_px: int = 16
     selection_points: int = 8_000
     selection_margin: float = 0.1
+    own_share: float = 0.8
 
 
 class ViewCache:
-    """A scene through its own cameras, in its own frame and unit.
+    """A scene through its own cameras, in its own frame and unit; where these are few, through made ones as well.
 
-    These renders do not depend on any pose, so a scene that meets many others is rendered once; the latest are kept.
+    Few cameras see the overlap with another scene by chance, or from behind a wall; the Gaussians that all cameras left
+    behind show it all the same. These renders do not depend on any pose, so a scene that meets many others is rendered
+    once; the latest are kept.
     """
 
     def __init__(self, gaussians: Gaussians, cameras: Cameras, params: Params | None = None) -> None:
@@ -44,8 +51,28 @@ class ViewCache:
         g = gaussians
         # The mean colour alone: the rest was fitted to directions from which the other scene's cameras do not look.
         self.gaussians = Gaussians(g.means, g.quats, g.log_scales, g.logit_opacities, g.sh[:, :1])
-        self.cameras = cameras.resized(self.params.image_size_px)
+        self.cameras = self._with_made(cameras).resized(self.params.image_size_px)
+        self.num_own = 0 if cameras.synthesised else len(cameras)  # the first; those that follow are made
         self._renders: OrderedDict[int, Rendered] = OrderedDict()
+
+    def _with_made(self, cameras: Cameras) -> Cameras:
+        """The scene's own cameras and, where they see too little of it, made ones."""
+        if cameras.synthesised or self._share_seen(cameras) >= self.params.own_share:
+            return cameras
+        made = synthesise_cameras(self.gaussians)
+        return Cameras(
+            np.concatenate([cameras.T_frame_camera, made.T_frame_camera]),
+            np.concatenate([cameras.intrinsics_px, made.intrinsics_px]),
+            np.concatenate([cameras.sizes_px, made.sizes_px]),
+        )
+
+    def _share_seen(self, cameras: Cameras) -> float:
+        """The share of the sample of opaque centres that any camera sees."""
+        coarse = cameras.resized(self.params.selection_px)
+        seen = np.zeros(len(self._sample), bool)
+        for at, pixel, z, nearest in self._projected(coarse):
+            seen[at[z <= nearest[pixel]]] = True
+        return float(seen.mean()) if len(seen) else 1.0
 
     def render(self, row: int) -> Rendered:
         """Colour, alpha and depth (1, H, W) of the view of one camera."""
@@ -68,15 +95,22 @@ class ViewCache:
     @cached_property
     def _nearest(self) -> list[np.ndarray]:
         """Nearest depth of each coarse pixel of each camera, by a sample of opaque centres: enough to choose by."""
+        return [nearest for *_, nearest in self._projected(self._coarse)]
+
+    @cached_property
+    def _sample(self) -> np.ndarray:
+        """(N, 3) opaque centres that stand for the scene."""
         solid = np.flatnonzero(self.gaussians.logit_opacities > 0.0)
-        rows = solid[np.linspace(0, len(solid) - 1, min(len(solid), self.params.selection_points)).astype(int)]
-        points, views, out = self.gaussians.means[rows], self._coarse.T_camera_frame, []
-        for view, intrinsics, size in zip(views, self._coarse.intrinsics_px, self._coarse.sizes_px, strict=True):
-            pixel, z, _ = _project(points, view, intrinsics, size)
+        rows = np.linspace(0, len(solid) - 1, min(len(solid), self.params.selection_points)).astype(int)
+        return self.gaussians.means[solid[rows]]
+
+    def _projected(self, coarse: Cameras) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """For each camera the rows of the sample in its image, their pixels and depths, and the nearest per pixel."""
+        for view, intrinsics, size in zip(coarse.T_camera_frame, coarse.intrinsics_px, coarse.sizes_px, strict=True):
+            pixel, z, at = _project(self._sample, view, intrinsics, size)
             nearest = np.full(int(size.prod()), np.inf, np.float32)
             np.minimum.at(nearest, pixel, z)
-            out.append(nearest * np.float32(1 + self.params.selection_margin))
-        return out
+            yield at, pixel, z, nearest * np.float32(1 + self.params.selection_margin)
 
 
 def select_views(

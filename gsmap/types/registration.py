@@ -19,7 +19,7 @@ class Proposal:
     Args:
         proposer: which method proposed it, and from what, such as ``graph:landmarks``.
         S_target_source: the pose, in the scenes' own units.
-        with_scale: the scale was estimated; otherwise it is exactly 1.
+        with_scale: the scale is free; otherwise it is 1, or near it, in one metre for both.
         num_inliers: correspondences that it rests on.
         num_correspondences: candidates that they were chosen from; 0 where none were counted.
         exact: whether the search proved its answer largest.
@@ -50,8 +50,8 @@ class Registration:
         reason: one short sentence for people; empty when accepted without remark.
         S_target_source: the pose; None unless one was found. Never identity for "I don't know".
         information: (7, 7) float64 SPD over the tangent [rot_rad (3), trans (3), log_scale] applied on the source
-            side (``S = S_hat * Exp(xi)``, gtsam's order, translation in the source's unit); a rigid edge carries a
-            stiff scale row.
+            side (``S = S_hat * Exp(xi)``, gtsam's order, translation in the source's unit); that of a rigid edge says
+            how surely its scale is 1.
         num_inliers: size of the accepted set of correspondences.
         num_correspondences: candidates it was chosen from.
         overlap: share of the smaller scene's surface that coincides, in [0, 1].
@@ -76,6 +76,9 @@ class Registration:
             ``disagreement``: of the surface that both saw, as area, the share that is not the same in both: one looked
             through it, or shows another pattern on it; NaN without cameras.
             ``seen_m2``: that surface, in square metres.
+            ``log_scale``: natural logarithm of the scale as the surfaces measure it, which is that of the pose only where
+            the pose is not rigid; NaN where too little coincides to measure it.
+            ``log_scale_sigma``: its standard deviation.
         notes: what a person should know of how it was computed (a package that is missing, ...).
     """
 

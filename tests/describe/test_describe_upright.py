@@ -21,7 +21,7 @@ def surface(name: str) -> np.ndarray:
     """Points of a furnished room without a ceiling, where walls and floor are alike, or of a whole one."""
     points = surface_cloud(furnished()[0] if name == "open" else room(n=10000)[0]).points
     points = points[points[:, 2] < 1.4] if name == "open" else points
-    return points[:: len(points) // 1500] @ FRAME.T
+    return points[:: len(points) // (1500 if name == "open" else 5000)] @ FRAME.T
 
 
 def held(pitch_deg: float, turn_deg: float, roll_deg: float = 0, *, way_m=(1.0, 0.8, 0.05), jitter_deg=2.0) -> Cameras:

@@ -227,3 +227,39 @@ def test_verdict_refuses_what_is_known_too_loosely():
     assert "fixes the pose only" in verdict.judge(_SURE, _GOOD, (0.05, 0.011, 1e-6))
     assert "too little surface" in verdict.judge(_SURE, _GOOD, None)
     assert verdict.judge(replace(_SURE, flaw="mirrored"), _GOOD, _SIGMAS) == "mirrored"
+
+
+def test_what_disagrees_is_measured_as_area_however_it_was_seen():
+    """A screen of known size before a wall that both see, in one of two captures: both ways round the same area."""
+    bare = _wall(3.0, width=3.0, height=2.0)
+    screened = Gaussians.concatenate([bare, _wall(2.0, width=0.6, height=1.0, seed=5)])
+    found, back = _measured(bare, screened), _measured(screened, bare)
+    for evidence in (found, back):
+        assert evidence.disagreement * evidence.seen_m2 == pytest.approx(0.7, rel=0.2)  # with its rim
+    assert found.disagreement == pytest.approx(back.disagreement, rel=0.1)
+    # Gaussians half as wide and four times as many are no more surface.
+    dense = Gaussians.concatenate([bare, _wall(2.0, width=0.6, height=1.0, step=0.015, seed=5)])
+    assert _measured(bare, dense).disagreement == pytest.approx(found.disagreement, rel=0.2)
+
+
+def test_one_wall_seen_twice_disagrees_in_nothing():
+    found = _measured(_wall(3.0), _wall(3.0, gain=0.8, offset=0.1))
+    assert found.disagreement < 0.005
+    assert found.seen_m2 > 10
+
+
+def test_another_pattern_on_the_same_surface_disagrees_and_another_exposure_does_not():
+    """A picture of one square metre hangs on the wall in both captures, and is another one in the second."""
+    wall = _wall(3.0, width=3.0, height=2.0)
+    pictures = [_wall(2.98, width=1.0, height=1.0, seed=seed) for seed in (5, 6)]
+    one, other = (Gaussians.concatenate([wall, picture]) for picture in pictures)
+    changed = _measured(one, other)
+    assert changed.free_space_violation < 0.005
+    assert 0.4 < changed.disagreement * changed.seen_m2 < 2.6  # of one square metre, in each direction
+    assert _measured(one, one).disagreement < 0.005
+
+
+def test_without_cameras_nobody_says_what_disagrees():
+    found = _measured(_wall(3.0), _wall(3.0), cameras=(None, None))
+    assert np.isnan(found.disagreement)
+    assert found.seen_m2 == 0.0

@@ -1,21 +1,27 @@
 """Refiners, covariance, significance and the scale vote against known answers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from register_worlds import node_world, splat_world
+from scipy.stats import norm
 
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
+from gsmap.register import error_field, metres
 from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
 from gsmap.register.correspondences import Correspondences
 from gsmap.register.covariance import Params as CovarianceParams
-from gsmap.register.covariance import in_scene_units, point_to_plane_jacobian, pose_covariance
+from gsmap.register.covariance import condition, in_scene_units, point_to_plane_jacobian
 from gsmap.register.refiners import colored_icp, gicp, icp
 from gsmap.register.scale import vote_scales
 from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Sim3
+
+NOTHING_HIDDEN = CovarianceParams(hidden_turn_m=0.0, hidden_shift_m=0.0, hidden_swell_m=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -118,17 +124,18 @@ def test_jacobian_equals_finite_differences():
 @pytest.mark.parametrize("cut_m", [(3.8, 2.2), (6.0, 0.0)], ids=["a strip overlaps", "all overlaps"])
 def test_covariance_is_as_large_as_the_errors_are(cut_m):
     """Surfaces whose every cubic metre is a centimetre off, as trainers and sensors leave them: squared errors over
-    the covariance follow a chi-square with 6 degrees of freedom (median 5.35, 22.5 at 0.999)."""
+    what the residuals say follow a chi-square with 6 degrees of freedom (median 5.35, 22.5 at 0.999)."""
     errors = []
     for seed in range(6):
         world = splat_world(seed, place=(seed, seed), points=20_000, cut_m=cut_m, with_cameras=False)
         target = _warped(Surface.of(world.target.gaussians), 0.01, seed)
         source = _warped(Surface.of(world.source.gaussians), 0.01, 99 + seed)
         pose = colored_icp.refine(target, source, world.S_target_source)
-        covariance, _ = pose_covariance(target, source, pose)
+        covariance = condition(target, source, pose, NOTHING_HIDDEN).known(pose, 0.0).covariance
         off = (Similarities.stack([pose]).inverse() @ Similarities.stack([world.S_target_source])).log()[0, :6]
         errors.append(off @ np.linalg.solve(covariance[:6, :6], off))
-    assert 5.35 / 2 < np.median(errors) < 5.35 * 2
+    # Of a narrow strip residuals tell little, and fields that are alike all over it are still found possible.
+    assert 5.35 / (2 if cut_m[0] == 6.0 else 5) < np.median(errors) < 5.35 * 2
     assert max(errors) < 22.5
 
 
@@ -142,55 +149,104 @@ def _warped(surface: Surface, sigma_m: float, seed: int, cell_m: float = 1.0) ->
 
 def test_covariance_moves_with_the_source_frame(world, surfaces):
     target, source = surfaces
-    covariance, _ = pose_covariance(target, source, world.S_target_source)
+    covariance = condition(target, source, world.S_target_source).known(world.S_target_source).covariance
     assert np.linalg.eigvalsh(covariance).min() > 0
     # The same source with its origin 40 m away: the spread of any of its points in the target stays as it was.
     shift = np.array([40.0, 0, 0])
     moved = Surface(source.points + shift, source.colours, source.resolution_m)
     pose = world.S_target_source @ Sim3(np.eye(3), -shift)
-    other, _ = pose_covariance(target, moved, pose)
+    other = condition(target, moved, pose).known(pose).covariance
     point = source.points.mean(0)
     a = point_to_plane_jacobian(world.S_target_source, np.tile(point, (3, 1)), np.eye(3))
     b = point_to_plane_jacobian(pose, np.tile(point + shift, (3, 1)), np.eye(3))
     assert np.allclose(a @ covariance @ a.T, b @ other @ b.T, rtol=0.05)
 
 
-def test_covariance_is_a_sandwich_over_cells_plus_a_floor(world, surfaces):
-    """Against the formula written out, at the source's origin: one gradient a cell, C / (C - 6), factor, floor."""
+def _walls(rng, blocks: int = 150) -> error_field.Blocks:
+    """Blocks on the walls, the floor and the ceiling of a room of 6 x 4 x 2.5 m, and how residuals there follow a pose."""
+    size = np.array([6.0, 4.0, 2.5])
+    positions, axis = rng.uniform(0, 1, (blocks, 3)) * size, rng.integers(0, 3, blocks)
+    positions[np.arange(blocks), axis] = size[axis] * rng.integers(0, 2, blocks)
+    directions = np.eye(3)[axis]
+    jacobian = point_to_plane_jacobian(Sim3.identity(), positions - positions.mean(0), directions)
+    return error_field.Blocks(jacobian, np.zeros(blocks), positions, directions, np.full(blocks, 1e9))
+
+
+def test_errors_are_judged_by_the_restricted_likelihood_of_one_field():
+    """With one length and one share there is nothing to average: the generalised least squares written out."""
+    rng = np.random.default_rng(3)
+    blocks = replace(_walls(rng), residual=rng.normal(size=150) * 0.01, counts=rng.uniform(3, 90, 150))
+    params = error_field.Params(lengths_m=(1.5,), shares=(0.3,))
+    influence = rng.normal(size=(4, 150))
+    found = error_field.judge_errors(blocks, influence, params)
+    distance = np.linalg.norm(blocks.positions[:, None] - blocks.positions[None], axis=2)
+    K = 0.3 * np.exp(-distance / 1.5) * (blocks.directions @ blocks.directions.T)
+    K += np.diag(0.7 * (1 + params.few / blocks.counts))
+    X, y, W = blocks.jacobian, blocks.residual, np.linalg.inv(K)
+    left = y - X @ np.linalg.solve(X.T @ W @ X, X.T @ W @ y)
+    variance = left @ W @ left / (150 - 7 - 2)
+    assert np.allclose(found.covariance, variance * influence @ K @ influence.T)
+    assert found.field_m == pytest.approx(np.sqrt(0.3 * variance))
+
+
+@pytest.mark.parametrize("length_m", [0.0, 1.0, 4.0], ids=["noise", "a metre", "four metres"])
+def test_errors_of_a_field_are_found_whatever_its_length(length_m):
+    """A thousandfold repeated room: squared errors of least squares over what its residuals say, on average 7."""
+    rng = np.random.default_rng(7)
+    blocks, values, fields = _walls(rng), [], []
+    distance = np.linalg.norm(blocks.positions[:, None] - blocks.positions[None], axis=2)
+    K = 1e-6 * np.eye(150)
+    if length_m:
+        K += 4e-6 * np.exp(-distance / length_m) * (blocks.directions @ blocks.directions.T)
+    root, influence = np.linalg.cholesky(K), np.linalg.pinv(blocks.jacobian)
+    for _ in range(40):
+        noise = root @ rng.normal(size=150)
+        off = influence @ noise
+        found = error_field.judge_errors(replace(blocks, residual=noise - blocks.jacobian @ off), influence)
+        values.append(off @ np.linalg.solve(found.covariance, off))
+        fields.append(found.field_m)
+    assert 6.35 / 2 < np.median(values) < 6.35 * 1.5
+    assert (np.median(fields) < 5e-4) == (length_m == 0.0)  # true: 0 or 2 mm
+
+
+def test_too_few_blocks_say_nothing():
+    blocks = _walls(np.random.default_rng(0), 9)
+    assert error_field.judge_errors(blocks, np.eye(9)) is None
+
+
+def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfaces):
+    """Over the overlap's radius, and as the square of the errors that residuals show."""
     target, source = surfaces
-    pose, params = world.S_target_source, CovarianceParams(floor_m=0.0)
-    found, _ = pose_covariance(target, source, pose, params)
-    points = source.coarse[0]
-    distance, row = target.nearest(pose.apply(points), params.radius_m)
-    hit = np.isfinite(distance)
-    normals, moved = target.normals[row[hit]], pose.apply(points[hit])
-    residual = (normals * (moved - target.coarse[0][row[hit]])).sum(1)
-    jacobian = point_to_plane_jacobian(pose, points[hit], normals)[:, :6]
-    cells = np.floor(moved / params.cell_m).astype(int)
-    gradients = []
-    for cell in np.unique(cells, axis=0):
-        inside = (cells == cell).all(1)
-        gradients.append((jacobian[inside] * residual[inside, None]).sum(0))
-    g, inverse = np.array(gradients), np.linalg.inv(jacobian.T @ jacobian)
-    expected = 2.0 * inverse @ (g.T @ g) @ inverse * len(g) / (len(g) - 6)
-    assert np.allclose(found[:6, :6], expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
-    assert found[6, 6] == pytest.approx(1e-12)
-    # The floor: a centimetre a cell, averaged over the cells, turns over the overlap's radius. It adds, never takes.
-    with_floor, sigmas = pose_covariance(target, source, pose)
-    assert np.linalg.eigvalsh(with_floor - found)[0] > -1e-12
-    least = 0.01 / np.sqrt(len(g))
-    assert sigmas[1] > least
-    spread = points[hit] - points[hit].mean(0)
-    assert sigmas[0] > least / np.sqrt((spread**2).sum(1).mean())
+    pose = world.S_target_source
+    params = CovarianceParams(hidden_turn_m=0.01, hidden_shift_m=0.02, hidden_swell_m=0.03, field_m=0.004)
+    bare, found = condition(target, source, pose, NOTHING_HIDDEN), condition(target, source, pose, params)
+    growth = (bare.field_m / 0.004) ** 2
+    near = np.isfinite(target.nearest(pose.apply(source.coarse[0]), params.radius_m)[0])
+    inside = source.coarse[0][near]
+    radius = np.sqrt(((inside - inside.mean(0)) ** 2).sum(1).mean())
+    expected = growth * np.r_[np.full(3, 0.01 / radius), np.full(3, 0.02), 0.03 / radius]
+    expected[6] = 1 / np.sqrt(1 / expected[6] ** 2 + 1 / 0.02**2)  # no sensor is off by much more than 2 percent
+    assert np.allclose(np.sqrt(np.diag(found.scaled - bare.scaled)), expected)
+    assert np.allclose(np.sqrt(np.diag(found.rigid - bare.rigid)), expected[:6])
 
 
-def test_the_variance_of_the_scale_has_a_factor_of_its_own(world, surfaces):
-    found = [
-        pose_covariance(*surfaces, world.S_target_source, CovarianceParams(scale_factor=f), with_scale=True)
-        for f in (1.0, 9.0)
-    ]
-    assert found[1][1][2] == pytest.approx(3.0 * found[0][1][2])
-    assert found[1][1][:2] == found[0][1][:2]
+def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
+    """Refined under a scale that is 0.3 percent wrong, a pose moves as its covariance says of that much scale."""
+    target, source = surfaces
+    pose = world.S_target_source
+    conditioned = condition(target, source, pose, NOTHING_HIDDEN)
+    wrong = conditioned.rescaled(pose, 1.003)
+    assert wrong.scale == pytest.approx(1.003)
+    again = colored_icp.refine(target, source, wrong, colored_icp.Params((0.06,), max_points=(20_000,)))
+    centre = np.median(source.points, axis=0)
+    moved = [np.linalg.norm(again.apply(centre) - other.apply(centre)) for other in (wrong, pose)]
+    assert moved[0] < 0.003
+    assert moved[0] < 0.5 * moved[1]
+    sure, unsure = (conditioned.known(pose, sigma).covariance for sigma in (0.0, 0.003))
+    off = (Similarities.stack([pose]).inverse() @ Similarities.stack([again])).log()[0]
+    assert off @ np.linalg.solve(sure, off) > 1e4
+    assert off @ np.linalg.solve(unsure, off) < 7
+    assert np.sqrt(unsure[6, 6]) == pytest.approx(0.003)
 
 
 def test_covariance_in_scene_units_scales_translations_only():
@@ -201,13 +257,36 @@ def test_covariance_in_scene_units_scales_translations_only():
 
 def test_a_small_overlap_knows_angles_and_scale_less_well(world, surfaces):
     target, source = surfaces
-    inside = world.S_target_source.apply(source.points)
+    pose = world.S_target_source
+    inside = pose.apply(source.points)
     near = np.linalg.norm(inside - [3.0, 0.0, 0.5], axis=1) < 0.8
     part = Surface(source.points[near], source.colours[near], source.resolution_m)
-    _, all_of_it = pose_covariance(target, source, world.S_target_source, with_scale=True)
-    _, little = pose_covariance(target, part, world.S_target_source, with_scale=True)
+    all_of_it, little = (condition(target, s, pose).known(pose).sigmas for s in (source, part))
     assert little[0] > 2 * all_of_it[0]
     assert little[2] > 2 * all_of_it[2]
+
+
+def test_a_measured_scale_is_one_or_what_was_measured():
+    """One within three sigma of it; and then as sure as Bayes' rule, written out, makes it."""
+    params = metres.Params(drift_sigma=0.02)
+    grid = np.linspace(-0.2, 0.2, 400_001)
+    for log_scale, sigma in [(0.0, 0.001), (0.002, 0.001), (-0.0029, 0.001), (0.02, 0.02), (0.0, 0.2)]:
+        found = metres.believe(log_scale, sigma, params)
+        posterior = norm.pdf(grid, 0, 0.02) * norm.pdf(log_scale, grid, sigma)
+        posterior /= posterior.sum()
+        assert found.rigid
+        assert found.log_scale_sigma == pytest.approx(np.sqrt(posterior @ grid**2), rel=1e-3)
+    for log_scale, sigma in [(0.0031, 0.001), (-0.02, 0.0005)]:
+        assert metres.believe(log_scale, sigma, params) == metres.Belief(False, log_scale, sigma, sigma)
+
+
+def test_sources_that_were_told_to_be_metric_stay_so_and_disagreement_is_said():
+    agrees, disagrees = (metres.believe(x, 0.001, told=True) for x in (0.003, -0.02))
+    assert agrees.rigid
+    assert not agrees.note
+    assert disagrees.rigid
+    assert "-1.98% (20 sigma)" in disagrees.note
+    assert disagrees.log_scale_sigma == pytest.approx(0.02, rel=0.01)  # 1 is taken, and is known to be that far off
 
 
 def test_surface_leaves_out_what_is_faint_or_huge():

@@ -14,7 +14,7 @@ from gsmap.methods.refiner import Surface
 from gsmap.register.covariance import point_to_plane_jacobian
 from gsmap.types import Sim3
 
-VERSION = 1
+VERSION = 2
 SCALES = True
 
 _FEWEST = 10  # cells and pairs; fewer tell nothing of a pose
@@ -26,24 +26,24 @@ class Params:
 
     Args:
         radii_m: correspondence distances, coarse to fine.
-        iterations: Gauss-Newton steps at each radius, where the pose is rigid.
-        scale_iterations: the same where the scale is free, which settles more slowly.
+        least_sigmas: among radii that are fine enough for colour, none is taken that is smaller than this many standard
+            deviations of the distances between the planes: it would cut off noise, and hold the pose where it is.
+        iterations: Gauss-Newton steps at each radius.
         colour_weight: metres of distance that one standard deviation of local colour counts for, at fine radii;
             0 leaves colour out.
         colour_radius_m: at radii beyond this colour is left out: lightness extrapolated so far in a tangent plane means
             nothing.
         max_points: source cells that take part at each radius.
-        overstep: factor on steps where the scale is free: pairs follow the pose only in part, so steps fall short, most
-            of all along the scale.
+        overstep: factor on steps: pairs follow the pose only in part, so steps fall short, most of all along the scale.
         max_scale_change: factor by which the scale may move away from the start's before the start is given back.
     """
 
-    radii_m: tuple[float, ...] = (0.4, 0.15, 0.06)
-    iterations: int = 10
-    scale_iterations: int = 20
+    radii_m: tuple[float, ...] = (0.4, 0.15, 0.06, 0.03)
+    least_sigmas: float = 4.0
+    iterations: int = 20
     colour_weight: float = 0.01
     colour_radius_m: float = 0.1
-    max_points: tuple[int, ...] = (3000, 6000, 20_000)
+    max_points: tuple[int, ...] = (3000, 6000, 20_000, 20_000)
     overstep: float = 1.5
     max_scale_change: float = 1.3
 
@@ -69,11 +69,16 @@ def refine(
     pose = start
     if len(source) < _FEWEST or len(target) < _FEWEST:
         return start
-    iterations = params.scale_iterations if with_scale else params.iterations
+    before, noise = np.inf, 0.0
     for radius, count in zip(params.radii_m, params.max_points, strict=True):
+        if before <= params.colour_radius_m:
+            radius = min(before, max(radius, params.least_sigmas * noise))
+            if radius > 0.9 * before:
+                continue
+        before = radius
         count = count // 2 if with_scale else count
         chosen, chosen_back = source.sample(count), target.sample(count)
-        for _ in range(iterations):
+        for _ in range(params.iterations):
             pairs = _Pairs.of(target, source, pose, chosen, radius)
             if len(pairs.points) < _FEWEST:
                 return pose
@@ -93,8 +98,7 @@ def refine(
             dim = 7 if with_scale else 6
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
             step[:dim] = -np.linalg.solve((system + damping)[:dim, :dim], gradient[:dim])
-            if with_scale:
-                step *= params.overstep
+            step *= params.overstep
             # No single step goes farther than the correspondences reach.
             step *= min(1.0, 0.1 / max(np.abs(step[:3]).max(), 1e-12), radius / max(np.abs(step[3:6]).max(), 1e-12))
             step[6] = np.clip(step[6], -0.05, 0.05)
@@ -103,6 +107,7 @@ def refine(
                 return start
             if np.linalg.norm(pose.apply(pairs.points) - pairs.moved, axis=1).max() < 0.002 * radius:
                 break
+        noise = pairs.noise_m
     return pose
 
 
@@ -134,6 +139,12 @@ class _Pairs:
         distance, rows = onto.nearest(moved, radius_m)
         hit = np.flatnonzero(np.isfinite(distance))
         return cls(onto, rows[hit], points[hit], moving.lightness[chosen[hit]], moved[hit])
+
+    @property
+    def noise_m(self) -> float:
+        """Robust standard deviation of the distances to the planes."""
+        offset = self.moved - self.onto.coarse[0][self.rows]
+        return 1.4826 * float(np.median(np.abs((self.onto.normals[self.rows] * offset).sum(1))))
 
     def equations(
         self, jacobian: Callable[[np.ndarray], np.ndarray], radius_m: float, params: Params

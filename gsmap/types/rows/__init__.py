@@ -29,7 +29,7 @@ from gsmap.types.rows.maps import (
     ViewReport,
 )
 from gsmap.types.rows.objects import HistoryReport, ObjectRow, ObjectsReport, RelationRow, SightingRow
-from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairRef, PairReport
+from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairRef, PairReport, WhyReport, WhyStep
 from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
 from gsmap.types.rows.scenes import (
     FactRow,
@@ -57,7 +57,6 @@ from gsmap.types.rows.truth import (
 from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
 
 __all__ = [
-    "SCHEMA",
     "AtWorkRow",
     "BackupReport",
     "BandRow",
@@ -104,6 +103,7 @@ __all__ = [
     "RestoreReport",
     "RevisionRow",
     "Row",
+    "SCHEMA",
     "SceneEdgeRow",
     "SceneRef",
     "SceneReport",
@@ -119,4 +119,6 @@ __all__ = [
     "TrustReport",
     "UpdateReport",
     "ViewReport",
+    "WhyReport",
+    "WhyStep",
 ]

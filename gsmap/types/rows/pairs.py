@@ -122,3 +122,41 @@ class PairReport(EdgeRow):
     residual_chi2: float | None = None
     notes: tuple[str, ...] = ()
     history: tuple[PairEventRow, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WhyStep(Row):
+    """One thing that was asked of a pair on the way from being found to its place in the map.
+
+    Args:
+        name: what was asked.
+        value: the answer; null where there is none.
+        bar: what it is held against, in words; empty where it is told for information alone.
+        passed: whether it cleared the bar; null where there is no bar or no answer.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"name": "step", "value": "value", "bar": "bar", "passed": "passed"}
+
+    name: str
+    value: float | int | str | None
+    bar: str = ""
+    passed: bool | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WhyReport(PairRef):
+    """Why a pair is an edge of the map, or is not.
+
+    Args:
+        status: as in `EdgeRow`.
+        reason: as in `EdgeRow`.
+        steps: from retrieval to the place in the map.
+        advice: what would settle it; empty where nothing is open.
+        picture: file with both captures seen from the same cameras, where it was asked for and there is a pose.
+    """
+
+    status: str
+    reason: str
+    steps: tuple[WhyStep, ...]
+    advice: str
+    picture: str | None = None

@@ -1,0 +1,35 @@
+"""gsmap why: why a pair is an edge of the map, or is not."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table, say
+
+
+def command(
+    map: MapPath,
+    pair: Annotated[str, typer.Argument(metavar="A:B", help="The pair of scenes.")],
+    pictures: Annotated[
+        str | None,
+        typer.Option("--pictures", metavar="DIR", help="Also draw both captures from the same cameras into a folder."),
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Show what was asked of a pair of scenes, step by step, what was found, and what would settle what is open.
+
+    Example: `gsmap why site.gsmap monday:tuesday --pictures why`
+    """
+    from gsmap.types.rows import WhyStep
+
+    with opened(map) as m:
+        report = m.why(pair, pictures=pictures)
+    if json:
+        print_rows("why", report, json)
+        return
+    print_facts(report.pair, {"status": report.status, "reason": report.reason, "what would settle it": report.advice})
+    print_table("steps", WhyStep.columns, report.steps)
+    if report.picture:
+        say(f"wrote {report.picture}")

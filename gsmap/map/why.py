@@ -1,0 +1,94 @@
+"""Why a pair is an edge of the map or is not: every step from retrieval to its place, and what would settle it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gsmap.map.one_state import of_one_state
+from gsmap.map.reports import pair_report
+from gsmap.map.settings import Settings
+from gsmap.register import verdict
+from gsmap.store import Store
+from gsmap.types import Scene
+from gsmap.types.rows import PairReport, WhyReport, WhyStep
+
+
+@of_one_state
+def why(store: Store, settings: Settings, a: Scene, b: Scene) -> WhyReport:
+    """Every step of a pair, from what is stored of it; nothing is computed again."""
+    pair = pair_report(store, a, b)
+    steps = _steps(pair, settings)
+    advice = _advice(pair, settings, {step.name: step for step in steps})
+    ends = {name: getattr(pair, name) for name in ("target", "target_name", "source", "source_name")}
+    return WhyReport(**ends, status=pair.status, reason=pair.reason, steps=tuple(steps), advice=advice)
+
+
+def _steps(pair: PairReport, settings: Settings) -> list[WhyStep]:
+    if pair.status == "never registered":
+        return [WhyStep(name="retrieval", value="never tried", bar="among the candidates", passed=False)]
+    steps = [WhyStep(name="retrieval", value="tried", bar="among the candidates", passed=True)]
+    if pair.proposer:
+        steps += _evidence(pair, settings.register.verdict, settings.optimize.aliasing.max_disagreement)
+    steps.append(WhyStep(name="verdict", value=pair.status, bar="accepted", passed=pair.status == "accepted"))
+    if pair.review:
+        steps.append(WhyStep(name="review", value=pair.review))
+    if pair.status == "accepted":
+        used = pair.used if isinstance(pair.used, str) else "used" if pair.used else "unused"
+        steps.append(WhyStep(name="the other edges", value=used, bar="bear it out: used", passed=pair.used is True))
+    return steps
+
+
+def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -> list[WhyStep]:
+    """The pose that was found, and each piece of evidence with its bar."""
+    figures: Mapping[str, Any] = pair.evidence
+
+    def held(name: str, figure: str, bar: float, *, at_least: bool = False, note: str = "") -> WhyStep:
+        value = float(figures.get(figure, np.nan))
+        known = bool(np.isfinite(value))
+        passed = None if not known else bool(value >= bar if at_least else value <= bar)
+        words = f"{'at least' if at_least else 'at most'} {bar:g}{note}"
+        return WhyStep(name=name, value=value if known else None, bar=words, passed=passed)
+
+    changed = figures.get("colour_correlation", 0.0) >= bars.changed_colour_correlation
+    free = bars.changed_free_space_violation if changed else bars.max_free_space_violation
+    agree = ", since colours agree" if changed else ""
+    return [
+        WhyStep(name="correspondences", value=pair.num_correspondences),
+        WhyStep(name="clique", value=pair.num_inliers),
+        held("log10 false alarms", "log_nfa", bars.max_log_nfa, note=", or strong surfaces"),
+        held("rival clique", "runner_up", bars.max_runner_up, note=" of its size"),
+        WhyStep(name="pose by", value=pair.proposer),
+        WhyStep(name="overlap", value=pair.overlap),
+        held("coinciding cells", "num_coinciding", bars.min_coinciding, at_least=True),
+        held("colour correlation", "colour_correlation", bars.min_colour_correlation, at_least=True),
+        held("colour significance", "colour_t", bars.min_colour_t, at_least=True, note=" sigma"),
+        held("free-space violation", "free_space_violation", free, note=agree),
+        held("disagreement", "disagreement", max_disagreement, note=" of what both saw, or it is in doubt"),
+    ]
+
+
+def _advice(pair: PairReport, settings: Settings, steps: Mapping[str, WhyStep]) -> str:
+    """What would settle the first thing that is open; empty where nothing is."""
+    a, b, at = pair.target_name, pair.source_name, "MAP"
+    failed = {name for name, step in steps.items() if step.passed is False}
+    if pair.review or pair.used is True:
+        return ""
+    if pair.status == "never registered":
+        return f"nothing says that they share a place; where you know better: gsmap register {at} {pair.pair}"
+    in_doubt = "disagreement" in failed
+    if in_doubt and pair.status == "accepted":
+        return (
+            "a place that changed, or another that looks alike: one capture that walks from what "
+            f"{a} shows to what {b} shows, or that passes what only one of them has, tells; dates do too "
+            f"(gsmap edit {at} SCENE --captured-at DATE); where you know it: gsmap confirm or reject {at} {pair.pair}"
+        )
+    if pair.status == "accepted":
+        return f"a further capture that overlaps both {a} and {b} closes a loop that bears it out or contradicts it"
+    if "coinciding cells" in failed or pair.status == "no_match":
+        return f"a capture of the way from {a} to {b} that shares about a third of either"
+    if "free-space violation" in failed or in_doubt:
+        return f"two places that look alike, or one that changed a lot: gsmap confirm {at} {pair.pair} where you know"
+    return f"a capture that shows more of what {a} and {b} share, from both sides"

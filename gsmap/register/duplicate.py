@@ -1,0 +1,72 @@
+"""Whether two scenes that lie on each other are one capture: converted, thinned out or trained again."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.geometry.umeyama import umeyama
+from gsmap.register.scene_view import SceneView
+from gsmap.types import Registration, Sim3
+
+SAME_CAPTURE = "the same capture"
+_MIN_OVERLAP = 0.5  # of the surface; below, neither scene is the other
+_MIN_SHARE = 0.9  # of the smaller scene's Gaussians, or of the fewer cameras
+_POINTS = 3000
+# Independent Gaussians of one surface lie half their spacing from the nearest of the other (2D Poisson: mean nearest
+# distance to another set equals that within the set); those of one training lie where they were.
+_SPACING_SHARE = 0.1
+_MIN_CAMERAS = 5
+_CAMERA_SHARE = 0.005  # of the distance between camera and scene: no second visit takes every picture to a centimetre
+_CAMERA_DEG = 1.0
+
+
+def same_capture(target: SceneView, source: SceneView, found: Registration) -> str:
+    """What says that an accepted pair is one capture twice; empty where nothing does."""
+    S = found.S_target_source
+    if found.status != "accepted" or S is None or found.overlap < _MIN_OVERLAP:
+        return ""
+    share = _coinciding_gaussians(target, source, S)
+    if share >= _MIN_SHARE:
+        return f"{SAME_CAPTURE} twice: {share:.0%} of the Gaussians of the smaller scene are Gaussians of the other"
+    shared, of = _coinciding_cameras(target, source, S)
+    if of >= _MIN_CAMERAS and shared >= _MIN_SHARE * of:
+        return f"{SAME_CAPTURE} trained twice: {shared} of {of} cameras are cameras of the other"
+    return ""
+
+
+def _coinciding_gaussians(target: SceneView, source: SceneView, S_target_source: Sim3) -> float:
+    """The share of the smaller scene's Gaussians that lie where one of the other's does."""
+    means, moved = target.gaussians.means.astype(float), S_target_source.apply(source.gaussians.means)
+    large, small = (means, moved) if len(means) >= len(moved) else (moved, means)
+    small = small[np.linspace(0, len(small) - 1, min(len(small), _POINTS)).astype(int)]
+    tree = cKDTree(large, balanced_tree=False, compact_nodes=False)
+    spacing = tree.query(large[np.linspace(0, len(large) - 1, len(small)).astype(int)], k=2)[0][:, 1]
+    distance, _ = _laid_exactly(tree, small)
+    return float((distance < _SPACING_SHARE * np.median(spacing)).mean())
+
+
+def _laid_exactly(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances to and rows of the nearest points of a set, once the nearer half of the points is laid on it: the
+    refined pose is good to a millimetre, which may be the spacing."""
+    for _ in range(4):
+        distance, row = tree.query(points)
+        near = np.argsort(distance)[: max(3, len(points) // 2)]
+        points = umeyama(tree.data[row[near]], points[near]).apply(points)
+    distance, row = tree.query(points)
+    return distance, row
+
+
+def _coinciding_cameras(target: SceneView, source: SceneView, S_target_source: Sim3) -> tuple[int, int]:
+    """How many cameras of the scene with fewer stand and look as one of the other's, and how many those are."""
+    ours, theirs = target.cameras, source.cameras
+    if not ours or not theirs or ours.synthesised or theirs.synthesised:
+        return 0, 0
+    poses = ours.T_frame_camera, theirs.T_frame_camera
+    centres = poses[0][:, :3, 3], S_target_source.apply(poses[1][:, :3, 3])
+    forward = poses[0][:, :3, 2], poses[1][:, :3, 2] @ S_target_source.rotation.T
+    few, many = (0, 1) if len(centres[0]) < len(centres[1]) else (1, 0)
+    away = np.median(np.linalg.norm(centres[0] - target.centre, axis=1))
+    distance, row = _laid_exactly(cKDTree(centres[many]), centres[few])
+    looks = (forward[few] * forward[many][row]).sum(1) > np.cos(np.radians(_CAMERA_DEG))
+    return int(np.sum((distance < _CAMERA_SHARE * away) & looks)), len(distance)

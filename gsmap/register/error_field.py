@@ -1,0 +1,100 @@
+"""The errors of a pair's surfaces as a random field, from the residuals that a pose leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_FREE = 3  # residuals more than parameters, at least: fewer have no variance
+
+
+@dataclass(frozen=True)
+class Params:
+    """Which error fields are thought possible.
+
+    Args:
+        lengths_m: over which distances errors may be alike (their correlation falls as ``exp(-distance / length)``).
+        shares: which share of a block's variance may be alike beyond the block.
+        few: a block of this many points has twice the variance of one of very many.
+    """
+
+    lengths_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    shares: tuple[float, ...] = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95)
+    few: float = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Means of residuals over B blocks of surface.
+
+    Args:
+        jacobian: (B, D) derivative of the residuals by the parameters.
+        residual: (B,) metres.
+        positions: (B, 3) metres.
+        directions: (B, 3) unit vectors along which the residuals are taken.
+        counts: (B,) how many residuals each mean is of.
+    """
+
+    jacobian: np.ndarray
+    residual: np.ndarray
+    positions: np.ndarray
+    directions: np.ndarray
+    counts: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """What residuals show of errors.
+
+    Args:
+        covariance: (E, E) of the estimates.
+        field_m: standard deviation of the errors that are alike beyond a block.
+    """
+
+    covariance: np.ndarray
+    field_m: float
+
+
+def judge_errors(blocks: Blocks, influence: np.ndarray, params: Params | None = None) -> Errors | None:
+    """The errors of estimates that are linear in those of the blocks, as the blocks' residuals show them.
+
+    The errors are those of a displacement field (isotropic, stationary, with an exponential covariance), seen along the
+    blocks' directions, and independent noise of each block. Residuals are what D fitted parameters left of the errors,
+    so the field is judged by its restricted likelihood (Patterson and Thompson 1971), which does not count what the fit
+    took away: a long-waved field leaves little, and is still found possible. What few residuals cannot tell apart is
+    averaged over, weighted by likelihood (Harville 1974: flat priors), not chosen.
+
+    Args:
+        influence: (E, B) change of each estimate by the error of each block.
+
+    Returns:
+        None where the blocks are hardly more than the parameters.
+    """
+    params = params or Params()
+    count, dim = blocks.jacobian.shape
+    free = count - dim
+    if free < _FREE:
+        return None
+    noise = np.sqrt(1.0 + params.few / blocks.counts)  # in these units the noise of all blocks is alike
+    # An orthonormal basis of what no parameter explains.
+    rest = np.linalg.qr(blocks.jacobian / noise[:, None], mode="complete")[0][:, dim:]
+    left = rest.T @ (blocks.residual / noise)
+    distance = np.linalg.norm(blocks.positions[:, None] - blocks.positions[None], axis=2)
+    alike = (blocks.directions @ blocks.directions.T) / np.outer(noise, noise)
+    spread = influence * noise
+    own, logs, outcomes, fields = spread @ spread.T, [], [], []
+    for length in params.lengths_m:
+        field = alike * np.exp(-distance / length)
+        values, vectors = np.linalg.eigh(rest.T @ field @ rest)
+        squares, shared = (vectors.T @ left) ** 2, spread @ field @ spread.T
+        for share in params.shares:
+            spectrum = share * np.maximum(values, 0.0) + 1.0 - share
+            chi2 = max(float((squares / spectrum).sum()), 1e-30)
+            logs.append(-0.5 * (np.log(spectrum).sum() + free * np.log(chi2)))
+            variance = chi2 / (free - 2)
+            fields.append(share * variance)
+            outcomes.append(variance * (share * shared + (1.0 - share) * own))
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    return Errors(np.einsum("k,kij->ij", weights, np.array(outcomes)), float(np.sqrt(weights @ np.array(fields))))

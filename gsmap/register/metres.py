@@ -1,0 +1,65 @@
+"""What a measured scale says of two sources that may both be in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Params:
+    """What is believed of sources that may be in metres.
+
+    Args:
+        drift_sigma: log scale by which two such sources differ: metres of phones and of SLAM drift by one to three
+            percent.
+        rigid_sigmas: the scale is taken for 1 where it is measured to be within this many standard deviations of it.
+        disagree_sigmas: two sources that were told to be in metres and measure further from 1 than this are noted.
+    """
+
+    drift_sigma: float = 0.02
+    rigid_sigmas: float = 3.0
+    disagree_sigmas: float = 5.0
+
+
+@dataclass(frozen=True)
+class Belief:
+    """The scale between two sources after it was measured.
+
+    Args:
+        rigid: the scale is taken for 1.
+        log_scale: the measured one ...
+        measured_sigma: ... and its standard deviation.
+        log_scale_sigma: standard deviation of the scale that is taken.
+        note: what a person should know, or empty.
+    """
+
+    rigid: bool
+    log_scale: float
+    measured_sigma: float
+    log_scale_sigma: float
+    note: str = ""
+
+
+def believe(log_scale: float, sigma: float, params: Params | None = None, *, told: bool = False) -> Belief:
+    """Whether a measured log scale is 1 or what was measured, and how sure that is.
+
+    Before it is measured the log scale is ``N(0, drift_sigma^2)``, the measurement is ``N(log scale, sigma^2)``; how
+    sure a scale of 1 is, is the root mean square of what Bayes' rule makes of both: of a scale that the surfaces do not
+    fix no more is known than that metres drift. What was ``told`` is taken whatever is measured, and its standard
+    deviation then says how far that is from the measurement.
+    """
+    params = params or Params()
+    off = abs(log_scale) / sigma
+    if not told and off > params.rigid_sigmas:
+        return Belief(False, log_scale, sigma, sigma)
+    weight = params.drift_sigma**2 / (params.drift_sigma**2 + sigma**2)
+    log_scale_sigma = float(np.sqrt(weight * sigma**2 + (weight * log_scale) ** 2))
+    note = ""
+    if off > params.disagree_sigmas:
+        note = (
+            f"both sources are said to be in metres, and their surfaces differ by {np.expm1(log_scale):+.2%} "
+            f"({off:.0f} sigma): check one's unit"
+        )
+    return Belief(True, log_scale, sigma, log_scale_sigma, note)

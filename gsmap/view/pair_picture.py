@@ -1,0 +1,48 @@
+"""A picture of a pair for a person to judge: both captures from the same cameras, and where they are not the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsmap.render import render
+from gsmap.types import Cameras, PlacedScene
+
+_TOLERANCE_M, _TOLERANCE = 0.10, 0.02  # depths that differ by more, and this share of the depth, are not the same
+_GAP_PX = 4
+_MARK = np.array([1.0, 0.25, 0.25])
+
+
+def draw_pair(
+    target: PlacedScene, source: PlacedScene, cameras: Sequence[Cameras], unit_m: float = 1.0, side_px: int = 320
+) -> np.ndarray:
+    """A row for each camera, (H, W, 3) uint8: the target, the source, and the target with what is not the same marked.
+
+    Args:
+        target, source: both captures, in one frame.
+        cameras: one camera each, in that frame; without any the picture is blank.
+        unit_m: metres per unit of that frame.
+        side_px: longer side of each of the three pictures.
+    """
+    rows = [_row(target, source, camera.resized(side_px), unit_m) for camera in cameras]
+    if not rows:
+        return np.full((_GAP_PX, _GAP_PX, 3), 255, np.uint8)
+    width = max(row.shape[1] for row in rows)
+    gap = np.full((_GAP_PX, width, 3), 255, np.uint8)
+    wide = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    return np.concatenate([part for row in wide for part in (row, gap)][:-1])
+
+
+def _row(target: PlacedScene, source: PlacedScene, camera: Cameras, unit_m: float) -> np.ndarray:
+    one, other = (render(scene.gaussians, camera) for scene in (target, source))
+    looks = [np.clip(np.nan_to_num(seen.colour[0]), 0, 1) for seen in (one, other)]
+    depth, other_depth = one.depth[0] * unit_m, other.depth[0] * unit_m
+    both = (one.alpha[0] > 0.5) & (other.alpha[0] > 0.5)
+    apart = both & (np.abs(depth - other_depth) > _TOLERANCE_M + _TOLERANCE * np.minimum(depth, other_depth))
+    grey = np.repeat(looks[0].mean(-1, keepdims=True), 3, axis=-1)
+    marked = np.where(apart[..., None], 0.4 * grey + 0.6 * _MARK, grey)
+    gap = np.ones((looks[0].shape[0], _GAP_PX, 3))
+    row = np.concatenate([looks[0], gap, looks[1], gap, marked], axis=1)
+    found: np.ndarray = (row * 255 + 0.5).astype(np.uint8)
+    return found

@@ -1,0 +1,131 @@
+"""Edges whose captures disagree in what both saw: what the map bears out, contradicts, or leaves open."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_worlds import poses_at, true_edges
+
+from gsmap.optimize import Params, optimize
+from gsmap.optimize.doubt import chance_alike
+
+QUICK = Params(marginals=False)
+SURE, DOUBTFUL = 0.05, 0.2
+ROOM_M = 4.5
+
+
+class Street:
+    """Captures of a street whose rooms come again after ``period``; capture k shares a room with k + 1 alone."""
+
+    def __init__(self, count=14, period=5):
+        rng = np.random.default_rng(3)
+        at = np.c_[ROOM_M * np.arange(count), np.zeros((count, 2))]
+        truth = poses_at(at, seed=1)
+        truth.rotations[:] = truth.rotations[:1]
+        self.ids = [f"s{k:02d}" for k in range(count)]
+        chain = np.c_[np.arange(count - 1), np.arange(1, count)]
+        self.right = [replace(e, disagreement=SURE) for e in true_edges(truth, chain, rng, self.ids)]
+        self.wrong = []
+        for a in range(count):
+            for b in range(a + period - 1, count):
+                seems = (b - a + 1) % period - 1  # rooms further on, as both captures show it
+                if seems <= 1:
+                    looks = truth.replaced(np.array([b]), poses_at(at[[a]] + [ROOM_M * seems, 0, 0]))
+                    looks.rotations[:] = truth.rotations
+                    (edge,) = true_edges(looks, np.array([(a, b)]), rng, self.ids)
+                    self.wrong.append(replace(edge, disagreement=DOUBTFUL))
+
+    def without(self, *gone):
+        keep = [s for k, s in enumerate(self.ids) if k not in gone]
+        right, wrong = ([e for e in edges if {e.target, e.source} <= set(keep)] for edges in (self.right, self.wrong))
+        return keep, right, wrong
+
+
+def uses(answer, edges):
+    return {answer.use(e.target, e.source) for e in edges}
+
+
+def components(answer):
+    found = {}
+    for scene, pose in answer.poses.items():
+        found.setdefault(pose.component, []).append(scene)
+    return sorted(found.values())
+
+
+def test_a_street_of_look_alikes_is_laid_out_as_it_is():
+    street = Street()
+    blind = [replace(e, disagreement=float("nan")) for e in street.right + street.wrong]
+    unseeing = optimize(street.ids, blind, params=QUICK)
+    assert "used" in uses(unseeing, street.wrong) or len(components(unseeing)) > 1
+    answer = optimize(street.ids, street.right + street.wrong, params=QUICK)
+    assert uses(answer, street.wrong) == {"unused"}
+    assert uses(answer, street.right) == {"tentative"}  # single edges: no cycle confirms them
+    assert components(answer) == [street.ids]
+    where = np.array([answer.poses[s].S_map_scene.translation for s in street.ids])
+    assert np.linalg.norm(where[-1] - where[0]) == pytest.approx(13 * ROOM_M, abs=1.0)
+    reason = answer.outcomes[street.wrong[0].target, street.wrong[0].source].reason
+    assert "20%" in reason
+    assert "looks alike" in reason
+
+
+@pytest.mark.parametrize("gone", [(7,), (4, 10)])
+def test_look_alikes_that_contradict_each_other_tie_no_parts(gone):
+    """The street has gaps; its parts contradict look-alikes by themselves (one gap), or once laid over each other."""
+    keep, right, wrong = Street().without(*gone)
+    answer = optimize(keep, right + wrong, params=QUICK)
+    assert uses(answer, wrong) == {"unused"}
+    assert len(components(answer)) == len(gone) + 1
+    part = {scene: answer.poses[scene].component for scene in keep}
+    between = [e for e in wrong if part[e.target] != part[e.source]]
+    assert between
+    assert all((e.target, e.source) in answer.undecided for e in between)
+    assert all("look alike" in answer.outcomes[e.target, e.source].reason for e in between)
+
+
+def test_a_place_that_changed_is_tied_tentatively():
+    """Two visits of one place: nothing but doubtful edges between them, and none contradicts another."""
+    rng = np.random.default_rng(0)
+    truth = poses_at(rng.uniform(0, 8, (6, 3)))
+    ids = [f"s{k}" for k in range(6)]
+    sure = [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5)]
+    known = [replace(e, disagreement=SURE) for e in true_edges(truth, np.array(sure), rng, ids)]
+    between = np.array([(0, 3), (1, 4), (2, 5)])
+    doubtful = [replace(e, disagreement=DOUBTFUL) for e in true_edges(truth, between, rng, ids)]
+    answer = optimize(ids, known + doubtful, params=QUICK)
+    assert uses(answer, known) == {"used"}
+    assert uses(answer, doubtful) == {"tentative"}
+    assert components(answer) == [ids]
+    statuses = [answer.poses[s].status for s in ids]
+    assert sorted([statuses[:3], statuses[3:]]) == [["placed"] * 3, ["tentative"] * 3]
+    assert "changed" in answer.outcomes["s0", "s3"].reason
+    # Captured within the hour nothing can have changed so much.
+    now = optimize(ids, known + [replace(e, same_visit=True) for e in doubtful], params=QUICK)
+    assert components(now) == [ids[:3], ids[3:]]
+    assert {("s0", "s3"), ("s1", "s4"), ("s2", "s5")} <= set(now.undecided)
+    assert "one visit" in now.outcomes["s0", "s3"].reason
+
+
+@pytest.mark.parametrize("given", [float("nan"), SURE])
+def test_what_the_others_bear_out_is_used(given):
+    rng = np.random.default_rng(0)
+    truth = poses_at(rng.uniform(0, 8, (4, 3)))
+    ids = [f"s{k}" for k in range(4)]
+    known = true_edges(truth, np.array([(0, 1), (1, 2), (0, 2), (2, 3), (0, 3)]), rng, ids)
+    known = [replace(e, disagreement=given) for e in known]
+    (odd,) = true_edges(truth, np.array([(1, 3)]), rng, ids)
+    answer = optimize(ids, [*known, replace(odd, disagreement=DOUBTFUL)], params=QUICK)
+    assert answer.use("s1", "s3") == "used"
+
+
+def test_a_confirmed_edge_is_in_no_doubt():
+    street = Street(4, period=2)
+    word = replace(street.right[1], disagreement=0.5, confirmed=True)
+    answer = optimize(street.ids, [street.right[0], word, street.right[2]], params=QUICK)
+    assert answer.use(word.target, word.source) == "used"
+    assert components(answer) == [street.ids]
+
+
+def test_the_rule_of_succession():
+    assert chance_alike(0, 0) == 0.5
+    assert chance_alike(0, 1) == pytest.approx(2 / 3)
+    assert chance_alike(8, 1) == pytest.approx(2 / 11)
