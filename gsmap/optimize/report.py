@@ -7,7 +7,6 @@ from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import Vote
-from gsmap.optimize.doubt import find_doubtful
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.robust import chi_squares
@@ -70,7 +69,7 @@ def _outcomes(
             out[key] = EdgeOutcome("tentative", residual, "in no agreeing cycle: rests on its own verdict alone")
         elif not together[k]:
             reason = state.pending.get(k, "contradicts what else is known of the two components")
-            if find_doubtful(m[np.array([k])], params.aliasing)[0]:
+            if state.doubtful[k]:
                 reason = f"{_unlike(m, k)}; {reason}"
             elif state.undecided[k]:
                 reason = "edges that agree among themselves contradict each other here: places that look alike?"
@@ -79,7 +78,7 @@ def _outcomes(
             reason = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
             if votes.agree[k] > 0:
                 reason += "; it agrees with others that do too (a place that looks alike?)"
-            if find_doubtful(m[np.array([k])], params.aliasing)[0]:
+            if state.doubtful[k]:
                 reason += f"; {_unlike(m, k)}: another place that looks alike"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
             undecided = bool(votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])
