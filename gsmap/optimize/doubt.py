@@ -28,6 +28,8 @@ from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.state import State, refine
 from gsmap.optimize.structure import component_labels
 
+_COST = 10.0  # right edges in doubt that a wrong one believed is as bad as
+_LEAST_SPREAD = 0.15  # of logarithms of disagreements, where few are known
 _STEPS = 64  # in which edges are taken in by how little they disagree, at most
 
 
@@ -41,9 +43,9 @@ def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
 def bar_of_map(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> float:
     """From which disagreement on the edges of this map are in doubt: ``max_disagreement`` at most.
 
-    Where the map contradicts more of the doubtful edges than it bears out, it has look-alikes, and the bar lies half
-    way (in logarithms) between what its other edges disagree in and what those do. Where the other edges contradict
-    each other it lies no higher than `first_contradicted`.
+    Where the map contradicts more of the doubtful edges than it bears out, it has look-alikes, and the bar is what best
+    divides its other edges from those. Where the other edges contradict each other it lies no higher than
+    `first_contradicted`.
 
     Args:
         state: of the map that the edges without doubt make.
@@ -58,11 +60,22 @@ def bar_of_map(m: Measurements, state: State, doubtful: np.ndarray, gate: float,
     alike = chance_alike(int((inside & doubtful & fits).sum()), int(contradicted.sum()))
     believed = state.accepted & (m.disagreement > 0)
     if alike > params.aliasing.max_chance_alike and believed.any():
-        between = np.sqrt(np.median(m.disagreement[believed]) * np.median(m.disagreement[contradicted]))
-        bar = min(bar, float(between))
+        bar = min(bar, dividing_bar(m.disagreement[believed], m.disagreement[contradicted]))
     if not (state.accepted | doubtful).all():
         bar = min(bar, first_contradicted(m, state.terms, gate, params))
     return bar
+
+
+def dividing_bar(believed: np.ndarray, contradicted: np.ndarray) -> float:
+    """What best divides two sets of disagreements, log-normal of one width, where a wrong edge costs as much as
+    ``_COST`` right ones (Bayes); infinity where they do not differ that way round."""
+    logs = [np.log(np.maximum(values, 1e-6)) for values in (believed, contradicted)]
+    low, high = (float(np.median(values)) for values in logs)
+    if high <= low:
+        return float("inf")
+    spread = np.concatenate([np.abs(values - middle) for values, middle in zip(logs, (low, high), strict=True)])
+    sigma = max(_LEAST_SPREAD, 1.4826 * float(np.median(spread)))
+    return float(np.exp((low + high) / 2 - sigma**2 * np.log(_COST) / (high - low)))
 
 
 def first_contradicted(m: Measurements, terms: PriorTerms, gate: float, params: Params) -> float:

@@ -26,8 +26,11 @@ def pose_graph(
     params: Params,
 ) -> PoseGraph:
     """Scenes and edges by id; its provenance is left to the caller."""
-    sure = state.accepted & ~state.doubted
+    sure = state.accepted & ~state.doubtful
     firm = sure & (~bridges(m, sure) | m.confirmed)
+    # What is in doubt confirms nothing, and is itself confirmed by what holds without it.
+    blocks = component_labels(m, np.flatnonzero(firm))
+    firm |= state.accepted & state.doubtful & (blocks[m.targets] == blocks[m.sources])
     status = _statuses(m, state.accepted, firm)
     return PoseGraph(
         poses={
@@ -63,7 +66,7 @@ def _outcomes(
         residual = float(chi[k]) if together[k] else None
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
-        elif state.doubted[k]:
+        elif state.accepted[k] and state.doubtful[k]:
             out[key] = EdgeOutcome("tentative", residual, f"{_unlike(m, k)}: the place changed, or it is another")
         elif state.accepted[k]:
             out[key] = EdgeOutcome("tentative", residual, "in no agreeing cycle: rests on its own verdict alone")
