@@ -130,7 +130,6 @@ def take_in_doubtful(m: Measurements, state: State, doubtful: np.ndarray, gate: 
         contradicted = int((doubtful & _within(m, state.accepted) & ~state.accepted).sum())
         if chance_alike(borne_out, contradicted) > most:
             state.accepted, state.failures, state.poses = before.accepted, before.failures, before.poses
-        state.doubted = tying & state.accepted
     apart = tying & ~_within(m, state.accepted)
     state.undecided |= apart
     for row in np.flatnonzero(apart).tolist():

@@ -28,7 +28,6 @@ class State:
         terms: priors that are believed.
         pending: by edge, why the components that it ties may not join.
         doubtful: (E,) bool, edges whose captures disagree in too much of what both show.
-        doubted: (E,) bool, those that are taken in although nothing else bears them out.
     """
 
     poses: Similarities
@@ -39,15 +38,12 @@ class State:
     terms: PriorTerms
     pending: dict[int, str]
     doubtful: np.ndarray
-    doubted: np.ndarray
 
     @classmethod
     def fresh(cls, m: Measurements, poses: Similarities, accepted: np.ndarray, terms: PriorTerms) -> State:
         """Nothing has failed yet."""
-        undecided, rejected, doubtful, doubted = np.zeros(
-            (4, len(m)), dtype=bool
-        )  # one array each: they are changed in place
-        return cls(poses, accepted, np.zeros(len(m), dtype=np.int64), undecided, rejected, terms, {}, doubtful, doubted)
+        undecided, rejected, doubtful = np.zeros((3, len(m)), dtype=bool)  # one array each: they change in place
+        return cls(poses, accepted, np.zeros(len(m), dtype=np.int64), undecided, rejected, terms, {}, doubtful)
 
     def spread(self, rows: np.ndarray, count: int) -> State:
         """The state of the edges at ``rows`` as that of all ``count``, of which the others are not taken in."""
@@ -57,9 +53,16 @@ class State:
             out[rows] = values
             return out
 
-        arrays = (self.accepted, self.failures, self.undecided, self.rejected)
-        pending = {int(rows[row]): why for row, why in self.pending.items()}
-        return State(self.poses, *map(put, arrays), self.terms, pending, put(self.doubtful), put(self.doubted))
+        return State(
+            self.poses,
+            put(self.accepted),
+            put(self.failures),
+            put(self.undecided),
+            put(self.rejected),
+            self.terms,
+            {int(rows[row]): why for row, why in self.pending.items()},
+            put(self.doubtful),
+        )
 
     def open(self, max_failures: int) -> np.ndarray:
         """Rows of the edges that may still be taken in."""
