@@ -30,6 +30,7 @@ from gsmap.optimize.structure import component_labels
 
 _COST = 10.0  # right edges in doubt that a wrong one believed is as bad as
 _LEAST_SPREAD = 0.15  # of logarithms of disagreements, where few are known
+_SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps take more in at a step, for each costs them a solve
 _STEPS = 64  # in which edges are taken in by how little they disagree, at most
 
 
@@ -90,7 +91,13 @@ def first_contradicted(m: Measurements, terms: PriorTerms, gate: float, params: 
     state = State.fresh(m, Similarities.identity(m.num_scenes), np.zeros(len(m), dtype=bool), terms)
     agrees, contradicted = np.zeros((2, len(m)), dtype=bool)
     steps = np.unique(disagreement[disagreement < most])
-    steps = np.unique(np.quantile(steps, np.linspace(0, 1, min(len(steps), _STEPS)), method="nearest"))
+    steps = np.unique(
+        np.quantile(
+            steps,
+            np.linspace(0, 1, min(len(steps), _STEPS, max(_FEWEST_STEPS, _SCENE_STEPS // m.num_scenes))),
+            method="nearest",
+        )
+    )
     below = -1.0
     for step in steps.tolist():
         state.rejected = disagreement > step
