@@ -59,7 +59,7 @@ OBJECTS: dict[str, Object] = {
     "show SCENE": One(rows.SceneReport),
     "show A:B": One(rows.PairReport),
     "show CHANGE": One(rows.ChangeDetail),
-    "why": One(rows.WhyReport),
+    "why A:B": One(rows.WhyReport),
     "diff": Many("scenes", rows.PoseChangeRow),
     "poses": Many("poses", rows.PoseRow),
     "settings": Many("settings", rows.SettingRow),

@@ -27,7 +27,7 @@ def command(
     with opened(map) as m:
         report = m.why(pair, pictures=pictures)
     if json:
-        print_rows("why", report, json)
+        print_rows("why A:B", report, json)
         return
     print_facts(report.pair, {"status": report.status, "reason": report.reason, "what would settle it": report.advice})
     print_table("steps", WhyStep.columns, report.steps)

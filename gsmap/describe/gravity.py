@@ -65,8 +65,8 @@ def estimate_up(points: np.ndarray, cameras: Cameras | None, params: Params | No
     room = _up_of_room(sample, axes, params)
     if held is None or held.at_all_angles:
         return room
-    up = _confirmed(held, sample, axes, room)
-    return up if up is None or held.is_upright(up) or _side(sample, up, params) > 0 else None
+    told = _confirmed(held, sample, axes, room)
+    return told if told is None or held.is_upright(told) or _side(sample, told, params) > 0 else None
 
 
 def _confirmed(held: Held, points: np.ndarray, axes: list[np.ndarray], room: np.ndarray | None) -> np.ndarray | None:

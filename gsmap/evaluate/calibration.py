@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.geometry.similarities import Similarities
+from gsmap.geometry.similarities import Similarities, without_scale
 from gsmap.types import Sim3
 from gsmap.types.rows import NeesRow
 
 SURE_LOG_SCALE = 1e-6
-"""Standard deviation at which a rigid pose is taken to claim its scale, as a rigid edge's stiff row does."""
+"""Standard deviation at which a rigid pose is taken to claim its scale, which its row leaves open."""
 _SAME_SCALE = 1e-9
 _THREE_SIGMA = 0.9973002039367398  # of a normal distribution
 
@@ -33,11 +33,12 @@ class Nees:
 def nees_of_edge(estimated: Sim3, information: np.ndarray, true: Sim3) -> Nees:
     """NEES of ``S_target_source`` from its (7, 7) information on the source side.
 
-    A rigid edge between captures whose scales truly differ is judged by its stiff scale row, too: it claimed to know.
+    A rigid edge between captures whose scales truly differ is judged by its scale row, too: it claimed to know.
     """
     error = _error(estimated, true)
-    dof = 6 if estimated.is_rigid and _is_one(true.scale) else 7
-    return Nees(float(error[:dof] @ information[:dof, :dof] @ error[:dof]), dof)
+    if estimated.is_rigid and _is_one(true.scale):
+        return Nees(float(error[:6] @ without_scale(information) @ error[:6]), 6)
+    return Nees(float(error @ information @ error), 7)
 
 
 def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3) -> Nees:

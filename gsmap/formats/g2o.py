@@ -17,6 +17,7 @@ import numpy as np
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
+from gsmap.geometry.similarities import without_scale
 from gsmap.types import Edge, Sim3
 
 # Certainty of the log scale of a rigid edge: stiff beside any measurement.
@@ -103,7 +104,7 @@ def write_graph(
         name = f"edge {edge.target}:{edge.source}"
         if edge.target not in numbers or edge.source not in numbers:
             raise InputError(f"{name} names a scene without a pose: write all scenes of the component")
-        information = np.asarray(edge.information, dtype=np.float64)[:6, :6][np.ix_(_SWAP, _SWAP)]
+        information = without_scale(np.asarray(edge.information, dtype=np.float64))[np.ix_(_SWAP, _SWAP)]
         upper = " ".join(repr(float(v)) for v in information[_UPPER])
         ends = f"{numbers[edge.target]} {numbers[edge.source]}"
         lines.append(f"EDGE_SE3:QUAT {ends} {_values(edge.S_target_source, name)} {upper}")

@@ -11,7 +11,8 @@ from gsmap.types import Gaussians, ScenePose, Sim3
 from gsmap.types.metre import Metre
 
 # Devices' metres are off by 1 to 3 percent, all captures of one device alike: many of them are no better than one.
-_SAID_SIGMA = 0.01  # of the metre that somebody vouches for, or measured with a tape
+_TOLD_SIGMA = 0.01  # of what a person measured: a tape is that good, and so is a look at where it was laid
+_MEASURED_SIGMA = 0.02  # of captures that are said to be in metres
 _ASSUMED_SIGMA = 0.03  # of an own unit that nobody said is the metre, if it is
 _FACTOR = 2.0  # that a guess from the content is good to
 _AGREE = 5.0  # sigmas by which units may differ that are one
@@ -37,18 +38,21 @@ class SceneUnit:
 def metre_of(scenes: Sequence[tuple[SceneUnit, ScenePose]]) -> Metre:
     """The metre of one component.
 
-    What people say of scenes goes before what may be assumed, and that before what is guessed. Each scene gives metres
-    per unit of the frame as those of its own unit by the scale of its pose; they are weighed by the variances of both.
+    What a person told of scenes goes before what captures are said to be in, that before what may be assumed, and that
+    before what is guessed. Each scene gives metres per unit of the frame as those of its own unit by the scale of its
+    pose; they are weighed by the variances of both.
     A solved scale moves a little with every capture, so what comes through one is rounded, and is 1 where nothing
     speaks against it: what is made in metres need not be made again for a digit that nobody knows.
 
     Args:
         scenes: all of the component, each with its pose in it.
     """
-    said = [(1.0 if unit.told is None else unit.told, pose) for unit, pose in scenes if unit.told or unit.in_metres]
-    if said:
-        told = any(unit.told is not None for unit, _ in scenes)
-        return _combined(said, _SAID_SIGMA, "told" if told else "measured")
+    told = [(unit.told, pose) for unit, pose in scenes if unit.told is not None]
+    if told:
+        return _combined(told, _TOLD_SIGMA, "told")
+    measured = [(1.0, pose) for unit, pose in scenes if unit.in_metres]
+    if measured:
+        return _combined(measured, _MEASURED_SIGMA, "measured")
     guesses = [np.log(unit.guess_m / pose.S_map_scene.scale) for unit, pose in scenes if unit.guess_m is not None]
     guess = float(np.exp(np.median(guesses))) if guesses else None
     metric = _agreeing([pose for unit, pose in scenes if unit.may_be_metres])

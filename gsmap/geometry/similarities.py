@@ -138,6 +138,16 @@ def rotation_vectors(matrices: np.ndarray) -> np.ndarray:
     return out
 
 
+def without_scale(information: np.ndarray) -> np.ndarray:
+    """(..., 6, 6) information on rotation and translation alone, whatever the scale is, of (..., 7, 7) on all three.
+
+    The Schur complement: what the scale is not known to is taken from the translation that hangs on it.
+    """
+    tied = information[..., :6, 6]
+    out: np.ndarray = information[..., :6, :6] - tied[..., :, None] * tied[..., None, :] / information[..., 6:, 6:]
+    return out
+
+
 def _left_factor(omega: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
     """(N, 3, 3) ``V`` with ``t = V trans``: the integral of ``exp(tau (skew(omega) + log_scale I))`` over [0, 1]."""
     theta = np.linalg.norm(omega, axis=1)[:, None]

@@ -74,7 +74,8 @@ def _free_places(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     while len(chosen) < min(_PLACES, len(free)):
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(free - free[chosen[-1]], axis=1))
-    return free[chosen]
+    out: np.ndarray = free[chosen]
+    return out
 
 
 def _panorama(points: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarray]:

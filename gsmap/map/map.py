@@ -157,6 +157,15 @@ class Map(AbstractContextManager["Map"]):
 
         return map_settings(self.store.folder, *self._run)
 
+    def _settings_to_look_by(self) -> Settings:
+        """Those in force, or the defaults where these cannot be: a map is looked at whatever its settings say."""
+        from gsmap.map.settings import Settings
+
+        try:
+            return self.settings
+        except ConfigError:
+            return Settings()
+
     def with_settings(self, values: Mapping[str, Any] | None = None, preset: str | None = None) -> Map:
         """Change settings for as long as this map is open, and not in ``settings.toml``; returns the map itself.
 
@@ -288,7 +297,7 @@ class Map(AbstractContextManager["Map"]):
 
         if (number := changes.number_of(what)) is not None:
             self.store.changes.review(number, review, note)
-            return changes.change_row(self.store, self.settings, number)
+            return changes.change_row(self.store, self._settings_to_look_by(), number)
         a, b = self._pair(what)
         self.store.registrations.review(a.id, b.id, review, note)
         return reports.edge_row(self.store, a, b)
@@ -396,7 +405,7 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map import changes
 
-        return changes.change_detail(self.store, self.settings, changes.named(name))
+        return changes.change_detail(self.store, self._settings_to_look_by(), changes.named(name))
 
     def read_change(self, name: str) -> Change:
         """A change (``c12``) with its arrays, map frame: voxels, and rows of the Gaussians of either capture.
@@ -521,7 +530,7 @@ class Map(AbstractContextManager["Map"]):
 
     def metres(self, revision: int | None = None) -> dict[int, Metre]:
         """How long a metre is in the frame of each component of a revision, by default the newest."""
-        return map_metres(self.store, self.settings, self.pose_graph(revision))
+        return map_metres(self.store, self._settings_to_look_by(), self.pose_graph(revision))
 
     def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
         """The poses of a revision, of the newest one by default; None before the first optimize."""
@@ -636,7 +645,7 @@ class Map(AbstractContextManager["Map"]):
 
     def diff(self, before: int, after: int) -> list[PoseChangeRow]:
         """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""
-        return reports.pose_change_rows(self.store, before, after, self.settings)
+        return reports.pose_change_rows(self.store, before, after, self._settings_to_look_by())
 
     def evaluate(
         self,
@@ -689,7 +698,7 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.viewing import view_of
         from gsmap.view import ViewServer
 
-        return ViewServer(view_of(self.store, self.settings), port=port)
+        return ViewServer(view_of(self.store, self._settings_to_look_by()), port=port)
 
     def draw_graph(self, ref: str, path: str | os.PathLike[str]) -> None:
         """``gsmap show MAP SCENE --picture``: the scene's graph over a render, for a person to judge."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from gsmap.errors import NotFoundError
 from gsmap.geometry.metres import SceneUnit, metre_of
-from gsmap.map.settings import Settings
 from gsmap.store import Store
 from gsmap.types import PoseGraph, ScenePose
 from gsmap.types.metre import Metre
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
 
 
 def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dict[int, Metre]:

@@ -20,6 +20,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes import change_arrays, named
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
+from gsmap.register.view_cache import Params as ViewParams
 from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
 from gsmap.types import PlacedScene, Scene, SceneGraph, Sim3
@@ -31,6 +32,7 @@ FILE_NAME = "changes.json"
 _VERSION = 1
 _PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png")
 _LOOKS = 2  # cameras of each capture that a picture of a pair is drawn from
+_OWN = ViewParams(own_share=0.0)  # pictures are of what a capture's own cameras saw
 _MAX_BYTES = 1 << 26
 
 
@@ -137,7 +139,7 @@ def _side_by_side(target: PlacedScene, source: PlacedScene, graph: SceneGraph | 
     chosen = []
     for one, other in ((target, source), (source, target)):
         if one.cameras is not None and len(one.cameras):
-            rows = ViewCache(one.gaussians, one.cameras).select_views(other.gaussians.means, _LOOKS)
+            rows = ViewCache(one.gaussians, one.cameras, _OWN).select_views(other.gaussians.means, _LOOKS)
             chosen += [one.cameras[[row]] for row in rows]
     return draw_pair(target, source, chosen, unit_m=1.0 if graph is None else graph.unit_m)
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsmap.map import reports
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.one_state import of_one_state
-from gsmap.map.settings import Settings
 from gsmap.store import Store
 from gsmap.view import ViewEdge, ViewMap, ViewScene
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
 
 
 @of_one_state

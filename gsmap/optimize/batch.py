@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from gsmap.errors import InputError
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import Vote, vote
-from gsmap.optimize.doubt import find_doubtful, take_in_doubtful
+from gsmap.optimize.doubt import bar_of_map, find_doubtful, take_in_doubtful
 from gsmap.optimize.final import solve_components
 from gsmap.optimize.fingerprint import fingerprint
 from gsmap.optimize.growing import attach_singles, close_through_singles, cut_weak_bridges, take_in_agreeing
@@ -43,15 +43,16 @@ def solve_batch(
     gate = float(chi2.ppf(params.gate_probability, m.dim))
 
     terms = PriorTerms.stack(m.scene_ids, priors)
-    doubtful = find_doubtful(m, params.aliasing)
+    doubtful = find_doubtful(m, params.aliasing.max_disagreement)
+    state, votes = _grown_from(m, ~doubtful, terms, gate, params, progress)
+    if (m.disagreement > 0).any() and not state.accepted.all():
+        stricter = find_doubtful(m, bar_of_map(m, state, doubtful, gate, params))
+        if (stricter & ~doubtful).any():
+            doubtful = stricter
+            state, votes = _grown_from(m, ~doubtful, terms, gate, params, progress)
     if doubtful.any():
         # What can be believed makes the map; only then is what may be of other places held against it.
-        rows = np.flatnonzero(~doubtful)
-        known, said = _grown(m[rows], terms, gate, params, progress)
-        state, votes = known.spread(rows, len(m)), said.spread(rows, len(m))
         take_in_doubtful(m, state, doubtful, gate, params)
-    else:
-        state, votes = _grown(m, terms, gate, params, progress)
     _reconsider(m, state, gate)
     _check_confirmed(m, state, gate, params)
 
@@ -65,6 +66,17 @@ def solve_batch(
         provenance=_provenance(m, edges, priors, state, params),
         notes=solved.notes,
     )
+
+
+def _grown_from(
+    m: Measurements, believed: np.ndarray, terms: PriorTerms, gate: float, params: Params, progress: Progress
+) -> tuple[State, Vote]:
+    """Components grown from some of the edges alone; the others are open."""
+    if believed.all():
+        return _grown(m, terms, gate, params, progress)
+    rows = np.flatnonzero(believed)
+    state, votes = _grown(m[rows], terms, gate, params, progress)
+    return state.spread(rows, len(m)), votes.spread(rows, len(m))
 
 
 def _grown(m: Measurements, terms: PriorTerms, gate: float, params: Params, progress: Progress) -> tuple[State, Vote]:

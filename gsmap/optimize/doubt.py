@@ -8,6 +8,9 @@ other places, the parts stay apart.
 Assumption: of one place captured twice without change nearly all of what both saw agrees, so edges without doubt are
 right as often as any. It fails where rooms are repeated entirely, their furniture included; see
 `gsmap.optimize.perceptual_aliasing` for what is left then.
+
+How much is too much differs: noisy captures disagree more, and bare rooms less. So where edges contradict each other
+they are taken in by how little they disagree, and the first that the map contradicts tell where doubt begins in it.
 """
 
 from __future__ import annotations
@@ -16,24 +19,109 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmap.geometry.similarities import Similarities
+from gsmap.optimize.consistency import consistent_with_component
 from gsmap.optimize.growing import close_loops, take_in
 from gsmap.optimize.measurements import Measurements
-from gsmap.optimize.params import Aliasing, Params
+from gsmap.optimize.params import Params
+from gsmap.optimize.priors import PriorTerms
 from gsmap.optimize.state import State, refine
 from gsmap.optimize.structure import component_labels
 
+_COST = 10.0  # right edges in doubt that a wrong one believed is as bad as
+_LEAST_SPREAD = 0.15  # of logarithms of disagreements, where few are known
+_SCENE_STEPS, _FEWEST_STEPS = 2000, 8  # large maps take more in at a step, for each costs them a solve
+_STEPS = 64  # in which edges are taken in by how little they disagree, at most
 
-def find_doubtful(m: Measurements, params: Aliasing) -> np.ndarray:
-    """(E,) bool: more of what both scenes saw disagrees than in one place captured twice without change."""
+
+def find_doubtful(m: Measurements, bar: float) -> np.ndarray:
+    """(E,) bool: at least this much of what both scenes saw disagrees, and nobody vouches for the edge."""
     with np.errstate(invalid="ignore"):  # nobody looked: no doubt
-        found: np.ndarray = (m.disagreement > params.max_disagreement) & ~m.confirmed
+        found: np.ndarray = (m.disagreement >= bar) & ~m.confirmed
     return found
+
+
+def bar_of_map(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> float:
+    """From which disagreement on the edges of this map are in doubt: ``max_disagreement`` at most.
+
+    Where the map contradicts more of the doubtful edges than it bears out, it has look-alikes, and the bar is what best
+    divides its other edges from those. Where the other edges contradict each other it lies no higher than
+    `first_contradicted`.
+
+    Args:
+        state: of the map that the edges without doubt make.
+    """
+    bar = params.aliasing.max_disagreement
+    inside = _within(m, state.accepted)
+    fits = np.zeros(len(m), dtype=bool)
+    rows = np.flatnonzero(inside & doubtful)
+    if len(rows):
+        fits[rows] = consistent_with_component(m, rows, state.drift(m, params), params.gate_probability)
+    contradicted = inside & doubtful & ~fits
+    alike = chance_alike(int((inside & doubtful & fits).sum()), int(contradicted.sum()))
+    believed = state.accepted & (m.disagreement > 0)
+    if alike > params.aliasing.max_chance_alike and believed.any():
+        bar = min(bar, dividing_bar(m.disagreement[believed], m.disagreement[contradicted]))
+    if not (state.accepted | doubtful).all():
+        bar = min(bar, first_contradicted(m, state.terms, gate, params))
+    return bar
+
+
+def dividing_bar(believed: np.ndarray, contradicted: np.ndarray) -> float:
+    """What best divides two sets of disagreements, log-normal of one width, where a wrong edge costs as much as
+    ``_COST`` right ones (Bayes); infinity where they do not differ that way round."""
+    logs = [np.log(np.maximum(values, 1e-6)) for values in (believed, contradicted)]
+    low, high = (float(np.median(values)) for values in logs)
+    if high <= low:
+        return float("inf")
+    spread = np.concatenate([np.abs(values - middle) for values, middle in zip(logs, (low, high), strict=True)])
+    sigma = max(_LEAST_SPREAD, 1.4826 * float(np.median(spread)))
+    return float(np.exp((low + high) / 2 - sigma**2 * np.log(_COST) / (high - low)))
+
+
+def first_contradicted(m: Measurements, terms: PriorTerms, gate: float, params: Params) -> float:
+    """The least disagreement from which on edges are contradicted more often than not; ``max_disagreement`` at most.
+
+    Edges are taken in by how little they disagree, each tying whatever it ties; those that come late find their scenes
+    tied.
+    """
+    most, disagreement = params.aliasing.max_disagreement, np.nan_to_num(m.disagreement, nan=0.0)
+    disagreement[m.confirmed] = 0.0
+    tying = replace(params, joining=replace(params.joining, small_component=m.num_scenes + 1))
+    state = State.fresh(m, Similarities.identity(m.num_scenes), np.zeros(len(m), dtype=bool), terms)
+    agrees, contradicted = np.zeros((2, len(m)), dtype=bool)
+    steps = np.unique(disagreement[disagreement < most])
+    steps = np.unique(
+        np.quantile(
+            steps,
+            np.linspace(0, 1, min(len(steps), _STEPS, max(_FEWEST_STEPS, _SCENE_STEPS // m.num_scenes))),
+            method="nearest",
+        )
+    )
+    below = -1.0
+    for step in steps.tolist():
+        state.rejected = disagreement > step
+        new = (disagreement > below) & ~state.rejected
+        known = _within(m, state.accepted)
+        take_in(m, state, tying)
+        refine(m, state, gate, 1.0, tying)
+        agrees |= new & known & state.accepted
+        contradicted |= new & _within(m, state.accepted) & ~state.accepted
+        below = step
+    for bar in np.unique(disagreement[contradicted & (disagreement > 0)]).tolist():
+        above = disagreement >= bar
+        if (
+            chance_alike(int((agrees & above).sum()), int((contradicted & above).sum()))
+            > params.aliasing.max_chance_alike
+        ):
+            return bar
+    return most
 
 
 def take_in_doubtful(m: Measurements, state: State, doubtful: np.ndarray, gate: float, params: Params) -> None:
     """Take in the doubtful edges that the map bears out, and by the others what nothing else ties, if this map's
     record allows it."""
-    most = params.aliasing.max_chance_alike
+    most, state.doubtful = params.aliasing.max_chance_alike, doubtful
     if close_loops(m, state, params):
         refine(m, state, gate, 1.0, params)
     inside = doubtful & _within(m, state.accepted)
@@ -49,7 +137,6 @@ def take_in_doubtful(m: Measurements, state: State, doubtful: np.ndarray, gate: 
         contradicted = int((doubtful & _within(m, state.accepted) & ~state.accepted).sum())
         if chance_alike(borne_out, contradicted) > most:
             state.accepted, state.failures, state.poses = before.accepted, before.failures, before.poses
-        state.doubted = tying & state.accepted
     apart = tying & ~_within(m, state.accepted)
     state.undecided |= apart
     for row in np.flatnonzero(apart).tolist():

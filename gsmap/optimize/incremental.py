@@ -74,7 +74,10 @@ def _place(scene: str, own: list[Edge], taken: list[Edge], previous: PoseGraph, 
     m = measurements([*near, scene], around + own, rigid=all_rigid([*around, *own], (), previous))
     poses = Similarities.stack([previous.poses[s].S_map_scene for s in near] + [Sim3.identity()])
     accepted = np.r_[np.ones(len(around), dtype=bool), m.confirmed[len(around) :]]
-    if m.confirmed[len(around) :].any() or find_doubtful(m[np.arange(len(around), len(m))], params.aliasing).any():
+    if (
+        m.confirmed[len(around) :].any()
+        or find_doubtful(m[np.arange(len(around), len(m))], params.aliasing.max_disagreement).any()
+    ):
         return None
     before = component_labels(m, np.flatnonzero(accepted))
     nothing = np.zeros(len(m), dtype=np.int64)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.geometry.similarities import Similarities
+from gsmap.geometry.similarities import Similarities, without_scale
 from gsmap.types import Edge, PoseGraph, Prior
 
 
@@ -21,7 +21,7 @@ class Measurements:
         scene_ids: N ids, in the caller's order.
         targets, sources: (E,) rows of ``scene_ids``.
         measured: E measured ``S_target_source``.
-        information: (E, D, D); D is 6 where every edge is rigid (a stiff scale row says nothing then), else 7.
+        information: (E, D, D); D is 6 where every edge is rigid, whatever the scale is then, else 7.
         confirmed: (E,) bool.
         disagreement: (E,) share of the surface seen twice that is not the same, NaN where unknown.
         same_visit: (E,) bool, next to nothing can have changed between the two captures.
@@ -106,8 +106,7 @@ def measurements(scene_ids: Sequence[str], edges: Sequence[Edge], *, rigid: bool
     measured = Similarities.stack([e.S_target_source for e in edges])
     information = (information + information.transpose(0, 2, 1)) / 2
     if rigid if rigid is not None else not measured.log_scales.any():
-        # With both scales known the log-scale residual is zero: its row and column drop out of the chi-square.
-        information = information[:, :6, :6]
+        information = without_scale(information)
     return Measurements(
         ids,
         targets,

@@ -7,7 +7,6 @@ from scipy.stats import chi2
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.cycles import Vote
-from gsmap.optimize.doubt import find_doubtful
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.robust import chi_squares
@@ -27,8 +26,11 @@ def pose_graph(
     params: Params,
 ) -> PoseGraph:
     """Scenes and edges by id; its provenance is left to the caller."""
-    sure = state.accepted & ~state.doubted
+    sure = state.accepted & ~state.doubtful
     firm = sure & (~bridges(m, sure) | m.confirmed)
+    # What is in doubt confirms nothing, and is itself confirmed by what holds without it.
+    blocks = component_labels(m, np.flatnonzero(firm))
+    firm |= state.accepted & state.doubtful & (blocks[m.targets] == blocks[m.sources])
     status = _statuses(m, state.accepted, firm)
     return PoseGraph(
         poses={
@@ -64,13 +66,13 @@ def _outcomes(
         residual = float(chi[k]) if together[k] else None
         if firm[k]:
             out[key] = EdgeOutcome("used", residual)
-        elif state.doubted[k]:
+        elif state.accepted[k] and state.doubtful[k]:
             out[key] = EdgeOutcome("tentative", residual, f"{_unlike(m, k)}: the place changed, or it is another")
         elif state.accepted[k]:
             out[key] = EdgeOutcome("tentative", residual, "in no agreeing cycle: rests on its own verdict alone")
         elif not together[k]:
             reason = state.pending.get(k, "contradicts what else is known of the two components")
-            if find_doubtful(m[np.array([k])], params.aliasing)[0]:
+            if state.doubtful[k]:
                 reason = f"{_unlike(m, k)}; {reason}"
             elif state.undecided[k]:
                 reason = "edges that agree among themselves contradict each other here: places that look alike?"
@@ -79,7 +81,7 @@ def _outcomes(
             reason = f"contradicts the other edges: chi-square {chi[k]:.0f}, limit {gate:.0f}"
             if votes.agree[k] > 0:
                 reason += "; it agrees with others that do too (a place that looks alike?)"
-            if find_doubtful(m[np.array([k])], params.aliasing)[0]:
+            if state.doubtful[k]:
                 reason += f"; {_unlike(m, k)}: another place that looks alike"
             doubtful = "tentative" in (status[m.targets[k]], status[m.sources[k]])
             undecided = bool(votes.agree[k] > 0 or doubtful or state.undecided[k] or state.rejected[k])

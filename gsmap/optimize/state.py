@@ -27,7 +27,7 @@ class State:
         undecided, rejected: (E,) bool, edges that places that look alike leave open, or that are surely wrong.
         terms: priors that are believed.
         pending: by edge, why the components that it ties may not join.
-        doubted: (E,) bool, edges taken in although what their captures show disagrees and nothing else bears them out.
+        doubtful: (E,) bool, edges whose captures disagree in too much of what both show.
     """
 
     poses: Similarities
@@ -37,13 +37,13 @@ class State:
     rejected: np.ndarray
     terms: PriorTerms
     pending: dict[int, str]
-    doubted: np.ndarray
+    doubtful: np.ndarray
 
     @classmethod
     def fresh(cls, m: Measurements, poses: Similarities, accepted: np.ndarray, terms: PriorTerms) -> State:
         """Nothing has failed yet."""
-        undecided, rejected, doubted = np.zeros((3, len(m)), dtype=bool)  # one array each: they are changed in place
-        return cls(poses, accepted, np.zeros(len(m), dtype=np.int64), undecided, rejected, terms, {}, doubted)
+        undecided, rejected, doubtful = np.zeros((3, len(m)), dtype=bool)  # one array each: they change in place
+        return cls(poses, accepted, np.zeros(len(m), dtype=np.int64), undecided, rejected, terms, {}, doubtful)
 
     def spread(self, rows: np.ndarray, count: int) -> State:
         """The state of the edges at ``rows`` as that of all ``count``, of which the others are not taken in."""
@@ -53,9 +53,16 @@ class State:
             out[rows] = values
             return out
 
-        arrays = (self.accepted, self.failures, self.undecided, self.rejected)
-        pending = {int(rows[row]): why for row, why in self.pending.items()}
-        return State(self.poses, *map(put, arrays), self.terms, pending, np.zeros(count, dtype=bool))
+        return State(
+            self.poses,
+            put(self.accepted),
+            put(self.failures),
+            put(self.undecided),
+            put(self.rejected),
+            self.terms,
+            {int(rows[row]): why for row, why in self.pending.items()},
+            put(self.doubtful),
+        )
 
     def open(self, max_failures: int) -> np.ndarray:
         """Rows of the edges that may still be taken in."""

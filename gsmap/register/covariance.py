@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import retract, skew
 from gsmap.register import error_field
 from gsmap.register.surface import Surface
@@ -42,9 +43,9 @@ class Params:
     block_m: float = 0.3
     max_blocks: int = 200
     field: error_field.Params = field(default_factory=error_field.Params)
-    hidden_turn_m: float = 0.0017
-    hidden_shift_m: float = 0.0037
-    hidden_swell_m: float = 0.0058
+    hidden_turn_m: float = 0.0016
+    hidden_shift_m: float = 0.0024
+    hidden_swell_m: float = 0.0049
     field_m: float = 0.002
     field_power: float = 2.0
     most_swell: float = 0.02
@@ -187,8 +188,8 @@ class _Blocks:
         centroid = points.mean(0)
         jacobian = point_to_plane_jacobian(pose, points, normals) @ np.linalg.inv(_shift(centroid))
         size, labels = params.block_m, _labels(moved, axis, params.block_m)
-        while labels.max() >= params.max_blocks:
-            size *= 1.2
+        while (num := int(labels.max()) + 1) > params.max_blocks:
+            size *= max(1.05, float(np.sqrt(num / params.max_blocks)))  # blocks lie on surfaces
             labels = _labels(moved, axis, size)
         total = np.bincount(labels, weights)
         counts = total**2 / np.bincount(labels, weights**2)
@@ -226,9 +227,9 @@ def hidden_sigmas(field_m: float, radius_m: float, params: Params) -> np.ndarray
 
 
 def _labels(points: np.ndarray, axis: np.ndarray, size_m: float) -> np.ndarray:
-    cells = np.c_[np.floor(points / size_m).astype(np.int64), axis]
-    labels: np.ndarray = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
-    return labels
+    cells = np.floor(points / size_m).astype(np.int64)
+    cells[:, 2] = 3 * cells[:, 2] + axis
+    return cell_labels(cells)[0]
 
 
 def _shift(centroid: np.ndarray) -> np.ndarray:

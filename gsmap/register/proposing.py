@@ -51,11 +51,11 @@ class Proposing:
     def _unlevelled(self) -> list[Proposal]:
         """What the landmarks of two scenes propose when neither vertical is believed: only significant cliques, for
         most pairs that come so far share nothing. Empty where a vertical is unknown, for then none was used."""
-        views = [unlevelled(view) for view in (self.target, self.source)]
-        if None in views:
+        target, source = unlevelled(self.target), unlevelled(self.source)
+        if target is None or source is None:
             return []
         with_scale = "unknown" in self.policies
-        found = self._asked(self.params.proposer, "match", with_scale=with_scale, views=views)
+        found = self._asked(self.params.proposer, "match", with_scale=with_scale, views=(target, source))
         return [p for p in found if verdict.is_significant(p, self.params.verdict)]
 
     def _asked(

@@ -27,8 +27,9 @@ class Params:
         selection_points: opaque centres, at most, that stand for a scene when cameras are chosen.
         selection_margin: share of the depth by which a point may lie behind what a coarse pixel shows and still count
             as visible: half a coarse pixel of a slanted wall.
-        own_share: where a scene's own cameras see less than this share of it, as a few of many do, views that are made
-            in its free space see the rest.
+        own_share: where a scene's own cameras see less than this share of it, as a few of many do, views are made in
+            its free space as well ...
+        own_half: ... and chosen among where its own see less than this share of what all see of some points.
     """
 
     image_size_px: int = 128
@@ -36,6 +37,7 @@ class Params:
     selection_points: int = 8_000
     selection_margin: float = 0.1
     own_share: float = 0.8
+    own_half: float = 0.5
 
 
 class ViewCache:
@@ -85,8 +87,17 @@ class ViewCache:
         return self._renders[row]
 
     def select_views(self, points: np.ndarray, count: int) -> list[int]:
-        """The cameras to which most of some points (N, 3) are visible, or stand in the way; see `select_views`."""
-        return select_views(self._coarse, points, count, self._nearest)
+        """The cameras to which most of some points (N, 3) are visible, or stand in the way; see `select_views`.
+
+        The scene's own, as long as they see enough: what they looked through was free, what a made view does may be.
+        """
+        # A made view shows nothing where the scene has no surface: what is seen there judges nothing.
+        made = [np.where(np.isfinite(depth), depth, -np.inf) for depth in self._nearest[self.num_own :]]
+        inside = _visible(self._coarse, points, self._nearest[: self.num_own] + made)
+        own = inside[: self.num_own]
+        if own.any(0).sum() >= self.params.own_half * inside.any(0).sum():
+            inside = own
+        return _greedy(inside, count)
 
     @cached_property
     def _coarse(self) -> Cameras:
@@ -124,14 +135,24 @@ def select_views(
         count: how many cameras, at most.
         nearest: flat depth image of each camera; points behind it are hidden and do not count.
     """
+    return _greedy(_visible(cameras, points, nearest), count)
+
+
+def _visible(cameras: Cameras, points: np.ndarray, nearest: list[np.ndarray] | None) -> np.ndarray:
+    """(C, S) whether each camera sees each of an even sample of the points."""
     sample = points[np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)].astype(np.float32)
     inside = np.zeros((len(cameras), len(sample)), dtype=bool)
     for c, view in enumerate(cameras.T_camera_frame):
         pixel, z, at = _project(sample, view, cameras.intrinsics_px[c], cameras.sizes_px[c])
         inside[c, at if nearest is None else at[z <= nearest[c][pixel]]] = True
-    left = np.ones(len(sample), dtype=bool)
+    return inside
+
+
+def _greedy(inside: np.ndarray, count: int) -> list[int]:
+    """Rows that together hold most of the columns, each the one that adds most."""
+    left = np.ones(inside.shape[1], dtype=bool)
     chosen: list[int] = []
-    for _ in range(min(count, len(cameras))):
+    for _ in range(min(count, len(inside))):
         gain = (inside & left).sum(1)
         best = int(gain.argmax())
         if not gain[best]:

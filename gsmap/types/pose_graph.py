@@ -20,7 +20,7 @@ class Edge:
         S_target_source: measured pose.
         information: (7, 7) SPD over xi = [rot_rad, trans, log_scale] applied on the source side,
             ``S = S_hat * Exp(xi)`` with the exact Sim(3) exponential (`gsmap.geometry.similarities`), translation in
-            the source's unit; a rigid edge carries a stiff scale row.
+            the source's unit; that of a rigid edge says how surely its scale is 1.
         confirmed: a person vouches for it: it joins components by itself and is never voted out.
         disagreement: of the surface that both scenes saw under this pose, the share that is not the same in both (a
             place that changed, or two that look alike); NaN where nobody looked.

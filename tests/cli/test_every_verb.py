@@ -65,6 +65,7 @@ RUNS = {
     "show SCENE": "show MAP left",
     "show A:B": "show MAP left:right",
     "show CHANGE": "show MAP c1",
+    "why A:B": "why MAP left:right --pictures TMP/why",
     "diff": "diff MAP 1 2",
     "poses": "poses MAP",
     "settings": "settings MAP",

@@ -9,7 +9,8 @@ from made_room import furnished
 from scipy.spatial.transform import Rotation
 
 from gsmap.describe.cloud import surface_cloud
-from gsmap.describe.gravity import estimate_up
+from gsmap.describe.gravity import _confirmed, estimate_up
+from gsmap.describe.heading import Held
 from gsmap.types import Cameras
 
 FRAME = Rotation.random(random_state=3).as_matrix()
@@ -83,3 +84,17 @@ def test_a_shaken_camera_that_stands_still_says_nothing_where_the_room_does_not(
 def test_upside_down_or_looking_up_is_not_believed():
     assert estimate_up(surface("open"), held(-45, 360)) is None
     assert estimate_up(surface("open"), held(45, 360, 180)) is None
+
+
+def test_what_bears_no_witness_on_one_heading():
+    def told(cameras, room=None):
+        return _confirmed(Held.of(cameras), surface("open"), [*FRAME.T], room)
+
+    x, y, z = FRAME.T
+    assert told(held(30, 0)) @ z > 0.99  # a level walk does
+    assert told(held(10, 0, way_m=(0.02, 1.0, 1.0))) is None  # along a facade, looking at it
+    assert told(held(30, 0, way_m=(0.2, 0.2, 0.01))) is None  # an arm's sway
+    still = held(0, 0, way_m=(0.02, 0.02, 0.02))
+    assert told(still, room=z) @ z > 0.99
+    assert told(still, room=x) is None  # they would look straight up
+    assert told(held(30, 0), room=y) is None  # the walk says otherwise

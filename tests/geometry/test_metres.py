@@ -21,14 +21,16 @@ def test_a_capture_in_metres_measures_the_unit_of_the_map_through_its_scale():
     # 1 m of the capture is 4 units of the map.
     found = metre_of([(UNKNOWN, pose()), (KNOWN, pose(4.0, 0.001))])
     assert (found.metres_per_unit, found.known_by) == (0.25, "measured")
-    assert found.sigma == pytest.approx(0.01, rel=0.02)
+    assert found.sigma == pytest.approx(0.02, rel=0.02)
 
 
 def test_what_a_person_gives_of_a_capture_is_of_its_own_unit():
     told = SceneUnit(told=0.3048)
     assert metre_of([(told, pose())]).metres_per_unit == 0.3048  # to the last digit
     assert metre_of([(UNKNOWN, pose()), (told, pose(2.0))]).metres_per_unit == pytest.approx(0.1524, rel=0.005)
-    assert metre_of([(KNOWN, pose()), (SceneUnit(told=2.0, in_metres=True), pose(2.0))]).known_by == "told"
+    # A person who measured knows better than a capture that is said to be in metres.
+    found = metre_of([(KNOWN, pose()), (KNOWN, pose()), (SceneUnit(told=1.05, in_metres=True), pose())])
+    assert (found.metres_per_unit, found.known_by) == (1.05, "told")
 
 
 def test_each_is_weighed_by_how_well_its_scale_is_known():
@@ -37,7 +39,7 @@ def test_each_is_weighed_by_how_well_its_scale_is_known():
 
 
 def test_many_captures_of_one_device_are_no_better_than_one():
-    assert metre_of([(KNOWN, pose(3.0, 0.002))] * 100).sigma >= 0.01
+    assert metre_of([(KNOWN, pose(3.0, 0.002))] * 100).sigma >= 0.02
 
 
 def test_captures_that_disagree_on_the_metre_are_told_of_and_the_sigma_says_so():

@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import expm
 
 from gsmap.geometry import similarities
-from gsmap.geometry.similarities import Similarities
+from gsmap.geometry.similarities import Similarities, without_scale
 
 
 def generator(xi):
@@ -79,3 +79,11 @@ def test_rows_compose_like_single_similarities(tangents):
         np.testing.assert_allclose(back.item(k).matrix(), a.item(k).inverse().matrix(), atol=1e-9)
         np.testing.assert_allclose(a.apply(points)[k], a.item(k).apply(points[k]), atol=1e-9)
     assert len(Similarities.stack([])) == 0
+
+
+def test_information_whatever_the_scale_is_that_of_the_marginal():
+    rng = np.random.default_rng(3)
+    roots = rng.normal(size=(5, 7, 7))
+    information = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(7)
+    marginal = np.linalg.inv(np.linalg.inv(information)[:, :6, :6])
+    np.testing.assert_allclose(without_scale(information), marginal, rtol=1e-8, atol=1e-10)

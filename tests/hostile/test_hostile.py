@@ -78,7 +78,7 @@ def _look(arguments: list[str]) -> NoReturn:
     """Make what a browser would ask the page of `gsmap view` for; an error goes to the page as it is."""
     try:
         with gsmap.map.open(arguments[1]) as m:
-            view = view_of(m.store)
+            view = view_of(m.store, m.settings)
             view.summary()
             for index in range(len(view.scenes)):
                 view.splats(index)

@@ -7,7 +7,7 @@ import pytest
 from made_worlds import poses_at, true_edges
 
 from gsmap.optimize import Params, optimize
-from gsmap.optimize.doubt import chance_alike
+from gsmap.optimize.doubt import chance_alike, dividing_bar
 
 QUICK = Params(marginals=False)
 SURE, DOUBTFUL = 0.05, 0.2
@@ -68,13 +68,13 @@ def test_a_street_of_look_alikes_is_laid_out_as_it_is():
     assert "looks alike" in reason
 
 
-@pytest.mark.parametrize("gone", [(7,), (4, 10)])
-def test_look_alikes_that_contradict_each_other_tie_no_parts(gone):
+@pytest.mark.parametrize(("gone", "parts"), [((7,), 2), ((4, 10), 3), ((4, 5, 10, 11, 12, 13), 2)])
+def test_look_alikes_that_contradict_each_other_tie_no_parts(gone, parts):
     """The street has gaps; its parts contradict look-alikes by themselves (one gap), or once laid over each other."""
     keep, right, wrong = Street().without(*gone)
     answer = optimize(keep, right + wrong, params=QUICK)
     assert uses(answer, wrong) == {"unused"}
-    assert len(components(answer)) == len(gone) + 1
+    assert len(components(answer)) == parts
     part = {scene: answer.poses[scene].component for scene in keep}
     between = [e for e in wrong if part[e.target] != part[e.source]]
     assert between
@@ -129,3 +129,27 @@ def test_the_rule_of_succession():
     assert chance_alike(0, 0) == 0.5
     assert chance_alike(0, 1) == pytest.approx(2 / 3)
     assert chance_alike(8, 1) == pytest.approx(2 / 11)
+
+
+def test_where_doubt_begins_is_told_by_the_map():
+    """One look-alike disagrees in less than the setting bears: the edges that disagree in still less contradict it."""
+    street = Street()
+    quiet = [replace(e, disagreement=0.09) if k == 3 else e for k, e in enumerate(street.wrong)]
+    noisy = [replace(e, disagreement=0.08) if k == 5 else e for k, e in enumerate(street.right)]
+    answer = optimize(street.ids, noisy + quiet, params=QUICK)
+    assert uses(answer, quiet) == {"unused"}
+    assert components(answer) == [street.ids]
+    # Bare and noisy maps in which nothing is contradicted are in no doubt below the setting.
+    alone = [replace(e, disagreement=0.09) for e in street.right]
+    assert uses(optimize(street.ids, alone, params=QUICK), alone) == {"tentative"}
+    assert "not the same" not in optimize(street.ids, alone, params=QUICK).outcomes["s00", "s01"].reason
+
+
+def test_the_bar_divides_what_agrees_from_what_is_contradicted():
+    rng = np.random.default_rng(0)
+    low, high = (middle * np.exp(rng.normal(0, 0.2, 4000)) for middle in (0.05, 0.15))
+    bar = dividing_bar(low, high)
+    # Bayes: log-normal densities of equal width meet at ten to one, for a wrong edge is as bad as ten right ones.
+    expected = np.exp(np.log(0.05 * 0.15) / 2 - 0.2**2 * np.log(10) / np.log(3))
+    assert bar == pytest.approx(expected, rel=0.02)
+    assert dividing_bar(high, low) == np.inf

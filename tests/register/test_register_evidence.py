@@ -52,6 +52,18 @@ def _measured(target, source, pose=_RIGHT, cameras=(_HERE, _HERE), unit_s=1.0) -
     return measure(Surface.of(target), Surface.of(source, unit_s), pose, tuple(views))
 
 
+@pytest.mark.parametrize(("ahead_m", "made", "said"), [(1.5, False, True), (1.5, True, False), (0.5, True, True)])
+def test_a_made_view_vouches_for_a_metre_in_front_of_what_it_sees(ahead_m, made, said):
+    cameras = replace(_HERE, synthesised=made)
+    # A part of the source lies on the target's wall, the other in front of it.
+    beside = _wall(3.0, width=1.5, centre=(-1.0, 0.0))
+    board = _wall(3.0 - ahead_m, width=0.8, height=0.8, centre=(0.4, 0.0))
+    with_board = _measured(_wall(3.0), Gaussians.concatenate([beside, board]), cameras=(cameras, None))
+    without = _measured(_wall(3.0), beside, cameras=(cameras, None))
+    assert without.free_space_violation == 0.0
+    assert (with_board.free_space_violation > 0.1) is said
+
+
 def test_two_captures_of_one_wall_agree():
     found = _measured(_wall(3.0), _wall(3.0))
     assert found.free_space_violation == 0.0

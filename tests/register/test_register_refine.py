@@ -10,16 +10,18 @@ from scipy.stats import norm
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.geometry.similarities import Similarities
-from gsmap.register import error_field, metres
+from gsmap.register import Params, error_field, metres
 from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
 from gsmap.register.correspondences import Correspondences
 from gsmap.register.covariance import Params as CovarianceParams
 from gsmap.register.covariance import condition, in_scene_units, point_to_plane_jacobian
+from gsmap.register.metric import MetricPair
 from gsmap.register.refiners import colored_icp, gicp, icp
 from gsmap.register.scale import vote_scales
+from gsmap.register.scaling import scaled_or_rigid
 from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
-from gsmap.types import Gaussians, Sim3
+from gsmap.types import Gaussians, Proposal, Sim3
 
 NOTHING_HIDDEN = CovarianceParams(hidden_turn_m=0.0, hidden_shift_m=0.0, hidden_swell_m=0.0)
 
@@ -163,7 +165,7 @@ def test_covariance_moves_with_the_source_frame(world, surfaces):
 
 
 def _walls(rng, blocks: int = 150) -> error_field.Blocks:
-    """Blocks on the sides of a room of 6 x 4 x 2.5 m, and how residuals there follow a pose."""
+    """Blocks on the walls, the floor and the ceiling of a room of 6 x 4 x 2.5 m; how residuals follow a pose."""
     size = np.array([6.0, 4.0, 2.5])
     positions, axis = rng.uniform(0, 1, (blocks, 3)) * size, rng.integers(0, 3, blocks)
     positions[np.arange(blocks), axis] = size[axis] * rng.integers(0, 2, blocks)
@@ -247,6 +249,25 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     assert off @ np.linalg.solve(sure, off) > 1e4
     assert off @ np.linalg.solve(unsure, off) < 7
     assert np.sqrt(unsure[6, 6]) == pytest.approx(0.003)
+    # Near a corner, growing moves: with nothing else uncertain, what the scale moved is one standard deviation.
+    near = np.linalg.norm(pose.apply(source.points) - [3.0, 0.0, 0.3], axis=1) < 1.0
+    corner = condition(target, Surface(source.points[near], source.colours[near], source.resolution_m), pose)
+    alone = replace(corner, rigid=1e-9 * np.eye(6)).known(pose, 0.003).covariance
+    moved = corner.rescaled(pose, np.exp(0.003))
+    off = (Similarities.stack([pose]).inverse() @ Similarities.stack([moved])).log()[0]
+    assert off @ np.linalg.solve(alone, off) == pytest.approx(1.0, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [0.96, 1.04])
+def test_a_scale_some_percent_off_is_reached_from_a_pose_that_it_put_off(factor):
+    world = splat_world(3, scale=factor)
+    S, centre = world.S_target_source, np.median(world.source.gaussians.means, axis=0)
+    start = Sim3(S.rotation, S.apply(centre) - S.rotation @ centre + [0.0, 0.15, 0.15])
+    pair = MetricPair.of(world.target, world.source, Proposal("test", start, False, 50), Params())
+    pose, known, belief = scaled_or_rigid(pair, start, Params(), with_scale=False)
+    assert abs(pose.scale / factor - 1) < 0.002
+    assert not belief.rigid
+    assert known.sigmas[2] == belief.measured_sigma == belief.log_scale_sigma
 
 
 def test_covariance_in_scene_units_scales_translations_only():

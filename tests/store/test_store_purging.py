@@ -1,5 +1,6 @@
 """Forgetting a scene: no byte of the map tells of it afterwards, whatever happened on the way."""
 
+import errno
 import json
 import os
 import shutil
@@ -13,7 +14,8 @@ from store_children import changes_disk
 from store_samples import key, make_cameras, make_gaussians
 
 import gsmap
-from gsmap.errors import BusyError, NotFoundError
+from gsmap.errors import BusyError, DiskError, DiskFullError, NotFoundError
+from gsmap.map.stages import purge
 from gsmap.store import Store, purging
 from gsmap.store.merging import merge
 from gsmap.types import EdgeOutcome, PoseGraph, Prior, Provenance, Registration, SceneGraph, ScenePose, Sim3
@@ -215,6 +217,26 @@ def test_tiles_made_with_it_go(place, tmp_path):
         assert finds(out, NAME, report.scene_id) == []
         m.export(out, tile_size_m=0, merge="union")
         assert len(list(out.rglob("*.ply"))) == 1
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.ENOSPC])
+def test_a_folder_whose_disk_failed_is_cleaned_by_the_same_command(place, tmp_path, monkeypatch, code):
+    make(place)
+    with gsmap.map.open(place) as m:
+        m.export(tmp_path / "out", tile_size_m=0, merge="union")
+        failing = [OSError(code, os.strerror(code))]
+        remove = purge.remove_file
+
+        def removed(*where):
+            if failing:
+                raise failing.pop()
+            return remove(*where)
+
+        monkeypatch.setattr(purge, "remove_file", removed)
+        with pytest.raises((DiskError, DiskFullError), match="run the same command again"):
+            m.purge(NAME)
+        assert m.purge(NAME).exports == (str(tmp_path / "out"),)
+        assert list((tmp_path / "out").rglob("*.ply")) == []
 
 
 def test_a_tile_outside_the_folder_stays(place, tmp_path):

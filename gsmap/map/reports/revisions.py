@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from gsmap.map.dates import is_after, parsed
 from gsmap.map.metres import metres_of_scenes
@@ -10,12 +11,14 @@ from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import names, refs, scenes_by_id
 from gsmap.map.reports.pairs import edge_rows
 from gsmap.map.reports.scenes import scene_rows
-from gsmap.map.settings import Settings
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
 from gsmap.types import PoseGraph
 from gsmap.types.metre import Metre
 from gsmap.types.rows import IngestRow, PairRef, PoseChangeRow, RevisionRow, UpdateReport
+
+if TYPE_CHECKING:
+    from gsmap.map.settings import Settings
 
 
 @of_one_state

@@ -17,7 +17,7 @@ from gsmap.durable import (
     remove_tree,
     sync_folder,
 )
-from gsmap.errors import GsmapError, NotFoundError
+from gsmap.errors import BusyError, DiskError, DiskFullError, GsmapError, NotFoundError, of_system
 from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.tileset import FILE_NAME as TILESET
@@ -44,7 +44,8 @@ def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, 
 
     Raises:
         NotFoundError: no scene is called so, and none of that id was purged.
-        StoreError: a branch cannot be read, or somebody reads an older state; the same call again goes on.
+        StoreError: a branch cannot be read, somebody reads an older state, or a folder of tiles or pictures failed; the
+            same call again goes on.
     """
     with ExitStack() as stack:
         catalogs = [store]
@@ -95,8 +96,16 @@ def _finish(store: Store, begun: Purge) -> Purge:
             else:
                 unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
+            if (passing := _passing(error)) is not None:
+                raise passing(f"{target} is not clean of it yet ({error}): run the same command again") from error
             unreachable.append(f"{target}: {error}")
     return purging.finish(store, begun, unreachable)
+
+
+def _passing(error: OSError | GsmapError) -> type[GsmapError] | None:
+    """Which error says that a folder that is there could not be cleaned for now; None where it cannot be reached."""
+    kind = of_system(error) if isinstance(error, OSError) else type(error)
+    return kind if kind in (DiskFullError, DiskError, BusyError) else None
 
 
 def _clean(store: Store, out: Path, begun: Purge) -> Purge:

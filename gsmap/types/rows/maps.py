@@ -22,7 +22,8 @@ class TodoRow(Row):
         what: ``undescribed`` scenes; ``stale_graphs``, made by other settings or another version; ``unregistered``
             scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews or priors are
             newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes; ``undecided``
-            edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``; ``isolated`` scenes.
+            edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``; ``duplicates``, pairs that
+            are one capture twice; ``isolated`` scenes.
         count: how many; 1 for ``unsolved`` and ``stale_poses``.
         verb: the command that helps.
         meaning: the same in words.
