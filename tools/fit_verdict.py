@@ -2,12 +2,13 @@
 
     python tools/make_verdict_places.py PLACES --set fit && python tools/make_verdict_places.py PLACES --set test
     python tools/fit_verdict.py PLACES --cache FOLDER            # writes gsmap/register/probability.json
-    python tools/fit_verdict.py PLACES --cache FOLDER --only-test
 
 Every pair of captures is matched, and every proposed pose refined and measured whatever the bars say; so are poses
 that were never proposed: the true one moved a little, and floors laid on floors at any angle. A pose is right within
-1.5 deg and 6 cm. The curves (`gsmap.register.probability`) are monotone and fitted by maximum likelihood with a
-penalty on steep ones; places are left out in turn to see how sure the sums may be.
+5 deg and 30 cm: the verdict says that it is the place, the covariance how exactly. Poses that lay a wing on its exact
+twin are left out: nothing of a pair can tell them, the map may. The curves (`gsmap.register.probability`) are monotone
+and fitted by maximum likelihood with a penalty on steep ones; places are left out in turn to see how sure the sums may
+be.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -24,11 +25,12 @@ import json
 import pickle
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
+from make_verdict_places import twin_m
 from scipy.optimize import minimize
 
 from gsmap.describe import Params as DescribeParams
@@ -45,7 +47,7 @@ from gsmap.register.stopwatch import Stopwatch
 from gsmap.types import Sim3
 from gsmap.types.registration import Proposal
 
-RIGHT_DEG, RIGHT_M = 1.5, 0.06
+RIGHT_DEG, RIGHT_M = 5.0, 0.3
 APART_FIT = 8  # captures of other places that each one is matched with
 
 KNOTS = {
@@ -73,7 +75,13 @@ class Judged:
     overlap: float
     error: tuple[float, float] | None
     accepted: bool
-    sigmas: tuple[float, float, float] | None
+
+    @property
+    def is_on_twin(self) -> bool:
+        """Whether the pose is that of a wing on its exact twin."""
+        if self.right or self.error is None:
+            return False
+        return self.error[0] < RIGHT_DEG and abs(self.error[1] - twin_m(int(self.place))) < RIGHT_M
 
 
 # --- what is judged --------------------------------------------------------------------------------------------------
@@ -81,9 +89,9 @@ class Judged:
 
 def collect(folder: Path, cache: Path, apart: int | None, seed: int = 0) -> list[Judged]:
     """Every pose that is judged of the captures below a folder."""
-    kept = cache / f"{folder.name}.pickle"
+    kept = cache / f"{folder.name}.json"
     if kept.exists():
-        return pickle.loads(kept.read_bytes())
+        return told_apart([Judged(**row) for row in json.loads(kept.read_text())])
     views, truths, places = read(folder, cache)
     rng = np.random.default_rng(seed)
     names = sorted(views)
@@ -103,8 +111,13 @@ def collect(folder: Path, cache: Path, apart: int | None, seed: int = 0) -> list
         found += judge_pair(views[a], views[b], places[a], truth, overlap, rng)
         if k % 50 == 0:
             say(f"{folder.name}: {k} of {len(pairs) + len(others)} pairs, {time.process_time() - began:.0f} CPU s")
-    kept.write_bytes(pickle.dumps(found))
-    return found
+    kept.write_text(json.dumps([asdict(judged) for judged in found]))
+    return told_apart(found)
+
+
+def told_apart(rows: list[Judged]) -> list[Judged]:
+    """Without the poses that nothing of a pair can tell from right ones."""
+    return [row for row in rows if not row.is_on_twin]
 
 
 def read(folder: Path, cache: Path) -> tuple[dict[str, SceneView], dict[str, Sim3], dict[str, str]]:
@@ -154,7 +167,6 @@ def judge_pair(
                 overlap,
                 error,
                 not judged.flaw,
-                None,
             )
         )
     return found
@@ -203,7 +215,7 @@ def design(rows: list[dict[str, float]]) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def fit(rows: list[Judged], penalty: float = 0.02) -> Model:
+def fit(rows: list[Judged], penalty: float = 0.005) -> Model:
     """Maximum likelihood, right and wrong poses weighed alike, under a ridge on every segment's rise."""
     x = design([row.evidence for row in rows])
     y = np.array([row.right for row in rows], float)
@@ -289,7 +301,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
     parser.add_argument("--cache", type=Path, required=True)
-    parser.add_argument("--prior", type=float, default=0.1)
+    parser.add_argument("--prior", type=float, default=0.2)
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
     rows = collect(args.places / "fit", args.cache, APART_FIT)

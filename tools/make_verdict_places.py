@@ -26,6 +26,7 @@ from gsmap_synthetic.capture import default_routes, unused_doors
 from gsmap_synthetic.edits import edit_place
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import Place
+from gsmap_synthetic.plan import make_plan, with_twin
 from gsmap_synthetic.script import random_edits
 
 SETS = {"fit": range(20_000, 20_044), "test": range(30_000, 30_020)}
@@ -48,9 +49,8 @@ def make(folder: Path, seed: int) -> None:
     if (folder / "done").exists():
         return
     began = time.process_time()
-    rng = np.random.default_rng([seed, 21])
-    rooms, twin = int(rng.integers(3, 6)), bool(rng.random() < 0.15)
-    place = synthetic.make_place(seed, rooms=3 if twin else rooms, twin=twin, texel_m=0.012)
+    rng, rooms, twin = layout(seed)
+    place = synthetic.make_place(seed, rooms=rooms, twin=twin, texel_m=0.012)
     told = []
     for k in range(int(rng.integers(2, 5))):
         capture, faults = visit(place, seed, k, rng)
@@ -60,6 +60,23 @@ def make(folder: Path, seed: int) -> None:
         told.append(f"{capture.name} {' '.join(faults) or 'as it is'}")
     (folder / "done").touch()
     print(f"{seed}: {'; '.join(told)} ({time.process_time() - began:.0f} CPU s)", flush=True)
+
+
+def layout(seed: int) -> tuple[np.random.Generator, int, bool]:
+    """What everything else is drawn from, how many rooms a wing has, and whether there is a second one like it."""
+    rng = np.random.default_rng([seed, 21])
+    rooms, twin = int(rng.integers(3, 6)), bool(rng.random() < 0.15)
+    return rng, 3 if twin else rooms, twin
+
+
+def twin_m(seed: int) -> float:
+    """How far a place's second wing lies beside the first; NaN where there is none."""
+    _, rooms, twin = layout(seed)
+    if not twin:
+        return float("nan")
+    plan, doors = make_plan(np.random.default_rng([seed, 1]), rooms)
+    wings, _ = with_twin(plan, doors, seed)
+    return float(wings[len(plan)].rect_m[0] - plan[0].rect_m[0])
 
 
 def visit(place: Place, seed: int, k: int, rng: np.random.Generator) -> tuple[synthetic.DemoCapture, dict[str, Any]]:

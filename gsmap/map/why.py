@@ -45,27 +45,28 @@ def _evidence(pair: PairReport, bars: verdict.Params, max_disagreement: float) -
     """The pose that was found, and each piece of evidence with its bar."""
     figures: Mapping[str, Any] = pair.evidence
 
-    def held(name: str, figure: str, bar: float, *, at_least: bool = False, note: str = "") -> WhyStep:
+    def known(figure: str) -> float | None:
         value = float(figures.get(figure, np.nan))
-        known = bool(np.isfinite(value))
-        passed = None if not known else bool(value >= bar if at_least else value <= bar)
-        words = f"{'at least' if at_least else 'at most'} {bar:g}{note}"
-        return WhyStep(name=name, value=value if known else None, bar=words, passed=passed)
+        return value if np.isfinite(value) else None
 
-    changed = figures.get("colour_correlation", 0.0) >= bars.changed_colour_correlation
-    free = bars.changed_free_space_violation if changed else bars.max_free_space_violation
-    agree = ", since colours agree" if changed else ""
+    def held(name: str, figure: str, bar: float, *, at_least: bool = False, note: str = "") -> WhyStep:
+        value = known(figure)
+        passed = None if value is None else bool(value >= bar if at_least else value <= bar)
+        words = f"{'at least' if at_least else 'at most'} {bar:g}{note}"
+        return WhyStep(name=name, value=value, bar=words, passed=passed)
+
     return [
         WhyStep(name="correspondences", value=pair.num_correspondences),
         WhyStep(name="clique", value=pair.num_inliers),
-        held("log10 false alarms", "log_nfa", bars.max_log_nfa, note=", or strong surfaces"),
-        held("rival clique", "runner_up", bars.max_runner_up, note=" of its size"),
+        WhyStep(name="log10 false alarms", value=known("log_nfa")),
+        WhyStep(name="rival clique", value=known("runner_up")),
         WhyStep(name="pose by", value=pair.proposer),
         WhyStep(name="overlap", value=pair.overlap),
         held("coinciding cells", "num_coinciding", bars.min_coinciding, at_least=True),
         held("colour correlation", "colour_correlation", bars.min_colour_correlation, at_least=True),
-        held("colour significance", "colour_t", bars.min_colour_t, at_least=True, note=" sigma"),
-        held("free-space violation", "free_space_violation", free, note=agree),
+        WhyStep(name="colour significance", value=known("colour_t")),
+        held("free-space violation", "free_space_violation", bars.max_free_space_violation),
+        held("probability", "probability", bars.min_probability, at_least=True, note=", of all of these"),
         held("disagreement", "disagreement", max_disagreement, note=" of what both saw, or it is in doubt"),
     ]
 

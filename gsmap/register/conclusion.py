@@ -13,6 +13,7 @@ from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.metres import Belief
 from gsmap.register.params import Params, SamePose
+from gsmap.register.probability import probability
 from gsmap.register.proposing import num_nodes
 from gsmap.register.scene_view import SceneView
 from gsmap.types import Registration, Sim3
@@ -77,7 +78,7 @@ def conclude(
         overlap=best.evidence.overlap,
         proposer=best.proposal.proposer,
         exact=best.proposal.exact,
-        evidence=_figures(best),
+        evidence=_figures(best, params.verdict),
         notes=tuple(notes),
         **common,
     )
@@ -105,7 +106,7 @@ def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:
     return f"two poses lie {degrees:.0f} deg and {metres:.1f} m apart"
 
 
-def _figures(judged: Judged) -> dict[str, float]:
+def _figures(judged: Judged, params: verdict.Params) -> dict[str, float]:
     """The evidence as it is stored; `gsmap.types.Registration` explains each name."""
     p, e = judged.proposal, judged.evidence
     log_scale = log_scale_sigma = float("nan")
@@ -121,6 +122,7 @@ def _figures(judged: Judged) -> dict[str, float]:
         "num_coinciding": float(e.num_coinciding),
         "colour_correlation": e.colour_correlation,
         "colour_t": e.colour_t,
+        "probability": probability(p, e, params.prior) if e.num_coinciding else float("nan"),
         "disagreement": e.disagreement,
         "seen_m2": e.seen_m2,
         "log_scale": log_scale,

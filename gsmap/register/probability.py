@@ -96,6 +96,15 @@ def worth(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None
     return {name: model.curves[name].at(value) for name, value in evidence_of(proposal, evidence).items()}
 
 
+def shortfalls(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> list[str]:
+    """The names of the evidence that could be had, what lacks most of what it could be worth first."""
+    model, lacks = model or Model.load(), {}
+    for name, value in evidence_of(proposal, evidence).items():
+        if not np.isnan(value):
+            lacks[name] = max(model.curves[name].worth) - model.curves[name].at(value)
+    return sorted(lacks, key=lambda name: -lacks[name])
+
+
 def probability(proposal: Proposal, evidence: PoseEvidence, prior: float = 0.5, model: Model | None = None) -> float:
     """How probable it is that a pose is right, in (0, 1).
 

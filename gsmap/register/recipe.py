@@ -7,6 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from gsmap.methods import MethodParams, RecipeKey, family
+from gsmap.register import probability
 from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
@@ -38,7 +39,7 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
         del settings["poor_nodes"]
     if params.scale_refiner not in coarse | fine:
         del settings["scale_refiner"]
-    versions = {"register": VERSION}
+    versions = {"register": VERSION, "probability": probability.VERSION}
     for kind, names in (("proposer", proposers), ("refiner", coarse | fine)):
         for name in sorted(names):
             versions |= family(kind).version(name)

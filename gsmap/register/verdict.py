@@ -7,20 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.register.evidence import PoseEvidence
+from gsmap.register.probability import probability, shortfalls
 from gsmap.types.registration import Proposal
 
 
 @dataclass(frozen=True)
 class Params:
-    """Bars a pose must clear; a wrong edge costs a map more than ten right ones missed.
+    """What a pose must show; a wrong edge costs a map more than ten right ones missed, hence a probability of .9.
 
-    Measured on 28 pairs of real captures and 39 of synthetic ones, after refinement, right poses against every proposal
-    for pairs apart and the best of random ones laid floor on floor. Right poses violate free space by at most 0.005 (a
-    house), 0.014 (a kitchen by a real sensor), 0.061 (synthetic scenes, whose doors were shut between captures) and
-    0.13 (through synthesised cameras); colours correlate by at least 0.76, 0.27 and 0.56. Of the wrong ones, those that
-    violate free space by up to 0.1 all have a correlation below 0.01; those that correlate by 0.1 or more violate it by
-    0.19 or more. The kitchen laid on itself 10 deg and 18 cm off correlates as well as the truth, but violates free
-    space by 0.05. The bars stand in the middle of these gaps.
+    How probable a pose is, of all its evidence, says `gsmap.register.probability`, fitted on made places. What one
+    scene has where the other looked through contradicts a pose whatever speaks for it: two wings that look alike agree
+    in everything else.
 
     Args:
         max_log_nfa: a clique is significant when fewer false alarms than this (log10) are expected of the background
@@ -28,18 +25,13 @@ class Params:
             measured down to -7 between different synthetic scenes, so the bar is lower than the theory's -2.
         max_runner_up: ... and no disagreeing clique comes nearer to its size than this share of it.
         min_coinciding: source cells that must coincide with the target's surface.
-        max_free_space_violation: share of a scene's surface in front of what the other scene's cameras saw.
-        min_colour_correlation: local colours of both scenes' renders must agree this well ...
-        min_colour_t: ... and this surely (standard deviations).
-        changed_free_space_violation: places change (a door that was open is shut), so this much violation of free space
-            is borne ...
-        changed_colour_correlation: ... where colours agree this well.
-        strong_overlap: share of the surface that must coincide to carry a pose whose clique is not significant, or that
-            came from no clique; what was seen by the cameras of both must be as follows.
-        strong_free_space_violation: the violation of free space that such a pose may show; where colours agree as well
-            as in a place that changed, ``max_free_space_violation`` will do.
-        strong_colour_correlation: the correlation of colours that such a pose needs.
-        strong_colour_t: the significance of that correlation that such a pose needs.
+        max_free_space_violation: share of a scene's surface in front of what the other scene's cameras saw: places
+            change (a door that was open is shut), but not by more.
+        min_colour_correlation: local colours of both scenes' renders must agree this well: places are repainted, but
+            not all of it.
+        min_probability: that the pose is right, of all evidence together.
+        prior: share of judged poses that are right before anything is known of them; most pairs that come so far do
+            share a place, most pairs of a large map do not come so far.
         prescreen_min_coinciding: a rough pose under which fewer cells coincide is not worth refining further ...
         prescreen_colour_correlation: ... nor one whose colours agree less than this ...
         prescreen_colour_t: ... and less surely than this ...
@@ -53,15 +45,10 @@ class Params:
     max_log_nfa: float = -8.0
     max_runner_up: float = 0.7
     min_coinciding: int = 300
-    max_free_space_violation: float = 0.08
+    max_free_space_violation: float = 0.18
     min_colour_correlation: float = 0.15
-    min_colour_t: float = 3.0
-    changed_free_space_violation: float = 0.18
-    changed_colour_correlation: float = 0.55
-    strong_overlap: float = 0.10
-    strong_free_space_violation: float = 0.025
-    strong_colour_correlation: float = 0.20
-    strong_colour_t: float = 4.0
+    min_probability: float = 0.9
+    prior: float = 0.2
     prescreen_min_coinciding: int = 50
     prescreen_colour_correlation: float = 0.05
     prescreen_colour_t: float = 1.5
@@ -102,7 +89,7 @@ def fails_prescreen(evidence: PoseEvidence, params: Params | None = None) -> str
         return _too_little(evidence, params.prescreen_min_coinciding)
     pale = evidence.colour_correlation < params.prescreen_colour_correlation
     if pale and evidence.colour_t < params.prescreen_colour_t:
-        return _colours_disagree(evidence, params.prescreen_colour_correlation, params.prescreen_colour_t)
+        return _colours_disagree(evidence, params.prescreen_colour_correlation)
     if evidence.free_space_violation > params.prescreen_free_space_violation:
         return _violates(evidence, params.prescreen_free_space_violation)
     return ""
@@ -126,12 +113,10 @@ def judge(
         return proposal.flaw
     if evidence.num_coinciding < params.min_coinciding or sigmas is None:
         return _too_little(evidence, params.min_coinciding)
-    if evidence.colour_correlation < params.min_colour_correlation or evidence.colour_t < params.min_colour_t:
-        return _colours_disagree(evidence, params.min_colour_correlation, params.min_colour_t)
-    changed = evidence.colour_correlation >= params.changed_colour_correlation
-    allowed = params.changed_free_space_violation if changed else params.max_free_space_violation
-    if evidence.free_space_violation > allowed:
-        return _violates(evidence, allowed)
+    if evidence.colour_correlation < params.min_colour_correlation:
+        return _colours_disagree(evidence, params.min_colour_correlation)
+    if evidence.free_space_violation > params.max_free_space_violation:
+        return _violates(evidence, params.max_free_space_violation)
     degrees = np.degrees(sigmas[0])
     if (
         degrees > params.max_rotation_sigma_deg
@@ -141,21 +126,26 @@ def judge(
         return (
             f"the overlap fixes the pose only to {degrees:.1f} deg, {100 * sigmas[1]:.0f} cm, {sigmas[2]:.1%} in scale"
         )
-    if is_significant(proposal, params) or _is_strong(evidence, params, changed):
+    probable = probability(proposal, evidence, params.prior)
+    # Where the cameras of one scene could not judge, nothing was learnt of what a clique beyond chance is worth.
+    if probable >= params.min_probability or (not evidence.num_seen and is_significant(proposal, params)):
         return ""
-    return not_significant(proposal, params, "and the surfaces do not confirm it strongly enough")
+    return f"not probable enough: {probable:.1%}, needs {params.min_probability:.0%}: {_weakest(proposal, evidence)}"
 
 
-def _is_strong(evidence: PoseEvidence, params: Params, changed: bool) -> bool:
-    """The surfaces and the cameras of both carry the pose by themselves."""
-    allowed = params.max_free_space_violation if changed else params.strong_free_space_violation
-    return (
-        evidence.num_seen > 0
-        and evidence.overlap >= params.strong_overlap
-        and evidence.free_space_violation <= allowed
-        and evidence.colour_correlation >= params.strong_colour_correlation
-        and evidence.colour_t >= params.strong_colour_t
-    )
+def _weakest(proposal: Proposal, evidence: PoseEvidence) -> str:
+    """The two pieces of evidence that a sure pose would show otherwise, in words."""
+    words = {
+        "log_nfa": f"chance explains the correspondences (log10 NFA {proposal.log_nfa:.1f})",
+        "runner_up": f"a rival clique has {proposal.runner_up:.0%} of its size",
+        "free_space_violation": f"free-space violation {evidence.free_space_violation:.0%}",
+        "disagreement": f"{evidence.disagreement:.0%} of what both saw differs",
+        "overlap": f"overlap {evidence.overlap:.0%}",
+        "num_coinciding": f"{evidence.num_coinciding} cells coincide",
+        "colour_correlation": f"colours disagree where surfaces coincide ({evidence.colour_correlation:.2f})",
+        "colour_t": f"colours agree by {evidence.colour_t:.1f} standard deviations",
+    }
+    return ", ".join(words[name] for name in shortfalls(proposal, evidence)[:2])
 
 
 _NOT_SIGNIFICANT = "not significant"
@@ -165,11 +155,9 @@ def _too_little(evidence: PoseEvidence, needs: int) -> str:
     return f"too little surface coincides: {evidence.num_coinciding} cells, needs {needs}"
 
 
-def _colours_disagree(evidence: PoseEvidence, correlation: float, t: float) -> str:
-    return (
-        f"colours disagree where surfaces coincide: correlation {evidence.colour_correlation:.2f}, needs "
-        f"{correlation:.2f} (t {evidence.colour_t:.1f}, needs {t:.1f})"
-    )
+def _colours_disagree(evidence: PoseEvidence, needs: float) -> str:
+    correlation = f"{evidence.colour_correlation:.2f}"
+    return f"colours disagree where surfaces coincide: correlation {correlation}, needs {needs:.2f}"
 
 
 def _violates(evidence: PoseEvidence, allowed: float) -> str:

@@ -73,6 +73,8 @@ class Registration:
             ``num_coinciding``: count of cells of the source's surface that lie on the target's.
             ``colour_correlation``: correlation, in [-1, 1], of local colours where both scenes show the same surface.
             ``colour_t``: its significance, in standard deviations over patches.
+            ``probability``: that the pose is right, of all evidence together, as far as captures of made places tell
+            (`gsmap.register.probability`); NaN where nothing was measured.
             ``disagreement``: of the surface that both saw, as area, the share that is not the same in both: one looked
             through it, or shows another pattern on it; NaN without cameras.
             ``seen_m2``: that surface, in square metres.

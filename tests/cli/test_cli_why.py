@@ -33,7 +33,7 @@ def test_every_step_has_its_bar_and_says_whether_it_passed(site, cli):
     steps = _steps(cli("why", site, "left:right", "--json").json)
     assert steps["retrieval"]["passed"] is True
     assert steps["verdict"] == {"name": "verdict", "value": "accepted", "bar": "accepted", "passed": True}
-    assert steps["log10 false alarms"]["bar"].startswith("at most -8")
+    assert steps["probability"]["bar"].startswith("at least 0.9")
     assert steps["colour correlation"]["passed"] is True
     assert steps["disagreement"]["passed"] is True
     assert steps["disagreement"]["value"] < 0.1
@@ -45,7 +45,7 @@ def test_what_disagrees_is_named_with_what_would_settle_it(site, cli):
     found = cli("why", site, "left:right", "--json").json
     steps = _steps(found)
     assert steps["disagreement"]["passed"] is False
-    assert steps["free-space violation"]["passed"] is True  # colours agree: the bar of places that changed
+    assert steps["free-space violation"]["passed"] is True
     assert steps["the other edges"] == {
         "name": "the other edges", "value": "tentative", "bar": "bear it out: used", "passed": False
     }  # fmt: skip

@@ -216,17 +216,18 @@ _SIGMAS = (0.003, 0.011, 1e-6)
         ({}, _UNSURE, True),
         ({"free_space_violation": 0.05}, _SURE, True),
         ({"free_space_violation": 0.12}, _SURE, True),  # a place that changed, its colours beyond doubt
-        ({"free_space_violation": 0.12, "colour_correlation": 0.4}, _SURE, False),
+        ({"free_space_violation": 0.12, "colour_correlation": 0.4}, _SURE, True),
         ({"free_space_violation": 0.25}, _SURE, False),
         ({"free_space_violation": 0.05, "colour_correlation": 0.4}, _SURE, True),
-        ({"free_space_violation": 0.05, "colour_correlation": 0.4}, _UNSURE, False),
+        ({"free_space_violation": 0.05, "colour_correlation": 0.4}, _UNSURE, True),
+        ({"free_space_violation": 0.16, "colour_correlation": 0.16, "overlap": 0.1}, _UNSURE, False),
         ({"free_space_violation": 0.015, "colour_correlation": 0.3}, _UNSURE, True),
         ({"colour_correlation": 0.1}, _SURE, False),
-        ({"colour_t": 2.0}, _SURE, False),
         ({"colour_correlation": 0.0, "colour_t": 0.0, "free_space_violation": np.nan, "num_seen": 0}, _SURE, False),
         ({"free_space_violation": np.nan, "num_seen": 0}, _SURE, True),  # no cameras, but a clique beyond chance
         ({"free_space_violation": np.nan, "num_seen": 0}, _UNSURE, False),
-        ({"overlap": 0.05}, _UNSURE, False),
+        ({"overlap": 0.05}, _UNSURE, True),
+        ({"overlap": 0.05, "num_coinciding": 400, "colour_correlation": 0.2}, _UNSURE, False),
         ({"num_coinciding": 100}, _SURE, False),
     ],
 )

@@ -21,6 +21,7 @@ def test_the_key_names_all_that_takes_part_and_nothing_else():
     assert (key.stage, key.method) == ("register", "pair")
     assert set(key.version) == {
         "register",
+        "probability",
         "proposer.graph",
         "proposer.kiss_matcher",
         "refiner.colored_icp",
@@ -163,9 +164,9 @@ def test_not_significant_is_said_in_the_fields_words():
     bars = replace(Params().verdict, max_log_nfa=-1000.0)
     found = register_pair(world.target, world.source, Params(fallback="never", verdict=bars))
     assert found.status == "no_match"
-    assert found.reason == (
-        f"not significant: log10 NFA {found.evidence['log_nfa']:.1f}, needs < -1000.0 (and the surfaces do not confirm "
-        "it strongly enough)"
+    assert found.reason.startswith(
+        f"not significant: log10 NFA {found.evidence['log_nfa']:.1f}, needs < -1000.0 (not probable enough: "
+        f"{found.evidence['probability']:.1%}, needs 90%: "
     )
     unsure = Proposal("graph:objects", Sim3.identity(), with_scale=False, num_inliers=9, log_nfa=-9.0, runner_up=0.9)
     assert "a rival clique has 90% of its size, allowed 70%" in verdict.not_significant(unsure, verdict.Params())
