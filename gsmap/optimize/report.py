@@ -27,8 +27,12 @@ def pose_graph(
 ) -> PoseGraph:
     """Scenes and edges by id; its provenance is left to the caller."""
     sure = state.accepted & ~state.doubtful
+    tied = component_labels(m, np.flatnonzero(sure))
+    borne_out = state.accepted & state.doubtful & (tied[m.targets] == tied[m.sources])
+    if not (state.doubtful & ~state.accepted).any():
+        sure |= borne_out  # two captures of places that look alike do not agree with the way round by chance
     firm = sure & (~bridges(m, sure) | m.confirmed)
-    # What is in doubt confirms nothing, and is itself confirmed by what holds without it.
+    # Else what is in doubt confirms nothing, and is itself confirmed by what holds without it.
     blocks = component_labels(m, np.flatnonzero(firm))
     firm |= state.accepted & state.doubtful & (blocks[m.targets] == blocks[m.sources])
     status = _statuses(m, state.accepted, firm)

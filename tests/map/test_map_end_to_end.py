@@ -26,7 +26,7 @@ from gsmap_synthetic import make_captures, write_captures
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures")
-    made = make_captures(0, 3, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
+    made = make_captures(0, 3, shut_doors=False, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
     write_captures(folder, made)
     return folder
 

@@ -8,6 +8,7 @@ from made_worlds import poses_at, true_edges
 
 from gsmap.optimize import Params, optimize
 from gsmap.optimize.doubt import chance_alike, dividing_bar
+from gsmap.types import Sim3
 
 QUICK = Params(marginals=False)
 SURE, DOUBTFUL = 0.05, 0.2
@@ -115,6 +116,24 @@ def test_what_the_others_bear_out_is_used(given):
     (odd,) = true_edges(truth, np.array([(1, 3)]), rng, ids)
     answer = optimize(ids, [*known, replace(odd, disagreement=DOUBTFUL)], params=QUICK)
     assert answer.use("s1", "s3") == "used"
+
+
+@pytest.mark.parametrize("contradicted", [False, True])
+def test_what_is_borne_out_confirms_unless_the_map_has_look_alikes(contradicted):
+    """A triangle whose third edge is in doubt; elsewhere a doubtful edge fits, or contradicts the others."""
+    rng = np.random.default_rng(0)
+    truth = poses_at(rng.uniform(0, 8, (6, 3)))
+    ids = [f"s{k}" for k in range(6)]
+    known = true_edges(truth, np.array([(0, 1), (1, 2), (3, 4), (4, 5), (3, 5)]), rng, ids)
+    third, other = true_edges(truth, np.array([(0, 2), (3, 5)]), rng, ids)
+    known = [replace(e, disagreement=SURE) for e in known[: 4 if contradicted else 5]]
+    given = [*known, replace(third, disagreement=DOUBTFUL)]
+    if contradicted:
+        moved = Sim3(other.S_target_source.rotation, np.array([4.0, 0, 0]) + other.S_target_source.translation)
+        given.append(replace(other, S_target_source=moved, disagreement=DOUBTFUL))
+    answer = optimize(ids, given, params=QUICK)
+    triangle = {answer.use(*pair) for pair in (("s0", "s1"), ("s1", "s2"), ("s0", "s2"))}
+    assert triangle == ({"tentative"} if contradicted else {"used"})
 
 
 def test_a_confirmed_edge_is_in_no_doubt():
