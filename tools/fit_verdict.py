@@ -2,6 +2,7 @@
 
     python tools/make_verdict_places.py PLACES --set fit && python tools/make_verdict_places.py PLACES --set test
     python tools/fit_verdict.py PLACES --cache FOLDER            # writes gsmap/register/probability.json
+    python tools/fit_verdict.py PLACES --cache FOLDER --also FLATS   # and says what becomes of FLATS/SEED/NAME.ply
 
 Every pair of captures is matched, and every proposed pose refined and measured whatever the bars say; so are poses
 that were never proposed: the true one moved a little, and floors laid on floors at any angle. A pose is right within
@@ -30,7 +31,7 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
-from make_verdict_places import twin_m
+from make_verdict_places import SETS, twin_m
 from scipy.optimize import minimize
 
 from gsmap.describe import Params as DescribeParams
@@ -39,7 +40,7 @@ from gsmap.evaluate.overlap import solid_centres, true_overlaps
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import exp_so3
 from gsmap.ingest import read_captures
-from gsmap.register import Params, SceneView
+from gsmap.register import Params, SceneView, verdict
 from gsmap.register.pair import measured
 from gsmap.register.probability import Curve, Model, evidence_of
 from gsmap.register.proposing import Proposing
@@ -79,7 +80,7 @@ class Judged:
     @property
     def is_on_twin(self) -> bool:
         """Whether the pose is that of a wing on its exact twin."""
-        if self.right or self.error is None:
+        if self.right or self.error is None or not any(self.place == str(seed) for of in SETS.values() for seed in of):
             return False
         return self.error[0] < RIGHT_DEG and abs(self.error[1] - twin_m(int(self.place))) < RIGHT_M
 
@@ -91,7 +92,7 @@ def collect(folder: Path, cache: Path, apart: int | None, seed: int = 0) -> list
     """Every pose that is judged of the captures below a folder."""
     kept = cache / f"{folder.name}.json"
     if kept.exists():
-        return told_apart([Judged(**row) for row in json.loads(kept.read_text())])
+        return [Judged(**row) for row in json.loads(kept.read_text())]
     views, truths, places = read(folder, cache)
     rng = np.random.default_rng(seed)
     names = sorted(views)
@@ -112,19 +113,20 @@ def collect(folder: Path, cache: Path, apart: int | None, seed: int = 0) -> list
         if k % 50 == 0:
             say(f"{folder.name}: {k} of {len(pairs) + len(others)} pairs, {time.process_time() - began:.0f} CPU s")
     kept.write_text(json.dumps([asdict(judged) for judged in found]))
-    return told_apart(found)
+    return found
 
 
-def told_apart(rows: list[Judged]) -> list[Judged]:
-    """Without the poses that nothing of a pair can tell from right ones."""
-    return [row for row in rows if not row.is_on_twin]
+def told_apart(rows: list[Judged]) -> tuple[list[Judged], list[Judged]]:
+    """Poses that the evidence of a pair can tell from right ones, and those that nothing of a pair can."""
+    twins = {id(row) for row in rows if row.is_on_twin}
+    return [row for row in rows if id(row) not in twins], [row for row in rows if id(row) in twins]
 
 
 def read(folder: Path, cache: Path) -> tuple[dict[str, SceneView], dict[str, Sim3], dict[str, str]]:
     """Captures with their graphs, truth and place, by name."""
     views, truths, places = {}, {}, {}
     (cache / "graphs").mkdir(exist_ok=True)
-    for place in sorted(p.parent for p in folder.glob("*/done")):
+    for place in sorted(p.parent for p in folder.glob("*/truth")):
         for capture in read_captures(place):
             name = f"{place.name}-{capture.name}"
             kept = cache / "graphs" / f"{name}.pickle"
@@ -281,35 +283,65 @@ def calibrated(model: Model, odds: np.ndarray, rows: list[Judged]) -> Model:
 # --- what it says ----------------------------------------------------------------------------------------------------
 
 
-def report(name: str, rows: list[Judged], odds: np.ndarray, prior: float) -> None:
-    z = odds + np.log(prior / (1 - prior))
-    p = 1 / (1 + np.exp(-z))
-    right = np.array([row.right for row in rows])
+def report(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.Params) -> None:
+    """What probabilities accept, and what is true of what they say."""
+    p = probabilities(odds, bars)
+    right, stands = np.array([row.right for row in rows]), np.array([not contradicted(row, bars) for row in rows])
     print(f"{name}: {right.sum()} right poses, {(~right).sum()} wrong ones")
     for bar in (0.5, 0.9, 0.95, 0.99, 0.999):
         yes = p >= bar
-        print(f"  p >= {bar}: {(yes & right).sum()} right, {(yes & ~right).sum()} wrong accepted")
+        past = f"past the bars on free space and colour {(yes & stands & right).sum()}, {(yes & stands & ~right).sum()}"
+        print(f"  p >= {bar}: {(yes & right).sum()} right, {(yes & ~right).sum()} wrong accepted; {past}")
     now = np.array([row.accepted for row in rows])
-    print(f"  the bars of today: {(now & right).sum()} right, {(now & ~right).sum()} wrong accepted")
+    print(f"  the verdict when they were judged: {(now & right).sum()} right, {(now & ~right).sum()} wrong accepted")
     for low, high in ((0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01)):
         those = (p >= low) & (p < high)
         if those.any():
             print(f"  said {low:.2f} to {min(high, 1):.2f}: {those.sum():5d} poses, {right[those].mean():.3f} right")
 
 
+def report_pairs(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.Params) -> None:
+    """Of how many pairs a right pose, and a wrong one, would be accepted."""
+    p = probabilities(odds, bars)
+    yes = [q >= bars.min_probability and not contradicted(row, bars) for row, q in zip(rows, p, strict=True)]
+    one_place = {tuple(row.pair) for row in rows if row.error is not None}
+    accepted = {tuple(row.pair) for row, y in zip(rows, yes, strict=True) if y and row.right}
+    wrong = {tuple(row.pair) for row, y in zip(rows, yes, strict=True) if y and not row.right}
+    apart = {tuple(row.pair) for row in rows} - one_place
+    print(f"{name}: {len(accepted)} of {len(one_place)} pairs of one place accepted, {len(wrong)} pairs wrongly;")
+    print(f"  {len(apart)} pairs of different places had a pose to judge")
+
+
+def probabilities(odds: np.ndarray, bars: verdict.Params) -> np.ndarray:
+    """Of log-odds without a prior, under the verdict's."""
+    out: np.ndarray = 1 / (1 + np.exp(-(odds + np.log(bars.prior / (1 - bars.prior)))))
+    return out
+
+
+def contradicted(row: Judged, bars: verdict.Params) -> bool:
+    """Whether the verdict refuses a pose whatever speaks for it; evidence that could not be had refuses none."""
+    violation = 10 ** row.evidence["free_space_violation"] - 1e-3
+    return violation > bars.max_free_space_violation or row.evidence["colour_correlation"] < bars.min_colour_correlation
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
     parser.add_argument("--cache", type=Path, required=True)
-    parser.add_argument("--prior", type=float, default=0.2)
+    parser.add_argument("--also", type=Path, nargs="+", default=[], help="folders of captured places to be judged, too")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
-    rows = collect(args.places / "fit", args.cache, APART_FIT)
+    bars = verdict.Params()
+    rows, twins = told_apart(collect(args.places / "fit", args.cache, APART_FIT))
     odds = left_out(rows)
     model = calibrated(fit(rows), odds, rows)
-    report("fit, each place left out", rows, odds, args.prior)
-    tests = collect(args.places / "test", args.cache, None, seed=1)
-    report("test", tests, log_odds(model, tests), args.prior)
+    report("fit, each place left out", rows, odds, bars)
+    tests, more = told_apart(collect(args.places / "test", args.cache, None, seed=1))
+    report("test", tests, log_odds(model, tests), bars)
+    report("wings on their twins, in neither", twins + more, log_odds(model, twins + more), bars)
+    for folder in args.also:
+        judged = collect(folder, args.cache, None, seed=1)
+        report_pairs(folder.name, judged, log_odds(model, judged), bars)
     target = Path(__file__).resolve().parents[1] / "gsmap" / "register" / "probability.json"
     stored = {
         "curves": {
