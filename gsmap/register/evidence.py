@@ -251,7 +251,7 @@ def _compare(
     both = solid & (other.alpha[0] > params.min_alpha)
     in_front = both & (other_depth < near - tolerance)
     agrees = both & ~in_front & (other_depth <= far + tolerance)
-    in_front &= near - other_depth <= reach_m
+    in_front[in_front] = near[in_front] - other_depth[in_front] <= reach_m  # elsewhere both may be infinite
     assert other.dominant_id is not None
     stats.in_front[other.dominant_id[0][in_front]] = True
     stats.agrees[other.dominant_id[0][agrees]] = True
