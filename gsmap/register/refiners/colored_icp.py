@@ -33,7 +33,8 @@ class Params:
         colour_radius_m: at radii beyond this colour is left out: lightness extrapolated so far in a tangent plane means
             nothing.
         max_points: cells of both surfaces together that take part at each radius.
-        tolerance: a radius is done with when a step moves the pairs by less than this share of it.
+        tolerance: a radius is done with when a step moves the pairs by less than this share of it ...
+        last_tolerance: ... and the last one by less than this: from pose to pose pairs change, and steps shrink slowly.
         overstep: factor on steps: pairs follow the pose only in part, so steps fall short, most of all along the scale.
         max_scale_change: factor by which the scale may move away from the start's before the start is given back.
     """
@@ -43,8 +44,9 @@ class Params:
     iterations: int = 20
     colour_weight: float = 1.0
     colour_radius_m: float = 0.1
-    max_points: tuple[int, ...] = (3000, 6000, 20_000, 40_000)
-    tolerance: float = 0.002
+    max_points: tuple[int, ...] = (3000, 6000, 10_000, 40_000)
+    tolerance: float = 0.01
+    last_tolerance: float = 0.002
     overstep: float = 1.5
     max_scale_change: float = 1.3
 
@@ -61,11 +63,11 @@ def refine(
     """Similarity (or rigid) pose that lays the source's cells on the target's planes and colours (both in metres).
 
     Iteratively reweighted Gauss-Newton (Geman-McClure over the radius) on the point-to-plane distance and, as in
-    Park et al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane; each in units of
-    its own spread, so that what is measured better counts more. The source's exposure (gain and offset) is fitted along,
-    so a change of it costs nothing. The target's cells are laid on the source's planes as well, half of ``max_points``
-    each way: that averages the errors of both surfaces' planes, and one way alone prefers a source that is too small,
-    whose points all come nearer to some surface.
+    Park et al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane; each in units
+    of its own spread, so that what is measured better counts more. The source's exposure (gain and offset) is fitted
+    along, so a change of it costs nothing. The target's cells are laid on the source's planes as well, half of
+    ``max_points`` each way: that averages the errors of both surfaces' planes, and one way alone prefers a source that
+    is too small, whose points all come nearer to some surface.
     """
     params = params or Params()
     pose = start
@@ -73,7 +75,8 @@ def refine(
         return start
     centre = source.coarse[0].mean(0)
     before, noise = np.inf, 0.0
-    for radius, count in zip(params.radii_m, params.max_points, strict=True):
+    tolerances = (*[params.tolerance] * (len(params.radii_m) - 1), params.last_tolerance)
+    for radius, count, tolerance in zip(params.radii_m, params.max_points, tolerances, strict=True):
         if before <= params.colour_radius_m:
             radius = min(before, max(radius, params.least_sigmas * noise))
             if radius > 0.9 * before:
@@ -102,7 +105,7 @@ def refine(
                 return start
             centre = centre + found.middle
             moved = np.r_[step[:3] * found.extent_m, step[3:6], step[6] * found.extent_m]
-            if pose.scale * np.linalg.norm(moved) < params.tolerance * radius:
+            if pose.scale * np.linalg.norm(moved) < tolerance * radius:
                 break
         noise = found.noise_m
     return pose
