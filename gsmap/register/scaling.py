@@ -41,4 +41,4 @@ def scaled_or_rigid(
     if not belief.rigid:
         return scaled, conditioned.known(scaled), belief
     rigid = refinement.fine(pair, conditioned.rescaled(scaled, 1.0 / pair.scale), params, with_scale=False)
-    return rigid, conditioned.known(rigid, belief.log_scale_sigma), belief
+    return rigid, conditioned.known(rigid, belief), belief
