@@ -338,6 +338,16 @@ def test_sources_that_were_told_to_be_metric_stay_so_and_disagreement_is_said():
     assert disagrees.log_scale_sigma == pytest.approx(0.02, rel=0.01)  # 1 is taken, and is known to be that far off
 
 
+def test_surfaces_that_measure_another_size_than_their_residuals_explain_are_said_to_bend():
+    rigid = metres.Belief(True, -0.008, 0.005, 0.008)
+    said = metres.bending(rigid, 0.0005, 6.0)
+    assert "the source measures +0.8% over 6.0 m, 16 times" in said
+    assert metres.bending(rigid, 0.003, 6.0) == ""  # residuals explain it
+    assert metres.bending(replace(rigid, log_scale=-0.0015), 0.0001, 6.0) == ""  # nobody needs to know
+    assert metres.bending(replace(rigid, rigid=False), 0.0005, 6.0) == ""  # the scale differs, and is measured
+    assert metres.bending(replace(rigid, note="disagrees"), 0.0005, 6.0) == ""  # was said
+
+
 def test_surface_leaves_out_what_is_faint_or_huge():
     g = Gaussians(np.arange(12.0).reshape(4, 3), np.tile([1.0, 0, 0, 0], (4, 1)),
                   np.log([[0.02] * 3, [0.02] * 3, [3.0] * 3, [0.02] * 3]), [3.0, -3.0, 3.0, 3.0],
