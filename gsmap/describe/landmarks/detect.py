@@ -60,7 +60,33 @@ class Blobs:
         return len(self.positions)
 
 
-def find_blobs(points: np.ndarray, lab: np.ndarray, areas: np.ndarray, params: Params | None = None) -> Blobs:
+class Octaves:
+    """The extrema of one levelled cloud by the size of the grid's cells, for layers that have octaves in common.
+
+    Layers whose units differ by a power of two do: they look at the same grids, bit by bit.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
+
+    def extrema(
+        self, points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray, size_m: float, unit_m: float
+    ) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
+        """As `_extrema` of a grid of ``size_m``; ``unit_m`` is that of the points."""
+        key = size_m / unit_m, thresholds.tobytes()
+        if key not in self._found:
+            self._found[key] = list(_extrema(points / size_m, lab, areas / size_m**2, thresholds))
+        return self._found[key]
+
+
+def find_blobs(
+    points: np.ndarray,
+    lab: np.ndarray,
+    areas: np.ndarray,
+    params: Params | None = None,
+    octaves: Octaves | None = None,
+    unit_m: float = 1.0,
+) -> Blobs:
     """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
 
     Points are spread over the grid with the surface they stand for as weight, so that neither the grid's place nor how
@@ -71,21 +97,22 @@ def find_blobs(points: np.ndarray, lab: np.ndarray, areas: np.ndarray, params: P
 
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
+        octaves: of this cloud in its own unit, which is ``unit_m`` metres.
     """
-    params = params or Params()
-    lab_threshold, octaves = params.lab_threshold, params.octaves
+    params, known = params or Params(), octaves or Octaves()
+    lab_threshold, count = params.lab_threshold, params.octaves
     spacing_m = np.sqrt(8 / np.pi * np.median(areas))
     thresholds = np.array(
         [params.lightness_factor * lab_threshold, lab_threshold, lab_threshold, params.density_threshold]
     )
     found = [_empty()]
-    for octave in range(octaves):
+    for octave in range(count):
         size_m = params.cell_m * 2**octave
         if spacing_m > params.max_spacing_cells * size_m:
             continue
         parts = [_empty()]
-        for channel, negative, cells, ratio in _extrema(points / size_m, lab, areas / size_m**2, thresholds):
-            kind = np.full(len(cells), (channel * 2 + negative) * octaves + octave, np.int32)
+        for channel, negative, cells, ratio in known.extrema(points, lab, areas, thresholds, size_m, unit_m):
+            kind = np.full(len(cells), (channel * 2 + negative) * count + octave, np.int32)
             parts.append(Blobs(cells * size_m, kind, ratio, np.full(len(cells), _SIGMA_CELLS * size_m)))
         found.append(_strongest(parts, params.max_per_octave))
     return _strongest(found)
