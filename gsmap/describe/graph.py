@@ -120,8 +120,10 @@ def describe(
     cloud = surface_cloud(gaussians, params.surface)
     up = estimate_up(cloud.points, cameras, params.gravity)
     guess_m = estimate_unit_m(cloud.points, cameras, up, params.unit)
-    units = landmark_units(guess_m, scale_policy, params.unit)
-    working_m = working_unit_m(guess_m) if "landmarks" in units else guess_m
+    working_m = working_unit_m(guess_m, cameras)
+    units = landmark_units(guess_m, scale_policy, params.unit, working_m=working_m)
+    if "landmarks" not in units:  # the unit is no metre
+        working_m = guess_m
     unit_m = 1.0 if scale_policy == "known" else guess_m
     layers: dict[str, NodeLayer] = {}
     notes: list[str] = []

@@ -26,7 +26,7 @@ from gsmap.types import Cameras
 
 LEVEL_STEP = 1.45
 LEVELS = (-2, 0, 1)
-_ROOM = 0.5  # octaves that rooms' guesses differ from one, at most
+_ROOM = 1.0  # octaves from one that are still a room: the guess is right to a factor of about two
 _MOST_OCTAVES = 5  # places seen from farther than 50 m, or nearer than 5 cm, are described as from there
 
 
@@ -91,7 +91,9 @@ def _view_distance(points: np.ndarray, cameras: Cameras, max_cameras: int = 32, 
     return float(np.median(all_parts)) if len(all_parts) else 0.0
 
 
-def landmark_units(guess_m: float, scale_policy: str, params: Params | None = None) -> dict[str, float]:
+def landmark_units(
+    guess_m: float, scale_policy: str, params: Params | None = None, *, working_m: float = 1.0
+) -> dict[str, float]:
     """Metres per scene unit that each landmark layer assumes, by the layer's name.
 
     ``landmarks`` and ``landmarks@K``, whose lengths are 2 to the power K times as many metres, where the unit may be
@@ -100,19 +102,25 @@ def landmark_units(guess_m: float, scale_policy: str, params: Params | None = No
     Args:
         guess_m: metres per scene unit, from `estimate_unit_m`.
         scale_policy: ``known``, ``unknown`` or ``auto``; see `gsmap.describe.describe`.
+        working_m: from `working_unit_m`.
     """
     low, high = (params or Params()).plausible_m
     levels = {f"landmarks:{i}": guess_m * LEVEL_STEP**power for i, power in enumerate(LEVELS)}
-    octaves = np.clip(-np.log2(guess_m), -_MOST_OCTAVES, _MOST_OCTAVES)
     metric = {"landmarks": 1.0}
-    if abs(octaves) > _ROOM:
-        metric |= {f"landmarks@{k}": 2.0**-k for k in (int(np.floor(octaves)), int(np.floor(octaves)) + 1) if k}
+    if working_m != 1.0:
+        octave = int(np.floor(-np.log2(working_m)))
+        metric |= {f"landmarks@{k}": 2.0**-k for k in (octave, octave + 1) if k}
     if scale_policy == "known":
         return metric
     return {**metric, **levels} if scale_policy == "auto" and low < guess_m < high else levels
 
 
-def working_unit_m(guess_m: float) -> float:
-    """Working metres per metre: 1 where views are those of a room, else what makes them so; see the module."""
+def working_unit_m(guess_m: float, cameras: Cameras | None) -> float:
+    """Working metres per metre: 1 where views are those of a room, else what makes them so; see the module.
+
+    Without cameras nobody knows from where a scene was seen, and the height of its content says little of that: 1.
+    """
+    if cameras is None or not len(cameras) or cameras.synthesised:
+        return 1.0
     octaves = np.clip(np.log2(guess_m), -_MOST_OCTAVES, _MOST_OCTAVES)
     return 1.0 if abs(octaves) <= _ROOM else float(2.0**octaves)
