@@ -129,7 +129,7 @@ class SceneGraph:
     Args:
         scene_id: the scene it describes.
         layers: by name; a layer that was not made is absent. ``objects``; ``landmarks`` takes the scene's unit for
-            a metre; ``landmarks:0``, ``:1``, ``:2`` are the landmarks at ``unit_m`` times 1.45 to the powers -2, 0, 1:
+            a metre, and ``landmarks@K`` takes it for 2 to the power -K of one; ``landmarks:0``, ``:1``, ``:2`` are the landmarks at ``unit_m`` times 1.45 to the powers -2, 0, 1:
             for any two captures of one place, whatever their units, two of them agree to within 20 percent
             (`gsmap.describe.unit`). ``landmarks_gravity_free`` (or ``landmarks_gravity_free:1``) are the landmarks of
             a scene that knows up as they compare with those of scenes that do not.
@@ -137,6 +137,8 @@ class SceneGraph:
         unit_m: guess of metres per scene unit (good to a factor of about 2); 1 where the scale is known.
         notes: what a person should know (few nodes, no gravity, ...).
         things: which Gaussians are one thing; None where it was not asked, as in graphs of older releases.
+        working_m: working metres per scene unit: the lengths of landmarks, refinement and evidence hold in them. The
+            metre, where that may be the unit and the scene is seen as rooms are; else what makes it look like one.
     """
 
     scene_id: str
@@ -145,6 +147,7 @@ class SceneGraph:
     unit_m: float = 1.0
     notes: tuple[str, ...] = ()
     things: Things | None = None
+    working_m: float = 1.0
 
     @property
     def num_nodes(self) -> int:
