@@ -21,9 +21,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     # has their models. The verdict and the pose graph, which the paper has none of, stay gsmap's.
     "paper": {
         "describe.landmarks": False,
-        "describe.object.hops": 3,
         "register.fallback": "never",
         "register.proposers.graph.kinds": ["objects"],
+        "register.proposers.graph.context.hops": 3,
         "register.proposers.graph.consistency.test": "ratio",
         "register.proposers.graph.consistency.height_slope": float("inf"),
         "register.coarse_refiner": "none",

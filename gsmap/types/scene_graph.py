@@ -15,11 +15,12 @@ class NodeLayer:
 
     Args:
         positions: (M, 3) float64, scene frame and unit.
-        embeddings: (M, D) float32 node embeddings ``[feature, context]``, unit length.
+        embeddings: (M, D) float32 unit vectors that tell nodes apart: what a landmark's surroundings look like; an
+            object's feature, to which its context is joined when two layers are compared.
         types: (M,) int32; nodes match only within a type (landmarks: channel x sign x scale; objects: all 0).
         weights: (M,) float32 confidence (objects) or response (landmarks), larger is better.
         extents: (M, 2, 3) float64 lowest and highest corner of the node's points, scene frame.
-        features: (M, F) float32 the embedding's own part without context; for queries by feature.
+        features: (M, F) float32 an object's feature; a landmark's response and scale.
         num_views: (M,) int32 how many rendered views saw the node; 0 where nothing was rendered.
         descriptor_id: digest of everything that decides what a node and its embedding mean; layers of different ids
             are never compared.
