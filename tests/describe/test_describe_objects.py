@@ -6,19 +6,23 @@ from describe_places import moved, room
 from scipy.spatial.transform import Rotation
 
 from gsmap.describe import Params, describe, embedders, recipe_key
+
+from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.landmarks import layer as landmarks
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
 from gsmap.describe.objects.associate import associate, giou, region
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import descriptor_id
 from gsmap.describe.objects.lift import visible
+from gsmap.describe.objects.views import render_views
 from gsmap.describe.onnx.check import check_model
+from gsmap.describe.segmenters import builtin, per_view
 from gsmap.describe.segmenters.builtin import felzenszwalb
 from gsmap.errors import ConfigError
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.settings import changed, leaves
 from gsmap.types import Cameras, Sim3
-from gsmap.types.views import View
+from gsmap.types.views import SceneContext, View
 
 OBJECTS = Params(landmarks=False, object=ObjectParams(num_cameras=16))
 
@@ -75,6 +79,27 @@ def test_lifting_takes_the_visible_surface_only():
     rows, pixel = visible(points, view)
     assert rows.tolist() == [0, 1]
     assert pixel[0].tolist() == [50, 40]
+    # As published: all that projects into the picture, behind the surface and before it, where something is shown.
+    assert visible(points, view, np.inf)[0].tolist() == [0, 1, 2, 3]
+    depth[40:60, :60] = 0
+    assert visible(points, view, np.inf)[0].tolist() == []
+
+
+def test_masks_of_one_view_each_are_those_of_the_parts_and_name_none():
+    gaussians, cameras = room(n=6000)
+    cloud = surface_cloud(gaussians)
+    context = SceneContext(cloud, len(gaussians), None, 1.0)
+    (view,) = render_views(gaussians, cameras.evenly(1), 160, "native")
+    parts, masks = (method.make(context, method.Params()).segment(view) for method in (builtin, per_view))
+    assert len(masks) > 3
+    assert [(m.pixels.tobytes(), m.confidence) for m in masks] == [(m.pixels.tobytes(), m.confidence) for m in parts]
+    assert {m.part for m in masks} == {None}
+    # So what becomes one object is decided by looks and place: nothing resembles itself more than 2.
+    split, joined = (
+        describe("room", gaussians, cameras, small(segmenter="per_view", tau_asso=tau, min_views=1)).layers["objects"]
+        for tau in (2.1, 0.5)
+    )
+    assert len(split) > 2 * len(joined)
 
 
 def test_felzenszwalb_cuts_at_the_heavy_edge():
@@ -160,7 +185,8 @@ def test_every_parameter_is_explained_and_in_the_key_of_what_it_changes():
         if isinstance(leaf.value, str):
             continue  # names of methods: see the tests above
         key = recipe_key(changed(explicit, {leaf.name: other[type(leaf.value)](leaf.value)})).digest
-        unused = any(part in leaf.name for part in ("segmenters.sam", "embedders.clip", "object.model_"))
+        other_methods = ("segmenters.per_view", "segmenters.sam", "embedders.clip", "object.model_")
+        unused = any(part in leaf.name for part in other_methods)
         assert (key == base) == unused, leaf.name
 
 

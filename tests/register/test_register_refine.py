@@ -53,6 +53,21 @@ def test_colored_icp_refiner_comes_back_from_four_degrees(world, surfaces):
     assert (error.rre_deg < 0.05, error.centroid_m < 0.003, found.scale) == (True, True, 1.0)
 
 
+def test_icp_aligns_cells_or_the_means_themselves():
+    """Half the points of every cell of the source lie off: cells average that away only in part, means pair as they
+    are."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0, 4, (4000, 3))
+    target, source = (
+        Surface(points, np.zeros((len(points), 3), np.float32), resolution_m=size) for size in (0.05, 0.8)
+    )
+    start = Sim3(exp_so3(np.array([0.0, 0.0, 0.004])), np.array([0.01, 0.0, -0.01]))
+    cells, means = (icp.refine(target, source, start, icp.Params((0.12,), means=m)) for m in (False, True))
+    errors = [np.linalg.norm(pose.apply(points) - points, axis=1).max() for pose in (cells, means)]
+    assert errors[1] < 1e-6
+    assert errors[0] > 1e-3
+
+
 def test_colored_icp_refiner_finds_the_scale(world, surfaces):
     centre = scene_centroid(world.source.gaussians)
     found = colored_icp.refine(*surfaces, _off(world.S_target_source, centre, 2, 0.08, 1.02), with_scale=True)

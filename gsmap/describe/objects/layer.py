@@ -47,7 +47,8 @@ class Params:
         longest_side_px: of a render.
         near_m: a view most of which is nearer than this looks out of the inside of something, and is left out.
         min_seen: a view of which a smaller share shows anything is left out.
-        depth_tolerance: a Gaussian is visible where its depth is that of the render to within this share.
+        depth_tolerance: a Gaussian is visible where its depth is that of the render to within this share; inf takes
+            every one whose centre projects into a mask (paper).
         c_mask: masks of lower confidence are dropped (paper).
         min_points: masks that show fewer Gaussians are dropped.
         tau_asso: cosine + GIoU above which a region joins a node (paper).
