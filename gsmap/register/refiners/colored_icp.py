@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import retract
 from gsmap.methods.refiner import Surface
-from gsmap.register.covariance import point_to_plane_jacobian
 from gsmap.types import Sim3
 
-VERSION = 2
+VERSION = 3
 SCALES = True
 
+_WIDTH = 0.3  # of the radius: distances to planes of this count a quarter
 _FEWEST = 10  # cells and pairs; fewer tell nothing of a pose
 
 
@@ -34,6 +32,10 @@ class Params:
         colour_radius_m: at radii beyond this colour is left out: lightness extrapolated so far in a tangent plane means
             nothing.
         max_points: source cells that take part at each radius.
+        fine_radius_m: at radii up to this ...
+        division: ... the surfaces' cells are this many times smaller than their resolution.
+        both_ways: the target's cells are laid on the source's planes as well even where the scale is not refined.
+        tolerance: a radius is done with when a step moves the pairs by less than this share of it.
         overstep: factor on steps: pairs follow the pose only in part, so steps fall short, most of all along the scale.
         max_scale_change: factor by which the scale may move away from the start's before the start is given back.
     """
@@ -44,6 +46,10 @@ class Params:
     colour_weight: float = 0.01
     colour_radius_m: float = 0.1
     max_points: tuple[int, ...] = (3000, 6000, 20_000, 20_000)
+    fine_radius_m: float = 0.045
+    division: int = 1
+    both_ways: bool = False
+    tolerance: float = 0.001
     overstep: float = 1.5
     max_scale_change: float = 1.3
 
@@ -51,6 +57,11 @@ class Params:
         if len(self.radii_m) != len(self.max_points):
             raise ConfigError(
                 f"colored_icp needs as many max_points as radii_m, got {len(self.max_points)} and {len(self.radii_m)}"
+            )
+        if not self.fine_radius_m >= 0 or self.division < 1:
+            raise ConfigError(
+                "colored_icp needs a fine_radius_m of 0 or more and a division of 1 or more, "
+                f"got {self.fine_radius_m} and {self.division}"
             )
 
 
@@ -69,6 +80,8 @@ def refine(
     pose = start
     if len(source) < _FEWEST or len(target) < _FEWEST:
         return start
+    both_ways = with_scale or params.both_ways
+    centre = source.coarse[0].mean(0)
     before, noise = np.inf, 0.0
     for radius, count in zip(params.radii_m, params.max_points, strict=True):
         if before <= params.colour_radius_m:
@@ -76,24 +89,23 @@ def refine(
             if radius > 0.9 * before:
                 continue
         before = radius
-        count = count // 2 if with_scale else count
-        chosen, chosen_back = source.sample(count), target.sample(count)
+        count = count // 2 if both_ways else count
+        division = params.division if radius <= params.fine_radius_m else 1
+        fine_target, fine_source = target.finer(division), source.finer(division)
+        there = _Laid(fine_target, fine_source, count, backward=False)
+        back = _Laid(fine_source, fine_target, count, backward=True)
         for _ in range(params.iterations):
-            pairs = _Pairs.of(target, source, pose, chosen, radius)
-            if len(pairs.points) < _FEWEST:
-                return pose
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
-            centre = pairs.points.mean(0)
-            centred, points = pose @ Sim3(np.eye(3), centre), pairs.points - centre
-            system, gradient = pairs.equations(partial(point_to_plane_jacobian, centred, points), radius, params)
-            if with_scale:
-                back = _Pairs.of(source, target, pose.inverse(), chosen_back, radius)
-                if len(back.points) < _FEWEST:
+            found = there.equations(pose, centre, radius, params)
+            if found.count < _FEWEST:
+                return pose
+            system, gradient = found.system, found.gradient
+            if both_ways:
+                other = back.equations(pose.inverse(), centre, radius, params)
+                if other.count < _FEWEST:
                     return pose
-                # A step that moves the source forward moves what is laid on it back.
-                other = back.equations(partial(_backward_jacobian, back.moved - centre), radius, params)
-                share = len(pairs.points) / len(back.points)
-                system, gradient = system + share * other[0], gradient + share * other[1]
+                share = found.count / other.count
+                system, gradient = system + share * other.system, gradient + share * other.gradient
             step = np.zeros(7)
             dim = 7 if with_scale else 6
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
@@ -102,78 +114,62 @@ def refine(
             # No single step goes farther than the correspondences reach.
             step *= min(1.0, 0.1 / max(np.abs(step[:3]).max(), 1e-12), radius / max(np.abs(step[3:6]).max(), 1e-12))
             step[6] = np.clip(step[6], -0.05, 0.05)
+            centred = pose @ Sim3(np.eye(3), centre)
             pose = retract(centred, step if with_scale else step[:6]) @ Sim3(np.eye(3), -centre)
             if abs(np.log(pose.scale / start.scale)) > np.log(params.max_scale_change):
                 return start
-            if np.linalg.norm(pose.apply(pairs.points) - pairs.moved, axis=1).max() < 0.002 * radius:
+            centre = centre + found.middle
+            moved = np.r_[step[:3] * found.extent_m, step[3:6], step[6] * found.extent_m]
+            if pose.scale * np.linalg.norm(moved) < params.tolerance * radius:
                 break
-        noise = pairs.noise_m
+        noise = found.noise_m
     return pose
 
 
-def _backward_jacobian(points: np.ndarray, along: np.ndarray) -> np.ndarray:
-    return point_to_plane_jacobian(Sim3.identity(), points, -along)
-
-
 @dataclass(frozen=True, eq=False)
-class _Pairs:
-    """R cells of one surface that a pose brings near another, and the cells there that they fall on.
+class _Equations:
+    """Normal equations (7, 7), (7,) of some pairs, how many these are, how far from the planes (robust standard
+    deviation), their mean less the centre, (3,), and their root mean square distance from it."""
 
-    Args:
-        onto: the surface they are laid on.
-        rows: (R,) cells of it.
-        points, lightness: (R, 3), (R,) the cells that move, in their own frame.
-        moved: (R, 3) the same in the frame of ``onto``.
-    """
-
-    onto: Surface
-    rows: np.ndarray
-    points: np.ndarray
-    lightness: np.ndarray
-    moved: np.ndarray
-
-    @classmethod
-    def of(cls, onto: Surface, moving: Surface, pose: Sim3, chosen: np.ndarray, radius_m: float) -> _Pairs:
-        points = moving.coarse[0][chosen]
-        moved = pose.apply(points)
-        distance, rows = onto.nearest(moved, radius_m)
-        hit = np.flatnonzero(np.isfinite(distance))
-        return cls(onto, rows[hit], points[hit], moving.lightness[chosen[hit]], moved[hit])
-
-    @property
-    def noise_m(self) -> float:
-        """Robust standard deviation of the distances to the planes."""
-        offset = self.moved - self.onto.coarse[0][self.rows]
-        return 1.4826 * float(np.median(np.abs((self.onto.normals[self.rows] * offset).sum(1))))
-
-    def equations(
-        self, jacobian: Callable[[np.ndarray], np.ndarray], radius_m: float, params: Params
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations (7, 7), (7,); ``jacobian`` of the moved points along given directions (R, 3)."""
-        offset = self.moved - self.onto.coarse[0][self.rows]
-        normals = self.onto.normals[self.rows]
-        plane = (normals * offset).sum(1)
-        weights = 1.0 / (1.0 + (plane / (0.3 * radius_m)) ** 2) ** 2
-        slope = jacobian(normals)
-        system = (slope * weights[:, None]).T @ slope
-        gradient = (slope * weights[:, None]).T @ plane
-        if params.colour_weight > 0 and radius_m <= params.colour_radius_m:
-            gradients = self.onto.lightness_gradients(self.rows)
-            expected = self.onto.lightness[self.rows] + (gradients * offset).sum(1)
-            gain, bias = _exposure(expected, self.lightness)
-            colour = expected - gain * self.lightness - bias
-            spread = 1.4826 * np.median(np.abs(colour)) + 1e-6
-            factor = params.colour_weight / spread
-            tint = weights / (1.0 + (colour / (2 * spread)) ** 2) ** 2
-            slope = jacobian(gradients) * factor
-            system += (slope * tint[:, None]).T @ slope
-            gradient += (slope * tint[:, None]).T @ (colour * factor)
-        return system, gradient
+    system: np.ndarray
+    gradient: np.ndarray
+    count: int
+    noise_m: float
+    middle: np.ndarray
+    extent_m: float
 
 
-def _exposure(target: np.ndarray, source: np.ndarray) -> tuple[float, float]:
-    """Gain and offset that map the source's lightness to the target's, by medians."""
-    spread_t = np.median(np.abs(target - np.median(target)))
-    spread_s = np.median(np.abs(source - np.median(source)))
-    gain = float(np.clip(spread_t / max(spread_s, 1e-6), 0.5, 2.0))
-    return gain, float(np.median(target) - gain * np.median(source))
+class _Laid:
+    """Cells of one surface laid on another by a pose, each on the nearest; the pairs of the last pose are kept."""
+
+    def __init__(self, onto: Surface, moving: Surface, count: int, *, backward: bool) -> None:
+        self._onto, self._moving, self._backward = onto, moving, backward
+        self._rows = moving.sample(count)
+        self._partners = np.full(len(self._rows), -1, np.int32)
+
+    def equations(self, pose: Sim3, centre: np.ndarray, radius_m: float, params: Params) -> _Equations:
+        """Under a pose that takes what moves into the frame of the other, for a step about ``centre`` (source frame).
+
+        A step that moves the source forward moves what is laid on it (``backward``) back.
+        """
+        from gsmap import _native
+
+        coloured = params.colour_weight > 0 and radius_m <= params.colour_radius_m
+        onto, moving = self._onto, self._moving
+        found = _native.icp_equations(
+            tree=onto.tree,
+            normals=onto.normals,
+            lightness=onto.lightness,
+            gradients=onto.lightness_gradients if coloured else None,
+            points=moving.coarse[0],
+            own_lightness=moving.lightness,
+            rows=self._rows,
+            partners=self._partners,
+            pose=np.ascontiguousarray(pose.matrix()[:3]),
+            centre=centre,
+            backward=self._backward,
+            radius_m=radius_m,
+            width_m=_WIDTH * radius_m,
+            colour_weight_m=params.colour_weight,
+        )
+        return _Equations(*found)
