@@ -96,7 +96,9 @@ def run(m, folder: Path, seed: int, mode: str, options: argparse.Namespace) -> l
     policy, drawn = MODES[mode]
     rng, captures, centres = np.random.default_rng([seed, 41]), [], {}
     for read in read_captures(folder):
-        S = Sim3.from_matrix(np.array(json.loads((folder / "truth" / f"{read.name}.json").read_text())["T_scene_world"]))
+        S = Sim3.from_matrix(
+            np.array(json.loads((folder / "truth" / f"{read.name}.json").read_text())["T_scene_world"])
+        )
         parts = read.gaussians, read.cameras, S
         if drawn:
             parts = rescaled(*parts, float(np.exp(rng.uniform(-1, 1) * np.log(5))))

@@ -23,7 +23,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     # graph, which the paper has none of, stay gsmap's. `tools/bench_paper.py` shows each stage.
     "paper": {
         "describe.landmarks": False,
-
         "describe.object.segmenter": "per_view",
         "describe.object.depth_tolerance": float("inf"),
         "register.fallback": "never",

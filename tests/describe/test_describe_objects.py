@@ -6,7 +6,6 @@ from describe_places import moved, room
 from scipy.spatial.transform import Rotation
 
 from gsmap.describe import Params, describe, embedders, recipe_key
-
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.landmarks import layer as landmarks
 from gsmap.describe.landmarks.layer import Params as LandmarkParams

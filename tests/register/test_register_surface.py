@@ -166,8 +166,20 @@ def test_equations_are_the_same_bits_whatever_the_threads(cells):
         rows = surface.sample(10_000)
         found.append(
             _native.icp_equations(
-                surface.tree, surface.normals, surface.lightness, surface.lightness_gradients, surface.coarse[0],
-                surface.lightness, rows, np.full(len(rows), -1, np.int32), pose, points.mean(0), False, 0.1, 0.03, 0.01,
+                surface.tree,
+                surface.normals,
+                surface.lightness,
+                surface.lightness_gradients,
+                surface.coarse[0],
+                surface.lightness,
+                rows,
+                np.full(len(rows), -1, np.int32),
+                pose,
+                points.mean(0),
+                False,
+                0.1,
+                0.03,
+                0.01,
             )  # fmt: skip
         )
     _native.set_num_threads(before)
