@@ -43,7 +43,8 @@ def scaled_or_rigid(
     if not belief.rigid:
         return scaled, conditioned.known(scaled), belief
     residual_sigma = float(np.sqrt(conditioned.scaled[6, 6]))
-    bends = bending(belief, residual_sigma, 2.0 * conditioned.radius_m, params.metres)
+    extent_m = 2.0 * conditioned.radius_m / pair.target.unit_m  # not in working metres: both units are the metre
+    bends = bending(belief, residual_sigma, extent_m, params.metres)
     belief = replace(belief, note=belief.note or bends)
     rigid = refinement.fine(pair, conditioned.rescaled(scaled, 1.0 / pair.scale), params, with_scale=False)
     return rigid, conditioned.known(rigid, belief), belief
