@@ -68,7 +68,7 @@ class Capture:
 
 @dataclass
 class Row:
-    """One pair: overlap, verdict, by method (degrees, metres, scale), seconds by stage, squared error over covariance."""
+    """One pair: errors (degrees, metres, scale) by method, seconds by stage, squared error over covariance."""
 
     pair: str
     overlap: float
@@ -249,9 +249,7 @@ def report(rows: list[Row], hopeless: list[float]) -> None:
         tables |= {f"accepted, {p}": [r for r in accepted if r.pair.startswith(f"{p}/")] for p in places}
     for title, some in tables.items():
         if some:
-            print(
-                f"\n{title} ({len(some)}): errors: median and 90 % of degrees, of cm; scale median; better than gsmap"
-            )
+            print(f"\n{title} ({len(some)}): median and 90 % of degrees, of cm; scale; better than gsmap")
             for name in dict.fromkeys(n for r in some for n in r.errors):
                 have = [r for r in some if name in r.errors]
                 degrees, metres, scale = np.array([r.errors[name] for r in have]).T

@@ -68,9 +68,6 @@ class Surface(Protocol):
     def tree(self) -> Any:
         """The search tree of the cell means: a ``gsmap._native.PointTree``."""
 
-    def finer(self, division: int) -> Surface:
-        """The same surface in cells ``division`` times smaller."""
-
     @property
     def cloud(self) -> tuple[Any, Any]:
         """The cell means with covariances and normals, and their search tree, as small_gicp keeps them."""

@@ -16,6 +16,7 @@ namespace {
 
 constexpr int kBlock = 512;  // points of a task; sums are taken by block, so threads change no bit
 constexpr int kMostNeighbours = 64;
+constexpr double kLeastNoise = 0.03;  // of the radius: planes that fit better than this leave colour its say
 
 using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
@@ -250,7 +251,7 @@ Equations equations(const Cells &onto, const double *points, const double *light
             std::copy_n(local, 3, slope + 3);
             slope[6] = dot(x, local);
         };
-        const double factor = how.colour_weight / spread;
+        const double factor = how.colour_weight * std::max(out.noise, kLeastNoise * how.radius) / spread;
         for (std::size_t i = 0; i < found[block].size(); ++i) {
             const Pair &pair = found[block][i];
             double slope[7];
@@ -333,7 +334,7 @@ void bind_surface(nb::module_ &m) {
         "icp_equations",
         [](const PointTree &tree, Points normals, Numbers lightness, std::optional<Points> gradients, Points points,
            Numbers own_lightness, Rows rows, Partners partners, Frame pose, Vector centre, bool backward, double radius_m,
-           double width_m, double colour_weight_m) {
+           double width_m, double colour_weight) {
             const auto size = std::size_t(tree.size());
             if (normals.shape(0) != size || lightness.shape(0) != size || (gradients && gradients->shape(0) != size))
                 throw std::invalid_argument("a tree's points, normals, lightness and gradients must be as many");
@@ -350,7 +351,7 @@ void bind_surface(nb::module_ &m) {
                 out = equations({&tree, normals.data(), lightness.data(), gradients ? gradients->data() : nullptr},
                                 points.data(), own_lightness.data(), rows.data(), int64_t(rows.shape(0)), partners.data(),
                                 pose.data(), centre.data(), backward,
-                                {radius_m, width_m, gradients ? colour_weight_m : 0.0});
+                                {radius_m, width_m, gradients ? colour_weight : 0.0});
             }
             std::vector<double> system(49), gradient(out.sums.gradient, out.sums.gradient + 7);
             for (int i = 0; i < 7; ++i)
@@ -363,7 +364,7 @@ void bind_surface(nb::module_ &m) {
         },
         nb::arg("tree"), nb::arg("normals"), nb::arg("lightness"), nb::arg("gradients").none(), nb::arg("points"),
         nb::arg("own_lightness"), nb::arg("rows"), nb::arg("partners"), nb::arg("pose"), nb::arg("centre"),
-        nb::arg("backward"), nb::arg("radius_m"), nb::arg("width_m"), nb::arg("colour_weight_m"),
+        nb::arg("backward"), nb::arg("radius_m"), nb::arg("width_m"), nb::arg("colour_weight"),
         "Normal equations (7, 7), (7,) over [rotation, translation, log scale] about `centre` of points laid on cells by a\n"
         "pose (3, 4), the number of pairs, the robust standard deviation of their plane distances, their mean (3,) less the\n"
         "centre and their root mean square distance from it. `partners` (int32, -1 for none) are each row's nearest cells under an earlier\n"

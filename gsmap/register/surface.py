@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -60,7 +60,6 @@ class Surface:
     unit_m: float = 1.0
     gaussians: Gaussians | None = None
     cameras: Cameras | None = None
-    _finer: dict[int, Surface] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -113,15 +112,6 @@ class Surface:
         """Rows of at most ``count`` cell means, evenly strided (cells come in spatial order)."""
         total = len(self.coarse[0])
         return np.arange(total) if total <= count else np.linspace(0, total - 1, count).astype(np.int64)
-
-    def finer(self, division: int) -> Surface:
-        """The same surface in cells ``division`` times smaller; the latter is kept, so each is prepared once."""
-        if division == 1:
-            return self
-        if division not in self._finer:
-            resolution_m = self.resolution_m / division
-            self._finer[division] = replace(self, resolution_m=resolution_m)
-        return self._finer[division]
 
     @cached_property
     def cloud(self) -> tuple[Any, Any]:

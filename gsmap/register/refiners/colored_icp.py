@@ -27,14 +27,12 @@ class Params:
         least_sigmas: among radii that are fine enough for colour, none is taken that is smaller than this many standard
             deviations of the distances between the planes: it would cut off noise, and hold the pose where it is.
         iterations: Gauss-Newton steps at each radius.
-        colour_weight: metres of distance that one standard deviation of local colour counts for, at fine radii;
-            0 leaves colour out.
+        colour_weight: how many standard deviations of the distances to the planes one of local colour counts for, at
+            fine radii: 1 where errors of colours are as independent of each other as those of points; 0 leaves colour
+            out.
         colour_radius_m: at radii beyond this colour is left out: lightness extrapolated so far in a tangent plane means
             nothing.
-        max_points: source cells that take part at each radius.
-        fine_radius_m: at radii up to this ...
-        division: ... the surfaces' cells are this many times smaller than their resolution.
-        both_ways: the target's cells are laid on the source's planes as well even where the scale is not refined.
+        max_points: cells of both surfaces together that take part at each radius.
         tolerance: a radius is done with when a step moves the pairs by less than this share of it.
         overstep: factor on steps: pairs follow the pose only in part, so steps fall short, most of all along the scale.
         max_scale_change: factor by which the scale may move away from the start's before the start is given back.
@@ -43,13 +41,10 @@ class Params:
     radii_m: tuple[float, ...] = (0.4, 0.15, 0.06, 0.03)
     least_sigmas: float = 4.0
     iterations: int = 20
-    colour_weight: float = 0.01
+    colour_weight: float = 1.0
     colour_radius_m: float = 0.1
-    max_points: tuple[int, ...] = (3000, 6000, 20_000, 20_000)
-    fine_radius_m: float = 0.045
-    division: int = 1
-    both_ways: bool = False
-    tolerance: float = 0.001
+    max_points: tuple[int, ...] = (3000, 6000, 20_000, 40_000)
+    tolerance: float = 0.002
     overstep: float = 1.5
     max_scale_change: float = 1.3
 
@@ -57,11 +52,6 @@ class Params:
         if len(self.radii_m) != len(self.max_points):
             raise ConfigError(
                 f"colored_icp needs as many max_points as radii_m, got {len(self.max_points)} and {len(self.radii_m)}"
-            )
-        if not self.fine_radius_m >= 0 or self.division < 1:
-            raise ConfigError(
-                "colored_icp needs a fine_radius_m of 0 or more and a division of 1 or more, "
-                f"got {self.fine_radius_m} and {self.division}"
             )
 
 
@@ -71,16 +61,16 @@ def refine(
     """Similarity (or rigid) pose that lays the source's cells on the target's planes and colours (both in metres).
 
     Iteratively reweighted Gauss-Newton (Geman-McClure over the radius) on the point-to-plane distance and, as in
-    Park et al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane. The source's
-    exposure (gain and offset) is fitted along, so a change of it costs nothing. With scale the target's cells are laid
-    on the source's planes as well, half of ``max_points`` each way: one way alone prefers a source that is too small,
+    Park et al. 2017, on the difference of lightness to the target's, extrapolated in its tangent plane; each in units of
+    its own spread, so that what is measured better counts more. The source's exposure (gain and offset) is fitted along,
+    so a change of it costs nothing. The target's cells are laid on the source's planes as well, half of ``max_points``
+    each way: that averages the errors of both surfaces' planes, and one way alone prefers a source that is too small,
     whose points all come nearer to some surface.
     """
     params = params or Params()
     pose = start
     if len(source) < _FEWEST or len(target) < _FEWEST:
         return start
-    both_ways = with_scale or params.both_ways
     centre = source.coarse[0].mean(0)
     before, noise = np.inf, 0.0
     for radius, count in zip(params.radii_m, params.max_points, strict=True):
@@ -89,23 +79,15 @@ def refine(
             if radius > 0.9 * before:
                 continue
         before = radius
-        count = count // 2 if both_ways else count
-        division = params.division if radius <= params.fine_radius_m else 1
-        fine_target, fine_source = target.finer(division), source.finer(division)
-        there = _Laid(fine_target, fine_source, count, backward=False)
-        back = _Laid(fine_source, fine_target, count, backward=True)
+        there, back = _Laid(target, source, count // 2), _Laid(source, target, count // 2, backward=True)
         for _ in range(params.iterations):
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
             found = there.equations(pose, centre, radius, params)
-            if found.count < _FEWEST:
+            other = back.equations(pose.inverse(), centre, radius, params)
+            if min(found.count, other.count) < _FEWEST:
                 return pose
-            system, gradient = found.system, found.gradient
-            if both_ways:
-                other = back.equations(pose.inverse(), centre, radius, params)
-                if other.count < _FEWEST:
-                    return pose
-                share = found.count / other.count
-                system, gradient = system + share * other.system, gradient + share * other.gradient
+            share = found.count / other.count
+            system, gradient = found.system + share * other.system, found.gradient + share * other.gradient
             step = np.zeros(7)
             dim = 7 if with_scale else 6
             damping = 1e-6 * np.diag(np.diag(system)) + 1e-9 * np.eye(7)
@@ -142,7 +124,7 @@ class _Equations:
 class _Laid:
     """Cells of one surface laid on another by a pose, each on the nearest; the pairs of the last pose are kept."""
 
-    def __init__(self, onto: Surface, moving: Surface, count: int, *, backward: bool) -> None:
+    def __init__(self, onto: Surface, moving: Surface, count: int, *, backward: bool = False) -> None:
         self._onto, self._moving, self._backward = onto, moving, backward
         self._rows = moving.sample(count)
         self._partners = np.full(len(self._rows), -1, np.int32)
@@ -170,6 +152,6 @@ class _Laid:
             backward=self._backward,
             radius_m=radius_m,
             width_m=_WIDTH * radius_m,
-            colour_weight_m=params.colour_weight,
+            colour_weight=params.colour_weight,
         )
         return _Equations(*found)
