@@ -1,6 +1,7 @@
 """Posed frames, or a synthetic place, to trained splats as people keep them.
 
     tools/make_scenes.py place OUT --seed 3 --captures 4
+    tools/make_scenes.py court OUT --seed 3 --captures 6
     tools/make_scenes.py frames FOLDER OUT --name kitchen --hold-out 4
 
 Writes OUT/NAME.ply, OUT/NAME.cameras.json and OUT/truth/NAME.json (`T_scene_world`, the frame the splats were put in).
@@ -26,6 +27,7 @@ from gsmap.errors import GsmapError, InputError
 from gsmap.evaluate.images import psnr
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians
+from gsmap_synthetic.court import court_captures
 from gsmap_synthetic.initialise import from_colour, from_depth
 from gsmap_synthetic.make import put_in_own_frame
 from gsmap_synthetic.train import Params, train
@@ -41,13 +43,18 @@ def main() -> int:
     place.add_argument("--frames", type=int, default=60, help="per capture")
     place.add_argument("--twin", action="store_true", help="build the wing twice")
     place.add_argument("--vary-exposure", action="store_true")
+    court = verbs.add_parser("court", help="capture a synthetic court: outdoors, 64 m long")
+    court.add_argument("out", type=Path)
+    court.add_argument("--captures", type=int, default=6)
+    court.add_argument("--frames", type=int, default=48, help="per capture")
+    court.add_argument("--vary-exposure", action="store_true")
     frames = verbs.add_parser("frames", help="train on posed frames")
     frames.add_argument("folder", type=Path)
     frames.add_argument("out", type=Path)
     frames.add_argument("--cameras", type=Path, help="where the cameras are, if not in the folder")
     frames.add_argument("--name", default="scene")
     frames.add_argument("--near-far", type=float, nargs=2, default=(0.3, 8.0), help="depth range, colour alone")
-    for verb in (place, frames):
+    for verb in (place, court, frames):
         verb.add_argument("--seed", type=int, default=0)
         verb.add_argument("--steps", type=int, default=600)
         verb.add_argument("--gaussians", type=int, default=50_000)
@@ -58,7 +65,7 @@ def main() -> int:
         verb.add_argument("--images", action="store_true", help="write the frames, too")
     args = parser.parse_args()
     try:
-        captures = _from_place(args) if args.verb == "place" else [_from_folder(args)]
+        captures = [_from_folder(args)] if args.verb == "frames" else _from_place(args)
         synthetic.write_captures(args.out, captures, images=args.images)
     except GsmapError as error:
         print(f"make_scenes: {error}", file=sys.stderr)
@@ -68,15 +75,15 @@ def main() -> int:
 
 def _from_place(args: argparse.Namespace) -> list[synthetic.DemoCapture]:
     start = time.process_time()
-    captures = synthetic.make_captures(
+    court = args.verb == "court"
+    captures = (court_captures if court else synthetic.make_captures)(
         args.seed,
         args.captures,
         steps=args.steps,
         num_frames=args.frames,
         num_gaussians=args.gaussians,
         size_px=(args.size, args.size * 3 // 4),
-        rooms=args.rooms,
-        twin=args.twin,
+        **({} if court else {"rooms": args.rooms, "twin": args.twin}),
         vary_exposure=args.vary_exposure,
         hold_out=args.hold_out,
         progress=lambda fraction, text: print(f"\r{100 * fraction:3.0f} %  {text:60}", end="", file=sys.stderr),

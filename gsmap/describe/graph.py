@@ -10,6 +10,7 @@ from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import Params as GravityParams
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
+from gsmap.describe.landmarks.detect import Octaves
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
 from gsmap.describe.landmarks.layer import gravity_free, landmark_layer
 from gsmap.describe.objects import things
@@ -18,7 +19,7 @@ from gsmap.describe.objects.layer import object_layer, resolved
 from gsmap.describe.objects.things import Params as ThingParams
 from gsmap.describe.objects.things import find_things
 from gsmap.describe.unit import Params as UnitParams
-from gsmap.describe.unit import estimate_unit_m, landmark_units
+from gsmap.describe.unit import estimate_unit_m, landmark_units, working_unit_m
 from gsmap.errors import ConfigError
 from gsmap.methods import RecipeKey
 from gsmap.types import Cameras, Gaussians, NodeLayer, SceneGraph
@@ -28,7 +29,7 @@ from gsmap.types.progress import Progress, silent
 from gsmap.types.scene import SCALE_POLICIES
 from gsmap.types.views import SceneContext
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,12 @@ def describe(
     progress(0.0, "surface")
     cloud = surface_cloud(gaussians, params.surface)
     up = estimate_up(cloud.points, cameras, params.gravity)
-    unit_m = 1.0 if scale_policy == "known" else estimate_unit_m(cloud.points, cameras, up, params.unit)
+    guess_m = estimate_unit_m(cloud.points, cameras, up, params.unit)
+    working_m = working_unit_m(guess_m, cameras)
+    units = landmark_units(guess_m, scale_policy, params.unit, working_m=working_m)
+    if "landmarks" not in units:  # the unit is no metre
+        working_m = guess_m
+    unit_m = 1.0 if scale_policy == "known" else guess_m
     layers: dict[str, NodeLayer] = {}
     notes: list[str] = []
     if len(cloud) == 0:
@@ -126,16 +132,17 @@ def describe(
     elif up is None:
         notes.append("up is unknown (no cameras that turn about it, no clear floor): landmarks are matched without it")
     if params.landmarks:
-        units = landmark_units(unit_m, scale_policy, params.unit)
+        octaves = Octaves()
         for i, (name, layer_unit_m) in enumerate(units.items()):
             progress(0.05 + 0.55 * i / len(units), name)
-            layers[name] = landmark_layer(cloud, up, layer_unit_m, params.landmark)
+            layers[name] = landmark_layer(cloud, up, layer_unit_m, params.landmark, octaves)
         if up is not None:
-            name = "landmarks" if "landmarks" in layers else "landmarks:1"
-            free = name.replace("landmarks", "landmarks_gravity_free")
-            layers[free] = gravity_free(layers[name], cloud, params.landmark)
+            for name in [name for name in units if ":" not in name] or ["landmarks:1"]:
+                free = name.replace("landmarks", "landmarks_gravity_free")
+                layers[free] = gravity_free(layers[name], cloud, params.landmark)
     if params.objects:
-        context = SceneContext(cloud, len(gaussians), up, unit_m, models or {})
+        seen_m = working_m if scale_policy == "known" else guess_m
+        context = SceneContext(cloud, len(gaussians), up, seen_m, models or {})
         layers["objects"], remarks = object_layer(
             gaussians, cameras, context, params.object, lambda fraction, text: progress(0.6 + 0.35 * fraction, text)
         )
@@ -145,7 +152,6 @@ def describe(
     found = None
     if params.things:
         progress(0.95, "things")
-        own_unit = "landmarks" in landmark_units(unit_m, scale_policy, params.unit)
-        found = find_things(gaussians, cloud, up, 1.0 if own_unit else unit_m, params.thing)
+        found = find_things(gaussians, cloud, up, 1.0 if "landmarks" in units else unit_m, params.thing)
     progress(1.0, "described")
-    return SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found)
+    return SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found, working_m)

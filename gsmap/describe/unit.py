@@ -7,6 +7,12 @@ correct matches remain), and guesses differ by less than a factor of 3. So each 
 1.45 to the powers -2, 0 and 1: differences of these three cover -3 to 3, hence any relative error of two guesses up
 to 1.45^3.5 = 3.7 is met by one pair of layers within 1.45^0.5 = 20 percent. The true scale then comes from
 registration.
+
+Nor is a metre the right size for landmarks wherever it is known. What is seen from 7 m, as a court is, has its corners
+and patterns, and its Gaussians, four times as large as what is seen from 1.7 m. So a capture whose views are not those
+of a room is described at other sizes as well: at the powers of two about its guess, which are the same for every
+capture, so that two of one place have one in common; and lengths of its registration hold in its *working metres*,
+under which it looks like a room.
 """
 
 from __future__ import annotations
@@ -20,6 +26,8 @@ from gsmap.types import Cameras
 
 LEVEL_STEP = 1.45
 LEVELS = (-2, 0, 1)
+_ROOM = 1.0  # octaves from one that are still a room: the guess is right to a factor of about two
+_MOST_OCTAVES = 5  # places seen from farther than 50 m, or nearer than 5 cm, are described as from there
 
 
 @dataclass(frozen=True)
@@ -83,15 +91,36 @@ def _view_distance(points: np.ndarray, cameras: Cameras, max_cameras: int = 32, 
     return float(np.median(all_parts)) if len(all_parts) else 0.0
 
 
-def landmark_units(guess_m: float, scale_policy: str, params: Params | None = None) -> dict[str, float]:
+def landmark_units(
+    guess_m: float, scale_policy: str, params: Params | None = None, *, working_m: float = 1.0
+) -> dict[str, float]:
     """Metres per scene unit that each landmark layer assumes, by the layer's name.
+
+    ``landmarks`` and ``landmarks@K``, whose lengths are 2 to the power K times as many metres, where the unit may be
+    the metre; ``landmarks:I`` at guesses.
 
     Args:
         guess_m: metres per scene unit, from `estimate_unit_m`.
         scale_policy: ``known``, ``unknown`` or ``auto``; see `gsmap.describe.describe`.
+        working_m: from `working_unit_m`.
     """
     low, high = (params or Params()).plausible_m
     levels = {f"landmarks:{i}": guess_m * LEVEL_STEP**power for i, power in enumerate(LEVELS)}
+    metric = {"landmarks": 1.0}
+    if working_m != 1.0:
+        octave = int(np.floor(-np.log2(working_m)))
+        metric |= {f"landmarks@{k}": 2.0**-k for k in (octave, octave + 1) if k}
     if scale_policy == "known":
-        return {"landmarks": 1.0}
-    return {"landmarks": 1.0, **levels} if scale_policy == "auto" and low < guess_m < high else levels
+        return metric
+    return {**metric, **levels} if scale_policy == "auto" and low < guess_m < high else levels
+
+
+def working_unit_m(guess_m: float, cameras: Cameras | None) -> float:
+    """Working metres per metre: 1 where views are those of a room, else what makes them so; see the module.
+
+    Without cameras nobody knows from where a scene was seen, and the height of its content says little of that: 1.
+    """
+    if cameras is None or not len(cameras) or cameras.synthesised:
+        return 1.0
+    octaves = np.clip(np.log2(guess_m), -_MOST_OCTAVES, _MOST_OCTAVES)
+    return 1.0 if abs(octaves) <= _ROOM else float(2.0**octaves)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+
+from gsmap.geometry.neighbours import chunks_of_neighbours
 
 _FAR = 4.0  # times the median distance to the 8th neighbour
 
@@ -24,7 +25,10 @@ def find_floaters(points: np.ndarray, colours: np.ndarray, max_difference: float
     """
     if len(points) < 9:
         return np.zeros(len(points), bool), np.zeros(len(points))
-    distances, neighbours = cKDTree(points).query(points, k=9)
-    spacing = distances[:, 8]
-    unlike = np.stack([np.linalg.norm(colours[column] - colours, axis=1) for column in neighbours[:, 1:].T])
-    return (spacing > _FAR * np.median(spacing)) | (np.partition(unlike, 1, axis=0)[1] >= max_difference), spacing
+    spacing, foreign = np.empty(len(points)), np.empty(len(points), bool)
+    for rows, distances, neighbours in chunks_of_neighbours(points, 9):
+        spacing[rows] = distances[:, 8]
+        own = colours[rows]
+        unlike = np.stack([np.linalg.norm(colours[column] - own, axis=1) for column in neighbours[:, 1:].T])
+        foreign[rows] = np.partition(unlike, 1, axis=0)[1] >= max_difference
+    return (spacing > _FAR * np.median(spacing)) | foreign, spacing

@@ -8,6 +8,7 @@ namespace nb = nanobind;
 namespace gsmap {
 void bind_correspondences(nb::module_ &);
 void bind_fit(nb::module_ &);
+void bind_landmarks(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_stopping(nb::module_ &);
 void bind_surface(nb::module_ &);
@@ -19,6 +20,7 @@ NB_MODULE(_native, m) {
     nb::set_leak_warnings(false);  // a view kept alive by an autograd graph at exit is no leak
     gsmap::bind_correspondences(m);
     gsmap::bind_fit(m);
+    gsmap::bind_landmarks(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_stopping(m);
     gsmap::bind_surface(m);

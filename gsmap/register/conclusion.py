@@ -12,6 +12,7 @@ from gsmap.geometry.rotations import angle_between
 from gsmap.register import verdict
 from gsmap.register.evidence import PoseEvidence
 from gsmap.register.metres import Belief
+from gsmap.register.metric import own_working_m
 from gsmap.register.params import Params, SamePose
 from gsmap.register.probability import probability
 from gsmap.register.proposing import num_nodes
@@ -85,7 +86,8 @@ def conclude(
 
 
 def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float, params: SamePose) -> bool:
-    """Both would be refined to one answer; ``centre`` is that of the source's content, ``unit_m`` the target's."""
+    """Both would be refined to one answer; ``centre`` is that of the source's content, ``unit_m`` working
+    metres per unit of the target."""
     return bool(
         abs(np.log(a.scale / b.scale)) < params.log_scale
         and np.degrees(angle_between(a.rotation, b.rotation)) < params.rotation_deg
@@ -95,7 +97,7 @@ def is_same_pose(a: Sim3, b: Sim3, centre: np.ndarray, unit_m: float, params: Sa
 
 def _same(a: Judged, b: Judged, target: SceneView, source: SceneView, params: SamePose) -> bool:
     poses = a.proposal.S_target_source, b.proposal.S_target_source
-    return is_same_pose(*poses, source.centre, target.graph.unit_m, params)
+    return is_same_pose(*poses, source.centre, own_working_m(target), params)
 
 
 def _apart(a: Judged, b: Judged, target: SceneView, source: SceneView) -> str:

@@ -1,8 +1,15 @@
-"""Scenes in metres: what each unit is taken for, and what is computed under it."""
+"""Scenes in metres: what each unit is taken for, and what is computed under it.
+
+These metres are *working metres*: under them both scenes look like rooms do, for which all lengths of refinement,
+evidence and covariance are meant. Where scenes in metres are seen from as near as rooms are, they are metres; where a
+court is seen from 7 m, one is four, whether or not the scenes' unit is known.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+import numpy as np
 
 from gsmap.register.evidence import Views
 from gsmap.register.params import Params
@@ -46,9 +53,9 @@ class MetricPair:
     def of(cls, target: SceneView, source: SceneView, proposal: Proposal, params: Params) -> MetricPair:
         """The frames in which a proposal is refined and judged."""
         scale = proposal.S_target_source.scale
-        unit_m = target_unit_m(target, with_scale=proposal.with_scale)
+        unit_m = working_unit_m(target, source, with_scale=proposal.with_scale)
         if proposal.with_scale and source.scale_policy == "known":
-            unit_m = 1.0 / scale  # the source knows what a metre is, the target only guesses
+            unit_m = source.graph.working_m / scale  # the source knows what a metre is, the target only guesses
         return cls(MetricScene(target, unit_m, params), MetricScene(source, unit_m * scale, params), scale)
 
     @property
@@ -63,6 +70,19 @@ class MetricPair:
     def to_scene_units(self, pose: Sim3) -> Sim3:
         """A pose between metres as one between the scenes' own units."""
         return Sim3(pose.rotation, pose.translation / self.target.unit_m, pose.scale * self.scale)
+
+
+def working_unit_m(target: SceneView, source: SceneView, *, with_scale: bool) -> float:
+    """Working metres per target unit; scenes that have one unit have one working metre, between both of theirs."""
+    metric = not with_scale and "landmarks" in target.graph.layers  # made under the scene's own unit
+    if metric or (target.scale_policy == source.scale_policy == "known"):
+        return float(np.sqrt(target.graph.working_m * source.graph.working_m))
+    return target.graph.working_m if target.scale_policy == "known" else target.graph.unit_m
+
+
+def own_working_m(view: SceneView) -> float:
+    """Working metres per unit of a scene by itself: of a guess where the scale is not known."""
+    return view.graph.working_m if view.scale_policy == "known" else view.graph.unit_m
 
 
 def target_unit_m(target: SceneView, *, with_scale: bool) -> float:

@@ -8,7 +8,7 @@ from gsmap.register import covariance, refinement, verdict
 from gsmap.register.conclusion import Judged, conclude, is_same_pose
 from gsmap.register.duplicate import same_capture
 from gsmap.register.evidence import PoseEvidence, measure
-from gsmap.register.metric import MetricPair
+from gsmap.register.metric import MetricPair, own_working_m
 from gsmap.register.params import Params
 from gsmap.register.proposing import Proposing
 from gsmap.register.scaling import scaled_or_rigid
@@ -73,7 +73,7 @@ def _is_worth_judging(
     """Neither explained by the background model, nor judged before, nor one too many."""
     if proposal.log_nfa > params.prescreen_log_nfa or len(judged) >= params.max_poses:
         return False
-    S, centre, unit_m = proposal.S_target_source, source.centre, target.graph.unit_m
+    S, centre, unit_m = proposal.S_target_source, source.centre, own_working_m(target)
     return not any(is_same_pose(S, j.proposal.S_target_source, centre, unit_m, params.same_pose) for j in judged)
 
 

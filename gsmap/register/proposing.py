@@ -10,7 +10,7 @@ import numpy as np
 from gsmap.errors import MissingDependencyError
 from gsmap.methods import family
 from gsmap.register import verdict
-from gsmap.register.metric import MetricScene, target_unit_m
+from gsmap.register.metric import MetricScene, working_unit_m
 from gsmap.register.params import Params, Snap
 from gsmap.register.scene_view import SceneView
 from gsmap.register.stopwatch import Stopwatch
@@ -61,7 +61,7 @@ class Proposing:
     def _asked(
         self, name: str, step: str, *, with_scale: bool, views: Sequence[SceneView] | None = None
     ) -> list[Proposal]:
-        unit_m = target_unit_m(self.target, with_scale=with_scale)
+        unit_m = working_unit_m(self.target, self.source, with_scale=with_scale)
         target, source = (MetricScene(view, unit_m, self.params) for view in views or (self.target, self.source))
         with self.watch.step(step):
             try:

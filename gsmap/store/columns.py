@@ -249,6 +249,7 @@ def a_graph(value: Any) -> bool:
     return (
         (value.get("up") is None or a_direction(value["up"]))
         and _numbers(value.get("unit_m"))
+        and _numbers(value.get("working_m", 1.0))
         and texts(value.get("notes"))
         and isinstance(things, dict)
         and isinstance(things.get("count"), int)

@@ -81,6 +81,7 @@ class Graphs:
         about: dict[str, Any] = {
             "up": from_array(graph.up),
             "unit_m": float(graph.unit_m),
+            "working_m": float(graph.working_m),
             "notes": list(graph.notes),
             "layers": layers,
         }
@@ -140,7 +141,10 @@ class Graphs:
             parts: dict[str, Any] = {name: arrays[f"things.{name}"] for name in _THINGS}
             things = Things(**parts, unit_m=about["unit_m"])
         up = to_array(row.about["up"])
-        return SceneGraph(row.scene, layers, up, row.about["unit_m"], tuple(row.about["notes"]), things)
+        unit_m = row.about["unit_m"]
+        # Graphs of older releases: the metre wherever it was plausible.
+        working_m = row.about.get("working_m", 1.0 if "landmarks" in layers else unit_m)
+        return SceneGraph(row.scene, layers, up, unit_m, tuple(row.about["notes"]), things, working_m)
 
     def num_bytes(self, ref: str) -> int:
         """Of the arrays of all graphs of a scene, as they were written."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +53,8 @@ def make_captures(
     vary_exposure: bool = False,
     hold_out: int = 0,
     place: Place | None = None,
+    paths: Sequence[np.ndarray] | None = None,
+    far: float = np.inf,
     progress: Progress | None = None,
 ) -> list[DemoCapture]:
     """Build the place of ``seed`` and capture it ``num_captures`` times, each in its own random frame.
@@ -71,6 +73,8 @@ def make_captures(
         vary_exposure: give each capture its own exposure (gain 0.85 to 1.15, gamma 0.9 to 1.15).
         hold_out: every ``hold_out``-th frame is not trained on (see `shown`); it stays among the images and cameras.
         place: a place already built, instead of the one of ``seed``.
+        paths: (C, 4, 4) camera poses of each capture, instead of walks along routes.
+        far: depths greater than this (metres) are unknown, as to a scanner; nothing is laid there.
 
     Raises:
         ConfigError: counts that do not fit together, or a route without doorways.
@@ -78,7 +82,7 @@ def make_captures(
     report = progress or silent
     report(0.0, "building a place")
     place = place or make_place(seed, rooms=rooms, twin=twin)
-    routes = routes or default_routes(place, num_captures)
+    routes = [()] * len(paths) if paths else routes or default_routes(place, num_captures)
     scales = scales or [1.0] * num_captures
     if not len(routes) == len(scales) == num_captures:
         raise ConfigError(
@@ -93,15 +97,22 @@ def make_captures(
         def step(fraction: float, text: str, start: float = i) -> None:
             report(0.05 + 0.95 * (start + fraction) / num_captures, text)
 
-        poses = walk(place, route, num_frames, seed=i)
-        shut = unused_doors(place, route) if shut_doors else ()
+        poses = paths[i] if paths else walk(place, route, num_frames, seed=i)
+        shut = unused_doors(place, route) if shut_doors and not paths else ()
         filming = _part(step, 0.0, 0.3)
         frames = film(place, poses, size_px=size_px, shut=shut, gain=gain, gamma=gamma, name=name, progress=filming)
-        known = frames[shown(len(frames), hold_out)]
+        known = _within(frames[shown(len(frames), hold_out)], far)
         gaussians = fit_frames(known, steps=steps, num_gaussians=num_gaussians, seed=i, progress=_part(step, 0.3, 1.0))
         out.append(put_in_own_frame(gaussians, frames, name, rng, scale))
     report(1.0, "captures made")
     return out
+
+
+def _within(frames: Frames, far: float) -> Frames:
+    """The frames with no depth beyond ``far``."""
+    if frames.depths_m is None or not np.isfinite(far):
+        return frames
+    return replace(frames, depths_m=np.where(frames.depths_m > far, np.float32(0), frames.depths_m))
 
 
 def shown(count: int, hold_out: int) -> np.ndarray:

@@ -29,7 +29,6 @@ _TEXTURE = np.linspace(-5, 0, 6)  # natural log of |grad L| / L per pixel
 _SIZE = np.log(np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4]))
 _RATIO = np.linspace(0, 1, 5)
 _PARTS = (_HUES + 1, len(_LIGHTNESS), len(_TEXTURE), len(_SIZE) + 3 * len(_RATIO))
-_WORDS = 48
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,6 @@ class BuiltinEmbedder:
         weights = np.array([params.hue, params.lightness, params.texture, params.shape])
         self.weights = np.repeat(weights / np.linalg.norm(weights), _PARTS).astype(np.float32)
         self.up, self.unit_m, self.grey_chroma = up, unit_m, params.grey_chroma
-        self.codebook = self._codebook()
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
         """(R, F) features of the masks; see `gsmap.methods.embedder`."""
@@ -74,12 +72,16 @@ class BuiltinEmbedder:
         middle = np.median(lab[seen, 0]) if seen.any() else 50.0
         slope = np.hypot(*np.gradient(lab[..., 0])) / np.maximum(lab[..., 0], 5.0)
         rows = []
+        # What every pixel says, once: masks overlap, and there are many.
+        hues = _hues(lab, self.grey_chroma)
+        lightness = _shared(lab[..., 0] - middle, _LIGHTNESS)
+        texture = _shared(np.log(np.maximum(slope, 1e-4)), _TEXTURE)
         for mask, shown in zip(masks, points, strict=True):
-            pixels, steep = lab[mask.pixels], slope[mask.pixels]
+            at = np.flatnonzero(mask.pixels)
             parts = [
-                _hues(pixels, self.grey_chroma),
-                _soft(pixels[:, 0] - middle, _LIGHTNESS),
-                _soft(np.log(np.maximum(steep, 1e-4)), _TEXTURE),
+                hues.of(at),
+                lightness.of(at),
+                texture.of(at),
                 self._shape(shown),
             ]
             rows.append(np.concatenate([np.sqrt(p / max(p.sum(), 1e-12)) for p in parts]) * self.weights)
@@ -93,39 +95,51 @@ class BuiltinEmbedder:
         size = _soft(np.log(4 * spread[2:]), _SIZE)
         return np.concatenate([size, *[_soft(np.array([r]), _RATIO) for r in ratios]])
 
-    def _codebook(self) -> np.ndarray:
-        """Words drawn as things might look: one or two hues, one lightness, texture and shape each; seeded."""
-        rng = np.random.default_rng(7)
-        rows = []
-        for _ in range(_WORDS):
-            parts = []
-            for size in _PARTS[:3]:
-                p = np.full(size, 0.1 / size)
-                p[rng.integers(size)] += 0.6
-                p[rng.integers(size)] += 0.3
-                parts.append(p)
-            picks = [rng.integers(n) for n in (len(_SIZE), *[len(_RATIO)] * 3)]
-            offsets = np.concatenate([[0], np.cumsum([len(_SIZE), *[len(_RATIO)] * 2])])
-            shape = np.full(_PARTS[3], 0.02)
-            shape[offsets + picks] += 1.0
-            rows.append(np.concatenate([np.sqrt(p / p.sum()) for p in [*parts, shape]]) * self.weights)
-        return np.stack(rows).astype(np.float32)
+
+@dataclass(frozen=True, eq=False)
+class _Shares:
+    """Bins that values fall into, each shared between two, by the values' flat index.
+
+    Args:
+        low, high: (N,) the two bins.
+        low_share, high_share: (N,) how much falls into each.
+        size: number of bins.
+        rest: (N,) what falls into one more bin than these; None where there is none.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    low_share: np.ndarray
+    high_share: np.ndarray
+    size: int
+    rest: np.ndarray | None = None
+
+    def of(self, rows: np.ndarray | slice) -> np.ndarray:
+        """The histogram of some of the values."""
+        out = np.bincount(self.low[rows], self.low_share[rows], self.size)
+        out = out + np.bincount(self.high[rows], self.high_share[rows], self.size)
+        return out if self.rest is None else np.concatenate([out, [self.rest[rows].sum()]])
+
+
+def _shared(values: np.ndarray, centres: np.ndarray) -> _Shares:
+    """Values over evenly spaced centres, each shared linearly between its two neighbours."""
+    at = np.clip((values.ravel() - centres[0]) / (centres[1] - centres[0]), 0, len(centres) - 1)
+    low = np.minimum(at.astype(int), len(centres) - 2)
+    share = at - low
+    return _Shares(low, low + 1, 1 - share, share, len(centres))
 
 
 def _soft(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Histogram of values over evenly spaced centres, each shared linearly between its two neighbours."""
-    at = np.clip((values - centres[0]) / (centres[1] - centres[0]), 0, len(centres) - 1)
-    low = np.minimum(at.astype(int), len(centres) - 2)
-    share = at - low
-    return np.bincount(low, 1 - share, len(centres)) + np.bincount(low + 1, share, len(centres))
+    """Histogram of values over evenly spaced centres."""
+    return _shared(values, centres).of(slice(None))
 
 
-def _hues(lab: np.ndarray, grey_chroma: float) -> np.ndarray:
-    """Histogram over hue circle and grey: a pixel is coloured as far as its chroma exceeds that of grey things."""
-    chroma = np.hypot(lab[:, 1], lab[:, 2])
+def _hues(lab: np.ndarray, grey_chroma: float) -> _Shares:
+    """Hue circle and grey: a pixel is coloured as far as its chroma exceeds that of grey things."""
+    a, b = lab[..., 1].ravel(), lab[..., 2].ravel()
+    chroma = np.hypot(a, b)
     coloured = chroma / (chroma + grey_chroma)
-    at = np.arctan2(lab[:, 2], lab[:, 1]) / (2 * np.pi) * _HUES % _HUES
+    at = np.arctan2(b, a) / (2 * np.pi) * _HUES % _HUES
     low = at.astype(int) % _HUES
     share = at - at.astype(int)
-    hues = np.bincount(low, coloured * (1 - share), _HUES) + np.bincount((low + 1) % _HUES, coloured * share, _HUES)
-    return np.concatenate([hues, [(1 - coloured).sum()]])
+    return _Shares(low, (low + 1) % _HUES, coloured * (1 - share), coloured * share, _HUES, 1 - coloured)

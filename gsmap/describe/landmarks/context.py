@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap.describe.cloud import downsample
 from gsmap.errors import ConfigError
@@ -69,14 +67,8 @@ def cylinder_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray,
     wall = 2 * (radius - inner)[:, None] * np.diff(height)[None]
     floor = np.pi * (radius**2 - inner**2)[:, None] * np.ones(levels)[None]
 
-    def bins(offsets: np.ndarray) -> np.ndarray:
-        ring = np.searchsorted(radius, np.hypot(offsets[:, 0], offsets[:, 1]))
-        level = np.searchsorted(height, offsets[:, 2]) - 1
-        outside = (ring == len(radius)) | (level < 0) | (level == levels)
-        return np.where(outside, -1, ring * levels + level)
-
-    reach = float(np.hypot(radius[-1], np.abs(height).max()))
-    return _context(positions, points, lab, params.cell_m, reach, bins, np.minimum(wall, floor).ravel())
+    expected = np.minimum(wall, floor).ravel()
+    return _context(positions, points, lab, params.cell_m, radius, height, expected)
 
 
 def shell_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray, params: Params) -> np.ndarray:
@@ -89,11 +81,8 @@ def shell_context(positions: np.ndarray, points: np.ndarray, lab: np.ndarray, pa
     radius = np.array(params.shells_m)
     inner = np.concatenate([[0], radius[:-1]])
 
-    def bins(offsets: np.ndarray) -> np.ndarray:
-        shell = np.searchsorted(radius, np.linalg.norm(offsets, axis=1))
-        return np.where(shell == len(radius), -1, shell)
-
-    return _context(positions, points, lab, params.cell_m, params.shells_m[-1], bins, np.pi * (radius**2 - inner**2))
+    expected = np.pi * (radius**2 - inner**2)
+    return _context(positions, points, lab, params.cell_m, radius, np.zeros(0), expected)
 
 
 def _context(
@@ -101,23 +90,25 @@ def _context(
     points: np.ndarray,
     lab: np.ndarray,
     cell_m: float,
-    reach_m: float,
-    bins: Callable[[np.ndarray], np.ndarray],
+    radii_m: np.ndarray,
+    heights_m: np.ndarray,
     expected_m2: np.ndarray,
 ) -> np.ndarray:
-    """Mean colour and occupancy (M, B, 4) per bin of the offsets to all points within reach; bin -1 is left out."""
+    """Mean colour and occupancy (M, B, 4) of rings and heights, or of shells where there are no heights."""
+    from gsmap import _native
+
     thin, colour = downsample(points, lab, cell_m)
     values = (colour - _LAB_CENTRE) / _LAB_SPREAD
-    size = len(expected_m2)
-    out = np.zeros((len(positions), size, 4))
-    for row, near in enumerate(cKDTree(thin).query_ball_point(positions, reach_m, return_sorted=False)):
-        near = np.asarray(near, dtype=np.int64)
-        at = bins(thin[near] - positions[row])
-        near, at = near[at >= 0], at[at >= 0]
-        count = np.bincount(at, minlength=size)
-        for c in range(3):
-            out[row, :, c] = np.bincount(at, values[near, c], size) / np.maximum(count, 1)
-        out[row, :, 3] = np.minimum(1, count * cell_m**2 / expected_m2)
+    sums, counts = _native.landmark_surroundings(
+        positions=np.ascontiguousarray(positions, np.float64),
+        points=np.ascontiguousarray(thin),
+        values=np.ascontiguousarray(values),
+        radii=radii_m,
+        heights=heights_m,
+    )
+    out = np.zeros((*counts.shape, 4))
+    out[..., :3] = sums / np.maximum(counts, 1)[..., None]
+    out[..., 3] = np.minimum(1, counts * cell_m**2 / expected_m2)
     return out
 
 

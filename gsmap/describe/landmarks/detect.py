@@ -10,13 +10,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter
 
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
 _BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
-_WINDOW = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)  # 1.2 sigma
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,39 @@ class Blobs:
         return len(self.positions)
 
 
-def find_blobs(points: np.ndarray, lab: np.ndarray, areas: np.ndarray, params: Params | None = None) -> Blobs:
+class Octaves:
+    """The extrema of one levelled cloud by the size of the grid's cells, for layers that have octaves in common.
+
+    Layers whose units differ by a power of two do: they look at the same grids, bit by bit.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
+
+    def extrema(
+        self,
+        points: np.ndarray,
+        lab: np.ndarray,
+        areas: np.ndarray,
+        thresholds: np.ndarray,
+        size_m: float,
+        unit_m: float,
+    ) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
+        """As `_extrema` of a grid of ``size_m``; ``unit_m`` is that of the points."""
+        key = size_m / unit_m, thresholds.tobytes()
+        if key not in self._found:
+            self._found[key] = list(_extrema(points / size_m, lab, areas / size_m**2, thresholds))
+        return self._found[key]
+
+
+def find_blobs(
+    points: np.ndarray,
+    lab: np.ndarray,
+    areas: np.ndarray,
+    params: Params | None = None,
+    octaves: Octaves | None = None,
+    unit_m: float = 1.0,
+) -> Blobs:
     """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
 
     Points are spread over the grid with the surface they stand for as weight, so that neither the grid's place nor how
@@ -73,21 +103,22 @@ def find_blobs(points: np.ndarray, lab: np.ndarray, areas: np.ndarray, params: P
 
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
+        octaves: of this cloud in its own unit, which is ``unit_m`` metres.
     """
-    params = params or Params()
-    lab_threshold, octaves = params.lab_threshold, params.octaves
+    params, known = params or Params(), octaves or Octaves()
+    lab_threshold, count = params.lab_threshold, params.octaves
     spacing_m = np.sqrt(8 / np.pi * np.median(areas))
     thresholds = np.array(
         [params.lightness_factor * lab_threshold, lab_threshold, lab_threshold, params.density_threshold]
     )
     found = [_empty()]
-    for octave in range(octaves):
+    for octave in range(count):
         size_m = params.cell_m * 2**octave
         if spacing_m > params.max_spacing_cells * size_m:
             continue
         parts = [_empty()]
-        for channel, negative, cells, ratio in _extrema(points / size_m, lab, areas / size_m**2, thresholds):
-            kind = np.full(len(cells), (channel * 2 + negative) * octaves + octave, np.int32)
+        for channel, negative, cells, ratio in known.extrema(points, lab, areas, thresholds, size_m, unit_m):
+            kind = np.full(len(cells), (channel * 2 + negative) * count + octave, np.int32)
             parts.append(Blobs(cells * size_m, kind, ratio, np.full(len(cells), _SIGMA_CELLS * size_m)))
         found.append(_strongest(parts, params.max_per_octave))
     return _strongest(found)
@@ -109,63 +140,30 @@ def _extrema(
     points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray
 ) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
     """Yield (channel, negative, positions (n, 3), responses over threshold (n,)); lengths in cells."""
-    blocks = np.unique(np.floor(points / _BLOCK_CELLS).astype(np.int64), axis=0)
-    for core in blocks * _BLOCK_CELLS:
+    from gsmap import _native
+
+    block = np.floor(points / _BLOCK_CELLS).astype(np.int64)
+    # One number a block, in the order of their rows.
+    span = np.ptp(block, axis=0) + 1
+    key = ((block[:, 0] - block[:, 0].min()) * span[1] + block[:, 1] - block[:, 1].min()) * span[2]
+    cores = block[np.unique(key + block[:, 2] - block[:, 2].min(), return_index=True)[1]] * _BLOCK_CELLS
+    for core in cores:
         near = ((points >= core - _HALO_CELLS) & (points < core + _BLOCK_CELLS + _HALO_CELLS)).all(1)
-        low = np.floor(points[near].min(0)).astype(np.int64) - 3  # room for extrema just off the surface
-        shape = tuple(np.floor(points[near].max(0)).astype(np.int64) - low + 4)
-        at, share = _corners(points[near] - low, shape)
-        share = share * areas[near]
-        channels = [np.ones(near.sum()), lab[near, 0] - 50.0, lab[near, 1], lab[near, 2]]
-        size = int(np.prod(shape))
-        fields = [
-            np.bincount(at.ravel(), (share * c).ravel(), size).reshape(shape).astype(np.float32) for c in channels
-        ]
-        for channel, response in enumerate(_responses(*fields)):
+        here = np.ascontiguousarray(points[near], np.float64)
+        low = np.floor(here.min(0)) - 3.0  # room for extrema just off the surface
+        table = _native.landmark_extrema(
+            points=here,
+            lab=np.ascontiguousarray(lab[near], np.float64),
+            areas=np.ascontiguousarray(areas[near], np.float64),
+            thresholds=thresholds.astype(np.float64),
+            low=low,
+            shape=np.floor(here.max(0)) - low + 4,
+            sigma=_SIGMA_CELLS,
+            surround=_SURROUND,
+        )
+        found = table[:, 2:5] + low + 0.5
+        inside = ((found >= core) & (found < core + _BLOCK_CELLS)).all(1)
+        for channel in range(4):
             for negative in (0, 1) if channel < 3 else (0,):
-                found, ratio = _maxima(-response if negative else response, thresholds[channel])
-                found = found + low + 0.5
-                inside = ((found >= core) & (found < core + _BLOCK_CELLS)).all(1)
-                yield channel, negative, found[inside], ratio[inside]
-
-
-def _corners(points: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices (8, n) and shares (8, n) of the cells that trilinear splatting spreads points over."""
-    base = np.floor(points - 0.5).astype(np.int64)
-    t = points - 0.5 - base
-    steps = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 1, 3)
-    at = base + steps
-    return (at[..., 0] * shape[1] + at[..., 1]) * shape[2] + at[..., 2], np.where(steps, t, 1 - t).prod(-1)
-
-
-def _responses(mass: np.ndarray, *colour: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the response of L, a, b and density on a dense block; zero away from the surface."""
-    more = _SIGMA_CELLS * np.sqrt(_SURROUND**2 - 1)
-    mass_s = _blur(mass, _SIGMA_CELLS)
-    planes = mass_s * (np.sqrt(2 * np.pi) * _SIGMA_CELLS)
-    surface = planes > 0.3
-    mass_wide = _blur(mass_s, more)
-    for field in colour:
-        colour_s = _blur(field, _SIGMA_CELLS)
-        colour_wide = _blur(colour_s, more)
-        yield np.where(surface, colour_s / np.maximum(mass_s, 1e-9) - colour_wide / np.maximum(mass_wide, 1e-9), 0)
-    yield planes - 1
-
-
-def _blur(field: np.ndarray, sigma: float) -> np.ndarray:
-    for axis in range(3):
-        field = gaussian_filter1d(field, sigma, axis=axis, mode="constant", truncate=3.0)
-    return field
-
-
-def _maxima(response: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sub-cell positions (n, 3) of the maxima above ``threshold`` in a window of 5 cells, and peak / threshold."""
-    peak = (response > threshold) & (response == maximum_filter(response, size=5, mode="constant", cval=-np.inf))
-    at = np.argwhere(peak)
-    if len(at) == 0:
-        return np.zeros((0, 3)), np.zeros(0)
-    around = np.clip(at[:, None] + _WINDOW, 0, np.array(response.shape) - 1)
-    values = response[tuple(np.moveaxis(around, -1, 0))]
-    top = response[tuple(at.T)]
-    weights = np.where(values > 0.6 * top[:, None], values, 0)
-    return np.einsum("nk,nkd->nd", weights, around) / weights.sum(1)[:, None], top / threshold
+                own = inside & (table[:, 0] == channel) & (table[:, 1] == negative)
+                yield channel, negative, found[own], table[own, 5]

@@ -8,15 +8,15 @@ import numpy as np
 
 from gsmap.describe.landmarks.context import Params as ContextParams
 from gsmap.describe.landmarks.context import cylinder_context, embed, shell_context
+from gsmap.describe.landmarks.detect import Octaves, find_blobs
 from gsmap.describe.landmarks.detect import Params as DetectParams
-from gsmap.describe.landmarks.detect import find_blobs
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey
 from gsmap.types import NodeLayer
 from gsmap.types.plain import plain
 from gsmap.types.views import Cloud
 
-VERSION = 6
+VERSION = 7
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,9 @@ def descriptor_id(params: Params, *, upright: bool = True) -> str:
     return RecipeKey("describe", name, {"landmarks": VERSION}, decides).recipe
 
 
-def landmark_layer(cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params | None = None) -> NodeLayer:
+def landmark_layer(
+    cloud: Cloud, up: np.ndarray | None, unit_m: float, params: Params | None = None, octaves: Octaves | None = None
+) -> NodeLayer:
     """Landmarks of a surface cloud.
 
     Args:
@@ -50,6 +52,7 @@ def landmark_layer(cloud: Cloud, up: np.ndarray | None, unit_m: float, params: P
         up: (3,) against gravity, scene frame, or None: contexts are then counted in shells, which tell places apart
             less well.
         unit_m: metres per scene unit to assume.
+        octaves: of this cloud, shared by its layers.
 
     Returns:
         Positions and extents in the scene's frame and unit; ``features`` are the blob's response and scale,
@@ -64,7 +67,7 @@ def landmark_layer(cloud: Cloud, up: np.ndarray | None, unit_m: float, params: P
         return NodeLayer.empty(descriptor, dim, unit_m)
     level = np.eye(3) if up is None else level_frame(up)
     points = cloud.points @ level.T * unit_m
-    blobs = find_blobs(points, cloud.lab, cloud.areas * unit_m**2, params.detect)
+    blobs = find_blobs(points, cloud.lab, cloud.areas * unit_m**2, params.detect, octaves, unit_m)
     if len(blobs) == 0:
         return NodeLayer.empty(descriptor, dim, unit_m)
     around = surroundings(blobs.positions, points, cloud.lab, params.context)

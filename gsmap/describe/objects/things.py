@@ -15,6 +15,7 @@ from gsmap.describe.objects.structure import Structure, components, find_structu
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.directions import level_frame
+from gsmap.geometry.neighbours import nearest_neighbours
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians, Things
@@ -118,7 +119,7 @@ def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: 
         return out
     areas = cloud.areas[rows] * unit_m**2 * (len(cloud) / len(rows))
     tree = cKDTree(points)
-    distances, neighbours = tree.query(points, k=_NEIGHBOURS + 1)
+    distances, neighbours = nearest_neighbours(points, _NEIGHBOURS + 1)
     normals, planarity = _normals(gaussians, cloud.index[rows], points, neighbours, level)
     structure = find_structure(points, normals, planarity, areas, neighbours)
     lab = cloud.lab[rows].astype(np.float64)
@@ -162,11 +163,11 @@ def _normals(
 
     def axes(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         centred = step - ((weight[..., None] * step).sum(1) / weight.sum(1)[:, None])[:, None]
-        values, vectors = np.linalg.eigh(np.einsum("nk,nki,nkj->nij", weight, centred, centred))
+        values, vectors = np.linalg.eigh((weight[..., None] * centred).transpose(0, 2, 1) @ centred)
         return vectors[:, :, 0], (values[:, 1] - values[:, 0]) / np.maximum(values[:, 2], 1e-12)
 
     rough = np.where((ordered[:, 0] < 0.5 * ordered[:, 1])[:, None], own, axes(np.ones(neighbours.shape))[0])
-    off = np.einsum("nki,ni->nk", step, rough)
+    off = (step @ rough[..., None])[..., 0]
     return axes(np.exp(-0.5 * (off / 0.025) ** 2) + 1e-6)
 
 

@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.methods.proposer import Proposal, Scene
-from gsmap.register import a_contrario, consistency, correspondences, pose, scale
+from gsmap.register import a_contrario, consistency, context, correspondences, pose, scale
 from gsmap.register.clique import maximum_clique
 from gsmap.register.correspondences import Correspondences
 from gsmap.types import NodeLayer, SceneGraph, Sim3
 
-VERSION = 1
+VERSION = 2
 SCALES = True
 PACKAGES = ()
 
@@ -26,6 +26,7 @@ class Params:
         kinds: of nodes, that propose; each on its own.
         landmarks: how landmarks are paired.
         objects: how objects are paired.
+        context: what is told of objects' surroundings.
         consistency: how pairs are tested against each other; its sigma is that of landmarks.
         objects_sigma_m: the same for objects, whose centres are less well defined.
         scale: the vote, where the scale is not known.
@@ -48,6 +49,7 @@ class Params:
     kinds: tuple[str, ...] = ("landmarks", "objects")
     landmarks: correspondences.Params = field(default_factory=correspondences.Params)
     objects: correspondences.Params = field(default_factory=lambda: correspondences.Params(top_k=5))
+    context: context.Params = field(default_factory=context.Params)
     consistency: consistency.Params = field(default_factory=consistency.Params)
     objects_sigma_m: float = 0.05
     scale: scale.Params = field(default_factory=scale.Params)
@@ -116,18 +118,28 @@ def comparable_layers(
         gravity_free = kind == "landmarks" and graph.up is not None and other.up is None
         own = "landmarks_gravity_free" if gravity_free else kind
         guesses = [layer for name, layer in graph.layers.items() if name.startswith(f"{own}:")]
-        plain = [graph.layers[own]] if own in graph.layers else []
-        return (guesses or plain) if with_scale else plain
+        metric = [layer for name, layer in graph.layers.items() if name == own or name.startswith(f"{own}@")]
+        return (guesses or metric) if with_scale else metric
 
     compared = [(a, b) for a in of(target, source) for b in of(source, target)]
     pairs = [(a, b) for a, b in compared if a.descriptor_id == b.descriptor_id and len(a) and len(b)]
     if not with_scale:
-        return pairs
+        return pairs if kind == "objects" else _of_working_size(pairs, target, source)
     # Guesses come in fixed steps, so several pairs stand for one relative scale: keep the one with most nodes.
     chosen: dict[float, tuple[NodeLayer, NodeLayer]] = {}
     for a, b in sorted(pairs, key=lambda pair: -min(len(pair[0]), len(pair[1]))):
         chosen.setdefault(round(float(np.log(a.unit_m / b.unit_m)), 3), (a, b))
     return list(chosen.values())
+
+
+def _of_working_size(
+    pairs: list[tuple[NodeLayer, NodeLayer]], target: SceneGraph, source: SceneGraph
+) -> list[tuple[NodeLayer, NodeLayer]]:
+    """The pairs of layers of one size; of several, those within an octave of what both scenes are worked on at."""
+    pairs = [(a, b) for a, b in pairs if a.unit_m == b.unit_m]
+    middle = 0.5 * np.log2(target.working_m * source.working_m)
+    near = [pair for pair in pairs if abs(np.log2(pair[0].unit_m) - middle) < 1.0]
+    return near or pairs
 
 
 def _voted(matchings: list[Matching], params: Params) -> list[tuple[Matching, float]]:
@@ -154,6 +166,8 @@ class Matching:
         params: Params,
         with_scale: bool,
     ) -> None:
+        if kind == "objects":
+            a, b = context.with_context(a, b, params.context)
         self.a, self.b, self.kind, self.params, self.with_scale = a, b, kind, params, with_scale
         sigma = params.objects_sigma_m if kind == "objects" else params.consistency.sigma_m
         self.test = replace(params.consistency, sigma_m=sigma)

@@ -1,0 +1,394 @@
+// Landmarks: extrema of colour and density on a block of a grid, and what surrounds a point.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <stdexcept>
+#include <vector>
+
+namespace nb = nanobind;
+
+namespace gsmap {
+namespace {
+
+using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+
+constexpr int SEGMENT = 16;  // cells along the last axis that are worked on, or left out, together
+constexpr int WINDOW = 2;    // a maximum is one among so many cells to either side
+
+// Taps of a normalised Gaussian, three standard deviations to either side.
+std::vector<float> taps_of(double sigma) {
+    int reach = int(3.0 * sigma + 0.5);
+    std::vector<double> taps(2 * reach + 1);
+    double total = 0;
+    for (int k = -reach; k <= reach; ++k) total += taps[k + reach] = std::exp(-0.5 * k * k / (sigma * sigma));
+    std::vector<float> out;
+    for (double t : taps) out.push_back(float(t / total));
+    return out;
+}
+
+// A dense block of cells, and which of its segments hold, or need, anything: surfaces fill little of a place.
+struct Grid {
+    int nx, ny, nz, segments;
+
+    Grid(int x, int y, int z)
+        : nx(x), ny(y), nz((z + SEGMENT - 1) / SEGMENT * SEGMENT), segments(nz / SEGMENT) {}
+    std::size_t row(int x, int y) const { return (std::size_t(x) * ny + y) * nz; }
+    std::size_t flag(int x, int y) const { return (std::size_t(x) * ny + y) * segments; }
+    std::size_t cells() const { return std::size_t(nx) * ny * nz; }
+    std::size_t flags() const { return std::size_t(nx) * ny * segments; }
+};
+
+using Field = std::vector<float>;
+using Flags = std::vector<std::uint8_t>;
+
+// Segments that have a flagged one within `reach` steps along an axis (along the last one: of segments).
+Flags dilated(const Grid &g, const Flags &in, int axis, int reach) {
+    Flags out(g.flags(), 0);
+    const int n[3] = {g.nx, g.ny, g.segments};
+    const std::size_t step[3] = {std::size_t(g.ny) * g.segments, std::size_t(g.segments), 1};
+    const int a = (axis + 1) % 3, b = (axis + 2) % 3;
+    for (int i = 0; i < n[a]; ++i)
+        for (int j = 0; j < n[b]; ++j) {
+            const std::size_t base = i * step[a] + j * step[b];
+            int last = -reach - 1;
+            for (int k = 0; k < n[axis] + reach; ++k) {
+                if (k < n[axis] && in[base + k * step[axis]]) last = k;
+                const int at = k - reach;  // the latest flag up to k tells of at, and so does any from at - reach on
+                if (at >= 0 && last >= at - reach) out[base + at * step[axis]] = 1;
+            }
+        }
+    return out;
+}
+
+void both(Flags &flags, const Flags &others) {
+    for (std::size_t i = 0; i < flags.size(); ++i) flags[i] &= others[i];
+}
+
+// One pass along the first or second axis into the wanted segments.
+void pass_across(const Grid &g, int axis, const std::vector<float> &taps, const Field &in, const Flags &filled,
+                 Field &out, const Flags &wanted) {
+    const int reach = int(taps.size()) / 2, length = axis == 0 ? g.nx : g.ny;
+    const std::ptrdiff_t step = axis == 0 ? g.row(1, 0) : g.nz, flag_step = axis == 0 ? g.flag(1, 0) : g.segments;
+    for (int x = 0; x < g.nx; ++x)
+        for (int y = 0; y < g.ny; ++y) {
+            const int at = axis == 0 ? x : y, from = std::max(-reach, -at), to = std::min(reach, length - 1 - at);
+            for (int s = 0; s < g.segments; ++s) {
+                const std::size_t flag = g.flag(x, y) + s, cell = g.row(x, y) + std::size_t(s) * SEGMENT;
+                if (!wanted[flag]) continue;
+                float sum[SEGMENT] = {};
+                for (int k = from; k <= to; ++k) {
+                    if (!filled[flag + k * flag_step]) continue;
+                    const float *source = &in[cell + k * step], tap = taps[k + reach];
+                    for (int c = 0; c < SEGMENT; ++c) sum[c] += tap * source[c];
+                }
+                std::memcpy(&out[cell], sum, sizeof sum);
+            }
+        }
+}
+
+// One pass along the last axis into the wanted segments.
+void pass_along(const Grid &g, const std::vector<float> &taps, const Field &in, const Flags &filled, Field &out,
+                const Flags &wanted) {
+    const int reach = int(taps.size()) / 2;  // less than a segment
+    Field line(g.nz + 2 * SEGMENT, 0.f);
+    for (int x = 0; x < g.nx; ++x)
+        for (int y = 0; y < g.ny; ++y) {
+            const std::size_t flag = g.flag(x, y), row = g.row(x, y);
+            if (!std::memchr(&wanted[flag], 1, g.segments)) continue;
+            for (int s = 0; s < g.segments; ++s) {
+                float *to = &line[(s + 1) * SEGMENT];
+                if (filled[flag + s]) std::memcpy(to, &in[row + s * SEGMENT], SEGMENT * sizeof(float));
+                else std::memset(to, 0, SEGMENT * sizeof(float));
+            }
+            for (int s = 0; s < g.segments; ++s) {
+                if (!wanted[flag + s]) continue;
+                float sum[SEGMENT] = {};
+                const float *source = &line[(s + 1) * SEGMENT - reach];
+                for (std::size_t k = 0; k < taps.size(); ++k)
+                    for (int c = 0; c < SEGMENT; ++c) sum[c] += taps[k] * source[k + c];
+                std::memcpy(&out[row + s * SEGMENT], sum, sizeof sum);
+            }
+        }
+}
+
+// A Gaussian convolution, zero beyond the block, of what is filled into what is wanted.
+struct Blur {
+    std::vector<float> taps;
+    Flags after_x, after_y, after_z;
+
+    Blur(const Grid &g, double sigma, const Flags &filled, const Flags *wanted) : taps(taps_of(sigma)) {
+        const int reach = int(taps.size()) / 2;
+        after_x = dilated(g, filled, 0, reach);
+        after_y = dilated(g, after_x, 1, reach);
+        after_z = dilated(g, after_y, 2, 1);
+        if (wanted) {
+            after_z = *wanted;
+            const Flags around = dilated(g, after_z, 2, 1);
+            both(after_y, around);
+            both(after_x, dilated(g, around, 1, reach));
+        }
+    }
+
+    void operator()(const Grid &g, const Field &in, const Flags &filled, Field &a, Field &b, Field &out) const {
+        pass_across(g, 0, taps, in, filled, a, after_x);
+        pass_across(g, 1, taps, a, after_x, b, after_y);
+        pass_along(g, taps, b, after_y, out, after_z);
+    }
+};
+
+struct Extremum {
+    double position[3], ratio;
+    int channel, negative;
+};
+
+// Trilinear splatting of values of points (in cells of the block) into its cells.
+void splat(const Grid &g, const Points &points, const double *low, const std::vector<double> &values, Field &out) {
+    for (std::size_t i = 0; i < values.size(); ++i) {
+        int base[3];
+        double t[3];
+        for (int k = 0; k < 3; ++k) {
+            const double at = points.data()[3 * i + k] - low[k] - 0.5;
+            base[k] = int(std::floor(at));
+            t[k] = at - base[k];
+        }
+        for (int corner = 0; corner < 8; ++corner) {
+            const int dx = corner >> 2, dy = corner >> 1 & 1, dz = corner & 1;
+            const double share = (dx ? t[0] : 1 - t[0]) * (dy ? t[1] : 1 - t[1]) * (dz ? t[2] : 1 - t[2]);
+            out[g.row(base[0] + dx, base[1] + dy) + base[2] + dz] += float(share * values[i]);
+        }
+    }
+}
+
+void maxima(const Grid &g, const Field &response, const Flags &surface, const int *shape, float sign, double threshold,
+            int channel, std::vector<Extremum> &found) {
+    for (int x = 0; x < shape[0]; ++x)
+        for (int y = 0; y < shape[1]; ++y)
+            for (int s = 0; s < g.segments; ++s) {
+                if (!surface[g.flag(x, y) + s]) continue;
+                for (int z = s * SEGMENT; z < std::min((s + 1) * SEGMENT, shape[2]); ++z) {
+                    const float top = sign * response[g.row(x, y) + z];
+                    if (!(top > threshold)) continue;
+                    const int x0 = std::max(x - WINDOW, 0), x1 = std::min(x + WINDOW, shape[0] - 1);
+                    const int y0 = std::max(y - WINDOW, 0), y1 = std::min(y + WINDOW, shape[1] - 1);
+                    const int z0 = std::max(z - WINDOW, 0), z1 = std::min(z + WINDOW, shape[2] - 1);
+                    bool highest = true;
+                    double total = 0, mean[3] = {};
+                    for (int i = x0; highest && i <= x1; ++i)
+                        for (int j = y0; highest && j <= y1; ++j)
+                            for (int k = z0; k <= z1; ++k) {
+                                const float value = sign * response[g.row(i, j) + k];
+                                if (value > top) {
+                                    highest = false;
+                                    break;
+                                }
+                                if (value > 0.6 * top) {
+                                    total += value;
+                                    mean[0] += double(value) * i, mean[1] += double(value) * j;
+                                    mean[2] += double(value) * k;
+                                }
+                            }
+                    if (highest)
+                        found.push_back({{mean[0] / total, mean[1] / total, mean[2] / total},
+                                         double(top) / threshold, channel, sign < 0});
+                }
+            }
+}
+
+// See gsmap/describe/landmarks/detect.py.
+std::vector<Extremum> extrema(const Points &points, const Points &lab, const Numbers &areas, const double *thresholds,
+                              const double *low, const int *shape, double sigma, double surround) {
+    const Grid g(shape[0], shape[1], shape[2]);
+    const std::size_t n = points.shape(0);
+    Field field(g.cells(), 0.f), a(g.cells()), b(g.cells()), mass(g.cells()), wide(g.cells());
+    std::vector<double> values(areas.data(), areas.data() + n);
+    splat(g, points, low, values, field);
+    Flags filled(g.flags());
+    for (std::size_t i = 0; i < filled.size(); ++i)
+        filled[i] = std::any_of(&field[i * SEGMENT], &field[i * SEGMENT] + SEGMENT, [](float v) { return v > 0; });
+    const Blur near(g, sigma, filled, nullptr);
+    near(g, field, filled, a, b, mass);
+    const float plane = float(std::sqrt(2 * 3.14159265358979323846) * sigma);
+    const auto is_surface = [&](std::size_t cell) { return mass[cell] * plane > 0.3f; };
+    Flags surface(g.flags(), 0);
+    for (std::size_t i = 0; i < surface.size(); ++i)
+        if (near.after_z[i])
+            for (int c = 0; c < SEGMENT; ++c) surface[i] |= is_surface(i * SEGMENT + c);
+    const Blur far(g, sigma * std::sqrt(surround * surround - 1), near.after_z, &surface);
+    far(g, mass, near.after_z, a, b, wide);
+    std::vector<Extremum> found;
+    Field response(g.cells(), 0.f), smooth(g.cells());
+    for (int channel = 0; channel < 4; ++channel) {
+        if (channel < 3) {
+            for (std::size_t i = 0; i < filled.size(); ++i)
+                if (filled[i]) std::fill_n(&field[i * SEGMENT], SEGMENT, 0.f);
+            for (std::size_t i = 0; i < n; ++i)
+                values[i] = areas.data()[i] * (lab.data()[3 * i + channel] - (channel == 0 ? 50.0 : 0.0));
+            splat(g, points, low, values, field);
+            near(g, field, filled, a, b, smooth);
+            far(g, smooth, near.after_z, a, b, field);  // leaves more filled than was: emptied below
+        }
+        for (std::size_t i = 0; i < surface.size(); ++i) {
+            if (!surface[i]) continue;
+            for (std::size_t cell = i * SEGMENT; cell < (i + 1) * SEGMENT; ++cell) {
+                if (channel == 3) response[cell] = mass[cell] * plane - 1;
+                else if (is_surface(cell))
+                    response[cell] = smooth[cell] / std::max(mass[cell], 1e-9f) - field[cell] / std::max(wide[cell], 1e-9f);
+                else response[cell] = 0;
+                field[cell] = 0;
+            }
+        }
+        maxima(g, response, surface, shape, 1.f, thresholds[channel], channel, found);
+        if (channel < 3) maxima(g, response, surface, shape, -1.f, thresholds[channel], channel, found);
+    }
+    return found;
+}
+
+// Points sorted into square columns of a plane, so that those near a place are found in few runs.
+struct Columns {
+    double low[2] = {}, size;
+    int n[2] = {};
+    std::vector<std::int64_t> starts, order;
+
+    Columns(const Points &points, double cell) : size(cell) {
+        const std::size_t count = points.shape(0);
+        double high[2] = {};
+        for (std::size_t i = 0; i < count; ++i)
+            for (int k = 0; k < 2; ++k) {
+                const double v = points.data()[3 * i + k];
+                low[k] = i ? std::min(low[k], v) : v;
+                high[k] = i ? std::max(high[k], v) : v;
+            }
+        for (int k = 0; k < 2; ++k) {  // however far the points reach, there are no more columns than these
+            const double columns = std::floor((high[k] - low[k]) / size) + 1;
+            if (columns > 4096) size = (high[k] - low[k]) / 4095;
+        }
+        for (int k = 0; k < 2; ++k) n[k] = int(std::floor((high[k] - low[k]) / size)) + 1;
+        starts.assign(std::size_t(n[0]) * n[1] + 1, 0);
+        std::vector<std::int64_t> column(count);
+        for (std::size_t i = 0; i < count; ++i) {
+            const double *p = points.data() + 3 * i;
+            column[i] = std::int64_t(at(p[0], 0)) * n[1] + at(p[1], 1);
+            ++starts[column[i] + 1];
+        }
+        for (std::size_t i = 1; i < starts.size(); ++i) starts[i] += starts[i - 1];
+        std::vector<std::int64_t> next(starts.begin(), starts.end() - 1);
+        order.resize(count);
+        for (std::size_t i = 0; i < count; ++i) order[next[column[i]]++] = std::int64_t(i);
+    }
+
+    int at(double v, int axis) const {
+        return int(std::clamp(std::floor((v - low[axis]) / size), 0.0, double(n[axis] - 1)));
+    }
+};
+
+// Index of the first edge that is not below a value; as many as there are where all are.
+int first_not_below(const Numbers &edges, double value) {
+    int i = 0;
+    while (i < int(edges.shape(0)) && edges.data()[i] < value) ++i;
+    return i;
+}
+
+// See gsmap/describe/landmarks/context.py: sums of values (M, bins, 3) and counts (M, bins), in rings of an upright
+// cylinder where there are heights, else in shells.
+void surroundings(const Points &positions, const Points &points, const Points &values, const Numbers &radii,
+                  const Numbers &heights, double *sums, double *counts) {
+    const int rings = int(radii.shape(0)), levels = std::max(int(heights.shape(0)) - 1, 1);
+    const double reach = radii.data()[rings - 1];
+    const Columns columns(points, reach / 4);
+    for (std::size_t m = 0; m < positions.shape(0); ++m) {
+        const double *p = positions.data() + 3 * m;
+        double *sum = sums + m * rings * levels * 3, *count = counts + m * rings * levels;
+        const int x1 = columns.at(p[0] + reach, 0), y0 = columns.at(p[1] - reach, 1), y1 = columns.at(p[1] + reach, 1);
+        for (int x = columns.at(p[0] - reach, 0); x <= x1; ++x) {
+            const std::size_t row = std::size_t(x) * columns.n[1];
+            for (std::int64_t i = columns.starts[row + y0]; i < columns.starts[row + y1 + 1]; ++i) {
+                const std::int64_t j = columns.order[i];
+                const double *q = points.data() + 3 * j, dx = q[0] - p[0], dy = q[1] - p[1], dz = q[2] - p[2];
+                int level = 0;
+                double distance = dx * dx + dy * dy;
+                if (heights.shape(0)) {
+                    level = first_not_below(heights, dz) - 1;
+                    if (level < 0 || level >= levels) continue;
+                } else distance += dz * dz;
+                const int ring = first_not_below(radii, std::sqrt(distance));
+                if (ring == rings) continue;
+                const int bin = ring * levels + level;
+                count[bin] += 1;
+                for (int c = 0; c < 3; ++c) sum[3 * bin + c] += values.data()[3 * j + c];
+            }
+        }
+    }
+}
+
+template <class T>
+nb::ndarray<nb::numpy, T> array_of(std::vector<std::size_t> shape, T *&data) {
+    std::size_t size = 1;
+    for (std::size_t n : shape) size *= n;
+    data = new T[size + 1]();
+    nb::capsule owner(data, [](void *p) noexcept { delete[] static_cast<T *>(p); });
+    return nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner);
+}
+
+}  // namespace
+
+void bind_landmarks(nb::module_ &m) {
+    m.def(
+        "landmark_extrema",
+        [](Points points, Points lab, Numbers areas, Numbers thresholds, Numbers low, Numbers shape, double sigma,
+           double surround) {
+            const std::size_t n = points.shape(0);
+            if (lab.shape(0) != n || areas.shape(0) != n || thresholds.shape(0) != 4 || low.shape(0) != 3 ||
+                shape.shape(0) != 3)
+                throw std::invalid_argument("extrema need as many colours and areas as points, and 4 thresholds");
+            int size[3];
+            for (int k = 0; k < 3; ++k) {
+                size[k] = int(shape.data()[k]);
+                for (std::size_t i = 0; i < n; ++i) {
+                    const double at = points.data()[3 * i + k] - low.data()[k];
+                    if (!(at >= 1 && at <= size[k] - 1)) throw std::invalid_argument("a point lies outside its block");
+                }
+            }
+            std::vector<Extremum> found;
+            {
+                nb::gil_scoped_release release;
+                found = extrema(points, lab, areas, thresholds.data(), low.data(), size, sigma, surround);
+            }
+            double *table;
+            auto out = array_of<double>({found.size(), 6}, table);
+            for (std::size_t i = 0; i < found.size(); ++i) {
+                const Extremum &e = found[i];
+                const double row[6] = {double(e.channel), double(e.negative), e.position[0],
+                                       e.position[1],     e.position[2],      e.ratio};
+                std::memcpy(table + 6 * i, row, sizeof row);
+            }
+            return out;
+        },
+        nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("low"), nb::arg("shape"),
+        nb::arg("sigma"), nb::arg("surround"),
+        "Rows (channel, negative, x, y, z, response over threshold) of the extrema of one block of cells.");
+    m.def(
+        "landmark_surroundings",
+        [](Points positions, Points points, Points values, Numbers radii, Numbers heights) {
+            if (values.shape(0) != points.shape(0) || radii.shape(0) < 1 || heights.shape(0) == 1)
+                throw std::invalid_argument("surroundings need a value for each point, a radius, and heights or none");
+            const std::size_t count = positions.shape(0), bins = radii.shape(0) * std::max<std::size_t>(
+                                                                                      heights.shape(0), 2) -
+                                                                 radii.shape(0);
+            double *sums, *counts;
+            auto sums_out = array_of<double>({count, bins, 3}, sums), counts_out = array_of<double>({count, bins}, counts);
+            if (points.shape(0)) {
+                nb::gil_scoped_release release;
+                surroundings(positions, points, values, radii, heights, sums, counts);
+            }
+            return nb::make_tuple(sums_out, counts_out);
+        },
+        nb::arg("positions"), nb::arg("points"), nb::arg("values"), nb::arg("radii"), nb::arg("heights"),
+        "Sums (M, bins, 3) of the values and counts (M, bins) of the points around each position.");
+}
+
+}  // namespace gsmap
