@@ -30,7 +30,7 @@ class PointTree {
         return x * x + y * y + z * z;
     }
 
-    // The nearest point closer than the bound; of equally near ones the first. The bound's own row may be a guess.
+    // The nearest point closer than the bound; of equally near ones the first.
     Neighbour nearest(const double *at, Neighbour bound) const {
         if (size()) {
             double away[3] = {0, 0, 0};
@@ -38,16 +38,16 @@ class PointTree {
         }
         return bound;
     }
-    // Up to k nearest points, nearest first; returns how many.
-    int nearest(const double *at, int k, Neighbour *out) const {
+    // Up to k nearest points whose squared distance is below a bound, nearest first; returns how many.
+    int nearest(const double *at, int k, Neighbour *out, double bound = __builtin_inf()) const {
         struct Best : Neighbour {
             Neighbour *list;
             int k, count;
-        } best{{__builtin_inf(), -1}, out, k, 0};
+        } best{{bound, -1}, out, k, 0};
         if (size() && k > 0) {
             double away[3] = {0, 0, 0};
             search(0, at, away, 0, best, [](Best &b, const Neighbour &found) {
-                if (b.count == b.k && !(found < b.list[b.k - 1])) return;
+                if (b.count == b.k ? !(found < b.list[b.k - 1]) : !(found.squared < b.squared)) return;
                 int i = b.count < b.k ? b.count++ : b.k - 1;
                 for (; i > 0 && found < b.list[i - 1]; --i) b.list[i] = b.list[i - 1];
                 b.list[i] = found;

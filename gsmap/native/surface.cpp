@@ -16,12 +16,13 @@ namespace {
 
 constexpr int kBlock = 512;  // points of a task; sums are taken by block, so threads change no bit
 constexpr int kMostNeighbours = 64;
+constexpr double kBeyond = 1.5, kStill = 0.05;  // of the radius, see Partner
 constexpr double kLeastNoise = 0.03;  // of the radius: planes that fit better than this leave colour its say
 
 using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Rows = nb::ndarray<const int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
-using Partners = nb::ndarray<int32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Kept = nb::ndarray<double, nb::shape<-1, 5>, nb::c_contig, nb::device::cpu>;
 using Frame = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 using Vector = nb::ndarray<const double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
 
@@ -169,6 +170,36 @@ struct Sums {
     }
 };
 
+// A point's nearest cell, as rows of Python's array keep it from pose to pose: where the point was when cells were last
+// searched, how near any other cell can have been then (negative: nothing is known yet), and the cell, -1 for none that near.
+// By the triangle inequality it stays the nearest until the point has moved by the difference, so late steps search little.
+struct Partner {
+    double at[3], others, row;
+
+    // The nearest cell closer than the radius, or -1.
+    int32_t follow(const PointTree &tree, const double *moved, double radius) {
+        const double step = std::sqrt(PointTree::squared(moved, at)), left = others - step;
+        if (others >= 0 && (row < 0 ? left >= radius : left > 0)) {
+            if (row < 0) return -1;
+            const double distance = std::sqrt(PointTree::squared(moved, tree.point(int32_t(row))));
+            if (distance * (1 + 1e-9) < left) return distance < radius ? int32_t(row) : -1;
+        }
+        std::copy_n(moved, 3, at);
+        if (others < 0 || step > kStill * radius) {  // it moves far still: the second nearest would be sought in vain
+            const Neighbour best = tree.nearest(moved, Neighbour{radius * radius, -1});
+            others = 0;
+            row = best.row;
+            return best.row;
+        }
+        const double reach = kBeyond * radius;
+        Neighbour near[2];
+        const int found = tree.nearest(moved, 2, near, reach * reach);
+        others = found > 1 ? std::sqrt(near[1].squared) : reach;
+        row = found ? near[0].row : -1;
+        return found && near[0].squared < radius * radius ? near[0].row : -1;
+    }
+};
+
 struct Pair {
     double moved[3], lever[3], offset[3], plane;
     int32_t row;
@@ -183,7 +214,7 @@ struct Equations {
 // Pairs every point with the nearest cell, and sums the normal equations of plane distances and lightness differences.
 // `backward`: the points are the target's, laid on the source's cells, which a step of the source moves the other way.
 Equations equations(const Cells &onto, const double *points, const double *lightness, const int64_t *rows, int64_t n,
-                    int32_t *partners, const double *pose, const double *centre, bool backward, const Weighing &how) {
+                    Partner *partners, const double *pose, const double *centre, bool backward, const Weighing &how) {
     const int64_t blocks = (n + kBlock - 1) / kBlock;
     std::vector<std::vector<Pair>> found(blocks);
     std::vector<std::vector<double>> light(blocks);
@@ -193,20 +224,14 @@ Equations equations(const Cells &onto, const double *points, const double *light
             const double *p = points + 3 * rows[i];
             Pair pair;
             for (int a = 0; a < 3; ++a) pair.moved[a] = dot(pose + 4 * a, p) + pose[4 * a + 3];
-            Neighbour best{how.radius * how.radius, -1};
-            if (partners[i] >= 0) {  // of the pose before: near already, so that little is searched
-                const double d = PointTree::squared(pair.moved, onto.tree->point(partners[i]));
-                if (d < best.squared) best = {d, partners[i]};
-            }
-            best = onto.tree->nearest(pair.moved, best);
-            partners[i] = pair.row = best.row;
-            if (best.row < 0) continue;
-            const double *cell = onto.tree->point(best.row);
+            pair.row = partners[i].follow(*onto.tree, pair.moved, how.radius);
+            if (pair.row < 0) continue;
+            const double *cell = onto.tree->point(pair.row);
             for (int a = 0; a < 3; ++a) {
                 pair.lever[a] = (backward ? pair.moved[a] : p[a]) - centre[a];
                 pair.offset[a] = pair.moved[a] - cell[a];
             }
-            pair.plane = dot(onto.normals + 3 * std::size_t(best.row), pair.offset);
+            pair.plane = dot(onto.normals + 3 * std::size_t(pair.row), pair.offset);
             found[block].push_back(pair);
             light[block].push_back(lightness[rows[i]]);
         }
@@ -333,7 +358,7 @@ void bind_surface(nb::module_ &m) {
     m.def(
         "icp_equations",
         [](const PointTree &tree, Points normals, Numbers lightness, std::optional<Points> gradients, Points points,
-           Numbers own_lightness, Rows rows, Partners partners, Frame pose, Vector centre, bool backward, double radius_m,
+           Numbers own_lightness, Rows rows, Kept partners, Frame pose, Vector centre, bool backward, double radius_m,
            double width_m, double colour_weight) {
             const auto size = std::size_t(tree.size());
             if (normals.shape(0) != size || lightness.shape(0) != size || (gradients && gradients->shape(0) != size))
@@ -343,13 +368,15 @@ void bind_surface(nb::module_ &m) {
             for (std::size_t i = 0; i < rows.shape(0); ++i) {
                 if (rows.data()[i] < 0 || rows.data()[i] >= int64_t(points.shape(0)))
                     throw std::invalid_argument("a row that is no point");
-                if (partners.data()[i] >= tree.size()) throw std::invalid_argument("a partner that is no cell");
+                const double *kept = partners.data() + 5 * i;
+                if (!(kept[3] < 0) && !(kept[4] >= -1 && kept[4] < double(tree.size())))
+                    throw std::invalid_argument("a partner that is no cell");
             }
             Equations out;
             {
                 nb::gil_scoped_release release;
                 out = equations({&tree, normals.data(), lightness.data(), gradients ? gradients->data() : nullptr},
-                                points.data(), own_lightness.data(), rows.data(), int64_t(rows.shape(0)), partners.data(),
+                                points.data(), own_lightness.data(), rows.data(), int64_t(rows.shape(0)), reinterpret_cast<Partner *>(partners.data()),
                                 pose.data(), centre.data(), backward,
                                 {radius_m, width_m, gradients ? colour_weight : 0.0});
             }
@@ -367,8 +394,8 @@ void bind_surface(nb::module_ &m) {
         nb::arg("backward"), nb::arg("radius_m"), nb::arg("width_m"), nb::arg("colour_weight"),
         "Normal equations (7, 7), (7,) over [rotation, translation, log scale] about `centre` of points laid on cells by a\n"
         "pose (3, 4), the number of pairs, the robust standard deviation of their plane distances, their mean (3,) less the\n"
-        "centre and their root mean square distance from it. `partners` (int32, -1 for none) are each row's nearest cells under an earlier\n"
-        "pose, and are overwritten by those under this one.");
+        "centre and their root mean square distance from it. `partners` (n, 5), -1 at first, keep each row's nearest cell from pose to\n"
+        "pose, for one radius, and are written to.");
 }
 
 }  // namespace gsmap

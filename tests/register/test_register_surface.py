@@ -129,7 +129,7 @@ def test_equations_equal_their_definition(cells, threads, backward, weight):
     centre = (onto if backward else moving).coarse[0].mean(0)
     expected = _reference(onto, moving, rows, pose, centre, backward, 0.1, 0.03, weight)
     assert expected[2] > 500
-    partners = np.full(len(rows), -1, np.int32)
+    partners = np.full((len(rows), 5), -1.0)
 
     def equations(pose):
         return _native.icp_equations(
@@ -152,10 +152,15 @@ def test_equations_equal_their_definition(cells, threads, backward, weight):
     found = equations(pose)
     for one, other in zip(found, expected, strict=True):
         assert np.allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
-    # Partners of another pose are a hint, no more; and threads change no bit.
-    equations(pose @ Sim3(exp_so3([0.0, 0.01, 0.0]), [0.02, 0.02, 0.0]))
-    again = equations(pose)
-    assert all(np.array_equal(one, other) for one, other in zip(found, again, strict=True))
+    # What is kept of earlier poses saves searching, and changes no bit.
+    rng = np.random.default_rng(3)
+    for step_m in (0.03, 0.004, 0.004, 0.002, 0.002, 0.001, 0.0):
+        other = pose @ Sim3(exp_so3(0.1 * step_m * rng.normal(size=3)), step_m * rng.normal(size=3))
+        once = equations(other)
+        kept, partners[:] = partners.copy(), -1.0
+        assert all(np.array_equal(one, anew) for one, anew in zip(once, equations(other), strict=True))
+        partners[:] = kept
+    assert (partners[:, 3] > 0.002).mean() > 0.5
 
 
 def test_equations_are_the_same_bits_whatever_the_threads(cells):
@@ -175,7 +180,7 @@ def test_equations_are_the_same_bits_whatever_the_threads(cells):
                 surface.coarse[0],
                 surface.lightness,
                 rows,
-                np.full(len(rows), -1, np.int32),
+                np.full((len(rows), 5), -1.0),
                 pose,
                 points.mean(0),
                 False,
@@ -192,7 +197,7 @@ def test_equations_are_the_same_bits_whatever_the_threads(cells):
 def test_equations_take_nothing_that_does_not_fit(cells):
     points, value = cells
     tree, rows, pose = _native.PointTree(points), np.arange(5), np.eye(4)[:3].copy()
-    partners = np.full(5, -1, np.int32)
+    partners = np.full((5, 5), -1.0)
 
     def ask(rows=rows, partners=partners, own=value):
         _native.icp_equations(
@@ -203,6 +208,6 @@ def test_equations_take_nothing_that_does_not_fit(cells):
     with pytest.raises(ValueError, match="no point"):
         ask(rows=np.array([0, 1, 2, 3, len(points)]))
     with pytest.raises(ValueError, match="no cell"):
-        ask(partners=np.array([0, 1, 2, 3, len(points)], np.int32))
+        ask(partners=np.full((5, 5), float(len(points))))
     with pytest.raises(ValueError, match="lightness each"):
         ask(own=value[1:])

@@ -125,12 +125,12 @@ class _Equations:
 
 
 class _Laid:
-    """Cells of one surface laid on another by a pose, each on the nearest; the pairs of the last pose are kept."""
+    """Cells of one surface laid on another by a pose, each on the nearest, within one radius; what is known of them is kept."""
 
     def __init__(self, onto: Surface, moving: Surface, count: int, *, backward: bool = False) -> None:
         self._onto, self._moving, self._backward = onto, moving, backward
         self._rows = moving.sample(count)
-        self._partners = np.full(len(self._rows), -1, np.int32)
+        self._partners = np.full((len(self._rows), 5), -1.0)
 
     def equations(self, pose: Sim3, centre: np.ndarray, radius_m: float, params: Params) -> _Equations:
         """Under a pose that takes what moves into the frame of the other, for a step about ``centre`` (source frame).
