@@ -13,16 +13,21 @@ _ACROSS = 64  # cells of the grid by whose order points are visited
 _CHUNK = 100_000  # points that are looked at together: memory stays bounded
 
 
+def spatial_order(points: np.ndarray, across: int) -> np.ndarray:
+    """Rows of the points (N, 3), those in one cell of a grid together; so many cells along the longest side."""
+    span = float(np.ptp(points, axis=0).max(initial=0)) if len(points) else 0.0
+    if span <= 0:
+        return np.arange(len(points))
+    return np.argsort(cell_labels(np.floor((points - points.min(0)) * (across / span)))[0], kind="stable")
+
+
 def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield rows (M,) of the points (N, 3), and distances and rows (M, k) of the nearest of all points to each, itself
     first; every row once. Where there are fewer than k points, distances are infinite and rows N, as in a k-d tree.
 
     Points are looked at in the order of a grid's cells, those near each other together: that is twice as fast.
     """
-    span = float(np.ptp(points, axis=0).max(initial=0)) if len(points) else 0.0
-    order = np.arange(len(points))
-    if span > 0:
-        order = np.argsort(cell_labels(np.floor((points - points.min(0)) * (_ACROSS / span)))[0], kind="stable")
+    order = spatial_order(points, _ACROSS)
     ordered, row_of = points[order], np.append(order, len(points))
     tree = cKDTree(ordered, balanced_tree=False)
     for start in range(0, len(points), _CHUNK):

@@ -69,8 +69,15 @@ void both(Flags &flags, const Flags &others) {
     for (std::size_t i = 0; i < flags.size(); ++i) flags[i] &= others[i];
 }
 
+// Wider vectors where the processor has them; nothing is contracted, so all give the same bits.
+#if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
+#define WIDE __attribute__((target_clones("avx2", "default")))
+#else
+#define WIDE
+#endif
+
 // One pass along the first or second axis into the wanted segments.
-void pass_across(const Grid &g, int axis, const std::vector<float> &taps, const Field &in, const Flags &filled,
+WIDE void pass_across(const Grid &g, int axis, const std::vector<float> &taps, const Field &in, const Flags &filled,
                  Field &out, const Flags &wanted) {
     const int reach = int(taps.size()) / 2, length = axis == 0 ? g.nx : g.ny;
     const std::ptrdiff_t step = axis == 0 ? g.row(1, 0) : g.nz, flag_step = axis == 0 ? g.flag(1, 0) : g.segments;
@@ -92,7 +99,7 @@ void pass_across(const Grid &g, int axis, const std::vector<float> &taps, const 
 }
 
 // One pass along the last axis into the wanted segments.
-void pass_along(const Grid &g, const std::vector<float> &taps, const Field &in, const Flags &filled, Field &out,
+WIDE void pass_along(const Grid &g, const std::vector<float> &taps, const Field &in, const Flags &filled, Field &out,
                 const Flags &wanted) {
     const int reach = int(taps.size()) / 2;  // less than a segment
     Field line(g.nz + 2 * SEGMENT, 0.f);
@@ -146,13 +153,41 @@ struct Extremum {
     int channel, negative;
 };
 
+// Points of one block and its halo, in cells, their colours and areas; and the block's least corner and shape.
+struct Block {
+    std::vector<double> points, lab, areas;
+    double low[3] = {};
+    int shape[3] = {};
+
+    Block(const Points &all, const Points &colours, const Numbers &sizes, const double *core, double edge, double halo) {
+        double high[3] = {};
+        for (std::size_t i = 0; i < all.shape(0); ++i) {
+            const double *at = all.data() + 3 * i;
+            bool inside = true;
+            for (int k = 0; k < 3; ++k) inside &= at[k] >= core[k] - halo && at[k] < core[k] + edge + halo;
+            if (!inside) continue;
+            for (int k = 0; k < 3; ++k) {
+                low[k] = areas.empty() ? at[k] : std::min(low[k], at[k]);
+                high[k] = areas.empty() ? at[k] : std::max(high[k], at[k]);
+            }
+            points.insert(points.end(), at, at + 3);
+            lab.insert(lab.end(), colours.data() + 3 * i, colours.data() + 3 * i + 3);
+            areas.push_back(sizes.data()[i]);
+        }
+        for (int k = 0; k < 3; ++k) {  // room for extrema just off the surface
+            low[k] = std::floor(low[k]) - 3;
+            shape[k] = int(std::floor(high[k]) - low[k]) + 4;
+        }
+    }
+};
+
 // Trilinear splatting of values of points (in cells of the block) into its cells.
-void splat(const Grid &g, const Points &points, const double *low, const std::vector<double> &values, Field &out) {
+void splat(const Grid &g, const Block &block, const std::vector<double> &values, Field &out) {
     for (std::size_t i = 0; i < values.size(); ++i) {
         int base[3];
         double t[3];
         for (int k = 0; k < 3; ++k) {
-            const double at = points.data()[3 * i + k] - low[k] - 0.5;
+            const double at = block.points[3 * i + k] - block.low[k] - 0.5;
             base[k] = int(std::floor(at));
             t[k] = at - base[k];
         }
@@ -199,14 +234,31 @@ void maxima(const Grid &g, const Field &response, const Flags &surface, const in
             }
 }
 
+// Cells of a block, kept from one to the next: making them anew costs as much as filling them.
+struct Work {
+    Field field, response;           // zero between blocks
+    Field a, b, mass, wide, smooth;  // anything
+
+    void fit(std::size_t cells) {
+        for (Field *f : {&field, &response, &a, &b, &mass, &wide, &smooth})
+            if (f->size() < cells) f->resize(cells, 0.f);
+    }
+};
+
+void empty(Field &field, const Flags &flags) {
+    for (std::size_t i = 0; i < flags.size(); ++i)
+        if (flags[i]) std::fill_n(&field[i * SEGMENT], SEGMENT, 0.f);
+}
+
 // See gsmap/describe/landmarks/detect.py.
-std::vector<Extremum> extrema(const Points &points, const Points &lab, const Numbers &areas, const double *thresholds,
-                              const double *low, const int *shape, double sigma, double surround) {
+std::vector<Extremum> extrema(const Block &block, Work &work, const double *thresholds, double sigma, double surround) {
+    const int *shape = block.shape;
     const Grid g(shape[0], shape[1], shape[2]);
-    const std::size_t n = points.shape(0);
-    Field field(g.cells(), 0.f), a(g.cells()), b(g.cells()), mass(g.cells()), wide(g.cells());
-    std::vector<double> values(areas.data(), areas.data() + n);
-    splat(g, points, low, values, field);
+    const std::size_t n = block.areas.size();
+    work.fit(g.cells());
+    auto &[field, response, a, b, mass, wide, smooth] = work;
+    std::vector<double> values(block.areas);
+    splat(g, block, values, field);
     Flags filled(g.flags());
     for (std::size_t i = 0; i < filled.size(); ++i)
         filled[i] = std::any_of(&field[i * SEGMENT], &field[i * SEGMENT] + SEGMENT, [](float v) { return v > 0; });
@@ -221,14 +273,12 @@ std::vector<Extremum> extrema(const Points &points, const Points &lab, const Num
     const Blur far(g, sigma * std::sqrt(surround * surround - 1), near.after_z, &surface);
     far(g, mass, near.after_z, a, b, wide);
     std::vector<Extremum> found;
-    Field response(g.cells(), 0.f), smooth(g.cells());
     for (int channel = 0; channel < 4; ++channel) {
         if (channel < 3) {
-            for (std::size_t i = 0; i < filled.size(); ++i)
-                if (filled[i]) std::fill_n(&field[i * SEGMENT], SEGMENT, 0.f);
+            empty(field, filled);
             for (std::size_t i = 0; i < n; ++i)
-                values[i] = areas.data()[i] * (lab.data()[3 * i + channel] - (channel == 0 ? 50.0 : 0.0));
-            splat(g, points, low, values, field);
+                values[i] = block.areas[i] * (block.lab[3 * i + channel] - (channel == 0 ? 50.0 : 0.0));
+            splat(g, block, values, field);
             near(g, field, filled, a, b, smooth);
             far(g, smooth, near.after_z, a, b, field);  // leaves more filled than was: emptied below
         }
@@ -245,6 +295,8 @@ std::vector<Extremum> extrema(const Points &points, const Points &lab, const Num
         maxima(g, response, surface, shape, 1.f, thresholds[channel], channel, found);
         if (channel < 3) maxima(g, response, surface, shape, -1.f, thresholds[channel], channel, found);
     }
+    empty(field, filled);
+    empty(response, surface);
     return found;
 }
 
@@ -339,38 +391,42 @@ nb::ndarray<nb::numpy, T> array_of(std::vector<std::size_t> shape, T *&data) {
 void bind_landmarks(nb::module_ &m) {
     m.def(
         "landmark_extrema",
-        [](Points points, Points lab, Numbers areas, Numbers thresholds, Numbers low, Numbers shape, double sigma,
-           double surround) {
+        [](Points points, Points lab, Numbers areas, Numbers thresholds, Points cores, double edge,
+           double halo, double sigma, double surround) {
             const std::size_t n = points.shape(0);
-            if (lab.shape(0) != n || areas.shape(0) != n || thresholds.shape(0) != 4 || low.shape(0) != 3 ||
-                shape.shape(0) != 3)
+            if (lab.shape(0) != n || areas.shape(0) != n || thresholds.shape(0) != 4)
                 throw std::invalid_argument("extrema need as many colours and areas as points, and 4 thresholds");
-            int size[3];
-            for (int k = 0; k < 3; ++k) {
-                size[k] = int(shape.data()[k]);
-                for (std::size_t i = 0; i < n; ++i) {
-                    const double at = points.data()[3 * i + k] - low.data()[k];
-                    if (!(at >= 1 && at <= size[k] - 1)) throw std::invalid_argument("a point lies outside its block");
-                }
-            }
-            std::vector<Extremum> found;
+            if (!(edge > 0 && edge <= 1024 && halo >= 0 && halo <= 64))
+                throw std::invalid_argument("a block has at most 1024 cells a side, and 64 around");
+            std::vector<double> rows;
             {
                 nb::gil_scoped_release release;
-                found = extrema(points, lab, areas, thresholds.data(), low.data(), size, sigma, surround);
+                Work work;
+                for (std::size_t c = 0; c < cores.shape(0); ++c) {
+                    const double *core = cores.data() + 3 * c;
+                    const Block block(points, lab, areas, core, edge, halo);
+                    if (block.areas.empty()) continue;
+                    for (Extremum &e : extrema(block, work, thresholds.data(), sigma, surround)) {
+                        bool own = true;
+                        for (int k = 0; k < 3; ++k) {
+                            e.position[k] = e.position[k] + block.low[k] + 0.5;
+                            own &= e.position[k] >= core[k] && e.position[k] < core[k] + edge;
+                        }
+                        if (own)
+                            rows.insert(rows.end(), {double(e.channel), double(e.negative), e.position[0],
+                                                     e.position[1], e.position[2], e.ratio});
+                    }
+                }
             }
             double *table;
-            auto out = array_of<double>({found.size(), 6}, table);
-            for (std::size_t i = 0; i < found.size(); ++i) {
-                const Extremum &e = found[i];
-                const double row[6] = {double(e.channel), double(e.negative), e.position[0],
-                                       e.position[1],     e.position[2],      e.ratio};
-                std::memcpy(table + 6 * i, row, sizeof row);
-            }
+            auto out = array_of<double>({rows.size() / 6, 6}, table);
+            std::copy(rows.begin(), rows.end(), table);
             return out;
         },
-        nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("low"), nb::arg("shape"),
-        nb::arg("sigma"), nb::arg("surround"),
-        "Rows (channel, negative, x, y, z, response over threshold) of the extrema of one block of cells.");
+        nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("cores"),
+        nb::arg("edge"), nb::arg("halo"), nb::arg("sigma"), nb::arg("surround"),
+        "Rows (channel, negative, x, y, z, response over threshold) of the extrema within blocks of cells, each looked at "
+        "with its halo; all lengths in cells.");
     m.def(
         "landmark_surroundings",
         [](Points positions, Points points, Points values, Numbers radii, Numbers heights) {

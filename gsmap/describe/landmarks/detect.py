@@ -11,8 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.geometry.cells import cell_labels
+from gsmap.geometry.neighbours import spatial_order
+
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's
+_MANY = 400_000  # points; clouds of more are thinned to what each grid resolves
+_UNTOLD = 0.3  # cells within which points are not told apart: a fifth of a blob's scale
+_ORDER_ACROSS = 256  # cells of the order in which points are spread over grids
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
 _BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
 
@@ -67,7 +73,17 @@ class Octaves:
     """
 
     def __init__(self) -> None:
+        self._order: np.ndarray | None = None
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
+
+    def order(self, points: np.ndarray) -> np.ndarray | slice:
+        """Rows of the points, neighbours together: spread over a grid so, they stay in the processor's cache; as they
+        are where they will be thinned, which sorts them."""
+        if len(points) > _MANY:
+            return slice(None)
+        if self._order is None:
+            self._order = spatial_order(points, _ORDER_ACROSS)
+        return self._order
 
     def extrema(
         self,
@@ -85,6 +101,22 @@ class Octaves:
         return self._found[key]
 
 
+def thinned(
+    points: np.ndarray, lab: np.ndarray, areas: np.ndarray, size_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A cloud of very many points as the means of those that a grid of ``size_m`` does not tell apart, with all of
+    their surface; one of fewer as it is."""
+    if len(points) <= _MANY:
+        return points, lab, areas
+    labels, counts = cell_labels(np.floor(points / (size_m * _UNTOLD)))
+    total = np.maximum(np.bincount(labels, areas, len(counts)), 1e-300)
+    means = np.empty((2, len(counts), 3))
+    for k, values in enumerate((points, lab)):
+        for axis in range(3):
+            means[k, :, axis] = np.bincount(labels, areas * values[:, axis], len(counts)) / total
+    return means[0], means[1], total
+
+
 def find_blobs(
     points: np.ndarray,
     lab: np.ndarray,
@@ -92,6 +124,7 @@ def find_blobs(
     params: Params | None = None,
     octaves: Octaves | None = None,
     unit_m: float = 1.0,
+    median_area_m2: float | None = None,
 ) -> Blobs:
     """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
 
@@ -104,10 +137,11 @@ def find_blobs(
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
         octaves: of this cloud in its own unit, which is ``unit_m`` metres.
+        median_area_m2: of the points before they were thinned.
     """
     params, known = params or Params(), octaves or Octaves()
     lab_threshold, count = params.lab_threshold, params.octaves
-    spacing_m = np.sqrt(8 / np.pi * np.median(areas))
+    spacing_m = np.sqrt(8 / np.pi * (np.median(areas) if median_area_m2 is None else median_area_m2))
     thresholds = np.array(
         [params.lightness_factor * lab_threshold, lab_threshold, lab_threshold, params.density_threshold]
     )
@@ -116,6 +150,7 @@ def find_blobs(
         size_m = params.cell_m * 2**octave
         if spacing_m > params.max_spacing_cells * size_m:
             continue
+        points, lab, areas = thinned(points, lab, areas, size_m)
         parts = [_empty()]
         for channel, negative, cells, ratio in known.extrema(points, lab, areas, thresholds, size_m, unit_m):
             kind = np.full(len(cells), (channel * 2 + negative) * count + octave, np.int32)
@@ -144,26 +179,22 @@ def _extrema(
 
     block = np.floor(points / _BLOCK_CELLS).astype(np.int64)
     # One number a block, in the order of their rows.
-    span = np.ptp(block, axis=0) + 1
-    key = ((block[:, 0] - block[:, 0].min()) * span[1] + block[:, 1] - block[:, 1].min()) * span[2]
-    cores = block[np.unique(key + block[:, 2] - block[:, 2].min(), return_index=True)[1]] * _BLOCK_CELLS
-    for core in cores:
-        near = ((points >= core - _HALO_CELLS) & (points < core + _BLOCK_CELLS + _HALO_CELLS)).all(1)
-        here = np.ascontiguousarray(points[near], np.float64)
-        low = np.floor(here.min(0)) - 3.0  # room for extrema just off the surface
-        table = _native.landmark_extrema(
-            points=here,
-            lab=np.ascontiguousarray(lab[near], np.float64),
-            areas=np.ascontiguousarray(areas[near], np.float64),
-            thresholds=thresholds.astype(np.float64),
-            low=low,
-            shape=np.floor(here.max(0)) - low + 4,
-            sigma=_SIGMA_CELLS,
-            surround=_SURROUND,
-        )
-        found = table[:, 2:5] + low + 0.5
-        inside = ((found >= core) & (found < core + _BLOCK_CELLS)).all(1)
-        for channel in range(4):
-            for negative in (0, 1) if channel < 3 else (0,):
-                own = inside & (table[:, 0] == channel) & (table[:, 1] == negative)
-                yield channel, negative, found[own], table[own, 5]
+    low = block.min(0)
+    span = block.max(0) - low + 1
+    keys = np.unique(((block[:, 0] - low[0]) * span[1] + block[:, 1] - low[1]) * span[2] + block[:, 2] - low[2])
+    cores = low + np.stack(np.unravel_index(keys, tuple(span)), axis=1)
+    table = _native.landmark_extrema(
+        points=np.ascontiguousarray(points, np.float64),
+        lab=np.ascontiguousarray(lab, np.float64),
+        areas=np.ascontiguousarray(areas, np.float64),
+        thresholds=thresholds,
+        cores=cores.astype(np.float64) * _BLOCK_CELLS,
+        edge=_BLOCK_CELLS,
+        halo=_HALO_CELLS,
+        sigma=_SIGMA_CELLS,
+        surround=_SURROUND,
+    )
+    for channel in range(4):
+        for negative in (0, 1) if channel < 3 else (0,):
+            own = (table[:, 0] == channel) & (table[:, 1] == negative)
+            yield channel, negative, table[own, 2:5], table[own, 5]

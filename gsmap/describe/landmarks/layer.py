@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.describe.landmarks.context import Params as ContextParams
 from gsmap.describe.landmarks.context import cylinder_context, embed, shell_context
-from gsmap.describe.landmarks.detect import Octaves, find_blobs
+from gsmap.describe.landmarks.detect import Octaves, find_blobs, thinned
 from gsmap.describe.landmarks.detect import Params as DetectParams
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey
@@ -66,11 +66,15 @@ def landmark_layer(
     if not cloud.areas.any():  # nothing, or only coincident points
         return NodeLayer.empty(descriptor, dim, unit_m)
     level = np.eye(3) if up is None else level_frame(up)
-    points = cloud.points @ level.T * unit_m
-    blobs = find_blobs(points, cloud.lab, cloud.areas * unit_m**2, params.detect, octaves, unit_m)
+    octaves, points = octaves or Octaves(), cloud.points @ level.T
+    order = octaves.order(points)
+    points, lab, areas = points[order] * unit_m, cloud.lab[order], cloud.areas[order] * unit_m**2
+    spacing_m2 = float(np.median(areas))
+    points, lab, areas = thinned(points, lab, areas, params.detect.cell_m)
+    blobs = find_blobs(points, lab, areas, params.detect, octaves, unit_m, spacing_m2)
     if len(blobs) == 0:
         return NodeLayer.empty(descriptor, dim, unit_m)
-    around = surroundings(blobs.positions, points, cloud.lab, params.context)
+    around = surroundings(blobs.positions, points, lab, params.context)
     positions = blobs.positions @ level / unit_m
     half = (1.5 * blobs.sigmas_m / unit_m)[:, None]
     return NodeLayer(

@@ -22,6 +22,7 @@ from gsmap.types.progress import Progress, silent
 from gsmap.types.views import SceneContext
 
 VERSION = 3
+_MANY = 400_000  # points of the surface; of more, an even share is lifted
 # What decides which things are nodes and how often they are seen, not what a node and its embedding mean.
 _NOT_COMPARED = (
     *("render_backend", "num_cameras", "longest_side_px", "near_m", "min_seen", "depth_tolerance"),
@@ -174,7 +175,7 @@ def object_layer(
     context = replace(context, models=limited)
     segmenter = _made(family("segmenter"), params.segmenter, params.segmenters, context)
     embedder = _made(family("embedder"), params.embedder, params.embedders, context)
-    cloud, up, unit_m = context.cloud, context.up, context.unit_m
+    cloud, up, unit_m = context.cloud.evenly(_MANY), context.up, context.unit_m
     level = np.eye(3) if up is None else level_frame(up)
     cell = params.voxel_m / unit_m
     nodes: list[Node] = []
