@@ -12,8 +12,11 @@ from gsmap.describe import Params, describe
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
+from gsmap.describe.landmarks.context import Params as ContextParams
+from gsmap.describe.landmarks.context import embed, metric
 from gsmap.describe.landmarks.layer import landmark_layer
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
+from gsmap.errors import ConfigError
 from gsmap.geometry.sh import rgb_of_sh0, sh0_of_rgb
 from gsmap.register.correspondences import correspondences
 from gsmap.types import Cameras, Gaussians, NodeLayer, Sim3
@@ -211,3 +214,19 @@ def test_house_landmarks_repeat(shared_data):
     S = truth["c0"] @ truth["c1"].inverse()
     assert recall(layers["c0"], layers["c1"], S, 0.15) > 0.7
     assert counterparts(layers["c0"], layers["c1"], S, 0.1) > 0.25
+
+
+def test_the_fitted_metric_maps_embeddings_and_holds_for_the_bins_it_was_fitted_for_alone():
+    params = ContextParams()
+    for bins in (params.num_rings, params.num_shells):
+        found = metric(4 * bins)
+        assert found.shape == (4 * bins, 4 * bins)
+        np.testing.assert_allclose(found, found.T, atol=1e-3)
+        values = np.linalg.eigvalsh(found)
+        assert 0.02 < values.min() < 0.6 * values.max()  # it tells directions apart, and forgets none
+        around = np.random.default_rng(0).uniform(0, 1, (30, bins, 4))
+        plain, fitted = (embed(around, ContextParams(fitted=on)) for on in (False, True))
+        moved = plain @ found
+        np.testing.assert_allclose(fitted, moved / np.linalg.norm(moved, axis=1, keepdims=True), atol=1e-9)
+    with pytest.raises(ConfigError, match="default of colour_weight alone"):
+        ContextParams(colour_weight=0.71, fitted=True)

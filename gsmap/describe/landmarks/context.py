@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from gsmap.describe.cloud import downsample
 from gsmap.errors import ConfigError
 
+METRICS = Path(__file__).with_name("metrics.npz")
 _LAB_CENTRE, _LAB_SPREAD = np.array([55.0, 3.0, 8.0]), np.array([20.0, 10.0, 14.0])
 
 
@@ -24,6 +27,8 @@ class Params:
         shells_m: outer radii of the spherical shells, where the vertical is unknown.
         occupancy_weight: of a bin's occupancy in the embedding.
         colour_weight: of a bin's colour in the embedding.
+        fitted: whether embeddings are brought into the metric that was fitted on made places (`metric`). It holds for
+            the other settings as they are by default.
     """
 
     cell_m: float = 0.07
@@ -32,12 +37,18 @@ class Params:
     shells_m: tuple[float, ...] = (0.12, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.95, 1.1)
     occupancy_weight: float = 0.75
     colour_weight: float = 0.7
+    fitted: bool = False
 
     def __post_init__(self) -> None:
         for name in ("radii_m", "heights_m", "shells_m"):
             edges = getattr(self, name)
             if len(edges) < 1 + (name == "heights_m") or any(b <= a for a, b in pairwise(edges)):
                 raise ConfigError(f"{name} must rise from one to the next, got {list(edges)}")
+        others = [f.name for f in fields(self) if f.name != "fitted" and getattr(self, f.name) != f.default]
+        if self.fitted and others:
+            raise ConfigError(
+                f"the fitted metric of landmarks holds for the default of {others[0]} alone: unset either"
+            )
 
     @property
     def num_rings(self) -> int:
@@ -126,5 +137,22 @@ def embed(context: np.ndarray, params: Params) -> np.ndarray:
     spread = np.sqrt((occupancy * relative**2).sum(1) / total) + 0.15
     relative *= params.colour_weight * np.sqrt(occupancy) / spread[:, None]
     own = params.occupancy_weight * occupancy[..., 0]
-    vector: np.ndarray = np.concatenate([own, relative.reshape(len(context), -1)], 1)
-    return vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-9)
+    vector = _unit(np.concatenate([own, relative.reshape(len(context), -1)], 1))
+    return _unit(vector @ metric(vector.shape[1])) if params.fitted else vector
+
+
+@cache
+def metric(dim: int) -> np.ndarray:
+    """(dim, dim) symmetric map under which differences of one landmark's embeddings in two captures are of equal size.
+
+    The inverse root of their scatter, with a share of the identity (`tools/fit_descriptor.py`, which writes the file):
+    directions in which true partners differ much count little (Mikolajczyk and Matas 2007; Hua, Brown and Winder 2007).
+    """
+    with np.load(METRICS) as stored:
+        out: np.ndarray = stored[str(dim)].astype(np.float64)
+        return out
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    out: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
+    return out
