@@ -86,7 +86,13 @@ class Octaves:
         return self._order
 
     def extrema(
-        self, points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray, size_m: float, unit_m: float
+        self,
+        points: np.ndarray,
+        lab: np.ndarray,
+        areas: np.ndarray,
+        thresholds: np.ndarray,
+        size_m: float,
+        unit_m: float,
     ) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
         """As `_extrema` of a grid of ``size_m``; ``unit_m`` is that of the points."""
         key = size_m / unit_m, thresholds.tobytes()

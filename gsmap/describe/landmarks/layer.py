@@ -8,8 +8,8 @@ import numpy as np
 
 from gsmap.describe.landmarks.context import Params as ContextParams
 from gsmap.describe.landmarks.context import cylinder_context, embed, shell_context
-from gsmap.describe.landmarks.detect import Params as DetectParams
 from gsmap.describe.landmarks.detect import Octaves, find_blobs, thinned
+from gsmap.describe.landmarks.detect import Params as DetectParams
 from gsmap.geometry.directions import level_frame
 from gsmap.methods import RecipeKey
 from gsmap.types import NodeLayer
