@@ -7,11 +7,13 @@ folder that --cache names.
 
     python tools/bench_register.py house kitchen_splats --methods all --json out.json --cache FOLDER
     python tools/bench_register.py house kitchen_splats --methods ablations --cache FOLDER
+    python tools/bench_register.py house kitchen_splats --methods ablations --encoder mobilenet.onnx --cache FOLDER
     python tools/bench_register.py house kitchen_splats --methods gsmap --rescale
     python tools/bench_register.py --made 6 --captures 3 --methods gsmap
 
 Under the table stands how honest the poses' covariances are: normalised squared errors against the truth and around
-triangles of accepted edges, next to the chi-square they should follow.
+triangles of accepted edges, next to the chi-square they should follow. With --encoder, by whose features objects are
+then told, stands there how alike the contexts of objects are that lie more than 6 m apart.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -37,6 +39,7 @@ from registration_methods import ABLATIONS, METHODS, Answer, Capture, Method
 from scipy.stats import chi2
 
 import gsmap.map
+from gsmap.evaluate.calibration import nees_of_edge, truth_covariance
 from gsmap.evaluate.overlap import solid_centres, true_overlaps
 from gsmap.evaluate.registration import PoseError, pose_error, scene_centroid, summarise
 from gsmap.geometry.similarities import Similarities
@@ -46,6 +49,7 @@ from gsmap.map.stages.describe import graph_keys
 from gsmap.optimize.cycles import cycle_chi2, list_triangles
 from gsmap.optimize.measurements import measurements
 from gsmap.register import SceneView
+from gsmap.register.context import with_context
 from gsmap.types import Cameras, Edge, Gaussians, Sim3
 
 OVERLAPPING, APART = 0.25, 0.01
@@ -60,6 +64,8 @@ def main() -> None:
     known = ", ".join([*METHODS, *ABLATIONS])
     parser.add_argument("--methods", default="gsmap", help=f"all (without ablations), ablations, none, or of: {known}")
     parser.add_argument("--rescale", action="store_true", help="each capture in a random unit, 1/5 to 5, not told")
+    parser.add_argument("--encoder", type=Path, metavar="FILE.onnx", help="an image encoder that objects are told by")
+    parser.add_argument("--pixels", default="imagenet", help="how that encoder's pixels are scaled")
     parser.add_argument("--overlapping", action="store_true", help="only pairs that overlap, for slow methods")
     parser.add_argument("--cache", type=Path, help="keep scene graphs and generated places here")
     parser.add_argument("--json", type=Path, help="keep the rows here; those it holds already are printed along")
@@ -76,12 +82,15 @@ def main() -> None:
         for name in names:
             row = measure(name, {**METHODS, **ABLATIONS}[name], pairs, options.verbose)
             row["method"] += " rescaled" if options.rescale else ""
+            row["method"] += f" {options.encoder.stem}" if options.encoder else ""
             if options.json:
                 rows = _kept(options.json)
                 rows[row["method"]] = row
                 options.json.write_text(json.dumps(rows, indent=1))
             else:
                 print_table([row])
+        if options.encoder:
+            print(contexts_apart(pairs))
     if options.json:
         print_table(list(_kept(options.json).values()))
 
@@ -99,7 +108,9 @@ def read_pairs(options: argparse.Namespace, cache: Path) -> list[tuple[Capture, 
     folders = options.folders + [make_place(cache, seed, options.captures) for seed in range(options.made)]
     rng = np.random.default_rng(0)
     captures = []
-    with gsmap.map.open_or_create(cache / "bench.gsmap") as m:
+    with gsmap.map.open_or_create(cache / f"bench{options.encoder.stem if options.encoder else ''}.gsmap") as m:
+        if options.encoder:
+            m.add_model("clip", options.encoder, preset=options.pixels)
         for folder in folders:
             for read in read_captures(folder):
                 truth = folder / "truth" / f"{read.name}.json"
@@ -195,6 +206,11 @@ def measure(name: str, method: Method, pairs: list[tuple[Capture, Capture, float
     }
 
 
+TRUTH_SIGMA = {"kitchen_splats": (0.5, 0.02)}
+"""Standard deviations (degrees, metres) of truths that are not exact: a sensor whose colour and depth cameras are not
+registered. Honesty is told with them and without."""
+
+
 def honesty(records: list[tuple[Capture, Capture, float, Answer, PoseError | None]]) -> dict[str, dict]:
     """By place: normalised squared errors (6 degrees of freedom, 7 with scale) of right poses, and of triangles."""
     out = {}
@@ -212,6 +228,15 @@ def honesty(records: list[tuple[Capture, Capture, float, Answer, PoseError | Non
         cycles = cycle_chi2(m, *list_triangles(m.targets, m.sources, m.num_scenes))
         nees = np.einsum("ed,edf,ef->e", errors, m.information, errors)
         out[place] = {"dof": m.dim, "nees": nees.tolist(), "cycles": cycles.tolist()}
+        if place in TRUTH_SIGMA:
+            degrees, metres = TRUTH_SIGMA[place]
+            allowed = []
+            for a, b, _, x, e in records:
+                if a.place == place and x.information is not None and e is not None and _right(e):
+                    unit, centroid = b.S_scene_world.scale, scene_centroid(b.view.gaussians)
+                    of_truth = truth_covariance(float(np.radians(degrees)), metres * unit, centroid)
+                    allowed.append(nees_of_edge(x.pose, x.information, _truth(a, b), of_truth).value)
+            out[place]["allowed"] = allowed
     return out
 
 
@@ -225,6 +250,25 @@ def _right(e: PoseError) -> bool:
 
 def _text(e: PoseError) -> str:
     return f"{e.rre_deg:.2f} deg {100 * e.centroid_m:.1f} cm scale {e.rse:.2%}"
+
+
+def contexts_apart(pairs: list[tuple[Capture, Capture, float]]) -> str:
+    """How alike the contexts of objects of one capture are that lie more than 6 m apart, over all pairs."""
+    cosines = []
+    for a, b, _ in pairs:
+        layers = [capture.graph.layers["objects"] for capture in (a, b)]
+        for plain, joined in zip(layers, with_context(*layers), strict=True):
+            contexts = joined.embeddings[:, plain.features.shape[1] :].astype(np.float64)
+            contexts /= np.maximum(np.linalg.norm(contexts, axis=1, keepdims=True), 1e-12)
+            at = plain.positions * plain.unit_m
+            far = np.triu(np.linalg.norm(at[:, None] - at[None], axis=2) > 6, 1)
+            cosines.append((contexts @ contexts.T)[far])
+    values = np.concatenate(cosines)
+    low, middle, high = np.percentile(values, [5, 50, 95])
+    return (
+        f"contexts of objects more than 6 m apart: median cosine {middle:.3f}, 5 to 95 % {low:.3f} to {high:.3f} "
+        f"({len(values)} pairs of objects)"
+    )
 
 
 # --- the table -----------------------------------------------------------------------------------------------------
@@ -264,7 +308,8 @@ def print_table(rows: list[dict]) -> None:
 
 def _honesty(h: dict) -> str:
     dof, parts = h["dof"], []
-    for name, values in (("errors", h["nees"]), ("triangles", h["cycles"])):
+    of = (("errors", "nees"), ("errors, the truth's own allowed for", "allowed"), ("triangles", "cycles"))
+    for name, values in ((name, h.get(key, [])) for name, key in of):
         if values:
             middle, high = np.percentile(values, [50, 95])
             parts.append(f"{len(values)} {name}: median chi2 {middle:.2f}, 95 % {high:.1f}")

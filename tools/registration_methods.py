@@ -12,16 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.describe.embedders.builtin import BuiltinEmbedder
-from gsmap.describe.embedders.builtin import Params as EmbedderParams
-from gsmap.describe.objects.context import context_histograms
-from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.methods import MethodParams
 from gsmap.register import Params, SceneView, register_pair
 from gsmap.register.a_contrario import BackgroundModel, agreeing
 from gsmap.register.clique import maximum_clique
 from gsmap.register.consistency import Params as TestParams
 from gsmap.register.consistency import consistency_graph, unpack
+from gsmap.register.context import with_context
 from gsmap.register.correspondences import Correspondences, correspondences
 from gsmap.register.metric import MetricScene
 from gsmap.register.pose import fit_pose
@@ -102,7 +99,18 @@ def gsmap(kinds: tuple[str, ...] | None = None, **changes) -> Method:
 
 # --- the paper's ablations: the pose that nodes alone propose, unrefined and unjudged ------------------------------
 
-CHANGES = ("full", "no-context", "5-hop", "fpfh-nodes", "ratio", "no-distance", "no-height", "no-clique", "best-score")
+CHANGES = (
+    "full",
+    "no-context",
+    "3-hop",
+    "5-hop",
+    "fpfh-nodes",
+    "ratio",
+    "no-distance",
+    "no-height",
+    "no-clique",
+    "best-score",
+)
 
 
 def ablation(change: str, kind: str) -> Method:
@@ -124,6 +132,9 @@ def _hypothesis(target: Capture, source: Capture, kind: str, change: str) -> tup
     if any(kind not in c.graph.layers or not len(c.graph.layers[kind]) for c in (target, source)):
         return None
     a, b = _layer(target, kind, change), _layer(source, kind, change)
+    if kind == "objects" and change not in ("no-context", "fpfh-nodes"):
+        hops = {"3-hop": 3, "5-hop": 5}.get(change, params.context.hops)
+        a, b = with_context(a, b, replace(params.context, hops=hops))
     unit = float(np.sqrt(a.unit_m * b.unit_m))  # one metre for both: the pose is rigid
     ups = target.graph.up, source.graph.up
     matching = params.objects if kind == "objects" else params.landmarks
@@ -176,14 +187,6 @@ def _layer(capture: Capture, kind: str, change: str) -> NodeLayer:
         # A landmark's embedding is its surroundings; what is its own beside the type is response and scale.
         own = np.log(np.maximum(layer.features, 1e-6))
         return replace(layer, embeddings=_unit((own - own.mean(0)) / (own.std(0) + 1e-9)))
-    if change == "no-context":
-        return replace(layer, embeddings=layer.features)
-    if change == "5-hop" and kind == "objects":
-        p = ObjectParams()
-        codebook = BuiltinEmbedder(EmbedderParams(), None, 1.0).codebook
-        reach = p.local_distance_m / layer.unit_m
-        contexts = context_histograms(layer.features, layer.positions, codebook, max_distance=reach, hops=5)
-        return replace(layer, embeddings=_unit(np.concatenate([layer.features, p.context_weight * contexts], 1)))
     if change == "fpfh-nodes":
         (cloud, features, centre), _ = _fpfh(capture, 0.1)
         _, row = _tree(np.asarray(cloud.points)).query(layer.positions - centre)
@@ -349,4 +352,4 @@ METHODS: dict[str, Method] = {
 ABLATIONS: dict[str, Method] = {
     f"{change}:{kind}": ablation(change, kind) for change in CHANGES for kind in ("objects", "landmarks")
 }
-del ABLATIONS["5-hop:landmarks"]  # contexts of landmarks are of space, not of a graph
+del ABLATIONS["3-hop:landmarks"], ABLATIONS["5-hop:landmarks"]  # contexts of landmarks are of space, not of a graph

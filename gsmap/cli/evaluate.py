@@ -30,6 +30,12 @@ def command(
         float | None,
         typer.Option("--max-rte", metavar="M", help="An edge off by more metres is wrong; 0.05 else."),
     ] = None,
+    truth_sigma: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--truth-sigma", metavar="DEG M", help="How exactly the truth of a scene is known: degrees and metres."
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Compare edges and poses with ground truth (and renders with the captures' own images).
@@ -42,7 +48,15 @@ def command(
         option = "--tiles" if tiles is not None else "--lpips"
         raise ConfigError(f"{option} compares images: give --images too")
     with opened(map, bars=images is not None) as m:
-        report = m.evaluate(truth, images=images, tiles=tiles, lpips=lpips, max_rre_deg=max_rre, max_rte_m=max_rte)
+        report = m.evaluate(
+            truth,
+            images=images,
+            tiles=tiles,
+            lpips=lpips,
+            max_rre_deg=max_rre,
+            max_rte_m=max_rte,
+            truth_sigma=truth_sigma,
+        )
     if json:
         print_rows("evaluate", report, json)
         return

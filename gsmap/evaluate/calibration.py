@@ -30,22 +30,41 @@ class Nees:
     dof: int
 
 
-def nees_of_edge(estimated: Sim3, information: np.ndarray, true: Sim3) -> Nees:
+def truth_covariance(sigma_rad: float, sigma: float, centroid: np.ndarray) -> np.ndarray:
+    """(7, 7) covariance on the source side of a true ``S_target_source``, whose two scenes' truths are not exact.
+
+    Args:
+        sigma_rad, sigma: standard deviations of each scene's truth, rotation and translation (source's unit), about ...
+        centroid: (3,) ... the middle of the source, in its own frame.
+    """
+    variances = 2.0 * np.r_[np.full(3, sigma_rad**2), np.full(3, sigma**2), 0.0]
+    carry = Similarities.stack([Sim3(np.eye(3), np.asarray(centroid, dtype=np.float64))]).adjoint()[0]
+    covariance: np.ndarray = carry @ np.diag(variances) @ carry.T
+    return covariance
+
+
+def nees_of_edge(estimated: Sim3, information: np.ndarray, true: Sim3, of_truth: np.ndarray | None = None) -> Nees:
     """NEES of ``S_target_source`` from its (7, 7) information on the source side.
 
     A rigid edge between captures whose scales truly differ is judged by its scale row, too: it claimed to know.
+
+    Args:
+        of_truth: (7, 7) covariance of the truth itself (`truth_covariance`); exact where None.
     """
-    error = _error(estimated, true)
+    error, dof = _error(estimated, true), 7
     if estimated.is_rigid and _is_one(true.scale):
-        return Nees(float(error[:6] @ without_scale(information) @ error[:6]), 6)
-    return Nees(float(error @ information @ error), 7)
+        error, information, dof = error[:6], without_scale(information), 6
+    if of_truth is not None:
+        information = np.linalg.inv(np.linalg.inv(information) + of_truth[:dof, :dof])
+    return Nees(float(error @ information @ error), dof)
 
 
-def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3) -> Nees:
+def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3, of_truth: np.ndarray | None = None) -> Nees:
     """NEES of a scene's pose in the scene that holds the frame, ``S_anchor_scene``.
 
     Args:
         covariance: (7, 7) relative to the anchor (`relative_covariance`), on the scene's side.
+        of_truth: as in `nees_of_edge`.
     """
     covariance = np.array(covariance, dtype=np.float64)
     error = _error(estimated, true)
@@ -54,6 +73,8 @@ def nees_of_pose(estimated: Sim3, covariance: np.ndarray, true: Sim3) -> Nees:
     if not knows_scale:
         covariance[6, :] = covariance[:, 6] = 0.0
         covariance[6, 6] = SURE_LOG_SCALE**2
+    if of_truth is not None:
+        covariance = covariance + of_truth
     covariance = covariance[:dof, :dof]
     return Nees(float(error[:dof] @ np.linalg.solve(covariance, error[:dof])), dof)
 

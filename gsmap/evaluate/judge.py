@@ -11,7 +11,14 @@ import numpy as np
 
 from gsmap.errors import ConfigError
 from gsmap.evaluate import overlap
-from gsmap.evaluate.calibration import Nees, nees_of_edge, nees_of_pose, nees_rows, relative_covariance
+from gsmap.evaluate.calibration import (
+    Nees,
+    nees_of_edge,
+    nees_of_pose,
+    nees_rows,
+    relative_covariance,
+    truth_covariance,
+)
 from gsmap.evaluate.registration import absolute_trajectory_error, pose_error
 from gsmap.types import PoseGraph, Sim3
 from gsmap.types.metre import Metre
@@ -36,12 +43,16 @@ class Params:
     Args:
         max_rre_deg: an edge that is turned by more is wrong,
         max_rte_m: and so is one that puts the source's middle farther off than this, in metres.
+        truth_sigma_deg: how exactly the truth is known: standard deviation of each scene's rotation ...
+        truth_sigma_m: ... and of where its middle lies; squared errors are told over these and the covariances.
         bands: true overlaps at which a band of pairs ends and the next begins.
         overlap: what the true overlap of a pair is.
     """
 
     max_rre_deg: float = 1.0
     max_rte_m: float = 0.05
+    truth_sigma_deg: float = 0.0
+    truth_sigma_m: float = 0.0
     bands: tuple[float, ...] = (0.1, 0.25, 0.5)
     overlap: overlap.Params = field(default_factory=overlap.Params)
 
@@ -49,6 +60,11 @@ class Params:
         if not (self.max_rre_deg > 0 and self.max_rte_m > 0):
             raise ConfigError(
                 f"an edge is wrong beyond a positive angle and distance, got {self.max_rre_deg} deg, {self.max_rte_m} m"
+            )
+        if not (0 <= self.truth_sigma_deg < np.inf and 0 <= self.truth_sigma_m < np.inf):
+            raise ConfigError(
+                "standard deviations of the truth must not be negative, got "
+                f"{self.truth_sigma_deg} deg, {self.truth_sigma_m} m"
             )
 
 
@@ -151,6 +167,8 @@ class _Judge:
             ),
             max_rre_deg=self.params.max_rre_deg,
             max_rte_m=self.params.max_rte_m,
+            truth_sigma_deg=self.params.truth_sigma_deg,
+            truth_sigma_m=self.params.truth_sigma_m,
             bands=self._bands(edges),
             components=components,
             nees=self._nees(edges),
@@ -165,6 +183,12 @@ class _Judge:
 
     def _true(self, target: str, source: str) -> Sim3:
         return self.truth[target] @ self.truth[source].inverse()
+
+    def _of_truth(self, source: str) -> np.ndarray:
+        """(7, 7) how well the truth of a pair is known, on the source's side."""
+        params, scene = self.params, self.scenes[source]
+        sigma = params.truth_sigma_m * self.truth[source].scale
+        return truth_covariance(float(np.radians(params.truth_sigma_deg)), sigma, scene.centroid)
 
     def _error(self, target: str, source: str, estimated: Sim3) -> PoseErrorRow:
         error = pose_error(estimated, self._true(target, source), self.scenes[source].centroid)
@@ -184,7 +208,8 @@ class _Judge:
         error = self._error(edge.target, edge.source, edge.S_target_source)
         nees = None
         if edge.information is not None:
-            nees = nees_of_edge(edge.S_target_source, edge.information, self._true(edge.target, edge.source))
+            true, of_truth = self._true(edge.target, edge.source), self._of_truth(edge.source)
+            nees = nees_of_edge(edge.S_target_source, edge.information, true, of_truth)
         return EdgeErrorRow(
             **vars(error),
             true_overlap=self.overlaps[frozenset((edge.target, edge.source))],
@@ -284,7 +309,7 @@ class _Judge:
             covariance = relative_covariance(estimated, known[s], known[anchor])
             if covariance is None:
                 return None
-            found.append(nees_of_pose(estimated, covariance, self._true(anchor, s)))
+            found.append(nees_of_pose(estimated, covariance, self._true(anchor, s), self._of_truth(s)))
         return found
 
     def _notes(self) -> tuple[str, ...]:

@@ -41,7 +41,8 @@ def on_surface(
     Args:
         points, T_camera_frame, intrinsics_px: as in `project`.
         depth: (H, W) camera-space z, the points' unit, 0 where nothing is seen.
-        tolerance: largest difference of depths, as a share of the surface's.
+        tolerance: largest difference of depths, as a share of the surface's; inf takes whatever is behind the surface
+            or before it as well.
 
     Returns:
         (n,) rows of the points, and the pixels (n, 2) int64 ``column row`` they fall on.
@@ -50,5 +51,6 @@ def on_surface(
     rows = np.flatnonzero(in_image(at, z, np.array(depth.shape[::-1]), 1e-9))
     pixel = at[rows].astype(np.int64)
     surface = depth[pixel[:, 1], pixel[:, 0]]
-    on = (surface > 0) & (np.abs(z[rows] - surface) < tolerance * surface)
+    rows, pixel, surface = rows[surface > 0], pixel[surface > 0], surface[surface > 0]
+    on = np.abs(z[rows] - surface) < tolerance * surface
     return rows[on], pixel[on]

@@ -656,6 +656,7 @@ class Map(AbstractContextManager["Map"]):
         lpips: str | os.PathLike[str] | None = None,
         max_rre_deg: float | None = None,
         max_rte_m: float | None = None,
+        truth_sigma: tuple[float, float] | None = None,
     ) -> EvaluationReport:
         """``gsmap evaluate MAP``: edges and poses against ground truth, renders against the captures' own images.
 
@@ -666,6 +667,7 @@ class Map(AbstractContextManager["Map"]):
             lpips: an LPIPS network to compare photographs with, too.
             max_rre_deg, max_rte_m: an edge that is turned or off (at the source's middle) by more is wrong; by default
                 what the settings ``evaluate.*`` say.
+            truth_sigma: how exactly a scene's truth is known, standard deviations in degrees and metres; by default 0.
 
         Raises:
             ConfigError: tiles or a network without photographs to compare with, or bars that are not positive.
@@ -680,6 +682,8 @@ class Map(AbstractContextManager["Map"]):
             params = replace(params, max_rre_deg=max_rre_deg)
         if max_rte_m is not None:
             params = replace(params, max_rte_m=max_rte_m)
+        if truth_sigma is not None:
+            params = replace(params, truth_sigma_deg=truth_sigma[0], truth_sigma_m=truth_sigma[1])
         report = evaluating.poses(self.store, truth, params, self.metres())
         if images is None:
             return report

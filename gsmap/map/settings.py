@@ -16,18 +16,23 @@ from gsmap.settings.file import PRESET
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    # Graph-GSReg (2026) as published, as far as its stages go: objects alone, context over three hops, the relative
-    # distance test, ICP, and plain L1 optimisation of the union on 1 cm voxels. SAM and CLIP are taken where the map
-    # has their models. The verdict and the pose graph, which the paper has none of, stay gsmap's.
+    # Graph-GSReg (2026) as published, as far as its stages go: objects alone, of masks that are lifted without a depth
+    # test and joined over views by feature and box, context over three hops, the relative distance test, ICP on the
+    # means, and plain L1 optimisation of the union on 1 cm voxels. A CLIP-like encoder is taken where the map has one;
+    # SAM, where the map has it, by `describe.object.segmenter` = "sam". The verdict, the measured scale and the pose
+    # graph, which the paper has none of, stay gsmap's. `tools/bench_paper.py` shows each stage.
     "paper": {
         "describe.landmarks": False,
-        "describe.object.hops": 3,
+        "describe.object.segmenter": "per_view",
+        "describe.object.depth_tolerance": float("inf"),
         "register.fallback": "never",
         "register.proposers.graph.kinds": ["objects"],
+        "register.proposers.graph.context.hops": 3,
         "register.proposers.graph.consistency.test": "ratio",
         "register.proposers.graph.consistency.height_slope": float("inf"),
         "register.coarse_refiner": "none",
         "register.refiner": "icp",
+        "register.refiners.icp.means": True,
         "merge.method": "tto",
         "merge.mergers.tto.voxel_m": 0.01,
         "merge.mergers.tto.owner_cells": False,

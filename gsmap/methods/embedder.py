@@ -14,12 +14,9 @@ from gsmap.types.views import Mask, SceneContext, View
 class Embedder(Protocol):
     """An embedder ready for the views of one scene: vectors whose cosine says how alike two things look.
 
-    Attributes:
-        codebook: (K, F) float32 unit vectors that context histograms are counted over. It depends on the method, its
-            parameters and its model alone, never on the scene, so that histograms of all scenes of all maps compare.
+    They depend on the method, its parameters and its model alone beside what is seen, so that those of all scenes
+    compare.
     """
-
-    codebook: np.ndarray
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
         """Features of the masks of a view.

@@ -60,8 +60,13 @@ class Surface(Protocol):
     def lightness(self) -> np.ndarray:
         """(M,) float64 lightness of the cells, 0 to 1."""
 
-    def lightness_gradients(self, rows: np.ndarray) -> np.ndarray:
-        """(R, 3) change of lightness per metre within the tangent plane of some cells."""
+    @property
+    def lightness_gradients(self) -> np.ndarray:
+        """(M, 3) float64 change of lightness per metre within the tangent planes of the cells."""
+
+    @property
+    def tree(self) -> Any:
+        """The search tree of the cell means: a ``gsmap._native.PointTree``."""
 
     @property
     def cloud(self) -> tuple[Any, Any]:

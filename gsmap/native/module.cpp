@@ -11,10 +11,11 @@ void bind_fit(nb::module_ &);
 void bind_landmarks(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_stopping(nb::module_ &);
+void bind_surface(nb::module_ &);
 }
 
 NB_MODULE(_native, m) {
-    m.doc() = "Kernels that decide gsmap's speed: rasteriser, consistency graphs and maximum clique.";
+    m.doc() = "Kernels that decide gsmap's speed: rasteriser, consistency graphs, maximum clique and surfaces.";
     bind_clique(m);
     nb::set_leak_warnings(false);  // a view kept alive by an autograd graph at exit is no leak
     gsmap::bind_correspondences(m);
@@ -22,4 +23,5 @@ NB_MODULE(_native, m) {
     gsmap::bind_landmarks(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_stopping(m);
+    gsmap::bind_surface(m);
 }

@@ -9,6 +9,7 @@ import numpy as np
 from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import retract, skew
 from gsmap.register import error_field
+from gsmap.register.metres import Belief
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
@@ -28,12 +29,14 @@ class Params:
         block_m: residuals within a cell of this size, on surfaces that face one way, are one measurement ...
         max_blocks: ... or of a larger cell, where there would be more of them than this.
         field: which errors of the surfaces are thought possible.
-        hidden_turn_m: standard deviation of what leaves no residual, by a trainer's bias or a sensor that bends what it
-            measures: rotations are this uncertain over the overlap's radius, where ``field_m`` is the errors that
-            residuals do show beyond a block. A model, fitted on made places by ``tools/fit_covariance.py``.
-        hidden_shift_m: the same of translations.
-        hidden_swell_m: the same of the logarithm of the scale, over the overlap's radius.
-        field_m: errors that residuals show, at which these three hold ...
+        hidden_shift_m: standard deviation of translations by what leaves no residual (a trainer's bias, a sensor that
+            bends what it measures), where ``field_m`` is the errors that residuals do show beyond a block. This and the
+            next three are a model, fitted on made places by ``tools/fit_covariance.py``.
+        hidden_swell_m: the same of the logarithm of the scale, over the overlap's radius, before it is measured.
+        shift_by_swell: a sensor that swells what it measures also bends it: translations are off by this share of the
+            swelling over the overlap's radius, besides ``hidden_shift_m`` ...
+        turn_by_shift: ... and rotations, over that radius, by this many times as much as translations.
+        field_m: errors that residuals show, at which ``hidden_shift_m`` and ``hidden_swell_m`` hold ...
         field_power: ... and they grow with this power of them.
         most_swell: no sensor's metre is off by more than about this (logarithm of a scale): what is hidden of the scale
             is bounded by it.
@@ -43,9 +46,10 @@ class Params:
     block_m: float = 0.3
     max_blocks: int = 200
     field: error_field.Params = field(default_factory=error_field.Params)
-    hidden_turn_m: float = 0.0016
-    hidden_shift_m: float = 0.0024
+    hidden_shift_m: float = 0.0015
     hidden_swell_m: float = 0.0049
+    shift_by_swell: float = 0.49
+    turn_by_shift: float = 0.94
     field_m: float = 0.002
     field_power: float = 2.0
     most_swell: float = 0.02
@@ -70,11 +74,14 @@ class Conditioning:
     """How a pose that was refined with its scale hangs on the errors of the surfaces, and on its scale.
 
     Args:
-        scaled: (7, 7) covariance about the overlap's centroid of the pose whose scale was refined along.
+        scaled: (7, 7) covariance about the overlap's centroid of the pose whose scale was refined along, as far as
+            residuals show errors.
         rigid: (6, 6) the same of the pose that has the right scale.
         tied: (7,) what a change of the scale by 1 (its logarithm) moves of a pose that is refined to it.
         centroid: (3,) of the overlap, in the source's frame, metres.
         field_m: standard deviation of the surfaces' errors that are alike beyond a block.
+        radius_m: of the overlap.
+        params: what is thought to be hidden.
     """
 
     scaled: np.ndarray
@@ -82,19 +89,38 @@ class Conditioning:
     tied: np.ndarray
     centroid: np.ndarray
     field_m: float
+    radius_m: float
+    params: Params
 
     @property
     def log_scale_sigma(self) -> float:
         """Standard deviation of the scale that was refined along."""
-        return float(np.sqrt(self.scaled[6, 6]))
+        return float(np.hypot(np.sqrt(self.scaled[6, 6]), hidden_log_scale(self.field_m, self.radius_m, self.params)))
 
-    def known(self, pose: Sim3, log_scale_sigma: float | None = None) -> Known:
-        """How well a pose (metres) is known: the scaled one, or a rigid one whose scale is known so well."""
-        covariance = self.scaled
-        if log_scale_sigma is not None:
-            covariance = np.zeros((7, 7))
-            covariance[:6, :6] = self.rigid
-            covariance += np.outer(self.tied, self.tied) * max(log_scale_sigma, _LEAST_LOG_SCALE_SIGMA) ** 2
+    def of_scaled(self, scale: float) -> np.ndarray:
+        """(7, 7) covariance about the overlap's centroid of the pose with the scale that was refined along."""
+        swell = hidden_log_scale(self.field_m, self.radius_m, self.params)
+        return self.scaled + np.diag(np.r_[self._hidden(swell, scale), swell] ** 2)
+
+    def of_rigid(self, scale: float, swell: float, log_scale_sigma: float) -> np.ndarray:
+        """(7, 7) the same of a pose whose scale is known otherwise.
+
+        Args:
+            swell: logarithm of the scale that the surfaces were measured to have over the true one: so much do their
+                errors hide, or more.
+            log_scale_sigma: how well the scale is known.
+        """
+        out = np.zeros((7, 7))
+        out[:6, :6] = self.rigid + np.diag(self._hidden(abs(swell), scale) ** 2)
+        out += np.outer(self.tied, self.tied) * max(log_scale_sigma, _LEAST_LOG_SCALE_SIGMA) ** 2
+        return out
+
+    def known(self, pose: Sim3, belief: Belief | None = None) -> Known:
+        """How well a pose (metres) is known: the scaled one, or one whose scale is believed to be something else."""
+        if belief is None or not belief.rigid:
+            covariance = self.of_scaled(pose.scale)
+        else:
+            covariance = self.of_rigid(pose.scale, belief.log_scale, belief.log_scale_sigma)
         sigmas = (
             float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
             float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * pose.scale,
@@ -110,6 +136,11 @@ class Conditioning:
         centre = Sim3(np.eye(3), self.centroid)
         return retract(pose @ centre, step) @ centre.inverse()
 
+    def _hidden(self, swell: float, scale: float) -> np.ndarray:
+        """(6,) of rotation and translation (the source's), by how much scale the surfaces' errors hide."""
+        turn, shift = hidden_motion(self.field_m, self.radius_m, swell, self.params)
+        return np.r_[np.full(3, turn), np.full(3, shift / scale)]
+
 
 def condition(target: Surface, source: Surface, pose: Sim3, params: Params | None = None) -> Conditioning | None:
     """How well a refined pose (metres) is known with its scale and without; None where too little overlaps to tell.
@@ -117,7 +148,7 @@ def condition(target: Surface, source: Surface, pose: Sim3, params: Params | Non
     An ICP Hessian is overconfident 10 to 900 times on splats, for neighbouring points share their error. So the
     point-to-plane residuals are averaged over blocks, `error_field` learns from them how far errors are alike, and the
     covariance is that of the pose under such errors: ``A K A^T``, where A is the pose's change by each block's error.
-    What leaves no residual is added by a model (`hidden_sigmas`).
+    What leaves no residual is added by a model (`hidden_motion`, `hidden_log_scale`).
     """
     params = params or Params()
     blocks = _Blocks.of(target, source, pose, params)
@@ -130,15 +161,36 @@ def condition(target: Surface, source: Surface, pose: Sim3, params: Params | Non
     errors = error_field.judge_errors(seen, influence, params.field)
     if errors is None:
         return None
-    hidden = hidden_sigmas(errors.field_m, blocks.radius_m, params) ** 2
-    hidden[3:6] /= pose.scale**2  # translations are the source's
     return Conditioning(
-        scaled=errors.covariance[:7, :7] + np.diag(hidden),
-        rigid=errors.covariance[7:, 7:] + np.diag(hidden[:6]),
+        scaled=errors.covariance[:7, :7],
+        rigid=errors.covariance[7:, 7:],
         tied=np.r_[-np.linalg.solve(hessian[:6, :6], hessian[:6, 6]), 1.0],
         centroid=blocks.centroid,
         field_m=errors.field_m,
+        radius_m=max(blocks.radius_m, 1e-6),
+        params=params,
     )
+
+
+def hidden_log_scale(field_m: float, radius_m: float, params: Params) -> float:
+    """Standard deviation of the scale's logarithm by what leaves no residual."""
+    swell = params.hidden_swell_m * (field_m / params.field_m) ** params.field_power
+    return float(swell / np.hypot(radius_m, swell / params.most_swell))
+
+
+def hidden_motion(field_m: float, radius_m: float, swell: float, params: Params) -> tuple[float, float]:
+    """Standard deviations (rad, metres) about the overlap's centroid by what leaves no residual.
+
+    Errors that leave none still show where the scale is known: a sensor whose depths are a percent off swells its
+    surfaces by as much, and its bend turns and shifts them in proportion. Without this one model has to serve sensors
+    of all kinds, too wide for most and too narrow for the worst.
+
+    Args:
+        swell: logarithm of the scale that such errors make, measured, or its standard deviation.
+    """
+    own = params.hidden_shift_m * (field_m / params.field_m) ** params.field_power
+    shift = float(np.hypot(own, params.shift_by_swell * swell * radius_m))
+    return params.turn_by_shift * shift / radius_m, shift
 
 
 def in_scene_units(covariance: np.ndarray, source_unit_m: float) -> np.ndarray:
@@ -215,15 +267,6 @@ class _Blocks:
             centroid=centroid,
             radius_m=float(np.sqrt(((moved - moved.mean(0)) ** 2).sum(1).mean())),
         )
-
-
-def hidden_sigmas(field_m: float, radius_m: float, params: Params) -> np.ndarray:
-    """(7,) standard deviations (rad, metres, log scale) about the overlap's centroid of what leaves no residual."""
-    growth = (field_m / params.field_m) ** params.field_power
-    turn, shift, swell = (growth * h for h in (params.hidden_turn_m, params.hidden_shift_m, params.hidden_swell_m))
-    radius = max(radius_m, 1e-6)
-    bounded = swell / np.hypot(radius, swell / params.most_swell)
-    return np.r_[np.full(3, turn / radius), np.full(3, shift), bounded]
 
 
 def _labels(points: np.ndarray, axis: np.ndarray, size_m: float) -> np.ndarray:

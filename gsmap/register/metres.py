@@ -16,11 +16,16 @@ class Params:
             percent.
         rigid_sigmas: the scale is taken for 1 where it is measured to be within this many standard deviations of it.
         disagree_sigmas: two sources that were told to be in metres and measure further from 1 than this are noted.
+        bend_sigmas: surfaces that are taken for metres and measure further from 1 than this many times what their
+            residuals explain are bent, which is noted ...
+        least_bend: ... from this log scale on.
     """
 
     drift_sigma: float = 0.02
     rigid_sigmas: float = 3.0
     disagree_sigmas: float = 5.0
+    bend_sigmas: float = 3.0
+    least_bend: float = 0.002
 
 
 @dataclass(frozen=True)
@@ -63,3 +68,21 @@ def believe(log_scale: float, sigma: float, params: Params | None = None, *, tol
             f"({off:.0f} sigma): check one's unit"
         )
     return Belief(True, log_scale, sigma, log_scale_sigma, note)
+
+
+def bending(belief: Belief, residual_sigma: float, extent_m: float, params: Params | None = None) -> str:
+    """What a person should know of surfaces that fit as well as residuals can tell, but measure another size than the
+    metres that both are taken to be in; empty where residuals explain it, or the scale is believed to differ.
+
+    Args:
+        residual_sigma: standard deviation of the log scale as far as residuals show errors.
+        extent_m: over which the surfaces overlap.
+    """
+    params = params or Params()
+    off = abs(belief.log_scale)
+    if belief.note or not belief.rigid or off < max(params.bend_sigmas * residual_sigma, params.least_bend):
+        return ""
+    return (
+        f"one capture bends, or its metre drifts: the source measures {np.expm1(-belief.log_scale):+.1%} over "
+        f"{extent_m:.1f} m, {off / residual_sigma:.0f} times what its residuals explain"
+    )

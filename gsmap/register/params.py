@@ -42,11 +42,12 @@ class Snap:
 
 
 def _coarse() -> MethodParams:
-    return MethodParams("refiner", (("colored_icp", colored_icp.Params((0.4, 0.15), max_points=(3000, 6000))),))
+    rough = colored_icp.Params((0.4, 0.15), max_points=(3000, 6000), tolerance=0.02, last_tolerance=0.01)
+    return MethodParams("refiner", (("colored_icp", rough),))
 
 
 def _fine() -> MethodParams:
-    return MethodParams("refiner", (("colored_icp", colored_icp.Params((0.06, 0.03), max_points=(20_000, 20_000))),))
+    return MethodParams("refiner", (("colored_icp", colored_icp.Params((0.06, 0.03), max_points=(10_000, 40_000))),))
 
 
 @dataclass(frozen=True)

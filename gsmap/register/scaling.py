@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsmap.register import refinement
 from gsmap.register.covariance import Known, condition
-from gsmap.register.metres import Belief, believe
+from gsmap.register.metres import Belief, believe, bending
 from gsmap.register.metric import MetricPair
 from gsmap.register.params import Params
 from gsmap.types import Sim3
@@ -40,5 +42,9 @@ def scaled_or_rigid(
     belief = believe(log_scale, conditioned.log_scale_sigma, params.metres, told=pair.policies == {"known"})
     if not belief.rigid:
         return scaled, conditioned.known(scaled), belief
+    residual_sigma = float(np.sqrt(conditioned.scaled[6, 6]))
+    extent_m = 2.0 * conditioned.radius_m / pair.target.unit_m  # not in working metres: both units are the metre
+    bends = bending(belief, residual_sigma, extent_m, params.metres)
+    belief = replace(belief, note=belief.note or bends)
     rigid = refinement.fine(pair, conditioned.rescaled(scaled, 1.0 / pair.scale), params, with_scale=False)
-    return rigid, conditioned.known(rigid, belief.log_scale_sigma), belief
+    return rigid, conditioned.known(rigid, belief), belief

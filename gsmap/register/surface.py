@@ -13,6 +13,9 @@ from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Cameras, Gaussians
 
+_PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is laid through, as small_gicp does
+_GRADIENT_NEIGHBOURS = 10
+
 
 @dataclass(frozen=True)
 class Params:
@@ -121,9 +124,16 @@ class Surface:
         return cloud, tree
 
     @cached_property
+    def tree(self) -> Any:
+        """The search tree of the cell means."""
+        from gsmap import _native
+
+        return _native.PointTree(np.ascontiguousarray(self.coarse[0]))
+
+    @cached_property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals at the cell means; signs mean nothing."""
-        normals: np.ndarray = self.cloud[0].normals()[:, :3]
+        normals: np.ndarray = self.tree.normals(_PLANE_NEIGHBOURS)
         return normals
 
     @cached_property
@@ -131,36 +141,15 @@ class Surface:
         """(M,) float64 lightness of the cell means, 0 to 1."""
         return self.coarse[1].astype(np.float64) @ np.array([0.299, 0.587, 0.114])
 
-    def lightness_gradients(self, rows: np.ndarray) -> np.ndarray:
-        """(R, 3) change of lightness per metre within the tangent plane of some cell means; each computed once."""
-        new = np.unique(rows[np.isnan(self._gradients[rows, 0])])
-        if len(new):
-            points, light = self.coarse[0], self.lightness
-            normals = self.normals[new]
-            _, near = self._tree.query(points[new], k=min(10, len(points)))
-            offset = points[near] - points[new][:, None]
-            offset -= (offset * normals[:, None]).sum(2, keepdims=True) * normals[:, None]
-            difference = light[near] - light[new][:, None]
-            # The normal is added to the normal equations: the gradient has no part along it.
-            system = offset.transpose(0, 2, 1) @ offset + self.resolution_m**2 * normals[:, :, None] * normals[:, None]
-            system += 0.1 * self.resolution_m**2 * np.eye(3)
-            self._gradients[new] = np.linalg.solve(system, (offset * difference[..., None]).sum(1)[..., None])[..., 0]
-        return self._gradients[rows]
-
     @cached_property
-    def _gradients(self) -> np.ndarray:
-        return np.full((len(self.coarse[0]), 3), np.nan)
-
-    @cached_property
-    def _tree(self) -> Any:
-        from scipy.spatial import cKDTree
-
-        return cKDTree(self.coarse[0])
+    def lightness_gradients(self) -> np.ndarray:
+        """(M, 3) change of lightness per metre within the tangent planes of the cell means, by least squares."""
+        gradients: np.ndarray = self.tree.tangent_gradients(
+            self.normals, self.lightness, _GRADIENT_NEIGHBOURS, self.resolution_m
+        )
+        return gradients
 
     def nearest(self, points: np.ndarray, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
         """Distance to and row of the nearest cell mean of each point; inf and 0 where none lies within the radius."""
-        if not len(self) or not len(points):
-            return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
-        # Bounded, unlike small_gicp's search, which spends most of its time on the points that have no partner.
-        distance, row = self._tree.query(points, distance_upper_bound=radius_m)
-        return distance, np.where(np.isfinite(distance), row, 0)
+        distance, rows = self.tree.nearest(np.ascontiguousarray(points, dtype=np.float64), radius_m)
+        return distance, rows

@@ -15,11 +15,12 @@ class NodeLayer:
 
     Args:
         positions: (M, 3) float64, scene frame and unit.
-        embeddings: (M, D) float32 node embeddings ``[feature, context]``, unit length.
+        embeddings: (M, D) float32 unit vectors that tell nodes apart: what a landmark's surroundings look like; an
+            object's feature, to which its context is joined when two layers are compared.
         types: (M,) int32; nodes match only within a type (landmarks: channel x sign x scale; objects: all 0).
         weights: (M,) float32 confidence (objects) or response (landmarks), larger is better.
         extents: (M, 2, 3) float64 lowest and highest corner of the node's points, scene frame.
-        features: (M, F) float32 the embedding's own part without context; for queries by feature.
+        features: (M, F) float32 an object's feature; a landmark's response and scale.
         num_views: (M,) int32 how many rendered views saw the node; 0 where nothing was rendered.
         descriptor_id: digest of everything that decides what a node and its embedding mean; layers of different ids
             are never compared.
@@ -128,12 +129,21 @@ class SceneGraph:
 
     Args:
         scene_id: the scene it describes.
+<<<<<<< HEAD
         layers: by name; a layer that was not made is absent. ``objects``; ``landmarks`` takes the scene's unit for
             a metre, and ``landmarks@K`` takes it for 2 to the power -K of one; ``landmarks:0``, ``:1``, ``:2`` are the
             landmarks at ``unit_m`` times 1.45 to the powers -2, 0, 1: for any two captures of one place, whatever their
             units, two of them agree to within 20 percent
             (`gsmap.describe.unit`). ``landmarks_gravity_free`` (or ``landmarks_gravity_free:1``) are the landmarks of
             a scene that knows up as they compare with those of scenes that do not.
+=======
+        layers: by name; a layer that was not made is absent. ``objects``; ``landmarks`` takes the scene's unit for a
+            metre, and ``landmarks@K`` takes it for 2 to the power -K of one; ``landmarks:0``, ``:1``, ``:2`` are the
+            landmarks at ``unit_m`` times 1.45 to the powers -2, 0, 1: for any two captures of one place, whatever their
+            units, two of them agree to within 20 percent (`gsmap.describe.unit`). ``landmarks_gravity_free`` (or
+            ``landmarks_gravity_free:1``) are the landmarks of a scene that knows up as they compare with those of
+            scenes that do not.
+>>>>>>> answers
         up: (3,) unit vector against gravity in the scene frame, or None where it could not be told.
         unit_m: guess of metres per scene unit (good to a factor of about 2); 1 where the scale is known.
         notes: what a person should know (few nodes, no gravity, ...).

@@ -98,7 +98,7 @@ def _embedder() -> dict[str, np.ndarray]:
     some = [i for i, points in enumerate(shown) if len(points) >= 4]
     words = embedder.make(context, embedder.Params())
     features = words.embed(view, [masks[i] for i in some], [shown[i] for i in some])
-    return {"features": features, "codebook": words.codebook}
+    return {"features": features}
 
 
 CASES: dict[str, Callable[[], dict[str, np.ndarray]]] = {

@@ -1,29 +1,27 @@
-"""Objects: parts found in renders, lifted, associated over views, with their context."""
+"""Objects: parts found in renders, lifted, associated over views."""
 
-import networkx as nx
 import numpy as np
 import pytest
 from describe_places import moved, room
 from scipy.spatial.transform import Rotation
 
 from gsmap.describe import Params, describe, embedders, recipe_key
-from gsmap.describe.embedders._codebook import random_codebook
-from gsmap.describe.embedders.builtin import BuiltinEmbedder
-from gsmap.describe.embedders.builtin import Params as EmbedderParams
+from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.landmarks import layer as landmarks
 from gsmap.describe.landmarks.layer import Params as LandmarkParams
 from gsmap.describe.objects.associate import associate, giou, region
-from gsmap.describe.objects.context import context_histograms, neighbourhood
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import descriptor_id
 from gsmap.describe.objects.lift import visible
+from gsmap.describe.objects.views import render_views
 from gsmap.describe.onnx.check import check_model
+from gsmap.describe.segmenters import builtin, per_view
 from gsmap.describe.segmenters.builtin import felzenszwalb
 from gsmap.errors import ConfigError
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.settings import changed, leaves
 from gsmap.types import Cameras, Sim3
-from gsmap.types.views import View
+from gsmap.types.views import SceneContext, View
 
 OBJECTS = Params(landmarks=False, object=ObjectParams(num_cameras=16))
 
@@ -80,26 +78,27 @@ def test_lifting_takes_the_visible_surface_only():
     rows, pixel = visible(points, view)
     assert rows.tolist() == [0, 1]
     assert pixel[0].tolist() == [50, 40]
+    # As published: all that projects into the picture, behind the surface and before it, where something is shown.
+    assert visible(points, view, np.inf)[0].tolist() == [0, 1, 2, 3]
+    depth[40:60, :60] = 0
+    assert visible(points, view, np.inf)[0].tolist() == []
 
 
-def test_neighbourhood_is_networkx_within_hops():
-    positions = np.random.default_rng(1).uniform(0, 6, (40, 3))
-    graph = nx.Graph((i, j) for i, j in np.argwhere(np.linalg.norm(positions[:, None] - positions[None], axis=2) < 1.5))
-    reach = neighbourhood(positions, 1.5, 3)
-    for i in range(40):
-        near = set(nx.single_source_shortest_path_length(graph, i, 3)) - {i}
-        assert set(np.flatnonzero(reach[i])) == near
-
-
-def test_context_counts_neighbours_not_oneself():
-    words = random_codebook(0, 8, 16)
-    features = np.stack([words[0], words[1], words[2], words[3]])
-    positions = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [50, 0, 0.0]])
-    context = context_histograms(features, positions, words, max_distance=1.2, hops=3)
-    np.testing.assert_allclose(context[0] ** 2, np.eye(8)[[1, 2]].mean(0), atol=1e-3)
-    np.testing.assert_array_equal(context[3], 0)
-    one_hop = context_histograms(features, positions, words, max_distance=1.2, hops=1)
-    np.testing.assert_allclose(one_hop[0] ** 2, np.eye(8)[1], atol=1e-3)
+def test_masks_of_one_view_each_are_those_of_the_parts_and_name_none():
+    gaussians, cameras = room(n=6000)
+    cloud = surface_cloud(gaussians)
+    context = SceneContext(cloud, len(gaussians), None, 1.0)
+    (view,) = render_views(gaussians, cameras.evenly(1), 160, "native")
+    parts, masks = (method.make(context, method.Params()).segment(view) for method in (builtin, per_view))
+    assert len(masks) > 3
+    assert [(m.pixels.tobytes(), m.confidence) for m in masks] == [(m.pixels.tobytes(), m.confidence) for m in parts]
+    assert {m.part for m in masks} == {None}
+    # So what becomes one object is decided by looks and place: nothing resembles itself more than 2.
+    split, joined = (
+        describe("room", gaussians, cameras, small(segmenter="per_view", tau_asso=tau, min_views=1)).layers["objects"]
+        for tau in (2.1, 0.5)
+    )
+    assert len(split) > 2 * len(joined)
 
 
 def test_felzenszwalb_cuts_at_the_heavy_edge():
@@ -113,26 +112,6 @@ def test_felzenszwalb_cuts_at_the_heavy_edge():
 def small(**changed) -> Params:
     """Objects of a few small views."""
     return Params(landmarks=False, object=ObjectParams(num_cameras=6, longest_side_px=160, **changed))
-
-
-def test_embeddings_hold_the_feature_and_the_context_of_the_neighbours_within_hops():
-    gaussians, cameras = room(n=6000)
-    for hops, weight in ((1, 0.5), (3, 1.5)):
-        params = small(hops=hops, context_weight=weight, local_distance_m=1.0)
-        layer = describe("room", gaussians, cameras, params, scale_policy="known").layers["objects"]
-        words = BuiltinEmbedder(EmbedderParams(), None, 1.0).codebook
-        apart = np.linalg.norm(layer.positions[:, None] - layer.positions[None], axis=2)
-        graph = nx.Graph((i, j) for i, j in np.argwhere((apart < 1.0) & (apart > 0)))
-        assert 5 < len(graph) <= len(layer)
-        length = layer.features.shape[1]
-        for i in range(len(layer)):
-            near = set(nx.single_source_shortest_path_length(graph, i, hops)) - {i} if i in graph else set()
-            share = np.exp(20.0 * layer.features[sorted(near)].astype(float) @ words.T)
-            counted = (share / share.sum(1, keepdims=True)).sum(0)
-            context = np.sqrt(counted / max(counted.sum(), 1e-12))
-            both = np.concatenate([layer.features[i], weight * context])
-            np.testing.assert_allclose(layer.embeddings[i], both / np.linalg.norm(both), atol=1e-5)
-            assert bool(layer.embeddings[i, length:].any()) == bool(near)
 
 
 def test_masks_of_low_confidence_make_no_objects():
@@ -174,10 +153,10 @@ def make(context, params):
 
 class Flat:
     def __init__(self, dim):
-        self.codebook = np.eye(dim, dtype=np.float32)
+        self.dim = dim
 
     def embed(self, view, masks, points):
-        return np.tile(self.codebook[:1], (len(masks), 1))
+        return np.tile(np.eye(self.dim, dtype=np.float32)[:1], (len(masks), 1))
 """
 
 
@@ -189,7 +168,7 @@ def test_an_embedder_is_one_file(tmp_path, monkeypatch):
     layer = describe("room", *room(n=6000), params, scale_policy="known").layers["objects"]
     assert len(layer) > 0
     assert layer.features.shape[1] == 6
-    assert layer.embeddings.shape[1] == 12
+    np.testing.assert_array_equal(layer.embeddings, layer.features)
     key = recipe_key(params)
     assert key.version["embedder.flat"] == 5
     assert key.settings["object"]["embedders"] == {"flat": {"dim": 6}}
@@ -205,14 +184,17 @@ def test_every_parameter_is_explained_and_in_the_key_of_what_it_changes():
         if isinstance(leaf.value, str):
             continue  # names of methods: see the tests above
         key = recipe_key(changed(explicit, {leaf.name: other[type(leaf.value)](leaf.value)})).digest
-        unused = any(part in leaf.name for part in ("segmenters.sam", "embedders.clip", "object.model_"))
+        other_methods = ("segmenters.per_view", "segmenters.sam", "embedders.clip", "object.model_")
+        unused = any(part in leaf.name for part in other_methods)
         assert (key == base) == unused, leaf.name
 
 
 def test_how_much_is_kept_does_not_keep_layers_from_being_compared():
     base, more = ObjectParams(), ObjectParams(num_cameras=96, c_mask=0.4)
     assert descriptor_id(base, {}) == descriptor_id(more, {})
-    assert descriptor_id(base, {}) != descriptor_id(ObjectParams(hops=2), {})
+    assert descriptor_id(base, {}) != descriptor_id(
+        changed(base, {"embedder": "builtin", "embedders.builtin.hue": 0.9}), {}
+    )
     many = changed(LandmarkParams(), {"detect.max_per_octave": 9})
     wide = changed(LandmarkParams(), {"context.radii_m": [0.5, 1.0]})
     ids = [landmarks.descriptor_id(p) for p in (LandmarkParams(), many, wide)]

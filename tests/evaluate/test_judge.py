@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from gsmap.errors import ConfigError
-from gsmap.evaluate.calibration import nees_of_edge, nees_of_pose, nees_rows, relative_covariance
+from gsmap.evaluate.calibration import nees_of_edge, nees_of_pose, nees_rows, relative_covariance, truth_covariance
 from gsmap.evaluate.judge import JudgedScene, Params, judge
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities, exp
@@ -263,6 +264,29 @@ def test_an_edge_that_claims_a_scale_of_one_pays_for_it() -> None:
     found = nees_of_edge(at(3), stiff, at(3, scale=1.02))
     assert found.dof == 7
     assert found.value > (0.0198 / 1e-6) ** 2
+
+
+def test_a_truth_that_is_not_exact_is_allowed_for() -> None:
+    """Edges whose errors are those of two truths alone, each turned and moved about its scene's middle."""
+    rng, middle, turn, shift = np.random.default_rng(3), np.array([40.0, -10.0, 5.0]), 0.01, 0.05
+    allowed = truth_covariance(turn, shift, middle)
+    values = []
+    for _ in range(200):
+        xi = np.sqrt(2) * rng.normal(size=(1, 7)) * np.r_[np.full(3, turn), np.full(3, shift), 0.0]
+        moved = Sim3(np.eye(3), middle) @ exp(xi).item(0) @ Sim3(np.eye(3), -middle)
+        values.append(nees_of_edge(at(3), np.eye(7) * 1e12, at(3) @ moved, allowed).value)
+    assert np.median(values) == pytest.approx(chi2.ppf(0.5, 6), rel=0.15)
+
+
+def test_a_report_says_how_exact_its_truth_is_taken_to_be() -> None:
+    scenes = [scene("a", at(0)), scene("b", at(5))]
+    edges = [replace(edge("a", "b", at(-5.1)), information=INFORMATION)]
+    exact = judge(scenes, edges, None, overlaps(scenes))
+    loose = judge(scenes, edges, None, overlaps(scenes), Params(truth_sigma_deg=0.5, truth_sigma_m=0.1))
+    assert (loose.truth_sigma_deg, loose.truth_sigma_m) == (0.5, 0.1)
+    assert loose.nees[0].median < 0.1 * exact.nees[0].median
+    with pytest.raises(ConfigError, match="not be negative"):
+        Params(truth_sigma_m=-1)
 
 
 def sampled_poses(scale_sigma: float, count: int) -> EvaluationReport:

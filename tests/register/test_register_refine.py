@@ -23,7 +23,12 @@ from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Proposal, Sim3
 
-NOTHING_HIDDEN = CovarianceParams(hidden_turn_m=0.0, hidden_shift_m=0.0, hidden_swell_m=0.0)
+NOTHING_HIDDEN = CovarianceParams(hidden_shift_m=0.0, hidden_swell_m=0.0, shift_by_swell=0.0)
+
+
+def believed(log_scale: float, sigma: float) -> metres.Belief:
+    """That the scale is 1 where another was measured."""
+    return metres.Belief(True, log_scale, 1e-3, sigma)
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +51,21 @@ def test_colored_icp_refiner_comes_back_from_four_degrees(world, surfaces):
     found = colored_icp.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15))
     error = pose_error(found, world.S_target_source, centre)
     assert (error.rre_deg < 0.05, error.centroid_m < 0.003, found.scale) == (True, True, 1.0)
+
+
+def test_icp_aligns_cells_or_the_means_themselves():
+    """Half the points of every cell of the source lie off: cells average that away only in part, means pair as they
+    are."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0, 4, (4000, 3))
+    target, source = (
+        Surface(points, np.zeros((len(points), 3), np.float32), resolution_m=size) for size in (0.05, 0.8)
+    )
+    start = Sim3(exp_so3(np.array([0.0, 0.0, 0.004])), np.array([0.01, 0.0, -0.01]))
+    cells, means = (icp.refine(target, source, start, icp.Params((0.12,), means=m)) for m in (False, True))
+    errors = [np.linalg.norm(pose.apply(points) - points, axis=1).max() for pose in (cells, means)]
+    assert errors[1] < 1e-6
+    assert errors[0] > 1e-3
 
 
 def test_colored_icp_refiner_finds_the_scale(world, surfaces):
@@ -133,7 +153,7 @@ def test_covariance_is_as_large_as_the_errors_are(cut_m):
         target = _warped(Surface.of(world.target.gaussians), 0.01, seed)
         source = _warped(Surface.of(world.source.gaussians), 0.01, 99 + seed)
         pose = colored_icp.refine(target, source, world.S_target_source)
-        covariance = condition(target, source, pose, NOTHING_HIDDEN).known(pose, 0.0).covariance
+        covariance = condition(target, source, pose, NOTHING_HIDDEN).known(pose, believed(0.0, 0.0)).covariance
         off = (Similarities.stack([pose]).inverse() @ Similarities.stack([world.S_target_source])).log()[0, :6]
         errors.append(off @ np.linalg.solve(covariance[:6, :6], off))
     # Of a narrow strip residuals tell little, and fields that are alike all over it are still found possible.
@@ -217,19 +237,40 @@ def test_too_few_blocks_say_nothing():
 
 
 def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfaces):
-    """Over the overlap's radius, and as the square of the errors that residuals show."""
+    """Over the overlap's radius, as the square of the errors that residuals show, and in proportion to the swelling."""
     target, source = surfaces
     pose = world.S_target_source
-    params = CovarianceParams(hidden_turn_m=0.01, hidden_shift_m=0.02, hidden_swell_m=0.03, field_m=0.004)
+    params = CovarianceParams(
+        hidden_shift_m=0.02, hidden_swell_m=0.03, shift_by_swell=0.4, turn_by_shift=0.5, field_m=0.004
+    )
     bare, found = condition(target, source, pose, NOTHING_HIDDEN), condition(target, source, pose, params)
     growth = (bare.field_m / 0.004) ** 2
     near = np.isfinite(target.nearest(pose.apply(source.coarse[0]), params.radius_m)[0])
     inside = source.coarse[0][near]
     radius = np.sqrt(((inside - inside.mean(0)) ** 2).sum(1).mean())
-    expected = growth * np.r_[np.full(3, 0.01 / radius), np.full(3, 0.02), 0.03 / radius]
-    expected[6] = 1 / np.sqrt(1 / expected[6] ** 2 + 1 / 0.02**2)  # no sensor is off by much more than 2 percent
-    assert np.allclose(np.sqrt(np.diag(found.scaled - bare.scaled)), expected)
-    assert np.allclose(np.sqrt(np.diag(found.rigid - bare.rigid)), expected[:6])
+    swell = growth * 0.03 / radius
+    swell = 1 / np.sqrt(1 / swell**2 + 1 / 0.02**2)  # no sensor is off by much more than 2 percent
+    for told, added in (
+        (swell, found.of_scaled(1.0) - bare.of_scaled(1.0)),
+        (0.01, found.of_rigid(1.0, -0.01, 0.0) - bare.of_rigid(1.0, -0.01, 0.0)),
+    ):
+        shift = np.hypot(growth * 0.02, 0.4 * told * radius)
+        assert np.allclose(np.sqrt(np.diag(added)[:6]), np.r_[np.full(3, 0.5 * shift / radius), np.full(3, shift)])
+    assert found.log_scale_sigma == pytest.approx(np.hypot(bare.log_scale_sigma, swell))
+    assert np.sqrt(found.of_scaled(1.0)[6, 6]) == pytest.approx(found.log_scale_sigma)
+
+
+def test_what_a_known_scale_reveals_of_the_sensors_widens_the_pose(world, surfaces):
+    """The same residuals: where surfaces in metres measure 1 % too large, their sensors hide more than where they fit;
+    translations of a source in another unit are told in that."""
+    target, source = surfaces
+    pose = world.S_target_source
+    found = condition(target, source, pose)
+    fits, swells = (found.known(pose, believed(off, 0.0)).sigmas for off in (0.0, 0.01))
+    assert swells[1] ** 2 - fits[1] ** 2 == pytest.approx((found.params.shift_by_swell * 0.01 * found.radius_m) ** 2)
+    assert swells[0] > fits[0]
+    hidden = [found.of_rigid(scale, 0.01, 0.0) - found.of_rigid(scale, 0.0, 0.0) for scale in (1.0, 4.0)]
+    assert np.allclose(hidden[1][3:6, 3:6], hidden[0][3:6, 3:6] / 16)
 
 
 def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
@@ -244,15 +285,17 @@ def test_a_rigid_pose_knows_what_its_scale_could_move(world, surfaces):
     moved = [np.linalg.norm(again.apply(centre) - other.apply(centre)) for other in (wrong, pose)]
     assert moved[0] < 0.003
     assert moved[0] < 0.5 * moved[1]
-    sure, unsure = (conditioned.known(pose, sigma).covariance for sigma in (0.0, 0.003))
+    sure, unsure = (conditioned.known(pose, believed(0.0, sigma)).covariance for sigma in (0.0, 0.003))
     off = (Similarities.stack([pose]).inverse() @ Similarities.stack([again])).log()[0]
     assert off @ np.linalg.solve(sure, off) > 1e4
     assert off @ np.linalg.solve(unsure, off) < 7
     assert np.sqrt(unsure[6, 6]) == pytest.approx(0.003)
     # Near a corner, growing moves: with nothing else uncertain, what the scale moved is one standard deviation.
     near = np.linalg.norm(pose.apply(source.points) - [3.0, 0.0, 0.3], axis=1) < 1.0
-    corner = condition(target, Surface(source.points[near], source.colours[near], source.resolution_m), pose)
-    alone = replace(corner, rigid=1e-9 * np.eye(6)).known(pose, 0.003).covariance
+    corner = condition(
+        target, Surface(source.points[near], source.colours[near], source.resolution_m), pose, NOTHING_HIDDEN
+    )
+    alone = replace(corner, rigid=1e-9 * np.eye(6)).known(pose, believed(0.0, 0.003)).covariance
     moved = corner.rescaled(pose, np.exp(0.003))
     off = (Similarities.stack([pose]).inverse() @ Similarities.stack([moved])).log()[0]
     assert off @ np.linalg.solve(alone, off) == pytest.approx(1.0, rel=0.05)
@@ -308,6 +351,16 @@ def test_sources_that_were_told_to_be_metric_stay_so_and_disagreement_is_said():
     assert disagrees.rigid
     assert "-1.98% (20 sigma)" in disagrees.note
     assert disagrees.log_scale_sigma == pytest.approx(0.02, rel=0.01)  # 1 is taken, and is known to be that far off
+
+
+def test_surfaces_that_measure_another_size_than_their_residuals_explain_are_said_to_bend():
+    rigid = metres.Belief(True, -0.008, 0.005, 0.008)
+    said = metres.bending(rigid, 0.0005, 6.0)
+    assert "the source measures +0.8% over 6.0 m, 16 times" in said
+    assert metres.bending(rigid, 0.003, 6.0) == ""  # residuals explain it
+    assert metres.bending(replace(rigid, log_scale=-0.0015), 0.0001, 6.0) == ""  # nobody needs to know
+    assert metres.bending(replace(rigid, rigid=False), 0.0005, 6.0) == ""  # the scale differs, and is measured
+    assert metres.bending(replace(rigid, note="disagrees"), 0.0005, 6.0) == ""  # was said
 
 
 def test_surface_leaves_out_what_is_faint_or_huge():

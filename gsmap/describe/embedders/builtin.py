@@ -29,7 +29,6 @@ _TEXTURE = np.linspace(-5, 0, 6)  # natural log of |grad L| / L per pixel
 _SIZE = np.log(np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4]))
 _RATIO = np.linspace(0, 1, 5)
 _PARTS = (_HUES + 1, len(_LIGHTNESS), len(_TEXTURE), len(_SIZE) + 3 * len(_RATIO))
-_WORDS = 48
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,6 @@ class BuiltinEmbedder:
         weights = np.array([params.hue, params.lightness, params.texture, params.shape])
         self.weights = np.repeat(weights / np.linalg.norm(weights), _PARTS).astype(np.float32)
         self.up, self.unit_m, self.grey_chroma = up, unit_m, params.grey_chroma
-        self.codebook = self._codebook()
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
         """(R, F) features of the masks; see `gsmap.methods.embedder`."""
@@ -96,24 +94,6 @@ class BuiltinEmbedder:
         ratios = [spread[0] / spread[2], spread[1] / spread[2], tilt]
         size = _soft(np.log(4 * spread[2:]), _SIZE)
         return np.concatenate([size, *[_soft(np.array([r]), _RATIO) for r in ratios]])
-
-    def _codebook(self) -> np.ndarray:
-        """Words drawn as things might look: one or two hues, one lightness, texture and shape each; seeded."""
-        rng = np.random.default_rng(7)
-        rows = []
-        for _ in range(_WORDS):
-            parts = []
-            for size in _PARTS[:3]:
-                p = np.full(size, 0.1 / size)
-                p[rng.integers(size)] += 0.6
-                p[rng.integers(size)] += 0.3
-                parts.append(p)
-            picks = [rng.integers(n) for n in (len(_SIZE), *[len(_RATIO)] * 3)]
-            offsets = np.concatenate([[0], np.cumsum([len(_SIZE), *[len(_RATIO)] * 2])])
-            shape = np.full(_PARTS[3], 0.02)
-            shape[offsets + picks] += 1.0
-            rows.append(np.concatenate([np.sqrt(p / p.sum()) for p in [*parts, shape]]) * self.weights)
-        return np.stack(rows).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

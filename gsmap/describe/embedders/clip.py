@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from gsmap.describe.embedders._codebook import random_codebook
 from gsmap.describe.onnx.session import misfit, open_session, run
 from gsmap.errors import InputError
 from gsmap.types.model import ModelSpec
@@ -16,8 +15,6 @@ from gsmap.types.views import Mask, SceneContext, View
 
 VERSION = 1
 MODELS = ("clip",)
-_CODEBOOK_SEED = 20
-_WORDS = 32
 
 
 @dataclass(frozen=True)
@@ -72,13 +69,12 @@ class ClipEmbedder:
         named = [o.name for o in spec.outputs if o.name in ("image_embeds", "embedding", "embeddings", "pooler_output")]
         flat = [o.name for o in spec.outputs if len(o.shape) == 2]
         self.output = (named or flat or [spec.outputs[0].name])[0]
-        dim = self._run(np.zeros((1, *self.size, 3), np.float32)).shape[1]
-        self.codebook = random_codebook(_CODEBOOK_SEED, _WORDS, dim)
+        self.dim = self._run(np.zeros((1, *self.size, 3), np.float32)).shape[1]
 
     def embed(self, view: View, masks: Sequence[Mask], points: Sequence[np.ndarray]) -> np.ndarray:
         """(R, F) features of the masks; see `gsmap.methods.embedder`."""
         if not masks:
-            return np.zeros((0, self.codebook.shape[1]), np.float32)
+            return np.zeros((0, self.dim), np.float32)
         crops = np.stack([crop(view.rgb, m.pixels, self.size, self.params) for m in masks])
         features = self._run(normalise(crops, self.spec))
         return (features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)).astype(np.float32)

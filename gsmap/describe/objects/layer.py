@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from gsmap.describe.objects.associate import Node, associate, region
-from gsmap.describe.objects.context import context_histograms
 from gsmap.describe.objects.lift import visible
 from gsmap.describe.objects.views import is_blocked, render_views
 from gsmap.errors import ConfigError
@@ -22,7 +21,7 @@ from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 from gsmap.types.views import SceneContext
 
-VERSION = 2
+VERSION = 3
 _MANY = 400_000  # points of the surface; of more, an even share is lifted
 # What decides which things are nodes and how often they are seen, not what a node and its embedding mean.
 _NOT_COMPARED = (
@@ -49,16 +48,13 @@ class Params:
         longest_side_px: of a render.
         near_m: a view most of which is nearer than this looks out of the inside of something, and is left out.
         min_seen: a view of which a smaller share shows anything is left out.
-        depth_tolerance: a Gaussian is visible where its depth is that of the render to within this share.
+        depth_tolerance: a Gaussian is visible where its depth is that of the render to within this share; inf takes
+            every one whose centre projects into a mask (paper).
         c_mask: masks of lower confidence are dropped (paper).
         min_points: masks that show fewer Gaussians are dropped.
         tau_asso: cosine + GIoU above which a region joins a node (paper).
         min_views: nodes seen in fewer views are dropped.
         voxel_m: a node's points are thinned to one per cell of this size.
-        local_distance_m: edges of the local graph that contexts are counted over.
-        hops: how far along it.
-        context_weight: length of the context against the feature's in the embedding.
-        word_sharpness: of the softmax by which a feature is shared among the words of a context.
         model_time_s: a model that loads, or runs once, for longer is ended, which is an error.
         model_memory_mb: a model that takes more, beside what the libraries take, is ended likewise (on Linux).
     """
@@ -78,10 +74,6 @@ class Params:
     tau_asso: float = 1.1
     min_views: int = 2
     voxel_m: float = 0.03
-    local_distance_m: float = 1.5
-    hops: int = 3
-    context_weight: float = 0.5
-    word_sharpness: float = 20.0
     model_time_s: float = ModelLimits.time_s
     model_memory_mb: int = ModelLimits.memory_mb
 
@@ -148,7 +140,7 @@ def resolved(params: Params, models: Mapping[str, ModelSpec]) -> Resolved:
 
 
 def descriptor_id(params: Params, models: Mapping[str, ModelSpec]) -> str:
-    """What two comparable object layers share: what a node is, and what its feature and context mean."""
+    """What two comparable object layers share: what a node is, and what its feature means."""
     chosen = resolved(params, models)
     decides = {name: value for name, value in chosen.settings(models).items() if name not in _NOT_COMPARED}
     return RecipeKey("describe", "objects", chosen.versions, decides).recipe
@@ -164,7 +156,7 @@ def object_layer(
     """Objects of a scene and what a person should know of them.
 
     Sample cameras, render, segment, keep confident masks, lift each to the Gaussians whose centres project into it on
-    the visible surface, embed, associate over views; then count contexts and join both to node embeddings.
+    the visible surface, embed, associate over views. Contexts are counted when two layers are compared.
 
     Args:
         gaussians, cameras: the capture, scene frame and unit.
@@ -189,9 +181,7 @@ def object_layer(
     nodes: list[Node] = []
     blocked = 0
     if len(cloud) == 0 or cameras is None or len(cameras) == 0:
-        return NodeLayer.empty(descriptor, sum(embedder.codebook.shape), unit_m), (
-            ["no cameras: no objects"] if len(cloud) else []
-        )
+        return NodeLayer.empty(descriptor, unit_m=unit_m), (["no cameras: no objects"] if len(cloud) else [])
     sampled = cameras.evenly(params.num_cameras)
     for i, view in enumerate(render_views(gaussians, sampled, params.longest_side_px, params.render_backend)):
         progress(i / len(sampled), f"objects, view {i + 1} of {len(sampled)}")
@@ -214,30 +204,17 @@ def object_layer(
     notes = list(chosen.fallbacks)
     if blocked:
         notes.append(f"{blocked} of {len(sampled)} sampled cameras see nothing or stand inside something; left out")
-    return _layer(nodes, level, embedder.codebook, unit_m, params, descriptor), notes
+    return _layer(nodes, level, unit_m, descriptor), notes
 
 
-def _layer(
-    nodes: list[Node], level: np.ndarray, codebook: np.ndarray, unit_m: float, params: Params, descriptor: str
-) -> NodeLayer:
-    dim = sum(codebook.shape)
+def _layer(nodes: list[Node], level: np.ndarray, unit_m: float, descriptor: str) -> NodeLayer:
     if not nodes:
-        return NodeLayer.empty(descriptor, dim, unit_m)
+        return NodeLayer.empty(descriptor, unit_m=unit_m)
     points = [n.points @ level for n in nodes]
-    positions = np.stack([p.mean(0) for p in points])
     features = np.stack([n.feature for n in nodes])
-    contexts = context_histograms(
-        features,
-        positions,
-        codebook,
-        max_distance=params.local_distance_m / unit_m,
-        hops=params.hops,
-        sharpness=params.word_sharpness,
-    )
-    both = np.concatenate([features, params.context_weight * contexts], axis=1)
     return NodeLayer(
-        positions=positions,
-        embeddings=both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), 1e-12),
+        positions=np.stack([p.mean(0) for p in points]),
+        embeddings=features,
         types=np.zeros(len(nodes)),
         weights=np.array([np.mean(n.confidences) for n in nodes]),
         extents=np.stack([np.stack([p.min(0), p.max(0)]) for p in points]),

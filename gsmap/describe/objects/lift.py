@@ -12,7 +12,8 @@ def visible(points: np.ndarray, view: View, tolerance: float = 0.03) -> tuple[np
     """Rows of the points that lie on the surface the view sees, and their pixels (n, 2) int64 ``column row``.
 
     A point is on it when its depth agrees with the rendered depth at its pixel to within ``tolerance`` of that depth:
-    the paper asks only that a centre projects into the mask, which also takes what lies behind the object.
+    the paper asks only that a centre projects into the mask, which also takes what lies behind the object, as a
+    tolerance of inf does.
 
     Args:
         points: (N, 3) in the frame and unit that was rendered.

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gsmap.methods.proposer import Proposal, Scene
-from gsmap.register import a_contrario, consistency, correspondences, pose, scale
+from gsmap.register import a_contrario, consistency, context, correspondences, pose, scale
 from gsmap.register.clique import maximum_clique
 from gsmap.register.correspondences import Correspondences
 from gsmap.types import NodeLayer, SceneGraph, Sim3
@@ -26,6 +26,7 @@ class Params:
         kinds: of nodes, that propose; each on its own.
         landmarks: how landmarks are paired.
         objects: how objects are paired.
+        context: what is told of objects' surroundings.
         consistency: how pairs are tested against each other; its sigma is that of landmarks.
         objects_sigma_m: the same for objects, whose centres are less well defined.
         scale: the vote, where the scale is not known.
@@ -48,6 +49,7 @@ class Params:
     kinds: tuple[str, ...] = ("landmarks", "objects")
     landmarks: correspondences.Params = field(default_factory=correspondences.Params)
     objects: correspondences.Params = field(default_factory=lambda: correspondences.Params(top_k=5))
+    context: context.Params = field(default_factory=context.Params)
     consistency: consistency.Params = field(default_factory=consistency.Params)
     objects_sigma_m: float = 0.05
     scale: scale.Params = field(default_factory=scale.Params)
@@ -164,6 +166,8 @@ class Matching:
         params: Params,
         with_scale: bool,
     ) -> None:
+        if kind == "objects":
+            a, b = context.with_context(a, b, params.context)
         self.a, self.b, self.kind, self.params, self.with_scale = a, b, kind, params, with_scale
         sigma = params.objects_sigma_m if kind == "objects" else params.consistency.sigma_m
         self.test = replace(params.consistency, sigma_m=sigma)

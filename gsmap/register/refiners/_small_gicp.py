@@ -9,17 +9,29 @@ _FEWEST = 10  # points and pairs; fewer tell nothing of a pose
 
 
 def align(
-    kind: str, target: Surface, source: Surface, start: Sim3, *, radii_m: tuple[float, ...], max_iterations: int
+    kind: str,
+    target: Surface,
+    source: Surface,
+    start: Sim3,
+    *,
+    radii_m: tuple[float, ...],
+    max_iterations: int,
+    every_point: bool = False,
 ) -> Sim3:
     """Rigid pose by one run at each correspondence distance; the start where too little overlaps, its scale kept.
 
     Args:
         kind: as small_gicp names it.
+        every_point: align the points themselves, not their means over cells; for kinds that need no normals.
     """
     import small_gicp
 
     source = source.scaled(start.scale)
-    (target_cloud, target_tree), (source_cloud, _) = target.cloud, source.cloud
+    if every_point:
+        target_cloud, source_cloud = (small_gicp.PointCloud(surface.points) for surface in (target, source))
+        target_tree = small_gicp.KdTree(target_cloud, num_threads=1)
+    else:
+        (target_cloud, target_tree), (source_cloud, _) = target.cloud, source.cloud
     if target_cloud.size() < _FEWEST or source_cloud.size() < _FEWEST:
         return start
     pose = Sim3(start.rotation, start.translation)

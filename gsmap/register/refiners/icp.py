@@ -22,18 +22,28 @@ class Params:
     Args:
         radii_m: correspondence distances, one run each, coarse to fine.
         max_iterations: of each run.
+        means: align the surface Gaussians' own means, as Graph-GSReg does, and not what they average to in cells.
     """
 
     radii_m: tuple[float, ...] = (0.12, 0.06)
     max_iterations: int = 50
+    means: bool = False
 
 
 def refine(
     target: Surface, source: Surface, start: Sim3, params: Params | None = None, *, with_scale: bool = False
 ) -> Sim3:
-    """Rigid pose of two surfaces by ICP on their cells' centres (small_gicp).
+    """Rigid pose of two surfaces by ICP on their cells' centres, or on all means (small_gicp).
 
     Surfaces are in metres. A start that carries a scale keeps it. Returns the start where too little overlaps.
     """
     params = params or Params()
-    return align("ICP", target, source, start, radii_m=params.radii_m, max_iterations=params.max_iterations)
+    return align(
+        "ICP",
+        target,
+        source,
+        start,
+        radii_m=params.radii_m,
+        max_iterations=params.max_iterations,
+        every_point=params.means,
+    )

@@ -250,6 +250,8 @@ class EvaluationReport(Row):
         bands: recall and precision of ``edges`` by true overlap.
         components: what the newest poses tie together, against the truth.
         nees: how honest the covariances of edges and poses are.
+        truth_sigma_deg: standard deviation of each scene's true rotation that ``nees`` allows for,
+        truth_sigma_m: and of where its middle truly lies, in metres.
         edges_median_rre_deg: over ``edges``; null where there are none.
         edges_median_centroid_m: as above.
         edges_median_rte: as above.
@@ -301,6 +303,8 @@ class EvaluationReport(Row):
     bands: tuple[BandRow, ...] = ()
     components: tuple[ComponentErrorRow, ...] = ()
     nees: tuple[NeesRow, ...] = ()
+    truth_sigma_deg: float = 0.0
+    truth_sigma_m: float = 0.0
     edges_median_rre_deg: float | None = None
     edges_median_centroid_m: float | None = None
     edges_median_rte: float | None = None

@@ -15,7 +15,6 @@ class MeanColour:
         """Nothing to set."""
 
     VERSION, MODELS = 1, ()
-    codebook = np.eye(3, dtype=np.float32)
 
     @classmethod
     def make(cls, context, params):

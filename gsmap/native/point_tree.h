@@ -1,0 +1,122 @@
+// A k-d tree of points: their nearest neighbours, the same whatever the order of the search.
+#pragma once
+#include <algorithm>
+#include <cstdint>
+#include <numeric>
+#include <vector>
+
+namespace gsmap {
+
+struct Neighbour {
+    double squared;
+    int32_t row;
+    bool operator<(const Neighbour &o) const { return squared < o.squared || (squared == o.squared && row < o.row); }
+};
+
+class PointTree {
+  public:
+    // Copies n rows (x, y, z) of finite numbers.
+    PointTree(const double *points, int32_t n) : points_(points, points + 3 * std::size_t(n)), rows_(n) {
+        std::iota(rows_.begin(), rows_.end(), 0);
+        if (n) build(0, n);
+        sorted_.resize(3 * std::size_t(n));
+        for (int32_t i = 0; i < n; ++i) std::copy_n(point(rows_[i]), 3, &sorted_[3 * std::size_t(i)]);
+    }
+    int32_t size() const { return int32_t(rows_.size()); }
+    const double *point(int32_t row) const { return &points_[3 * std::size_t(row)]; }
+
+    static double squared(const double *a, const double *b) {
+        const double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2];
+        return x * x + y * y + z * z;
+    }
+
+    // The nearest point closer than the bound; of equally near ones the first.
+    Neighbour nearest(const double *at, Neighbour bound) const {
+        if (size()) {
+            double away[3] = {0, 0, 0};
+            search(0, at, away, 0, bound, [](Neighbour &best, const Neighbour &found) { if (found < best) best = found; });
+        }
+        return bound;
+    }
+    // Up to k nearest points whose squared distance is below a bound, nearest first; returns how many.
+    int nearest(const double *at, int k, Neighbour *out, double bound = __builtin_inf()) const {
+        struct Best : Neighbour {
+            Neighbour *list;
+            int k, count;
+        } best{{bound, -1}, out, k, 0};
+        if (size() && k > 0) {
+            double away[3] = {0, 0, 0};
+            search(0, at, away, 0, best, [](Best &b, const Neighbour &found) {
+                if (b.count == b.k ? !(found < b.list[b.k - 1]) : !(found.squared < b.squared)) return;
+                int i = b.count < b.k ? b.count++ : b.k - 1;
+                for (; i > 0 && found < b.list[i - 1]; --i) b.list[i] = b.list[i - 1];
+                b.list[i] = found;
+                if (b.count == b.k) b.squared = b.list[b.k - 1].squared;
+            });
+        }
+        return best.count;
+    }
+
+  private:
+    static constexpr int32_t kLeaf = 8;
+    struct Node {
+        double split;
+        int32_t begin, end, right;  // of a leaf right is 0; the left child is the next node
+        int axis;
+    };
+
+    int32_t build(int32_t begin, int32_t end) {
+        const int32_t at = int32_t(nodes_.size());
+        nodes_.push_back({0, begin, end, 0, 0});
+        if (end - begin <= kLeaf) return at;
+        double low[3] = {__builtin_inf(), __builtin_inf(), __builtin_inf()}, high[3] = {-low[0], -low[0], -low[0]};
+        for (int32_t i = begin; i < end; ++i)
+            for (int a = 0; a < 3; ++a) {
+                low[a] = std::min(low[a], point(rows_[i])[a]);
+                high[a] = std::max(high[a], point(rows_[i])[a]);
+            }
+        int axis = 0;
+        for (int a = 1; a < 3; ++a)
+            if (high[a] - low[a] > high[axis] - low[axis]) axis = a;
+        const int32_t middle = begin + (end - begin) / 2;
+        std::nth_element(rows_.begin() + begin, rows_.begin() + middle, rows_.begin() + end, [&](int32_t i, int32_t j) {
+            const double x = point(i)[axis], y = point(j)[axis];
+            return x < y || (x == y && i < j);
+        });
+        nodes_[at].axis = axis;
+        nodes_[at].split = point(rows_[middle])[axis];
+        build(begin, middle);
+        const int32_t right = build(middle, end);
+        nodes_[at].right = right;
+        return at;
+    }
+
+    // Calls take(best, found) for every point that may come before `best`, whose distance bounds the search; `away` is how
+    // far the node's box lies from `at` along each axis, `distance` the sum of its squares.
+    template <class Best, class Take>
+    void search(int32_t node, const double *at, double *away, double distance, Best &best, const Take &take) const {
+        const Node &n = nodes_[node];
+        if (!n.right) {
+            for (int32_t i = n.begin; i < n.end; ++i) {
+                const Neighbour found{squared(at, &sorted_[3 * std::size_t(i)]), rows_[i]};
+                if (found.squared <= best.squared) take(best, found);
+            }
+            return;
+        }
+        const double offset = at[n.axis] - n.split;
+        search(offset < 0 ? node + 1 : n.right, at, away, distance, best, take);
+        const double before = away[n.axis], across = distance - before * before + offset * offset;
+        // Rounding must not hide an equally near point, of which the first counts.
+        if (across <= best.squared * (1 + 1e-9)) {
+            away[n.axis] = offset;
+            search(offset < 0 ? n.right : node + 1, at, away, across, best, take);
+            away[n.axis] = before;
+        }
+    }
+
+    std::vector<double> points_, sorted_;
+    std::vector<int32_t> rows_;
+    std::vector<Node> nodes_;
+};
+
+}  // namespace gsmap

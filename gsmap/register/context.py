@@ -1,0 +1,117 @@
+"""What stands around an object: a histogram of the features in its neighbourhood of the graph (Graph-GSReg).
+
+The paper's local graph reaches three hops far; on made places one tells objects best apart (`docs/design/0027`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.types import NodeLayer
+
+_LLOYD_STEPS = 10  # of spherical k-means; made places' recall is the same after 5 and after 20
+
+
+@dataclass(frozen=True)
+class Params:
+    """How an object's surroundings are counted and weighed.
+
+    Args:
+        max_distance_m: objects nearer to each other than this are joined in the local graph.
+        hops: how far along it the surroundings reach.
+        num_words: of the codebook, at most.
+        sharpness: of the softmax by which a feature is shared among the words; the inverse of its temperature.
+        weight: length of the context against the feature's in the embedding; 0: features alone.
+    """
+
+    max_distance_m: float = 1.5
+    hops: int = 1
+    num_words: int = 48
+    sharpness: float = 20.0
+    weight: float = 0.5
+
+
+def with_context(a: NodeLayer, b: NodeLayer, params: Params | None = None) -> tuple[NodeLayer, NodeLayer]:
+    """Two layers of one descriptor with embeddings ``[feature, weight * context]`` of unit length.
+
+    The words that contexts are counted over are those of the two layers themselves (`word_shares`): an image encoder's
+    features all lie in one narrow cone, which a codebook that knows nothing of them cannot tell apart. Nothing of a
+    context is stored, so that layers compare whatever other scenes a map holds, and in whatever order they came.
+    """
+    params = params or Params()
+    if params.weight == 0 or not len(a) or not len(b):
+        return a, b
+    shares = word_shares(np.concatenate([a.features, b.features]), params.num_words, params.sharpness)
+    return _joined(a, shares[: len(a)], params), _joined(b, shares[len(a) :], params)
+
+
+def _joined(layer: NodeLayer, shares: np.ndarray, params: Params) -> NodeLayer:
+    reach = neighbourhood(layer.positions, params.max_distance_m / layer.unit_m, params.hops)
+    both = np.concatenate([layer.features, params.weight * context_histograms(shares, reach)], axis=1)
+    return replace(layer, embeddings=both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), 1e-12))
+
+
+def neighbourhood(positions: np.ndarray, max_distance: float, hops: int) -> np.ndarray:
+    """(M, M) bool: which nodes are within ``hops`` edges of which, itself left out.
+
+    Edges join nodes nearer than ``max_distance``: the paper's local graph.
+    """
+    count = len(positions)
+    step = np.eye(count, dtype=bool)
+    for i, j in cKDTree(positions).query_pairs(max_distance) if count else ():
+        step[i, j] = step[j, i] = True
+    reach = step
+    for _ in range(hops - 1):
+        reach = (reach.astype(np.float32) @ step.astype(np.float32)) > 0
+    return reach & ~np.eye(count, dtype=bool)
+
+
+def word_shares(features: np.ndarray, num_words: int, sharpness: float) -> np.ndarray:
+    """(M, K) how each of M features is shared among K <= ``num_words`` words; rows sum to 1.
+
+    Features are centred on their mean, which all have in common and which tells none from another, and brought to unit
+    length. Words are the centres of spherical k-means (Dhillon and Modha 2001) from seeds each farthest from those
+    before it, so that nothing is drawn at random. Centres are sums of features, so the products of features with each
+    other are all that is needed, however long the features are. A feature is shared by the softmax of its cosines.
+
+    Args:
+        features: (M, F).
+        num_words: K at most; M where there are fewer features.
+        sharpness: of the softmax.
+    """
+    centred = features.astype(np.float64) - features.mean(0, dtype=np.float64)
+    centred /= np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-12)
+    alike = centred @ centred.T
+    seeds = [int(alike.mean(0).argmax())]
+    nearest = alike[seeds[0]]
+    for _ in range(min(num_words, len(features)) - 1):
+        seeds.append(int(nearest.argmin()))
+        nearest = np.maximum(nearest, alike[seeds[-1]])
+    cosines = alike[:, seeds]
+    for _ in range(_LLOYD_STEPS):
+        members = np.zeros_like(cosines)
+        members[np.arange(len(members)), cosines.argmax(1)] = 1
+        sums = alike @ members
+        lengths = np.sqrt((members * sums).sum(0))
+        some = lengths > 1e-9  # a word that lost all its features stays where it was
+        cosines = np.where(some, sums / np.where(some, lengths, 1), cosines)
+    shares = np.exp(sharpness * (cosines - cosines.max(1, keepdims=True)))
+    out: np.ndarray = shares / shares.sum(1, keepdims=True)
+    return out
+
+
+def context_histograms(shares: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """(M, K) unit vectors: the root of how a node's neighbours spread over the words.
+
+    Cosines of roots compare histograms as Bhattacharyya coefficients. A node with no neighbour has the zero vector.
+
+    Args:
+        shares: (M, K) of `word_shares`.
+        reach: (M, M) which nodes are each node's neighbours.
+    """
+    total = reach.astype(np.float64) @ shares
+    out: np.ndarray = np.sqrt(total / np.maximum(total.sum(1, keepdims=True), 1e-12))
+    return out
