@@ -26,6 +26,7 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from bench_register import described, rescaled
@@ -61,7 +62,7 @@ def main() -> None:
     parser.add_argument("--verbose", action="store_true", help="one line per pair")
     options = parser.parse_args()
     options.cache.mkdir(parents=True, exist_ok=True)
-    rows: dict[str, list[dict]] = {mode: [] for mode in options.modes}
+    rows: dict[str, list[dict[str, Any]]] = {mode: [] for mode in options.modes}
     with gsmap.map.open_or_create(options.cache / "bench.gsmap") as m:
         for seed in options.seeds:
             folder = make_folder(options, seed)
@@ -91,7 +92,7 @@ def make_folder(options: argparse.Namespace, seed: int) -> Path:
     return folder
 
 
-def run(m, folder: Path, seed: int, mode: str, options: argparse.Namespace) -> list[dict]:
+def run(m: Any, folder: Path, seed: int, mode: str, options: argparse.Namespace) -> list[dict[str, Any]]:
     """Register the pairs of one court."""
     policy, drawn = MODES[mode]
     rng, captures, centres = np.random.default_rng([seed, 41]), [], {}
@@ -111,9 +112,13 @@ def run(m, folder: Path, seed: int, mode: str, options: argparse.Namespace) -> l
         overlap = overlaps.get(frozenset((a.name, b.name)), 0.0)
         start = time.process_time()
         found = register_pair(a.view, b.view)
-        row = {"overlap": overlap, "seconds": time.process_time() - start, "accepted": found.status == "accepted"}
+        row: dict[str, Any] = {
+            "overlap": overlap,
+            "seconds": time.process_time() - start,
+            "accepted": found.status == "accepted",
+        }
         said = f"{seed} {mode}: {a.name}-{b.name} overlap {overlap:.2f} {found.status}"
-        if found.status == "accepted":
+        if found.status == "accepted" and found.S_target_source is not None:
             row |= measured(a, b, found.S_target_source, found.information)
             said += f" {row['deg']:.3f} deg {100 * row['m']:.2f} cm scale {row['scale']:.3%} chi2 {row['chi2']:.1f}"
             if options.gicp and mode == "metres, known":
@@ -166,9 +171,9 @@ def gicp(a: Capture, b: Capture, start: Sim3) -> tuple[float, float]:
     return min(errors, key=lambda e: e[1])
 
 
-def print_line(mode: str, rows: list[dict]) -> None:
-    def right(r: dict) -> bool:
-        return r["accepted"] and r["deg"] < RIGHT_DEG and r["m"] < RIGHT_M
+def print_line(mode: str, rows: list[dict[str, Any]]) -> None:
+    def right(r: dict[str, Any]) -> bool:
+        return bool(r["accepted"] and r["deg"] < RIGHT_DEG and r["m"] < RIGHT_M)
 
     bands = []
     for low, high in ((0.25, 1.01), (0.1, 0.25), (0.0, 0.1)):

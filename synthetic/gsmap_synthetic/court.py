@@ -90,9 +90,10 @@ def _pave(s: Surfaces, rng: np.random.Generator, length: float, width: float) ->
     for _ in range(int(length * width / 28)):
         w, d = rng.uniform(0.5, 2.5, 2)
         x, y = rng.uniform(0.5, length - w - 0.5), rng.uniform(0.5, width - d - 0.5)
-        paint = (tx.plaster, tx.marble, tx.fabric)[int(rng.integers(3))]
+        kind = int(rng.integers(3))
         tone, seed = colour(rng, (0.0, 0.2), (0.0, 0.35), (0.2, 0.75)), int(rng.integers(1 << 20))
-        patch = paint(tone, seed) if paint is tx.plaster else paint(tone, 0.5 * tone, seed, *([1] * (paint is tx.fabric)))
+        worn = tx.marble(tone, 0.5 * tone, seed) if kind == 1 else tx.fabric(tone, 0.5 * tone, seed, 1)
+        patch = tx.plaster(tone, seed) if kind == 0 else worn
         s.box(x, y, 0, w, d, 0.012, patch, glow=_GLOW)
 
 
@@ -121,7 +122,10 @@ def _openings(s: Surfaces, rng: np.random.Generator, width: float, storey: float
     """Windows in columns; at the bottom doors, shop windows and signs instead, no two houses alike."""
     count = max(1, int(width // 1.9))
     wide, high = rng.uniform(0.8, 1.1), rng.uniform(1.2, 1.5)
-    glass, frame = tx.plain(colour(rng, (0.5, 0.65), (0.1, 0.4), (0.1, 0.3)), 3), _lit(tx.plain(np.full(3, 0.7), 5), light)
+    glass, frame = (
+        tx.plain(colour(rng, (0.5, 0.65), (0.1, 0.4), (0.1, 0.3)), 3),
+        _lit(tx.plain(np.full(3, 0.7), 5), light),
+    )
     shutter = _lit(tx.wood(colour(rng, value=(0.2, 0.6)), int(rng.integers(99)), True), light)
     has_shutters = rng.random() < 0.5
     for k in range(count):
@@ -145,7 +149,17 @@ def _openings(s: Surfaces, rng: np.random.Generator, width: float, storey: float
             s.box(x, 0.03, 0.9, wide, 0.06, 1.3, frame, front=glass, glow=_GLOW)
         if rng.random() < 0.4:
             sign = tx.picture(palette(rng, 5), seed + 1, 1 + int(rng.integers(2)))
-            s.box(x, 0.1, 2.45, rng.uniform(0.8, 1.5), 0.2, rng.uniform(0.3, 0.6), frame, front=_lit(sign, light), glow=_GLOW)
+            s.box(
+                x,
+                0.1,
+                2.45,
+                rng.uniform(0.8, 1.5),
+                0.2,
+                rng.uniform(0.3, 0.6),
+                frame,
+                front=_lit(sign, light),
+                glow=_GLOW,
+            )
 
 
 def _arcade(
@@ -225,7 +239,8 @@ def stroll(place: Place, at_m: float, count: int, seed: int = 0, *, width_m: flo
     low, high = max(at_m - _REACH_M / 2, 4.0), min(at_m + _REACH_M / 2, length - 4.0)
     middle, radii = np.array([(low + high) / 2, width_m / 2]), np.array([(high - low) / 2, width_m / 2 - 5.5])
     radii = radii * rng.uniform(0.8, 1.0, 2)
-    phase, turn, yaw0, tilt0 = *rng.uniform(0, 2 * np.pi, 1), rng.choice([-1.0, 1.0]), *rng.uniform(0, 2 * np.pi, 2)
+    phase, turn = float(rng.uniform(0, 2 * np.pi)), float(rng.choice([-1.0, 1.0]))
+    yaw0, tilt0 = (float(x) for x in rng.uniform(0, 2 * np.pi, 2))
     out = []
     for i in range(count):
         angle = phase + turn * 2 * np.pi * i / count

@@ -8,6 +8,7 @@ from gsmap.describe import Params, describe
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.landmarks.detect import Octaves
 from gsmap.describe.landmarks.layer import landmark_layer
+from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.unit import landmark_units, working_unit_m
 from gsmap.types import Sim3
 
@@ -74,3 +75,11 @@ def test_octaves_that_layers_share_are_those_that_each_finds():
         np.testing.assert_array_equal(shared.positions, alone.positions)
         np.testing.assert_array_equal(shared.types, alone.types)
         np.testing.assert_array_equal(shared.weights, alone.weights)
+
+
+def test_objects_of_a_large_place_are_of_its_size_where_the_metre_is_told():
+    few = ObjectParams(segmenter="builtin", embedder="builtin", render_backend="native", num_cameras=2, min_views=1)
+    params = Params(landmarks=False, things=False, object=few)
+    graph = describe("hall", *large(4.0), params, scale_policy="known")
+    assert graph.unit_m == 1.0
+    assert graph.layers["objects"].unit_m == graph.working_m < 0.2

@@ -1,0 +1,112 @@
+"""The native kernels of landmarks against what they compute, written plainly."""
+
+import numpy as np
+import pytest
+from describe_places import room
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from gsmap.describe import Params, describe
+from gsmap.describe.cloud import downsample, surface_cloud
+from gsmap.describe.landmarks import detect
+from gsmap.describe.landmarks.context import Params as ContextParams
+from gsmap.describe.landmarks.context import cylinder_context, shell_context
+from gsmap.describe.landmarks.detect import find_blobs, thinned
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    return surface_cloud(room(n=12_000)[0])
+
+
+def plain_extrema(points, lab, areas, threshold, channel):
+    """Positive extrema of one channel on one dense grid, in cells: see `find_blobs`."""
+    low = np.floor(points.min(0)) - 3
+    shape = tuple((np.floor(points.max(0)) - low + 4).astype(int))
+    fields = np.zeros((2, *shape))
+    base = np.floor(points - low - 0.5).astype(int)
+    t = points - low - 0.5 - base
+    for corner in np.ndindex(2, 2, 2):
+        share = np.where(corner, t, 1 - t).prod(1) * areas
+        for field, value in zip(fields, (np.ones(len(points)), lab[:, channel] - 50 * (channel == 0)), strict=True):
+            np.add.at(field, tuple((base + corner).T), share * value)
+    wide = 1.6 * np.sqrt(1.8**2 - 1)
+    near = [gaussian_filter(f, 1.6, truncate=3.0, mode="constant") for f in fields]
+    far = [gaussian_filter(f, wide, truncate=3.0, mode="constant") for f in near]
+    surface = near[0] * np.sqrt(2 * np.pi) * 1.6 > 0.3
+    response = np.where(surface, near[1] / np.maximum(near[0], 1e-9) - far[1] / np.maximum(far[0], 1e-9), 0)
+    peaks = (response > threshold) & (response == maximum_filter(response, 5, mode="constant"))
+    return np.argwhere(peaks) + low + 0.5, response[peaks] / threshold
+
+
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_extrema_are_those_of_the_plain_computation(cloud, channel):
+    size = 0.1
+    # Clear of the edges of the grid's blocks.
+    points, lab, areas = cloud.points / size + 30, cloud.lab.astype(float), cloud.areas / size**2
+    thresholds = np.array([2.6, 2.0, 2.0, 0.6])
+    found = [(at, ratio) for c, negative, at, ratio in detect._extrema(points, lab, areas, thresholds)
+             if c == channel and not negative]  # fmt: skip
+    (at, ratio), (expected, strong) = found[0], plain_extrema(points, lab, areas, thresholds[channel], channel)
+    assert len(expected) > 15
+    distance = np.linalg.norm(at[:, None] - expected[None], axis=2)
+    # Positions are refined within the window; of two equal peaks within one, rounding may leave either.
+    assert distance.min(0).max() < 4.0
+    assert distance.min(1).max() < 2.5
+    assert abs(len(at) - len(expected)) <= 0.2 * len(expected)
+    np.testing.assert_allclose(ratio, strong[distance.argmin(1)], rtol=1e-3)
+
+
+def test_blocks_find_what_one_grid_finds(cloud, monkeypatch):
+    args = cloud.points, cloud.lab, cloud.areas
+    whole = find_blobs(*args)
+    monkeypatch.setattr(detect, "_BLOCK_CELLS", 40)
+    parts = find_blobs(*args)
+    assert len(whole) > 100
+    distance = np.linalg.norm(whole.positions[:, None] - parts.positions[None], axis=2).min(1)
+    assert (distance < 0.01).mean() > 0.95
+
+
+def test_a_thinned_cloud_has_its_surface_and_its_landmarks(cloud, monkeypatch):
+    monkeypatch.setattr(detect, "_MANY", 1000)
+    points, lab, areas = thinned(cloud.points, cloud.lab, cloud.areas, 0.5)
+    assert len(points) < 0.7 * len(cloud)
+    assert areas.sum() == pytest.approx(cloud.areas.sum())
+    np.testing.assert_allclose((areas[:, None] * lab).sum(0), (cloud.areas[:, None] * cloud.lab).sum(0), rtol=1e-6)
+    few = find_blobs(cloud.points, cloud.lab, cloud.areas)
+    monkeypatch.setattr(detect, "_MANY", 10**9)
+    all_ = find_blobs(cloud.points, cloud.lab, cloud.areas)
+    distance = np.linalg.norm(all_.positions[:, None] - few.positions[None], axis=2).min(1)
+    assert np.median(distance) < 0.01
+
+
+def test_surroundings_are_the_means_of_what_lies_in_each_ring(cloud):
+    params = ContextParams()
+    rng = np.random.default_rng(0)
+    positions = cloud.points[rng.integers(len(cloud), size=7)] + rng.normal(size=(7, 3)) * 0.05
+    thin, colour = downsample(cloud.points, cloud.lab, params.cell_m)
+    values = (colour - [55.0, 3.0, 8.0]) / [20.0, 10.0, 14.0]
+    cylinders = cylinder_context(positions, cloud.points, cloud.lab, params)
+    shells = shell_context(positions, cloud.points, cloud.lab, params)
+    levels = len(params.heights_m) - 1
+    for row, position in enumerate(positions):
+        step = thin - position
+        ring, level = (
+            np.searchsorted(params.radii_m, np.hypot(*step[:, :2].T)),
+            np.searchsorted(params.heights_m, step[:, 2]) - 1,
+        )
+        shell = np.searchsorted(params.shells_m, np.linalg.norm(step, axis=1))
+        for i in range(len(params.radii_m)):
+            for j in range(levels):
+                inside = (ring == i) & (level == j)
+                expected = values[inside].mean(0) if inside.any() else np.zeros(3)
+                np.testing.assert_allclose(cylinders[row, i * levels + j, :3], expected, atol=1e-9)
+                assert (cylinders[row, i * levels + j, 3] > 0) == inside.any()
+        for i in range(len(params.shells_m)):
+            inside = shell == i
+            expected = values[inside].mean(0) if inside.any() else np.zeros(3)
+            np.testing.assert_allclose(shells[row, i, :3], expected, atol=1e-9)
+
+
+def test_nothing_around_is_no_error():
+    graph = describe("none", room(n=100)[0][:0], None, Params(objects=False))
+    assert graph.num_nodes == 0

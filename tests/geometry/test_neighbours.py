@@ -1,0 +1,28 @@
+"""Nearest neighbours are those of a k-d tree, whatever the order they are looked at in."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gsmap.geometry import neighbours
+from gsmap.geometry.neighbours import chunks_of_neighbours, nearest_neighbours, spatial_order
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 3000])
+def test_neighbours_are_those_of_a_search_tree(count, monkeypatch):
+    monkeypatch.setattr(neighbours, "_CHUNK", 700)
+    points = np.random.default_rng(count).normal(size=(count, 3)) * [5, 1, 0.2]
+    distances, rows = nearest_neighbours(points, 6)
+    assert distances.shape == rows.shape == (count, 6)
+    if count:
+        near, of = cKDTree(points).query(points, k=6)
+        np.testing.assert_allclose(distances, near)
+        np.testing.assert_array_equal(rows, of)
+    seen = [r for r, *_ in chunks_of_neighbours(points, 3)]
+    assert sorted(np.concatenate([*seen, []]).astype(int)) == list(range(count))
+
+
+def test_points_in_one_place_keep_their_order():
+    np.testing.assert_array_equal(spatial_order(np.ones((4, 3)), 8), np.arange(4))
+    points = np.array([[0.0, 0, 0], [9, 0, 0], [0.1, 0, 0], [9.1, 0, 0]])
+    np.testing.assert_array_equal(spatial_order(points, 4), [0, 2, 1, 3])
