@@ -34,7 +34,7 @@ class PointTree {
     Neighbour nearest(const double *at, Neighbour bound) const {
         if (size()) {
             double away[3] = {0, 0, 0};
-            search(0, at, away, 0, bound, [](Neighbour &best, const Neighbour &found) { if (found < best) best = found; });
+            search(0, at, away, 0, bound, [](Neighbour &best, const Neighbour &found) { best = std::min(best, found); });
         }
         return bound;
     }

@@ -171,7 +171,7 @@ struct Sums {
 };
 
 // A point's nearest cell, as rows of Python's array keep it from pose to pose: where the point was when cells were last
-// searched, how near any other cell can have been then (negative: nothing is known yet), and the cell, -1 for none that near.
+// searched, how near any other cell can have been then (negative: nothing is known yet), and the cell, -1 for none.
 // By the triangle inequality it stays the nearest until the point has moved by the difference, so late steps search little.
 struct Partner {
     double at[3], others, row;
@@ -268,7 +268,8 @@ Equations equations(const Cells &onto, const double *points, const double *light
         const auto slope_of = [&](const Pair &pair, const double *along, double factor, double *slope) {
             double local[3];
             for (int a = 0; a < 3; ++a)
-                local[a] = factor * (backward ? -along[a] : pose[a] * along[0] + pose[4 + a] * along[1] + pose[8 + a] * along[2]);
+                local[a] = factor * (backward ? -along[a] :
+                                     pose[a] * along[0] + pose[4 + a] * along[1] + pose[8 + a] * along[2]);
             const double *x = pair.lever;
             slope[0] = x[1] * local[2] - x[2] * local[1];
             slope[1] = x[2] * local[0] - x[0] * local[2];
@@ -376,8 +377,8 @@ void bind_surface(nb::module_ &m) {
             {
                 nb::gil_scoped_release release;
                 out = equations({&tree, normals.data(), lightness.data(), gradients ? gradients->data() : nullptr},
-                                points.data(), own_lightness.data(), rows.data(), int64_t(rows.shape(0)), reinterpret_cast<Partner *>(partners.data()),
-                                pose.data(), centre.data(), backward,
+                                points.data(), own_lightness.data(), rows.data(), int64_t(rows.shape(0)),
+                                reinterpret_cast<Partner *>(partners.data()), pose.data(), centre.data(), backward,
                                 {radius_m, width_m, gradients ? colour_weight : 0.0});
             }
             std::vector<double> system(49), gradient(out.sums.gradient, out.sums.gradient + 7);
@@ -394,8 +395,8 @@ void bind_surface(nb::module_ &m) {
         nb::arg("backward"), nb::arg("radius_m"), nb::arg("width_m"), nb::arg("colour_weight"),
         "Normal equations (7, 7), (7,) over [rotation, translation, log scale] about `centre` of points laid on cells by a\n"
         "pose (3, 4), the number of pairs, the robust standard deviation of their plane distances, their mean (3,) less the\n"
-        "centre and their root mean square distance from it. `partners` (n, 5), -1 at first, keep each row's nearest cell from pose to\n"
-        "pose, for one radius, and are written to.");
+        "centre and their root mean square distance from it. `partners` (n, 5), -1 at first, keep each row's nearest cell\n"
+        "from pose to pose, for one radius, and are written to.");
 }
 
 }  // namespace gsmap

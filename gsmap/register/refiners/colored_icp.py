@@ -125,7 +125,7 @@ class _Equations:
 
 
 class _Laid:
-    """Cells of one surface laid on another by a pose, each on the nearest, within one radius; what is known of them is kept."""
+    """Cells of one surface laid on another by a pose, each on the nearest within one radius; what is known is kept."""
 
     def __init__(self, onto: Surface, moving: Surface, count: int, *, backward: bool = False) -> None:
         self._onto, self._moving, self._backward = onto, moving, backward
