@@ -11,6 +11,7 @@ void bind_fit(nb::module_ &);
 void bind_landmarks(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_stopping(nb::module_ &);
+void bind_surroundings(nb::module_ &);
 void bind_surface(nb::module_ &);
 }
 
@@ -23,5 +24,6 @@ NB_MODULE(_native, m) {
     gsmap::bind_landmarks(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_stopping(m);
+    gsmap::bind_surroundings(m);
     gsmap::bind_surface(m);
 }

@@ -1,0 +1,129 @@
+// What surrounds a landmark: colours and counts of the points in rings, or in shells.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <stdexcept>
+#include <vector>
+
+namespace nb = nanobind;
+
+namespace gsmap {
+namespace {
+
+using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+
+// Points sorted into square columns of a plane, so that those near a place are found in few runs.
+struct Columns {
+    double low[2] = {}, size;
+    int n[2] = {};
+    std::vector<std::int64_t> starts, order;
+
+    Columns(const Points &points, double cell) : size(cell) {
+        const std::size_t count = points.shape(0);
+        double high[2] = {};
+        for (std::size_t i = 0; i < count; ++i)
+            for (int k = 0; k < 2; ++k) {
+                const double v = points.data()[3 * i + k];
+                low[k] = i ? std::min(low[k], v) : v;
+                high[k] = i ? std::max(high[k], v) : v;
+            }
+        for (int k = 0; k < 2; ++k) {  // however far the points reach, there are no more columns than these
+            const double columns = std::floor((high[k] - low[k]) / size) + 1;
+            if (columns > 4096) size = (high[k] - low[k]) / 4095;
+        }
+        for (int k = 0; k < 2; ++k) n[k] = int(std::floor((high[k] - low[k]) / size)) + 1;
+        starts.assign(std::size_t(n[0]) * n[1] + 1, 0);
+        std::vector<std::int64_t> column(count);
+        for (std::size_t i = 0; i < count; ++i) {
+            const double *p = points.data() + 3 * i;
+            column[i] = std::int64_t(at(p[0], 0)) * n[1] + at(p[1], 1);
+            ++starts[column[i] + 1];
+        }
+        for (std::size_t i = 1; i < starts.size(); ++i) starts[i] += starts[i - 1];
+        std::vector<std::int64_t> next(starts.begin(), starts.end() - 1);
+        order.resize(count);
+        for (std::size_t i = 0; i < count; ++i) order[next[column[i]]++] = std::int64_t(i);
+    }
+
+    int at(double v, int axis) const {
+        return int(std::clamp(std::floor((v - low[axis]) / size), 0.0, double(n[axis] - 1)));
+    }
+};
+
+// Index of the first edge that is not below a value; as many as there are where all are.
+int first_not_below(const Numbers &edges, double value) {
+    int i = 0;
+    while (i < int(edges.shape(0)) && edges.data()[i] < value) ++i;
+    return i;
+}
+
+// See gsmap/describe/landmarks/context.py: sums of values (M, bins, 3) and counts (M, bins), in rings of an upright
+// cylinder where there are heights, else in shells.
+void surroundings(const Points &positions, const Points &points, const Points &values, const Numbers &radii,
+                  const Numbers &heights, double *sums, double *counts) {
+    const int rings = int(radii.shape(0)), levels = std::max(int(heights.shape(0)) - 1, 1);
+    const double reach = radii.data()[rings - 1];
+    const Columns columns(points, reach / 4);
+    for (std::size_t m = 0; m < positions.shape(0); ++m) {
+        const double *p = positions.data() + 3 * m;
+        double *sum = sums + m * rings * levels * 3, *count = counts + m * rings * levels;
+        const int x1 = columns.at(p[0] + reach, 0), y0 = columns.at(p[1] - reach, 1), y1 = columns.at(p[1] + reach, 1);
+        for (int x = columns.at(p[0] - reach, 0); x <= x1; ++x) {
+            const std::size_t row = std::size_t(x) * columns.n[1];
+            for (std::int64_t i = columns.starts[row + y0]; i < columns.starts[row + y1 + 1]; ++i) {
+                const std::int64_t j = columns.order[i];
+                const double *q = points.data() + 3 * j, dx = q[0] - p[0], dy = q[1] - p[1], dz = q[2] - p[2];
+                int level = 0;
+                double distance = dx * dx + dy * dy;
+                if (heights.shape(0)) {
+                    level = first_not_below(heights, dz) - 1;
+                    if (level < 0 || level >= levels) continue;
+                } else distance += dz * dz;
+                const int ring = first_not_below(radii, std::sqrt(distance));
+                if (ring == rings) continue;
+                const int bin = ring * levels + level;
+                count[bin] += 1;
+                for (int c = 0; c < 3; ++c) sum[3 * bin + c] += values.data()[3 * j + c];
+            }
+        }
+    }
+}
+
+template <class T>
+nb::ndarray<nb::numpy, T> array_of(std::vector<std::size_t> shape, T *&data) {
+    std::size_t size = 1;
+    for (std::size_t n : shape) size *= n;
+    data = new T[size + 1]();
+    nb::capsule owner(data, [](void *p) noexcept { delete[] static_cast<T *>(p); });
+    return nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner);
+}
+
+}  // namespace
+
+void bind_surroundings(nb::module_ &m) {
+    m.def(
+        "landmark_surroundings",
+        [](Points positions, Points points, Points values, Numbers radii, Numbers heights) {
+            if (values.shape(0) != points.shape(0) || radii.shape(0) < 1 || heights.shape(0) == 1)
+                throw std::invalid_argument("surroundings need a value for each point, a radius, and heights or none");
+            const std::size_t count = positions.shape(0), bins = radii.shape(0) * std::max<std::size_t>(
+                                                                                      heights.shape(0), 2) -
+                                                                 radii.shape(0);
+            double *sums, *counts;
+            auto sums_out = array_of<double>({count, bins, 3}, sums), counts_out = array_of<double>({count, bins}, counts);
+            if (points.shape(0)) {
+                nb::gil_scoped_release release;
+                surroundings(positions, points, values, radii, heights, sums, counts);
+            }
+            return nb::make_tuple(sums_out, counts_out);
+        },
+        nb::arg("positions"), nb::arg("points"), nb::arg("values"), nb::arg("radii"), nb::arg("heights"),
+        "Sums (M, bins, 3) of the values and counts (M, bins) of the points around each position.");
+}
+
+}  // namespace gsmap
