@@ -28,8 +28,8 @@ class Params:
             deviations of the distances between the planes: it would cut off noise, and hold the pose where it is.
         iterations: Gauss-Newton steps at each radius.
         colour_weight: how many standard deviations of the distances to the planes one of local colour counts for, at
-            fine radii: 1 where errors of colours are as independent of each other as those of points; 0 leaves colour
-            out.
+            fine radii: 1 were errors of colours as independent of each other as those of points, but a texture is
+            blurred or lit otherwise as a whole; 0 leaves colour out.
         colour_radius_m: at radii beyond this colour is left out: lightness extrapolated so far in a tangent plane means
             nothing.
         max_points: cells of both surfaces together that take part at each radius.
@@ -42,7 +42,7 @@ class Params:
     radii_m: tuple[float, ...] = (0.4, 0.15, 0.06, 0.03)
     least_sigmas: float = 4.0
     iterations: int = 20
-    colour_weight: float = 1.0
+    colour_weight: float = 0.3
     colour_radius_m: float = 0.1
     max_points: tuple[int, ...] = (3000, 6000, 10_000, 40_000)
     tolerance: float = 0.01
