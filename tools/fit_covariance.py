@@ -35,6 +35,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from gsmap.describe.cloud import surface_cloud
+from gsmap.describe.gravity import estimate_up
+from gsmap.describe.unit import estimate_unit_m, working_unit_m
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.ingest import read_captures
@@ -43,15 +46,19 @@ from gsmap.register.covariance import Conditioning, condition
 from gsmap.register.metres import believe
 from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import Surface
-from gsmap.types import Sim3
+from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap_synthetic import make_captures, write_captures
 from gsmap_synthetic.capture import Frames, default_routes, film, unused_doors, walk
+from gsmap_synthetic.court import court_captures
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import make_place
 
 TRAINED = -1.0  # on perfect frames; other levels lay Gaussians on bent depths
+COURT = -2.0  # the same, outdoors and seen from far
+KINDS = {TRAINED: "trained", COURT: "court"}
 FITTED = {
     TRAINED: (501, 502, 503),
+    COURT: (401, 402),
     0.0: (631,),
     0.25: (621, 650, 652, 654),
     0.5: (611, 612, 660, 662, 664),
@@ -60,6 +67,7 @@ FITTED = {
 }
 TESTED = {
     TRAINED: (504, 505, 506),
+    COURT: (403,),
     0.0: (632,),
     0.25: (622, 651, 653, 655),
     0.5: (613, 661, 663, 665),
@@ -81,7 +89,7 @@ def main() -> None:
         print(f"{name} = {getattr(model, name):.5f}")
     for title, groups in (("fitted", fitted), ("tested", tested)):
         for level, pairs in groups.items():
-            report(f"{title}, " + ("trained" if level == TRAINED else f"bent x {level:g}"), pairs, model)
+            report(f"{title}, " + KINDS.get(level, f"bent x {level:g}"), pairs, model)
         report(f"{title}, all", [pair for pairs in groups.values() for pair in pairs], model)
     for folder in options.test:
         report(folder.name, pairs_of(folder, options.cache), model)
@@ -92,12 +100,15 @@ def main() -> None:
 
 def made(cache: Path, level: float, seed: int) -> Path:
     """The folder of three captures of a made place."""
-    folder = cache / (f"trained_{seed}" if level == TRAINED else f"bent_{level:g}_{seed}")
+    folder = cache / f"{KINDS.get(level, f'bent_{level:g}')}_{seed}"
     if not folder.exists():
         print(f"making {folder.name}", file=sys.stderr, flush=True)
         if level == TRAINED:
             sizes = {"num_frames": 40, "num_gaussians": 30_000, "size_px": (240, 180)}
             write_captures(folder, make_captures(seed, 3, steps=200, vary_exposure=True, **sizes))
+        elif level == COURT:
+            sizes = {"num_gaussians": 60_000, "size_px": (240, 180)}
+            write_captures(folder, court_captures(seed, 6, steps=150, vary_exposure=True, **sizes))
         else:
             write_captures(folder, bent_captures(level, seed))
     return folder
@@ -168,14 +179,24 @@ def pairs_of(folder: Path, cache: Path) -> list[Pair]:
     """All pairs of a folder that overlap, refined from a start near the truth."""
     kept = cache / f"{folder.name}.pairs"
     if not kept.exists():
-        captures = []
-        for read in read_captures(folder):
+        captures, reads = [], list(read_captures(folder))
+        working_m = float(np.exp(np.mean([np.log(_working_m(read.gaussians, read.cameras)) for read in reads])))
+        for read in reads:
             truth = json.loads((folder / "truth" / f"{read.name}.json").read_text())["T_scene_world"]
-            captures.append((Surface.of(read.gaussians), Sim3.from_matrix(np.array(truth))))
+            metres = Sim3.from_matrix(np.array(truth))
+            captures.append(
+                (Surface.of(read.gaussians, working_m), Sim3(metres.rotation, metres.translation * working_m))
+            )
         pairs = [_pair(*a, *b, seed) for seed, (a, b) in enumerate(itertools.combinations(captures, 2))]
         kept.write_bytes(pickle.dumps([pair for pair in pairs if pair is not None]))
     found: list[Pair] = pickle.loads(kept.read_bytes())
     return found
+
+
+def _working_m(gaussians: Gaussians, cameras: Cameras | None) -> float:
+    """Working metres per metre of a capture."""
+    points = surface_cloud(gaussians).points
+    return working_unit_m(estimate_unit_m(points, cameras, estimate_up(points, cameras)), cameras)
 
 
 def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, seed: int) -> Pair | None:
