@@ -76,6 +76,7 @@ TESTED = {
 }
 LEAST_OVERLAP = 0.08
 START_DEG, START_M = 1.5, 0.05
+RIGHT_M = 0.3
 
 
 def main() -> None:
@@ -187,7 +188,9 @@ def pairs_of(folder: Path, cache: Path) -> list[Pair]:
             captures.append(
                 (Surface.of(read.gaussians, working_m), Sim3(metres.rotation, metres.translation * working_m))
             )
-        pairs = [_pair(*a, *b, seed) for seed, (a, b) in enumerate(itertools.combinations(captures, 2))]
+        pairs = [
+            _pair(*a, *b, RIGHT_M * working_m, seed) for seed, (a, b) in enumerate(itertools.combinations(captures, 2))
+        ]
         kept.write_bytes(pickle.dumps([pair for pair in pairs if pair is not None]))
     found: list[Pair] = pickle.loads(kept.read_bytes())
     return found
@@ -199,7 +202,8 @@ def _working_m(gaussians: Gaussians, cameras: Cameras | None) -> float:
     return working_unit_m(estimate_unit_m(points, cameras, estimate_up(points, cameras)), cameras)
 
 
-def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, seed: int) -> Pair | None:
+def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, right_m: float, seed: int) -> Pair | None:
+    """None where too little overlaps, or another pose was found, which the verdict is to tell."""
     params, truth = Params(), S_target @ S_source.inverse()
     near = np.isfinite(target.nearest(truth.apply(source.coarse[0]), params.covariance.radius_m)[0])
     if near.mean() < LEAST_OVERLAP:
@@ -220,6 +224,8 @@ def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, seed
     centroid = Sim3(np.eye(3), conditioned.centroid)
     inverse = Similarities.stack([truth @ centroid])
     errors = [(Similarities.stack([p @ centroid]).inverse() @ inverse).log()[0] for p in (scaled, rigid)]
+    if np.linalg.norm(errors[1][3:6]) > right_m:
+        return None
     return Pair(errors[0], errors[1][:6], scaled.scale, conditioned)
 
 

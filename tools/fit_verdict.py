@@ -301,7 +301,7 @@ def report(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.Params
 
 
 def report_pairs(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.Params) -> None:
-    """Of how many pairs a right pose, and a wrong one, would be accepted."""
+    """Of how many pairs a right pose, and a wrong one, would be accepted; by overlap those that gsmap proposes."""
     p = probabilities(odds, bars)
     yes = [q >= bars.min_probability and not contradicted(row, bars) for row, q in zip(rows, p, strict=True)]
     one_place = {tuple(row.pair) for row in rows if row.error is not None}
@@ -310,6 +310,13 @@ def report_pairs(name: str, rows: list[Judged], odds: np.ndarray, bars: verdict.
     apart = {tuple(row.pair) for row in rows} - one_place
     print(f"{name}: {len(accepted)} of {len(one_place)} pairs of one place accepted, {len(wrong)} pairs wrongly;")
     print(f"  {len(apart)} pairs of different places had a pose to judge")
+    proposed = [row.kind == "proposed" for row in rows]
+    for low, high in ((0.02, 0.1), (0.1, 0.25), (0.25, 1.01)):
+        band = {tuple(row.pair) for row in rows if low <= row.overlap < high}
+        right = {tuple(row.pair) for row, y, p in zip(rows, yes, proposed, strict=True) if y and p and row.right}
+        found = {tuple(row.pair) for row, p in zip(rows, proposed, strict=True) if p and row.right}
+        share = f"{len(right & band)} of {len(band)} pairs accepted, of {len(found & band)} a right pose was proposed"
+        print(f"  overlap {low:.0%} to {min(high, 1):.0%}: {share}")
 
 
 def probabilities(odds: np.ndarray, bars: verdict.Params) -> np.ndarray:
@@ -338,6 +345,7 @@ def main() -> int:
     report("fit, each place left out", rows, odds, bars)
     tests, more = told_apart(collect(args.places / "test", args.cache, None, seed=1))
     report("test", tests, log_odds(model, tests), bars)
+    report_pairs("test", tests, log_odds(model, tests), bars)
     report("wings on their twins, in neither", twins + more, log_odds(model, twins + more), bars)
     for folder in args.also:
         judged = collect(folder, args.cache, None, seed=1)

@@ -48,7 +48,9 @@ def _off(pose: Sim3, about: np.ndarray, degrees: float, metres: float, factor: f
 
 def test_colored_icp_refiner_comes_back_from_four_degrees(world, surfaces):
     centre = scene_centroid(world.source.gaussians)
-    found = colored_icp.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15))
+    # Colours of this world are off point by point, as by default they are not thought to be.
+    params = colored_icp.Params(colour_weight=1.0)
+    found = colored_icp.refine(*surfaces, _off(world.S_target_source, centre, 4, 0.15), params)
     error = pose_error(found, world.S_target_source, centre)
     assert (error.rre_deg < 0.05, error.centroid_m < 0.003, found.scale) == (True, True, 1.0)
 
@@ -310,7 +312,8 @@ def test_a_scale_some_percent_off_is_reached_from_a_pose_that_it_put_off(factor)
     pose, known, belief = scaled_or_rigid(pair, start, Params(), with_scale=False)
     assert abs(pose.scale / factor - 1) < 0.002
     assert not belief.rigid
-    assert known.sigmas[2] == belief.measured_sigma == belief.log_scale_sigma
+    assert known.sigmas[2] == pytest.approx(belief.measured_sigma)
+    assert belief.measured_sigma == belief.log_scale_sigma
 
 
 def test_covariance_in_scene_units_scales_translations_only():
