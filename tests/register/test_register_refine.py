@@ -158,9 +158,29 @@ def test_covariance_is_as_large_as_the_errors_are(cut_m):
         covariance = condition(target, source, pose, NOTHING_HIDDEN).known(pose, believed(0.0, 0.0)).covariance
         off = (Similarities.stack([pose]).inverse() @ Similarities.stack([world.S_target_source])).log()[0, :6]
         errors.append(off @ np.linalg.solve(covariance[:6, :6], off))
-    # Of a narrow strip residuals tell little, and fields that are alike all over it are still found possible.
-    assert 5.35 / (2 if cut_m[0] == 6.0 else 5) < np.median(errors) < 5.35 * 2
+    # Pairs follow errors as they follow motions, and of that a part is counted twice. Of a narrow strip residuals tell
+    # little, and fields that are alike all over it are still found possible.
+    assert 5.35 / (4 if cut_m[0] == 6.0 else 10) < np.median(errors) < 5.35 * 2
     assert max(errors) < 22.5
+
+
+def test_noise_of_walls_does_not_hold_what_slides_along_them():
+    """A corridor without ends: nothing but the noise of its normals would tell how far along it a pose is."""
+
+    def corridor(seed: int) -> Surface:
+        rng = np.random.default_rng(seed)
+        along, across, up = rng.uniform(0, 8, 9000), rng.uniform(0, 2, 9000), rng.uniform(0, 2.5, 9000)
+        zero = np.zeros(3000)
+        points = np.concatenate(
+            [np.c_[along[:3000], across[:3000], zero]]
+            + [np.c_[along[i : i + 3000], zero + y, up[i : i + 3000]] for i, y in ((3000, 0.0), (6000, 2.0))]
+        )
+        return Surface(points + rng.normal(0, 0.006, points.shape), np.full(points.shape, 0.5), 0.05)
+
+    found = condition(corridor(0), corridor(1), Sim3.identity(), NOTHING_HIDDEN)
+    along, across, up = np.sqrt(np.diag(found.rigid)[3:6])
+    assert max(across, up) < 0.003
+    assert along > 5 * across
 
 
 def _warped(surface: Surface, sigma_m: float, seed: int, cell_m: float = 1.0) -> Surface:
@@ -243,7 +263,12 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
     target, source = surfaces
     pose = world.S_target_source
     params = CovarianceParams(
-        hidden_shift_m=0.02, hidden_swell_m=0.03, shift_by_swell=0.4, turn_by_shift=0.5, field_m=0.004
+        hidden_shift_m=0.02,
+        hidden_swell_m=0.03,
+        shift_by_swell=0.4,
+        turn_by_shift=0.5,
+        field_m=0.004,
+        field_power=2.0,
     )
     bare, found = condition(target, source, pose, NOTHING_HIDDEN), condition(target, source, pose, params)
     growth = (bare.field_m / 0.004) ** 2
