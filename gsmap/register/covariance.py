@@ -16,7 +16,10 @@ from gsmap.types import Sim3
 _FEWEST = 20  # cells that coincide
 _FEWEST_OF_A_BLOCK = 3.0
 _LEAST_LOG_SCALE_SIGMA = 1e-6  # keeps the matrix regular
-_FLATTEST = 1e-3  # of the steepest direction: what hardly pulls is known no better than by this
+_LEAST_HELD = 0.1  # of a motion, whatever the probe says: farther out than it reaches something holds
+# Pairs follow errors of the surfaces as they follow motions, which cancels; but then the residuals show less of the
+# errors than there is, which does not. Half of it, in made worlds whose errors are known.
+_CANCELS = 0.5
 _CLIP = 3.0  # standard deviations: what moved between captures is no error of the surfaces
 
 
@@ -52,12 +55,12 @@ class Params:
     probe_m: float = 0.01
     probe_points: int = 6000
     field: error_field.Params = field(default_factory=error_field.Params)
-    hidden_shift_m: float = 0.0007
-    hidden_swell_m: float = 0.0032
-    shift_by_swell: float = 0.5
-    turn_by_shift: float = 0.65
+    hidden_shift_m: float = 0.0009
+    hidden_swell_m: float = 0.0034
+    shift_by_swell: float = 0.58
+    turn_by_shift: float = 0.91
     field_m: float = 0.002
-    field_power: float = 2.1
+    field_power: float = 2.16
     most_swell: float = 0.02
 
 
@@ -162,8 +165,6 @@ def condition(target: Surface, source: Surface, pose: Sim3, params: Params | Non
     if blocks is None:
         return None
     hessian = _pulled_back(target, source, pose, blocks, params)
-    if hessian is None:
-        return None
     pull = (blocks.jacobian * blocks.weights[:, None]).T
     influence = np.concatenate([np.linalg.solve(hessian, pull), np.linalg.solve(hessian[:6, :6], pull[:6])])
     seen = error_field.Blocks(blocks.jacobian, blocks.residual, blocks.positions, blocks.directions, blocks.counts)
@@ -202,26 +203,30 @@ def hidden_motion(field_m: float, radius_m: float, swell: float, params: Params)
     return params.turn_by_shift * shift / radius_m, shift
 
 
-def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks, params: Params) -> np.ndarray | None:
+def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks, params: Params) -> np.ndarray:
     """(7, 7) Hessian about the overlap's centroid of the residuals' squares, the pairs found anew as the pose moves.
 
     The usual one takes the pairs as given. They follow a motion along a wall, though, and the noise of its normals then
     seems to hold it where nothing does: of a street's far end that Hessian knew a pose to millimetres that was a
-    decimetre off. None where nothing is pulled back at all.
+    decimetre off. So the pose is moved each way, and of each motion (an eigenvector of both Hessians together) as much
+    is taken to be held as pulls back.
     """
     chosen = source.sample(params.probe_points)
     points, centre = source.coarse[0][chosen], Sim3(np.eye(3), blocks.centroid)
     spread = np.r_[np.full(3, 1 / blocks.radius_m), np.ones(3), 1 / blocks.radius_m]
     pulled = np.empty((7, 7))
-    for k, step in enumerate(np.diag(params.probe_m * spread)):
+    for k, step in enumerate(params.probe_m * np.diag(spread)):
         ahead, behind = (_pull(target, points, retract(pose @ centre, x), centre, params) for x in (step, -step))
-        pulled[k] = (ahead - behind) * spread / (2 * params.probe_m)
-    values, vectors = np.linalg.eigh(0.5 * (pulled + pulled.T))
-    if not values[-1] > 0:
-        return None
-    values = np.maximum(values, _FLATTEST * values[-1]) * len(source.coarse[0]) / len(chosen)
-    hessian: np.ndarray = (vectors * values) @ vectors.T / np.outer(spread, spread)
-    return hessian
+        pulled[k] = (ahead - behind) / (2 * step[k]) * len(source.coarse[0]) / len(chosen)
+    hessian = blocks.hessian + 1e-9 * np.trace(blocks.hessian) / 7 * np.eye(7)
+    root = np.linalg.cholesky(hessian)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, pulled).T)
+    held, motions = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    held = np.clip(held, _LEAST_HELD, None)
+    held /= held.mean() ** _CANCELS
+    rotated = root @ motions
+    measured: np.ndarray = (rotated * held) @ rotated.T
+    return measured
 
 
 def _pull(target: Surface, points: np.ndarray, centred: Sim3, centre: Sim3, params: Params) -> np.ndarray:
@@ -257,7 +262,7 @@ def point_to_plane_jacobian(pose: Sim3, points: np.ndarray, normals: np.ndarray)
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Weighted means over B blocks of the pairs that a pose makes.
+    """Weighted means over B blocks of the pairs that a pose makes, and their (7, 7) Hessian.
 
     ``radius_m`` is that of the overlap. Derivatives are about ``centroid``: rotation and translation then hardly mix,
     and the matrices are well scaled.
@@ -269,6 +274,7 @@ class _Blocks:
     directions: np.ndarray
     counts: np.ndarray
     weights: np.ndarray
+    hessian: np.ndarray
     centroid: np.ndarray
     radius_m: float
 
@@ -312,6 +318,7 @@ class _Blocks:
             directions=directions[kept],
             counts=counts[kept],
             weights=total[kept],
+            hessian=(jacobian * weights[:, None]).T @ jacobian,
             centroid=centroid,
             radius_m=max(float(np.sqrt(((moved - moved.mean(0)) ** 2).sum(1).mean())), 1e-6),
         )
