@@ -6,10 +6,10 @@
 
 Every pair of captures is matched, and every proposed pose refined and measured whatever the bars say; so are poses
 that were never proposed: the true one moved a little, and floors laid on floors at any angle. A pose is right within
-5 deg and 30 cm: the verdict says that it is the place, the covariance how exactly. Poses that lay a wing on its exact
-twin are left out: nothing of a pair can tell them, the map may. The curves (`gsmap.register.probability`) are monotone
-and fitted by maximum likelihood with a penalty on steep ones; places are left out in turn to see how sure the sums may
-be.
+5 deg and 30 cm (of working metres: more where places are seen from far): the verdict says that it is the place, the
+covariance how exactly. Poses that lay a wing on its exact twin are left out: nothing of a pair can tell them, the map
+may. The curves (`gsmap.register.probability`) are monotone and fitted by maximum likelihood with a penalty on steep
+ones; places are left out in turn to see how sure the sums may be.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -144,6 +144,7 @@ def judge_pair(
 ) -> list[Judged]:
     """Every pose of a pair that is worth a look, by its evidence."""
     params, watch, found = Params(fallback="never"), Stopwatch(), []
+    working_m = float(np.sqrt(a.graph.working_m * b.graph.working_m))
     proposals = [("proposed", p) for round_ in Proposing(a, b, params, watch).rounds() for p in round_[:3]]
     proposals = [(k, p) for k, p in proposals if not p.flaw and not p.with_scale and p.log_nfa < 12]
     if truth is not None and overlap > 0.02:
@@ -158,7 +159,7 @@ def judge_pair(
         if truth is not None:
             e = pose_error(judged.proposal.S_target_source, truth, scene_centroid(b.gaussians))
             error = (e.rre_deg, e.centroid_m)
-        right = error is not None and error[0] < RIGHT_DEG and error[1] < RIGHT_M
+        right = error is not None and error[0] < RIGHT_DEG and error[1] * working_m < RIGHT_M
         found.append(
             Judged(
                 place,
