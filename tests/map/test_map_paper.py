@@ -9,12 +9,12 @@ from gsmap.settings import differences
 def test_the_preset_is_what_was_published():
     settings = settings_of({}, "paper")
     describe, register, merge = settings.describe, settings.register, settings.merge
+    graph = register.proposers["graph"]
     # Nodes are objects alone, of masks of single views, lifted without a depth test, in their context over three hops.
-    assert (describe.landmarks, describe.objects, describe.object.hops) == (False, True, 3)
+    assert (describe.landmarks, describe.objects, graph.context.hops) == (False, True, 3)
     assert describe.object.segmenter == "per_view"
     assert np.isinf(describe.object.depth_tolerance)
     # One relative test of distances, and nothing of gravity; the clique is searched to its end by default limits.
-    graph = register.proposers["graph"]
     assert (register.proposer, register.fallback, graph.kinds) == ("graph", "never", ("objects",))
     assert graph.consistency.test == "ratio"
     assert np.isinf(graph.consistency.height_slope)
@@ -33,7 +33,6 @@ def test_the_preset_says_nothing_that_is_the_default_anyway():
     changed = set(differences(settings_of({}, "paper"), settings_of({})))
     assert changed <= said
     assert said - changed <= {
-        "describe.object.hops",
         "merge.method",
         "merge.mergers.tto.voxel_m",
     }

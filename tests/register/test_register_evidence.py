@@ -221,7 +221,7 @@ _SIGMAS = (0.003, 0.011, 1e-6)
         ({"free_space_violation": 0.05, "colour_correlation": 0.4}, _SURE, True),
         ({"free_space_violation": 0.05, "colour_correlation": 0.4}, _UNSURE, True),
         ({"free_space_violation": 0.16, "colour_correlation": 0.16, "overlap": 0.1}, _UNSURE, False),
-        ({"free_space_violation": 0.015, "colour_correlation": 0.3}, _UNSURE, True),
+        ({"free_space_violation": 0.015, "colour_correlation": 0.4}, _UNSURE, True),
         ({"colour_correlation": 0.1}, _SURE, False),
         ({"colour_correlation": 0.0, "colour_t": 0.0, "free_space_violation": np.nan, "num_seen": 0}, _SURE, False),
         ({"free_space_violation": np.nan, "num_seen": 0}, _SURE, True),  # no cameras, but a clique beyond chance
