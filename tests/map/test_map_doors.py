@@ -97,7 +97,7 @@ def test_a_scene_that_is_named_gets_its_damaged_graph_again(site: Map, monkeypat
             yield i, _graph(scene)
 
     def spoil(which: str = "*") -> None:
-        for path in site.store.home.glob(f"arrays/graphs/{which}/0.positions/zarr.json"):
+        for path in site.store.home.glob(f"arrays/graphs/{which}/arrays.zip"):
             path.write_bytes(b"")
 
     monkeypatch.setattr("gsmap.map.stages.describe.run_jobs", jobs)
