@@ -138,7 +138,7 @@ class Pool:
     def run(
         self, job: Callable[..., Any], numbered: Iterable[tuple[int, tuple[Any, ...]]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield ``(index, result)`` for each ``(index, arguments)`` as it is done; see `gsmap.methods.executor.Workers.run`.
+        """Yield ``(index, result)`` for each ``(index, arguments)`` as it is done; see `gsmap.methods.executor.Workers`.
 
         As many arguments as there may be workers are taken ahead, so that each worker is given a job whose scenes it
         has read. A job that was lost with its worker is tried again when nothing else runs: if memory was short, it
@@ -219,7 +219,7 @@ class Pool:
         return self._idle.pop() if self.num_idle else Worker()
 
     def _matched(self, ahead: deque[_Task]) -> tuple[Worker, _Task]:
-        """Of idle workers and jobs ahead those that share most of what is read, earlier jobs first; a new worker else."""
+        """Of idle workers and jobs ahead those that share most of what is read, earlier ones first; or a new worker."""
         if not self.num_idle:
             return Worker(), ahead.popleft()
         known = [set().union(*worker.read) for worker in self._idle]

@@ -43,8 +43,8 @@ class Store:
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``changes``,
     ``revisions``, ``priors``, ``models``, ``exports``, ``branches``, ``backups``, ``leases`` and ``set_aside``. Every
-    method that changes something is one transaction, durable when it returns; `transaction` makes several of them one. Killed
-    anywhere, the map opens whole. Threads may share a store; processes open their own.
+    method that changes something is one transaction, durable when it returns; `transaction` makes several of them one.
+    Killed anywhere, the map opens whole. Threads may share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 

@@ -18,7 +18,7 @@ from gsmap.engine.executors.local import Params, start
 from gsmap.errors import ConfigError, GsmapError
 
 
-def run_jobs(job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params) -> Iterator[tuple[int, Any]]:
+def run_jobs(job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params) -> Iterator[Any]:
     """As one stage does that keeps no workers."""
     workers = start(params)
     try:
