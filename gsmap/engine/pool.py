@@ -138,7 +138,7 @@ class Pool:
     def run(
         self, job: Callable[..., Any], numbered: Iterable[tuple[int, tuple[Any, ...]]]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield ``(index, result)`` for each ``(index, arguments)`` as it is done; see `gsmap.methods.executor.Workers`.
+        """Yield ``(index, result)`` of each ``(index, arguments)`` as it is done: see `gsmap.methods.executor.Workers`
 
         As many arguments as there may be workers are taken ahead, so that each worker is given a job whose scenes it
         has read. A job that was lost with its worker is tried again when nothing else runs: if memory was short, it
