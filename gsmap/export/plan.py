@@ -19,16 +19,12 @@ class Params:
     Args:
         moved_m: a tile is made again when a scene moved farther than this within it.
         max_tiles: an export of more tiles than this is refused.
-        workers: tiles that are merged at once, each in a thread of its own; memory grows with it.
     """
 
     moved_m: float = 0.005
     max_tiles: int = 1_000_000
-    workers: int = 1
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"an export needs at least one worker, got {self.workers}")
         if not self.moved_m >= 0:
             raise ConfigError(f"moved_m must not be negative, got {self.moved_m}")
 

@@ -30,7 +30,9 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     """The pairs that were registered, as (target, source) ids; each finds that they lie a metre apart."""
     pairs: list[tuple[str, str]] = []
 
-    def jobs(job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
+    def jobs(
+        job: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], params: Any, **how: Any
+    ) -> Iterator[tuple[int, Any]]:
         for i, (_, (target, _), (source, _), _) in enumerate(arguments):
             pairs.append((target, source))
             pose = Sim3(np.eye(3), np.array([1.0, 0, 0]))
