@@ -192,6 +192,8 @@ struct Partner {
     }
 };
 
+static_assert(sizeof(Partner) == 5 * sizeof(double), "rows of five numbers, see icp_equations");
+
 struct Pair {
     double moved[3], lever[3], offset[3], plane;
     int32_t row;
