@@ -80,7 +80,7 @@ def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | N
     backend = ""
     if params.landmarks:
         version["landmarks"] = landmarks.VERSION
-        settings["landmark"] = plain(params.landmark)
+        settings["landmark"] = landmarks.settings(params.landmark)
     if params.objects:
         chosen = resolved(params.object, models)
         version |= chosen.versions
