@@ -131,6 +131,9 @@ class Grid:
         Raises:
             ConfigError: more cells than may be.
         """
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            if self.bbox is None and not (np.prod(2 * boxes.halves / self.edge, axis=1) <= self.most).all():
+                raise self.too_many(boxes)  # by volume alone
         first, last = self._ranges(boxes, reach)
         sizes = np.maximum(last - first, 0)
         boxed = np.flatnonzero((sizes > 0).all(1))
