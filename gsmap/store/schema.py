@@ -44,7 +44,7 @@ from gsmap.store.columns import (
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 
-HEAD = "0007"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0008"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
