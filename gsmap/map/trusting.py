@@ -8,6 +8,7 @@ from pathlib import Path
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.store import Store, homes
 from gsmap.store import trust as trusting
+from gsmap.store.explained import called
 from gsmap.types.rows import TrustReport
 
 
@@ -57,7 +58,7 @@ def _folder(path: str | os.PathLike[str]) -> Path:
 
 def _remembered(folder: Path) -> trusting.Remembered:
     if not folder.is_dir():
-        raise NotFoundError(f"no map at {folder}")
+        raise NotFoundError(f"no map at {called(folder)}")
     if not (folder / trusting.URL_FILE).exists():
         raise ConfigError(f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust")
     return trusting.remembered(folder)

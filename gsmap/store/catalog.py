@@ -20,7 +20,7 @@ from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 from gsmap.durable import lock_within
 from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
 from gsmap.store import advisory, digests, sqlite, trust
-from gsmap.store.explained import NOT_KEPT, explained, is_full, summary
+from gsmap.store.explained import NOT_KEPT, called, explained, is_full, summary
 from gsmap.store.wal import log_of, read_log
 
 LOCK_FILE = "lock"
@@ -43,7 +43,7 @@ class Catalog:
         self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0, refusal: str = ""
     ) -> None:
         self.folder = folder
-        self._refusal = refusal or f"{folder} was opened for reading: open it with mode 'w' to change it"
+        self._refusal = refusal or f"{called(folder)} was opened for reading: open it with mode 'w' to change it"
         self.engine = engine
         self.writable = writable
         self.patience_s = patience_s
@@ -68,7 +68,7 @@ class Catalog:
 
     @property
     def _busy(self) -> str:
-        return f"{self.folder}: others have been writing"
+        return f"{called(self.folder)}: others have been writing"
 
     @property
     def _writing(self) -> Connection | None:

@@ -17,7 +17,8 @@ from gsmap.durable import write_whole
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import cache, trust
-from gsmap.store.backup.places import ObjectPlace, place_of
+from gsmap.store.explained import call
+from gsmap.store.places import ObjectPlace, place_of
 
 _MAX_BYTES = 1 << 20  # of what is brought to a desk; longer ones are not read
 _FILES = (trust.URL_FILE, SETTINGS)
@@ -63,6 +64,7 @@ class Home:
         self.place = place
         self.url = place.url
         self.desk = cache.folder() / "desks" / hashlib.sha256(self.url.encode()).hexdigest()[:32]
+        call(self.desk, self.url)
 
     def exists(self) -> bool:
         return self.place.size_bytes(trust.URL_FILE) is not None

@@ -23,9 +23,9 @@ import numpy as np
 from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.store import cache, layout, packed
 from gsmap.store.arrays import Arrays, Staged, StoredFile, stored_file
-from gsmap.store.backup.places import CHUNK_BYTES, SINGLE_PUT_BYTES, ObjectPlace
 from gsmap.store.columns import KINDS, is_digest
 from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.places import CHUNK_BYTES, SINGLE_PUT_BYTES, ObjectPlace
 
 _ROOT = "arrays"
 _MAX_REQUESTS = 5  # for the parts of a group that are read, beside the one for its table of contents
@@ -48,6 +48,7 @@ class ObjectArrays(Arrays):
         self.url = f"{place.url}/{_ROOT}"
         self._home = place
         self._lock = lock
+        self._sent: set[str] = set()  # by us, and not yet named
 
     @contextlib.contextmanager
     def stage(self, arrays: Mapping[str, np.ndarray], kind: str, name: str) -> Iterator[Staged]:
@@ -87,18 +88,24 @@ class ObjectArrays(Arrays):
             key, path = self._key(kind, name, file), staged.folder / file.path
             if file.size_bytes <= SINGLE_PUT_BYTES:
                 try:
-                    self._home.put_new(key, path.read_bytes())
+                    if self._home.put_new(key, path.read_bytes()):
+                        self._sent.add(key)
                 except StoreError:
                     if self._home.size_bytes(key) != file.size_bytes:  # else only the answer was lost
                         raise
             elif self._home.size_bytes(key) != file.size_bytes:  # S3 has no condition for objects of several parts
                 self._home.put(key, _chunks(path), file.size_bytes)
+                self._sent.add(key)
 
     def publish(self, staged: Staged, kind: str, name: str) -> None:
         for file in staged.files:
             key = self._key(kind, name, file)
-            if self._home.size_bytes(key) != file.size_bytes:  # it was never sent, or a prune took it for an orphan
+            whole = self._home.size_bytes(key) == file.size_bytes  # else a prune took it for an orphan
+            if key not in self._sent:  # another one sent it, some time
+                whole = whole and self._sha256(key) == file.sha256
+            if not whole:
                 self._home.put(key, _chunks(staged.folder / file.path), file.size_bytes)
+            self._sent.discard(key)
 
     def read(
         self,
@@ -139,14 +146,10 @@ class ObjectArrays(Arrays):
         out = []
         expected = {self._key(kind, name, file): file for file in files}
         for key, file in expected.items():
-            digest = hashlib.sha256()
-            try:
-                for chunk in self._home.get(key):
-                    digest.update(chunk)
-            except NotFoundError:
+            found = self._sha256(key)
+            if found is None:
                 out.append(f"{self._home.url}/{key} is missing")
-                continue
-            if digest.hexdigest() != file.sha256:
+            elif found != file.sha256:
                 out.append(f"{self._home.url}/{key} differs from what was written")
         if not out and files:
             try:
@@ -168,6 +171,16 @@ class ObjectArrays(Arrays):
 
     def chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
         return self._home.get(self._key(kind, name, file))
+
+    def _sha256(self, key: str) -> str | None:
+        """Of an object's bytes; None where there is none."""
+        digest = hashlib.sha256()
+        try:
+            for chunk in self._home.get(key):
+                digest.update(chunk)
+        except NotFoundError:
+            return None
+        return digest.hexdigest()
 
     def size_bytes(self, kind: str, name: str) -> int:
         return sum(found.size_bytes for found in self._home.list(self._prefix(kind, name)).values())

@@ -19,10 +19,10 @@ from gsmap.errors import ConfigError, CorruptError, DiskFullError, NotFoundError
 from gsmap.store import Store
 from gsmap.store.backup import Backup, restore, save
 from gsmap.store.backup import saving as saving_module
-from gsmap.store.backup.places import FolderPlace, place_of
 from gsmap.store.backup.repository import object_name
 from gsmap.store.backup.sharing import EXPIRES_S, SAVE, SWEEP, Lease
 from gsmap.store.catalog import Catalog
+from gsmap.store.places import FolderPlace, place_of
 
 
 @pytest.fixture
@@ -505,7 +505,7 @@ def test_a_lease_that_a_sweeper_takes_for_a_leftover_is_written_again(place, mon
             place.drop_leftovers()
         replace(staged, target)
 
-    monkeypatch.setattr("gsmap.store.backup.places.os.replace", swept_first)
+    monkeypatch.setattr("gsmap.store.places.os.replace", swept_first)
     place.put("leases/save-1.json", [b"{}"], 2)
     assert b"".join(place.get("leases/save-1.json")) == b"{}"
     assert swept

@@ -18,7 +18,6 @@ from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import catalog as _catalog
 from gsmap.store import sqlite
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.places import CHUNK_BYTES
 from gsmap.store.branches import FOLDER as BRANCHES
 from gsmap.store.branches import MARKER as BRANCH_FILE
 from gsmap.store.branches import places
@@ -27,6 +26,7 @@ from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.explained import explained
 from gsmap.store.layout import mend
 from gsmap.store.models import FOLDER as MODELS
+from gsmap.store.places import CHUNK_BYTES
 
 if TYPE_CHECKING:
     from gsmap.store.store import Store
