@@ -1,4 +1,4 @@
-"""The whole job on a map without a folder (PostgreSQL, and an object store that speaks S3) beside the embedded one: from
+"""The whole job on a map without a folder (PostgreSQL and an object store) beside the embedded one: from
 captures to tiles, every pose and every byte is the same."""
 
 import itertools
