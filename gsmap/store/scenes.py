@@ -106,7 +106,7 @@ class Scenes:
         boxes = chunk_boxes(ordered, CHUNK_ROWS, sigmas=_SIGMAS)
         if progress:
             progress(0.4, f"writing {name}")
-        staging = self._arrays.stage(to_arrays(ordered, cameras))
+        staging = self._arrays.stage(to_arrays(ordered, cameras), KIND, new_id)
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             row = by_id(connection, new_id)
             if row is not None and row.removed_at is None:
@@ -279,7 +279,7 @@ class Scenes:
         content = compact.pack(own) | camera_arrays(self.cameras(before.id))
         boxes = chunk_boxes(own, CHUNK_ROWS, sigmas=_SIGMAS)
         group_id = digest(*content.values(), text=f"compact {before.id}")
-        staging = self._arrays.stage(content)
+        staging = self._arrays.stage(content, KIND, group_id)
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             row = alive(connection, before.id)
             if row.thinned is None:
