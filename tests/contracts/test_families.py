@@ -174,7 +174,8 @@ def _few_steps(method: Any) -> Any:
 def test_merger(name: str, world: World) -> None:
     method = family("merger").get(name)
     params = _few_steps(method)
-    assert method.reading_m(params) >= method.reach_m(params) >= 0
+    assert method.reading_m(params, True) >= method.reading_m(params, False) >= method.reach_m(params) >= 0
+    assert method.looking_m(params) >= 0
     assert isinstance(method.min_cameras(params), int)
     assert isinstance(method.uses_dates(params), bool)
     assert isinstance(method.RENDERS, bool)
