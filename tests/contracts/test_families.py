@@ -301,6 +301,10 @@ def test_embedder(name: str, world: World) -> None:
 @pytest.mark.parametrize("name", of("executor"))
 def test_executor(name: str) -> None:
     method = family("executor").get(name)
+    if name == "dask":
+        with pytest.raises(ConfigError, match="--scheduler"):
+            method.start(method.Params())  # with a cluster: tests/engine/test_engine_dask.py
+        return
     workers = method.start(method.Params())
     try:
         assert dict(workers.run(divmod, [(7, 2), (9, 4)])) == {0: (3, 1), 1: (2, 1)}
