@@ -37,7 +37,9 @@ class RecipeKey:
 
     def of(self, *inputs: str) -> RecipeKey:
         """The same recipe for these inputs."""
-        return replace(self, inputs=inputs)
+        made = replace(self, inputs=inputs)
+        made.__dict__["recipe"] = self.recipe  # the settings are the same, and turning them into a text takes long
+        return made
 
     def to_json(self) -> dict[str, Any]:
         """The recipe without its inputs, as plain values."""
