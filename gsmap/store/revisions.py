@@ -158,25 +158,18 @@ class Revisions:
             row = connection.execute(_NEWEST).first()
         return None if row is None else _revision(row)
 
-    def poses_of(self, *scenes: str) -> dict[str, ScenePose]:
-        """The newest poses of some scenes (ids), without reading the others."""
-        mine = poses.c.scene.in_(scenes) & poses.c.until.is_(None)
+    def poses(self, *scenes: str) -> dict[str, ScenePose]:
+        """The newest poses of some scenes (ids), or of all where none is named; no edge is read."""
+        newest = poses.c.until.is_(None)
         with self._catalog.read() as connection:
-            return _poses(connection, mine)
+            return _poses(connection, newest & poses.c.scene.in_(scenes) if scenes else newest)
 
-    def outcomes_of(self, *scenes: str) -> dict[tuple[str, str], EdgeOutcome]:
-        """What the newest revision made of the edges of some scenes (ids)."""
-        mine = or_(edges.c.target.in_(scenes), edges.c.source.in_(scenes)) & edges.c.until.is_(None)
+    def outcomes(self, *scenes: str) -> dict[tuple[str, str], EdgeOutcome]:
+        """What the newest revision made of the edges of some scenes (ids), or of all where none is named."""
+        newest = edges.c.until.is_(None)
+        mine = or_(edges.c.target.in_(scenes), edges.c.source.in_(scenes))
         with self._catalog.read() as connection:
-            return _outcomes(connection, mine)
-
-    def changed_since(self, number: int | None) -> tuple[set[str], set[tuple[str, str]]]:
-        """Scenes whose pose, and (target, source) of edges whose outcome, is other than in a revision; all if None."""
-        with self._catalog.read() as connection:
-            later = [table.c.until.is_(None) & (table.c.since > (number or 0)) for table in (poses, edges)]
-            moved = set(connection.execute(select(poses.c.scene).where(later[0])).scalars())
-            decided = connection.execute(select(edges.c.target, edges.c.source).where(later[1]))
-            return moved, {(row.target, row.source) for row in decided}
+            return _outcomes(connection, newest & mine if scenes else newest)
 
     def undecided(self, number: int | None = None) -> dict[int, list[tuple[str, str]]]:
         """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""

@@ -27,14 +27,14 @@ class PoseBasis:
     """What names the poses of a map: all that decides them, without the figures of any edge.
 
     Args:
-        scenes: in the order they came.
+        scenes: ids, in the order they came.
         same_visits: (target, source) of the edges between captures that are known to be of about one time.
         priors: outside knowledge.
         ups: (3,) direction against gravity in the scene's frame, by scene id, where it is known.
         key: the recipe with all of these, and the edges that may be used, as its inputs.
     """
 
-    scenes: list[Scene]
+    scenes: list[str]
     same_visits: set[tuple[str, str]]
     priors: list[Prior]
     ups: dict[str, np.ndarray]
@@ -59,12 +59,23 @@ def pose_basis(store: Store, settings: Settings) -> PoseBasis:
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
     recipe = solver.recipe_key(settings.optimize)
     key = recipe.of(*(scene.id for scene in living), *named, canonical(told), canonical(ups))
-    return PoseBasis(living, same_visits, priors, ups, key)
+    return PoseBasis([scene.id for scene in living], same_visits, priors, ups, key)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseInputs(PoseBasis):
+    """What decides the poses of a map.
+
+    Args:
+        edges: those that may be used, by (target, source).
+    """
+
+    edges: list[Edge]
 
 
 @of_one_state
-def _with_edges(store: Store, settings: Settings) -> tuple[PoseBasis, list[Edge]]:
-    """The same with the edges that may be used, in the order of their names."""
+def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
+    """Read what decides the poses."""
     basis = pose_basis(store, settings)
     edges = [
         Edge(
@@ -79,7 +90,7 @@ def _with_edges(store: Store, settings: Settings) -> tuple[PoseBasis, list[Edge]
         for stored in store.registrations.usable()
         if stored.registration.S_target_source is not None and stored.registration.information is not None
     ]
-    return basis, edges
+    return PoseInputs(**vars(basis), edges=edges)
 
 
 def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool:
@@ -97,13 +108,13 @@ def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dic
 
 def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
     """Solve for all poses and keep the answer as a new revision; returns its number."""
-    basis, edges = _with_edges(store, settings)
+    given = pose_inputs(store, settings)
     progress("optimize", 0.0, "poses")
     previous: PoseGraph | None = store.revisions.get()
-    answer = solver.optimize([scene.id for scene in basis.scenes], edges, basis.priors, previous, settings.optimize)
-    held = {prior.scene for prior in basis.priors}
-    answer = solver.gravity_align(answer, basis.ups, fixed=held, params=settings.optimize.gravity)
-    number = store.revisions.save(solver.kept_still(answer, previous, edges, settings.optimize), basis.key)
+    fixed = {prior.scene for prior in given.priors}
+    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, settings.optimize)
+    answer = solver.gravity_align(answer, given.ups, fixed=fixed, params=settings.optimize.gravity)
+    number = store.revisions.save(solver.kept_still(answer, previous, given.edges, settings.optimize), given.key)
     progress("optimize", 1.0, f"revision {number}")
     return number
 
