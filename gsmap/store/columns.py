@@ -228,8 +228,8 @@ def not_ours(where: str) -> Iterator[None]:
         yield
     except GsmapError as error:
         raise CorruptError(
-            f"the catalog holds bytes in {where} that gsmap did not write ({error}): restore the catalog from a "
-            "backup, and do not trust a map that was sent to you so"
+            f"the catalog holds bytes in {where} that are none of its numbers ({error}): gsmap did not write that; "
+            "restore the catalog from a backup, and do not trust a map that was sent to you so"
         ) from error
 
 

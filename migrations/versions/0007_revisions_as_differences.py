@@ -60,7 +60,7 @@ def downgrade() -> None:
     for name, (ends, values) in _TABLES.items():
         columns = ("revision", *ends, *values)
         places = ", ".join(f":{column}" for column in columns)
-        query = text(f"INSERT INTO {name} ({', '.join(columns)}) VALUES ({places})")
+        query = text(f"INSERT INTO {name} ({', '.join(_quoted(columns))}) VALUES ({places})")
         for rows in whole[name]:
             if rows:
                 connection.execute(query, [dict(zip(columns, row, strict=True)) for row in rows])
