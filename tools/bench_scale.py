@@ -1,14 +1,14 @@
-"""How well scales are measured of captures whose unit is nearly, but not quite, a metre: ``auto``, the default.
+"""What an update, and a look at a map, cost as the map grows: CPU seconds, SQL statements, graphs loaded, bytes.
 
-The source of each pair that overlaps is enlarged by a factor between .95 and 1.05, of which nothing is told. Pairs of
-unknown scale get a random factor each.
+    python tools/bench_scale.py                               # maps of 10, 100 and 1,000 scenes
+    python tools/bench_scale.py --scenes 10 100 1000 10000 --updates 100 --cache FOLDER
 
-    python tools/bench_scale.py house kitchen_splats --cache FOLDER
-    python tools/bench_scale.py house --factors .98 1.02 --cache FOLDER --describe
-
-The scene graph of an enlarged capture is that of the capture as it is, moved along, which is exact for the layers that
-are made under a guess of the metre, and differs for those made under the capture's own unit by what a landmark's radius
-differs: --describe makes each anew (10 CPU s).
+The maps are filled, not made: a street on which every capture sees what its neighbours see. All rows are real (scenes,
+graphs, ten registrations a scene of which two or three are accepted, a real solve), and so is all that reads them; what
+is made up is stated here. Two captures are really ingested, described and registered with each other; the scenes of a
+map share their arrays and, copied under keys of their own, their registration. So a catalog here lacks the rows of
+`files` that scenes of their own would have (a line says how many bytes those are). The scene's own share, describing
+and registering it, does not grow with the map; here its results are made, and the line "own share" says what they cost.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -17,123 +17,175 @@ from __future__ import annotations
 
 import os
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "GSMAP_WORKERS"):
+    os.environ[_name] = "1"
 
 import argparse
-import itertools
+import json
+import resource
+import tempfile
 import time
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
-from bench_register import OVERLAPPING, described, rescaled, true_overlap
-from registration_methods import Capture
-from scipy.stats import chi2
+from scale_maps import Filled, Pattern, filled, pattern
 
-import gsmap.map
-from gsmap.evaluate.registration import pose_error, scene_centroid
-from gsmap.geometry.similarities import Similarities
-from gsmap.ingest import read_captures
-from gsmap.register import SceneView, register_pair
-from gsmap.types import SceneGraph, Sim3
-
-FACTORS = tuple(np.round(np.arange(0.95, 1.051, 0.01), 2).tolist())
-RIGHT_DEG, RIGHT_M = 5.0, 0.3
-HONEST = float(chi2.ppf(0.5, 7))
+from gsmap.export import plan_tiles
+from gsmap.geometry.rotations import exp_so3
+from gsmap.types import Sim3
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="+", type=Path)
-    parser.add_argument("--factors", nargs="+", type=float, default=FACTORS)
-    parser.add_argument("--describe", action="store_true", help="describe each enlarged capture anew")
-    parser.add_argument("--cache", type=Path, required=True, help="keep scene graphs here")
+    parser.add_argument("--scenes", nargs="+", type=int, default=[10, 100, 1000])
+    parser.add_argument("--updates", type=int, default=20, help="one-scene updates before the catalog is weighed")
+    parser.add_argument("--tiles", nargs="+", type=int, default=[100, 1000, 10_000])
+    parser.add_argument("--lookup", action="store_true", help="also let the map say which pairs to try")
+    parser.add_argument("--cache", type=Path, help="keep the two real captures here")
     options = parser.parse_args()
-    options.cache.mkdir(parents=True, exist_ok=True)
-    with gsmap.map.open_or_create(options.cache / "bench.gsmap") as m:
-        for folder in options.folders:
-            captures = read_folder(m, folder)
-            pairs = [(a, b) for a, b in itertools.combinations(captures, 2) if true_overlap(a, b) >= OVERLAPPING]
-            for factor in options.factors:
-                run(f"{folder.name}, auto, x {factor:.3f}", [(a, enlarged(m, b, factor, options)) for a, b in pairs])
-            rng = np.random.default_rng(0)
-            drawn = {c.name: float(np.exp(rng.uniform(-1, 1) * np.log(5))) for c in captures}
-            scaled = {c.name: enlarged(m, c, drawn[c.name], options, "unknown") for c in captures}
-            run(f"{folder.name}, unknown", [(scaled[a.name], scaled[b.name]) for a, b in pairs])
-    print(
-        f"accepted: of the pairs that overlap by {OVERLAPPING:.0%}; scale, centroid: errors of those, median and worst "
-        f"(centroids in metres); NEES: normalised squared errors, 7 degrees of freedom (honest median {HONEST:.2f}, "
-        f"99 % {chi2.ppf(0.99, 7):.1f}); sigma: median claimed standard deviation of the scale"
-    )
-
-
-def read_folder(m, folder: Path) -> list[Capture]:
-    """The captures of a folder whose pose is known, described as they are."""
-    import json
-
-    out = []
-    for read in read_captures(folder):
-        truth = folder / "truth" / f"{read.name}.json"
-        if truth.exists():
-            S = Sim3.from_matrix(np.array(json.loads(truth.read_text())["T_scene_world"]))
-            out.append(described(m, read.name, folder.name, read.gaussians, read.cameras, S, "auto"))
-    return out
-
-
-def enlarged(m, capture: Capture, factor: float, options: argparse.Namespace, policy: str = "auto") -> Capture:
-    """A capture in another unit, with its graph made anew or moved along."""
-    if factor == 1.0 and policy == "auto":
-        return capture
-    gaussians, cameras, S = rescaled(capture.view.gaussians, capture.view.cameras, capture.S_scene_world, factor)
-    if options.describe:
-        return described(m, f"{capture.name}x{factor:.3f}", capture.place, gaussians, cameras, S, policy)
-    layers = {
-        name: replace(
-            layer,
-            positions=layer.positions * factor,
-            extents=layer.extents * factor,
-            unit_m=layer.unit_m / factor if ":" in name else layer.unit_m,
-        )
-        for name, layer in capture.graph.layers.items()
-        if policy == "auto" or ":" in name
-    }
-    graph = SceneGraph(capture.view.id, layers, capture.graph.up, capture.graph.unit_m / factor)
-    view = SceneView(capture.view.id, gaussians, cameras, graph, policy)
-    return Capture(capture.name, capture.place, view, S)
-
-
-def run(name: str, pairs: list[tuple[Capture, Capture]]) -> None:
-    """Register the pairs and print one line for each, and one for all."""
-    rows, seconds = [], []
-    for a, b in pairs:
-        start = time.process_time()
-        found = register_pair(a.view, b.view)
-        seconds.append(time.process_time() - start)
-        said = f"  {a.name}-{b.name} {found.status}"
-        if found.status == "accepted":
-            truth = a.S_scene_world @ b.S_scene_world.inverse()
-            error = pose_error(found.S_target_source, truth, scene_centroid(b.view.gaussians))
-            off = (Similarities.stack([found.S_target_source]).inverse() @ Similarities.stack([truth])).log()[0]
-            nees = float(off @ found.information @ off)
-            sigma = float(np.sqrt(np.linalg.inv(found.information)[6, 6]))
-            metres = error.centroid_m / a.S_scene_world.scale
-            rows.append((error.rse, metres, nees, sigma, error.rre_deg))
-            said += (
-                f" {error.rre_deg:.2f} deg {100 * metres:.1f} cm scale {error.rse:.3%} (sigma {sigma:.3%}) "
-                f"NEES {nees:.1f}" + (" rigid" if found.S_target_source.is_rigid else "")
-            )
-        print(f"{said} {found.reason} {' '.join(found.notes)}".rstrip(), flush=True)
-    if rows:
-        scale, metres, nees, sigma, degrees = np.array(rows).T
-        wrong = int(((degrees > RIGHT_DEG) | (metres > RIGHT_M)).sum())
+    with tempfile.TemporaryDirectory() as scratch:
+        made = pattern(options.cache or Path(scratch) / "pattern")
+        print(f"own share of one scene: describe {made.describe_s:.2f} CPU s, a pair {made.register_s:.2f} CPU s")
+        rows = []
+        for num in options.scenes:
+            with filled(Path(scratch) / f"{num}.gsmap", num, made) as one:
+                rows.append(measured(one, made, options))
+                print(json.dumps({"scenes": num} | rows[-1]), flush=True)
+        table(options.scenes, rows)
+    print("plan_tiles (tiles of 10 m, reach 11 m), CPU s")
+    for name, place in (("street along an axis", _straight), ("street along the diagonal", _diagonal)):
         print(
-            f"{name}: accepted {len(rows)} of {len(pairs)}, wrong {wrong}; scale {np.median(scale):.3%} "
-            f"{scale.max():.3%}; centroid {100 * np.median(metres):.2f} cm {100 * metres.max():.1f} cm; "
-            f"NEES {np.median(nees):.1f} {nees.max():.1f}; sigma {np.median(sigma):.3%}; "
-            f"CPU {np.median(seconds):.2f} s",
-            flush=True,
+            f"  {name}: " + ", ".join(f"{num} scenes {planning(num, place):.2f}" for num in options.tiles), flush=True
         )
+
+
+def measured(one: Filled, made: Pattern, options: argparse.Namespace) -> dict[str, float]:
+    """What a filled map costs, part by part."""
+    m, row = one.map, {}
+    with counted(one) as count:
+        m.update()
+    row |= {f"no-op {name}": value for name, value in count.items()}
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with counted(one) as count, parts() as spent:
+        one.add()
+        m.update()
+    row |= {f"update {name}": value for name, value in count.items()} | {f"  {k}": v for k, v in spent.items()}
+    row["update memory MB"] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    scene = m.scenes()[-1].name
+    looks: dict[str, Callable[[], Any]] = {
+        "list revisions": m.revision_rows,
+        "show SCENE": lambda: m.show_scene(scene),
+        "show A:B": lambda: m.show_pair(one.some_pair()),
+        "status": m.status,
+    }
+    for name, look in looks.items():
+        with counted(one) as count:
+            look()
+        row |= {f"{name} {k}": v for k, v in count.items() if k != "graphs"}
+    size = one.catalog_bytes()
+    for _ in range(options.updates):
+        one.add()
+        m.update()
+    row["bytes an update"] = (one.catalog_bytes() - size) / max(options.updates, 1)
+    row["catalog MB"] = one.catalog_bytes() / 1e6
+    if options.lookup:
+        with counted(one) as count, one.standing_in(lookup=True):
+            one.add()
+            m.update()
+        row |= {f"update, pairs looked up, {name}": value for name, value in count.items()}
+        with counted(one) as count, one.standing_in(lookup=True):
+            m.update()
+        row |= {f"no-op, pairs looked up, {name}": value for name, value in count.items()}
+    m.prune(keep_revisions=1)
+    row["catalog MB, pruned"] = one.catalog_bytes() / 1e6
+    row["files rows MB of scenes with arrays of their own"] = one.num_scenes * made.file_rows_bytes / 1e6
+    return {name: round(float(value), 4) for name, value in row.items()}
+
+
+@contextmanager
+def counted(one: Filled) -> Iterator[dict[str, float]]:
+    """CPU seconds, SQL statements and graphs loaded inside."""
+    out: dict[str, float] = {}
+    with one.counting() as counts:
+        start = time.process_time()
+        yield out
+        out["CPU s"] = time.process_time() - start
+    out |= {"SQL": counts["sql"], "graphs": counts["graphs"]}
+
+
+@contextmanager
+def parts() -> Iterator[dict[str, float]]:
+    """CPU seconds of the steps of an update, each without those inside it."""
+    from gsmap.map import reports
+    from gsmap.map.stages import describe, optimize, register
+
+    spent: Counter[str] = Counter()
+    open_parts: list[float] = []
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def inside(*args: Any, **kwargs: Any) -> Any:
+            start = time.process_time()
+            open_parts.append(0.0)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                took = time.process_time() - start
+                spent[f"{name} CPU s"] += took - open_parts.pop()
+                if open_parts:
+                    open_parts[-1] += took
+
+        return inside
+
+    steps = [
+        ("describe", describe, "describe"),
+        ("look up and register", register, "register"),
+        ("poses: what names them", optimize, "pose_basis"),
+        ("poses: edges", optimize, "pose_inputs"),
+        ("poses: solve", optimize.solver, "optimize"),
+        ("poses: keep still", optimize.solver, "kept_still"),
+        ("poses: save and load", optimize, "optimize"),
+        ("report", reports, "update_report"),
+    ]
+    patches = [mock.patch.object(where, name, timed(part, getattr(where, name))) for part, where, name in steps]
+    for patch in patches:
+        patch.start()
+    try:
+        yield spent
+    finally:
+        for patch in patches:
+            patch.stop()
+
+
+def table(scenes: Sequence[int], rows: Sequence[dict[str, float]]) -> None:
+    """A line for each figure, with the exponent of its growth over the last decade."""
+    print(f"{'':52}" + "".join(f"{num:>12,}" for num in scenes) + "    exponent")
+    for name in rows[0]:
+        values = [row.get(name, float("nan")) for row in rows]
+        grown = ""
+        if len(values) > 1 and min(values[-2:]) > 0:
+            grown = f"{np.log(values[-1] / values[-2]) / np.log(scenes[-1] / scenes[-2]):12.2f}"
+        print(f"{name:52}" + "".join(f"{value:>12,.6g}" for value in values) + grown)
+
+
+def _straight(i: int) -> list[float]:
+    return [4.0 * i, 0.0, 0.0]
+
+
+def _diagonal(i: int) -> list[float]:
+    return [2.83 * i, 2.83 * i, 0.0]
+
+
+def planning(num: int, place: Callable[[int], list[float]]) -> float:
+    poses = {f"s{i:05d}": Sim3(exp_so3([0, 0, 0.1 * i]), place(i)) for i in range(num)}
+    bounds = dict.fromkeys(poses, np.array([[-4.0, -4, -1], [4, 4, 3]]))
+    start = time.process_time()
+    plan_tiles(poses, bounds, tile_size_m=10.0, reach_m=11.0)
+    return time.process_time() - start
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
 from gsmap.map.stages.export import dirty_tiles
-from gsmap.map.stages.optimize import pose_inputs
+from gsmap.map.stages.optimize import pose_basis
 from gsmap.map.stages.register import stale
 from gsmap.register.duplicate import SAME_CAPTURE
 from gsmap.store import Store
@@ -116,8 +116,8 @@ def at_work_rows(leases: Sequence[Lease]) -> tuple[AtWorkRow, ...]:
 
 def _add_unsolved(store: Store, settings: Settings, add: Callable[[str, int, str, str], None], verb: str) -> None:
     """Whether the newest poses are what these settings make of what the map knows now, and if not, why."""
-    given = pose_inputs(store, settings)
-    newest = next(reversed(store.revisions.list()), None)
+    given = pose_basis(store, settings)
+    newest = store.revisions.newest()
     if not given.scenes or (newest is not None and newest.key == given.key.digest):
         return
     if newest is not None and newest.recipe != given.key.recipe:

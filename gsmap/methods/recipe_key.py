@@ -38,7 +38,7 @@ class RecipeKey:
     def of(self, *inputs: str) -> RecipeKey:
         """The same recipe for these inputs."""
         made = replace(self, inputs=inputs)
-        made.__dict__["recipe"] = self.recipe  # read once for all that is made so
+        made.__dict__["recipe"] = self.recipe  # the settings are the same, and turning them into a text takes long
         return made
 
     def to_json(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Edges in, one pose per scene out: robust, incremental, in as many components as the evidence ties together.
 
 `optimize` is the entry, `recipe_key` names its answers; `diff` and `moved` compare two of them, `gravity_align` turns
-one upright. Solvers (gtsam, networkx) load on first use.
+one upright, `kept_still` leaves alone what it did not change. Solvers (gtsam, networkx) load on first use.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from gsmap.optimize.gravity import gravity_align
 from gsmap.optimize.measurements import check_priors
 from gsmap.optimize.params import Params
 from gsmap.optimize.recipe import recipe_key
+from gsmap.optimize.stillness import kept_still
 from gsmap.types import Edge, PoseGraph, Prior
 from gsmap.types.progress import Progress, silent
 
-__all__ = ["Params", "check_priors", "diff", "gravity_align", "motion", "moved", "optimize", "recipe_key"]
+__all__ = ["Params", "check_priors", "diff", "gravity_align", "kept_still", "motion", "moved", "optimize", "recipe_key"]
 
 
 def optimize(

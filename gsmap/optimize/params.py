@@ -202,6 +202,9 @@ class Params:
         gauge: how frames are held, and which priors are believed.
         gravity: how components are turned upright.
         limits: sizes beyond which something cheaper is done.
+        still_sigmas: a scene keeps its last pose where the new one is no further from it than this share of what its
+            edges leave open; 0 keeps a pose only where rounding moved it.
+        still_variance: the same of covariances, as a share of the variances, and of chi-squares of edges.
     """
 
     gate_probability: float = 0.999
@@ -219,11 +222,13 @@ class Params:
     gauge: Gauge = field(default_factory=Gauge)
     gravity: Gravity = field(default_factory=Gravity)
     limits: Limits = field(default_factory=Limits)
+    still_sigmas: float = 1e-3
+    still_variance: float = 1e-2
 
     def __post_init__(self) -> None:
         _probability(self, "gate_probability")
         _at_least(self, 1, "gnc_start", "max_failures", "neighbourhood")
-        _at_least(self, 0, "max_rounds", "growth")
+        _at_least(self, 0, "max_rounds", "growth", "still_sigmas", "still_variance")
         _positive(self, "restart", "contradiction")
         if not self.gnc_shrink > 1:
             raise ConfigError(f"gnc_shrink must be above 1, got {self.gnc_shrink}")

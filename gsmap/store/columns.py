@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import Text
+from sqlalchemy import LargeBinary, Text
 from sqlalchemy.types import TypeDecorator, TypeEngine
 
-from gsmap.errors import CorruptError, InputError
+from gsmap.errors import CorruptError, GsmapError, InputError
 from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
@@ -189,6 +190,49 @@ class Json(TypeDecorator[Any]):
         return found
 
 
+class Numbers(TypeDecorator[Any]):
+    """Numbers as bytes (`gsmap.store.matrices`): a tenth of the time of JSON, a third of the room.
+
+    Args:
+        pack: the bytes of a value; bytes are taken as they are.
+        unpack: the value of bytes; raises `InputError` where they are none.
+    """
+
+    impl = LargeBinary
+    cache_ok = True
+
+    def __init__(self, pack: Callable[[Any], bytes], unpack: Callable[[bytes], Any], where: str = "") -> None:
+        super().__init__()
+        self.pack, self.unpack, self.where = pack, unpack, where
+
+    def at(self, where: str) -> Numbers:
+        """The same type, knowing its column (``table.column``)."""
+        made: Numbers = self.copy()
+        made.where = where
+        return made
+
+    def process_bind_param(self, value: Any, dialect: Any) -> bytes | None:
+        return value if value is None or isinstance(value, bytes) else self.pack(value)
+
+    def process_result_value(self, value: Any, dialect: Any) -> Any:
+        if value is None:
+            return None
+        with not_ours(self.where):
+            return self.unpack(bytes(value))
+
+
+@contextmanager
+def not_ours(where: str) -> Iterator[None]:
+    """Let bytes of a column that are no numbers of gsmap's be told as such."""
+    try:
+        yield
+    except GsmapError as error:
+        raise CorruptError(
+            f"the catalog holds bytes in {where} that are none of its numbers ({error}): gsmap did not write that; "
+            "restore the catalog from a backup, and do not trust a map that was sent to you so"
+        ) from error
+
+
 def an_object(value: Any) -> bool:
     return isinstance(value, dict)
 
@@ -212,10 +256,6 @@ def sigmas(value: Any) -> bool:
 
 def a_box(value: Any) -> bool:
     return _numbers(value, 2, 3)
-
-
-def a_matrix(value: Any) -> bool:
-    return _numbers(value, 7, 7)
 
 
 def a_pose(value: Any) -> bool:

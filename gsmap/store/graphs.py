@@ -144,6 +144,13 @@ class Graphs:
     def _is_damaged(self, connection: Connection, group_id: str) -> bool:
         return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
 
+    def node_counts(self) -> dict[str, int]:
+        """How many nodes the newest graph of each living scene has, by scene id."""
+        query = select(graphs.c.scene, graphs.c.num_nodes).join(scenes, scenes.c.id == graphs.c.scene)
+        with self._catalog.read() as connection:
+            rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at))
+            return {row.scene: row.num_nodes for row in rows}
+
     def list(self) -> list[StoredGraph]:
         """The graphs of all living scenes, oldest first."""
         query = select(graphs).join(scenes, scenes.c.id == graphs.c.scene).where(scenes.c.removed_at.is_(None))

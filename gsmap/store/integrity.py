@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 import os
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from gsmap.store.groups import manifest
 from gsmap.store.indexes import KIND as INDEXES
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
+from gsmap.store.revisions import forget_dropped, named_by_kept
 from gsmap.store.schema import (
     CHUNK_BOXES,
     comparisons,
@@ -33,12 +35,14 @@ from gsmap.store.schema import (
     groups,
     index_segments,
     models,
-    poses,
     revisions,
     scenes,
 )
 from gsmap.types.progress import Progress
 
+_WORTH_BYTES = 64 << 10
+_WORTH_SHARE = 0.05  # of the file: less stays for rows to come
+_log = logging.getLogger("gsmap.store")
 _AGAIN = "what was to be reclaimed and is still there goes with the next prune"
 
 
@@ -144,7 +148,8 @@ def prune(catalog: Catalog, arrays: Arrays, *, keep_revisions: int | None = None
     What another branch or tag of the map names stays, whichever of them is pruned.
 
     Args:
-        keep_revisions: keep only this many of the newest; older ones stay listed but lose their claim. None: all.
+        keep_revisions: keep only this many of the newest; of older ones only their line in the list is left. None:
+            all. The newest poses stay in any case.
         dry_run: only say what would go (also of a map that was opened for reading).
 
     Raises:
@@ -180,6 +185,7 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
                 _drop_rows(catalog, waste)
             # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
             num_bytes += reclaim(catalog, arrays).num_bytes
+            _give_back(catalog)
     return Pruned(
         scenes=tuple(name for name, _ in waste.scenes),
         revisions=tuple(waste.revisions),
@@ -189,6 +195,19 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
         num_bytes=num_bytes,
         dry_run=dry_run,
     )
+
+
+def _give_back(catalog: Catalog) -> None:
+    """Give the room of rows that are gone back to the disk, where it is worth it. (A server does so by itself.)"""
+    if not catalog.is_sqlite:
+        return
+    file = catalog.folder / sqlite.FILE
+    try:
+        with explained(catalog.folder):
+            if sqlite.num_free_bytes(catalog.engine) > max(_WORTH_BYTES, _WORTH_SHARE * file.stat().st_size):
+                sqlite.vacuum(catalog.engine, file)
+    except StoreError as error:  # a full disk, or a reader: what is gone is gone, and its room is used again
+        _log.warning("%s keeps the room of what was dropped: %s", sqlite.FILE, error)
 
 
 @dataclass(frozen=True)
@@ -250,8 +269,8 @@ class _Waste:
 
 
 def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
-    kept, dropped = _revisions_to_keep(connection, keep_revisions)
-    named = select(poses.c.scene).where(poses.c.revision.in_(kept))
+    dropped = _revisions_to_drop(connection, keep_revisions)
+    named = named_by_kept(after=max(dropped, default=0))
     gone = scenes.c.removed_at.is_not(None) & scenes.c.id.not_in(named)
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)
     dead = connection.execute(select(scenes).where(gone, scenes.c.group_id.is_not(None)))
@@ -275,6 +294,7 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
     ids = [group for _, group in waste.doomed]
     with catalog.write() as connection:
         connection.execute(update(revisions).where(revisions.c.number.in_(waste.revisions)).values(dropped_at=now()))
+        forget_dropped(connection)
         connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
         for table in (scenes, comparisons):
             connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))
@@ -345,12 +365,11 @@ def _row_problems(connection: Connection, home: Path) -> list[str]:
     return out
 
 
-def _revisions_to_keep(connection: Connection, keep: int | None) -> tuple[list[int], list[int]]:
-    """Numbers to keep, and numbers to drop now."""
+def _revisions_to_drop(connection: Connection, keep: int | None) -> list[int]:
+    """Numbers to drop now: the oldest of those that are kept."""
     query = select(revisions.c.number).where(revisions.c.dropped_at.is_(None)).order_by(revisions.c.number)
     numbers = list(connection.execute(query).scalars())
-    cut = 0 if keep is None else max(0, len(numbers) - max(keep, 0))
-    return numbers[cut:], numbers[:cut]
+    return [] if keep is None else numbers[: max(0, len(numbers) - max(keep, 0))]
 
 
 def _forgotten_models(catalog: Catalog, others: Others, home: Path) -> list[Path]:

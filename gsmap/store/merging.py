@@ -7,15 +7,15 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, func, insert, select
+from sqlalchemy import Connection, Row, func, select
 
 from gsmap.errors import CorruptError, NotFoundError
 from gsmap.settings import FILE_NAME, load
 from gsmap.store.groups import manifest
 from gsmap.store.joint import joined, restricted
-from gsmap.store.revisions import newest_poses
+from gsmap.store.revisions import newest_poses, put, stored_lines
 from gsmap.store.scenes import KIND as SCENES
-from gsmap.store.schema import about, edges, poses, revisions, scenes
+from gsmap.store.schema import about, revisions, scenes
 from gsmap.store.store import Store
 from gsmap.store.transfer import Transfer, between
 from gsmap.store.transfer_changes import comparisons_of
@@ -186,13 +186,11 @@ def _append(transfer: Transfer, row: Row[Any], identity: Identity) -> None:
     number = 1 + (transfer.ours.execute(select(func.max(revisions.c.number))).scalar() or 0)
     map_id, its_number, part = identity
     origin = {"map": map_id, "number": its_number, **({"part": part} if part else {})}
-    transfer.ours.execute(insert(revisions), dict(row._mapping) | {"number": number, "origin": origin})
     here = set(transfer.ours.execute(select(scenes.c.id)).scalars())  # all but those that were forgotten
-    for table, ends in ((poses, ("scene",)), (edges, ("target", "source"))):
-        lines = transfer.theirs.execute(select(table).where(table.c.revision == row.number)).mappings()
-        taken = [{**line, "revision": number} for line in lines if {line[end] for end in ends} <= here]
-        if taken:
-            transfer.ours.execute(insert(table), taken)
+    lines = stored_lines(transfer.theirs, row)
+    if lines is not None:
+        lines = {name: {k: v for k, v in of_table.items() if here.issuperset(k)} for name, of_table in lines.items()}
+    put(transfer.ours, dict(row._mapping) | {"number": number, "origin": origin}, lines)
 
 
 def _identity(row: Row[Any], map_id: str) -> Identity:

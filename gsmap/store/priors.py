@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import Connection, Row, insert, select, update
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.store.catalog import Catalog, now
@@ -42,10 +44,14 @@ class Priors:
         with self._catalog.read() as connection:
             alive = living_ids(connection)
             rows = [row for row in connection.execute(query) if row.scene in alive]
-        return [
-            Prior(row.scene, to_pose(row.S_map_scene), to_array(row.sigmas), to_array(row.up), row.up_sigma_rad)
-            for row in rows
-        ]
+        return [_prior(row) for row in rows]
+
+    def of(self, scene: str) -> Prior | None:
+        """The standing prior of a scene (id); None where it has none."""
+        query = select(priors).where(priors.c.scene == scene, priors.c.removed_at.is_(None)).order_by(priors.c.number)
+        with self._catalog.read() as connection:
+            rows = connection.execute(query).all()
+        return _prior(rows[-1]) if rows else None
 
     def remove(self, ref: str) -> None:
         """Take a scene's prior back.
@@ -60,3 +66,7 @@ class Priors:
     def _retire(self, connection: Connection, scene: str) -> int:
         standing = (priors.c.scene == scene) & priors.c.removed_at.is_(None)
         return int(connection.execute(update(priors).where(standing).values(removed_at=now())).rowcount)
+
+
+def _prior(row: Row[Any]) -> Prior:
+    return Prior(row.scene, to_pose(row.S_map_scene), to_array(row.sigmas), to_array(row.up), row.up_sigma_rad)

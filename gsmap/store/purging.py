@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import Connection, Row, Table, delete, func, insert, select, text, update
+from sqlalchemy import Connection, Row, Table, delete, exists, func, insert, select, text, update
 
 from gsmap.durable import files_below, is_file, is_folder, remove_file, sync_folder
 from gsmap.errors import BusyError
@@ -23,6 +23,7 @@ from gsmap.store.branches import Others, Place
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import KINDS
 from gsmap.store.explained import explained
+from gsmap.store.revisions import holds_in_revision
 from gsmap.store.schema import (
     CHUNK_BOXES,
     change_reviews,
@@ -213,17 +214,7 @@ def overwrite(catalog: Catalog) -> None:
                 connection.execute(text("SET lock_timeout = '60s'"))  # it waits for all who read
                 connection.execute(text("VACUUM FULL"))
             return
-        file = catalog.folder / sqlite.FILE
-        raw = catalog.engine.raw_connection()
-        try:
-            driver: Any = raw.driver_connection
-            driver.execute("PRAGMA secure_delete = ON")
-            driver.execute("VACUUM")
-        finally:
-            raw.close()
-        sqlite.checkpoint(catalog.engine, file, at_bytes=1)
-        log = file.with_name(file.name + "-wal")
-        if log.exists() and log.stat().st_size:
+        if not sqlite.vacuum(catalog.engine, catalog.folder / sqlite.FILE, erase=True):
             raise BusyError(
                 f"{catalog.folder}: another process reads the state from before the purge; its rows are gone, but not "
                 "yet from the file: run the same command again when that process is done"
@@ -242,7 +233,8 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
         counts[noun] += int(connection.execute(delete(table).where(condition)).rowcount)
 
     pairs = (registrations.c.target == scene) | (registrations.c.source == scene)
-    affected = set(connection.execute(select(poses.c.revision).where(poses.c.scene == scene)).scalars())
+    placed = exists().where(poses.c.scene == scene, holds_in_revision(poses))
+    affected = connection.execute(select(revisions.c.number).where(placed)).scalars().all()
     drop("reviews", reviews, reviews.c.pair.contains(scene))
     drop("registrations", registrations, pairs)
     with_it = (comparisons.c.older == scene) | (comparisons.c.newer == scene)
@@ -370,9 +362,7 @@ def _backups(connection: Connection, scene: Row[Any], of_map: Iterable[tuple[str
     firsts = [
         select(func.min(scene_facts.c.created_at)).where(scene_facts.c.scene == scene.id),
         select(func.min(registrations.c.created_at)).where(pairs),
-        select(func.min(revisions.c.created_at))
-        .join(poses, poses.c.revision == revisions.c.number)
-        .where(poses.c.scene == scene.id),
+        select(func.min(revisions.c.created_at)).join(poses, holds_in_revision(poses)).where(poses.c.scene == scene.id),
     ]
     seen = [connection.execute(query).scalar() for query in firsts]
     since = min([scene.ingested_at, *(when for when in seen if when is not None)])

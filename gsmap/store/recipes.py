@@ -13,7 +13,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.schema import recipes
 from gsmap.types.plain import canonical, plain
 
-_ASKED_AT_ONCE = 10_000  # values in one query; SQLite takes 32,766
+ASKED_AT_ONCE = 10_000  # values in one query; SQLite takes 32,766
 PARTS = ("stage", "method", "version", "settings", "backend")
 
 
@@ -68,8 +68,8 @@ def kept(
 ) -> set[str]:
     """Those of the keys (as digests) that a column holds, in rows that meet a condition."""
     wanted, found = sorted({digest_of(key) for key in keys}), set()
-    for start in range(0, len(wanted), _ASKED_AT_ONCE):
-        some = column.in_(wanted[start : start + _ASKED_AT_ONCE])
+    for start in range(0, len(wanted), ASKED_AT_ONCE):
+        some = column.in_(wanted[start : start + ASKED_AT_ONCE])
         query = select(column).where(some, true() if where is None else where)
         found |= set(connection.execute(query).scalars())
     return found

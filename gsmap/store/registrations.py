@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, Select, case, func, insert, select
+from sqlalchemy import ColumnElement, Connection, LargeBinary, Row, case, func, insert, or_, select, true, type_coerce
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
+from gsmap.store.columns import not_ours
+from gsmap.store.matrices import matrices_of_bytes, poses_of_bytes
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import registrations, reviews
-from gsmap.types import Registration
+from gsmap.types import Registration, Sim3
 from gsmap.types.plain import plain
 
 REVIEWS = ("confirm", "reject", "withdraw")
@@ -52,6 +53,44 @@ class StoredRegistration:
         """Whether a person measured it."""
         return self.registration.proposer == MANUAL
 
+    @property
+    def is_usable(self) -> bool:
+        """Whether it has a pose, and a person confirmed it, or it was accepted and nobody rejected it."""
+        posed = self.registration.S_target_source is not None and self.registration.information is not None
+        return posed and _may_be_used(self.registration.status, self.review)
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What counts of a pair, without its figures: all that decides whether it is used; see `StoredRegistration`.
+
+    Args:
+        usable: as `StoredRegistration.is_usable`.
+        keys: of all that was computed for the pair.
+        disagreement: of what both scenes saw; NaN where that is not known.
+    """
+
+    number: int
+    target: str
+    source: str
+    status: str
+    key: str
+    recipe: str | None
+    review: str | None
+    usable: bool
+    keys: frozenset[str]
+    disagreement: float
+
+    @property
+    def manual(self) -> bool:
+        """Whether a person measured it."""
+        return not self.key
+
+    @property
+    def is_told(self) -> bool:
+        """Whether a person measured or confirmed it."""
+        return self.manual or self.review == "confirm"
+
 
 @dataclass(frozen=True)
 class Review:
@@ -61,27 +100,6 @@ class Review:
     registration: int
     note: str
     created_at: str
-
-
-@dataclass(frozen=True)
-class Standing:
-    """What stands of a pair, without its pose.
-
-    Args:
-        key: of its current registration; empty for a person's own measurement.
-        keys: of all that were computed for it.
-        is_edge: whether it ties its scenes: accepted, or confirmed, and not rejected by a person.
-        said: whether a person measured or confirmed it.
-        disagreement: of what both scenes saw; NaN where that is not known.
-    """
-
-    target: str
-    source: str
-    key: str
-    keys: frozenset[str]
-    is_edge: bool
-    said: bool
-    disagreement: float
 
 
 class Registrations:
@@ -118,8 +136,8 @@ class Registrations:
                 "recipe": recipes.keep(connection, key),
                 "status": r.status,
                 "reason": r.reason,
-                "S_target_source": from_pose(r.S_target_source),
-                "information": from_array(r.information),
+                "S_target_source": r.S_target_source,
+                "information": r.information,
                 "num_inliers": int(r.num_inliers),
                 "num_correspondences": int(r.num_correspondences),
                 "overlap": float(r.overlap),
@@ -150,60 +168,61 @@ class Registrations:
             newest = [r for r in pair if r.proposer != MANUAL][-1]
             original = row.number if row.adopts is None else row.adopts
             if original in (newest.number, newest.adopts):
-                return _stored(newest, _decide(pair, _reviews_of(connection, row.pair)).word)
+                return _stored_one(newest, _decide(pair, _reviews_of(connection, row.pair)).word)
             copied = {name: value for name, value in row._mapping.items() if name != "number"}
             return self._insert(connection, copied | {"adopts": original, "created_at": now()})
 
     def current(self) -> list[StoredRegistration]:
         """The current registration of each pair of living scenes, by the pair's first registration."""
         with self._catalog.read() as connection:
-            alive = living_ids(connection)
-            rows = connection.execute(select(registrations).order_by(registrations.c.number)).all()
-            said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all()
-        words = {pair: [_review(row) for row in mine] for pair, mine in groupby(said, lambda row: str(row.pair))}
-        pairs: dict[str, list[Row[Any]]] = {}
-        for row in rows:
-            if row.target in alive and row.source in alive:
-                pairs.setdefault(row.pair, []).append(row)
-        chosen = [_decide(mine, words.get(pair, [])) for pair, mine in pairs.items()]
-        return [_stored(choice.row, choice.word) for choice in chosen if choice.row is not None]
+            return _current(connection)
+
+    def current_of(self, scene: str) -> list[StoredRegistration]:
+        """The same of the pairs of one scene (id)."""
+        mine = or_(registrations.c.target == scene, registrations.c.source == scene)
+        with self._catalog.read() as connection:
+            return _current(connection, mine)
+
+    def current_of_pairs(self, pairs: Iterable[tuple[str, str]]) -> list[StoredRegistration]:
+        """The same of some pairs of scenes (ids), in either direction."""
+        wanted = sorted({":".join(sorted(pair)) for pair in pairs})
+        found: list[StoredRegistration] = []
+        with self._catalog.read() as connection:
+            for start in range(0, len(wanted), recipes.ASKED_AT_ONCE):
+                some = wanted[start : start + recipes.ASKED_AT_ONCE]
+                found += _current(connection, registrations.c.pair.in_(some))
+        return found
 
     def standing(self) -> list[Standing]:
-        """What stands of each pair of living scenes, by the pair's first registration: `current`, read far quicker."""
-        r = registrations.c
-        evidence = case((r.status == "accepted", r.evidence))
-        light: Select[Any] = select(
-            r.number, r.target, r.source, r.pair, r.key, r.status, r.proposer, evidence.label("evidence")
-        )
+        """What counts of each pair of living scenes, by (target, source); no matrix of any is read."""
+        repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
         with self._catalog.read() as connection:
             alive = living_ids(connection)
-            rows = connection.execute(light.order_by(r.number)).all()
-            said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all()
-        words = {pair: [_review(row) for row in mine] for pair, mine in groupby(said, lambda row: str(row.pair))}
-        pairs: dict[str, list[Row[Any]]] = {}
-        for row in rows:
-            if row.target in alive and row.source in alive:
-                pairs.setdefault(row.pair, []).append(row)
-        found = []
-        for pair, mine in pairs.items():
-            choice = _decide(mine, words.get(pair, []))
-            if (current := choice.row) is None:
-                continue
-            row, word = current, choice.word
-            review = None if word is None else word.review
-            is_edge = review == "confirm" or (row.status == "accepted" and review != "reject")
-            keys = frozenset(one.key for one in mine if one.key)
-            doubt = float((row.evidence or {}).get("disagreement", np.nan))
-            known = row.proposer == MANUAL or review == "confirm"
-            found.append(Standing(row.target, row.source, row.key, keys, is_edge, known, doubt))
-        return found
+            chosen = _choose(connection, _LEAN, true())
+            keys: dict[str, set[str]] = {}
+            again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
+            for row in connection.execute(again):
+                keys.setdefault(row.pair, set()).add(row.key)
+        made = [
+            _standing(choice, keys.get(choice.row.pair, {choice.row.key}))
+            for choice in chosen
+            if choice.row.target in alive and choice.row.source in alive
+        ]
+        return sorted(made, key=lambda one: (one.target, one.source))
+
+    def usable(self) -> list[StoredRegistration]:
+        """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source)."""
+        with self._catalog.read() as connection:
+            found = _current(connection, silent_if=registrations.c.status == "accepted")
+        found = [one for one in found if one.is_usable]
+        return sorted(found, key=lambda one: (one.registration.target, one.registration.source))
 
     def get(self, a: str, b: str) -> StoredRegistration | None:
         """The current registration of a pair (scene refs, either direction); None where there is none."""
         with self._catalog.read() as connection:
             pair = _pair(connection, a, b)
             choice = _decide(_rows_of(connection, pair), _reviews_of(connection, pair))
-        return None if choice.row is None else _stored(choice.row, choice.word)
+        return None if choice.row is None else _stored_one(choice.row, choice.word)
 
     def find(self, key: RecipeKey | str) -> StoredRegistration | None:
         """The newest registration that is kept under a key (or its digest); None where there is none."""
@@ -216,7 +235,7 @@ class Registrations:
             if row is None:
                 return None
             choice = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
-        return _stored(row, choice.word)
+        return _stored_one(row, choice.word)
 
     def kept(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
         """Those of the keys (as digests) that a registration is kept under, made later than the one of a number."""
@@ -234,7 +253,7 @@ class Registrations:
             pair = _pair(connection, a, b)
             rows = _rows_of(connection, pair)
             choice = _decide(rows, _reviews_of(connection, pair))
-        return [_stored(row, choice.word) for row in rows]
+        return [_stored_one(row, choice.word) for row in rows]
 
     def review(self, a: str, b: str, review: str, note: str = "") -> StoredRegistration | None:
         """Write down a person's word on a pair: ``confirm`` its current pose, ``reject`` it, or ``withdraw`` the last.
@@ -275,7 +294,7 @@ class Registrations:
         number = connection.execute(insert(registrations).returning(registrations.c.number), row).scalar_one()
         stored = connection.execute(select(registrations).where(registrations.c.number == number)).one()
         choice = _decide(_rows_of(connection, stored.pair), _reviews_of(connection, stored.pair))
-        return _stored(stored, choice.word)
+        return _stored_one(stored, choice.word)
 
 
 @dataclass(frozen=True)
@@ -331,14 +350,122 @@ def _review(row: Row[Any]) -> Review:
     return Review(row.review, row.registration, row.note, row.created_at)
 
 
-def _stored(row: Row[Any], word: Review | None) -> StoredRegistration:
+# --- what counts of every pair ---------------------------------------------------------------------------------------
+
+_FULL = tuple(
+    type_coerce(column, LargeBinary).label(column.name) if column.name in ("S_target_source", "information") else column
+    for column in registrations.columns
+)
+_PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "status")
+_LEAN = (
+    *(registrations.c[name] for name in _PARTS),
+    (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed"),
+    case((registrations.c.status == "accepted", registrations.c.evidence)).label("evidence"),
+)
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The current row of a pair, and the word that stands on it."""
+
+    row: Row[Any]
+    word: Review | None
+
+
+def _current(
+    connection: Connection, of: ColumnElement[bool] | None = None, silent_if: ColumnElement[bool] | None = None
+) -> list[StoredRegistration]:
+    alive = living_ids(connection)
+    chosen = _choose(connection, _FULL, of, silent_if)
+    return _stored_all([one for one in chosen if one.row.target in alive and one.row.source in alive])
+
+
+def _choose(
+    connection: Connection,
+    columns: Sequence[ColumnElement[Any]],
+    of: ColumnElement[bool] | None = None,
+    silent_if: ColumnElement[bool] | None = None,
+) -> list[_Chosen]:
+    """The current row of every pair, by the pair's first row.
+
+    Of a pair on which nobody ever spoke it is the newest, which the index of pairs tells without reading the others.
+
+    Args:
+        of: only pairs all of whose rows meet this.
+        silent_if: pairs on which nobody spoke only if their current row meets this.
+    """
+    spoken = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
+    wanted = true() if of is None else of
+    ends = select(func.min(registrations.c.number).label("first"), func.max(registrations.c.number).label("newest"))
+    silent = ends.where(wanted, registrations.c.pair.not_in(spoken)).group_by(registrations.c.pair).subquery()
+    query = select(*columns, silent.c.first).join(silent, silent.c.newest == registrations.c.number)
+    rows = connection.execute(query if silent_if is None else query.where(silent_if)).all()
+    found = [(row.first, _Chosen(row, None)) for row in rows]
+
+    ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
+    every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(spoken))).all()
+    said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all() if every else ()
+    words = {pair: [_review(row) for row in of_pair] for pair, of_pair in groupby(said, lambda row: str(row.pair))}
+    for pair, of_pair in groupby(every, lambda row: str(row.pair)):
+        history = list(of_pair)
+        choice = _decide(history, words.get(pair, []))
+        if choice.row is not None:
+            found.append((history[0].number, _Chosen(choice.row, choice.word)))
+    return [chosen for _, chosen in sorted(found, key=lambda item: item[0])]
+
+
+def _may_be_used(status: str, review: str | None) -> bool:
+    return review == "confirm" or (status == "accepted" and review != "reject")
+
+
+def _standing(chosen: _Chosen, keys: Collection[str]) -> Standing:
+    row, review = chosen.row, None if chosen.word is None else chosen.word.review
+    return Standing(
+        number=row.number,
+        target=row.target,
+        source=row.source,
+        status=row.status,
+        key=row.key,
+        recipe=row.recipe,
+        review=review,
+        usable=bool(row.posed) and _may_be_used(row.status, review),
+        keys=frozenset(keys) - {""},
+        disagreement=float((row.evidence or {}).get("disagreement", np.nan)),
+    )
+
+
+def _stored_all(chosen: Sequence[_Chosen]) -> list[StoredRegistration]:
+    """As `_stored`; poses and matrices are taken from their bytes all at once."""
+    rows = [one.row for one in chosen]
+    with not_ours("registrations.S_target_source"):
+        poses = iter(poses_of_bytes([bytes(r.S_target_source) for r in rows if r.S_target_source is not None]))
+    with not_ours("registrations.information"):
+        matrices = iter(matrices_of_bytes([bytes(r.information) for r in rows if r.information is not None]))
+    return [
+        _stored(
+            one.row,
+            one.word,
+            None if one.row.S_target_source is None else next(poses),
+            None if one.row.information is None else next(matrices),
+        )
+        for one in chosen
+    ]
+
+
+def _stored_one(row: Row[Any], word: Review | None) -> StoredRegistration:
+    return _stored(row, word, row.S_target_source, row.information)
+
+
+def _stored(
+    row: Row[Any], word: Review | None, S_target_source: Sim3 | None, information: np.ndarray | None
+) -> StoredRegistration:
     registration = Registration(
         target=row.target,
         source=row.source,
         status=row.status,
         reason=row.reason,
-        S_target_source=to_pose(row.S_target_source),
-        information=to_array(row.information),
+        S_target_source=S_target_source,
+        information=information,
         num_inliers=row.num_inliers,
         num_correspondences=row.num_correspondences,
         overlap=row.overlap,

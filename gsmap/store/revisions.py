@@ -1,18 +1,42 @@
-"""Revisions: every answer of the optimiser, numbered from 1, never changed."""
+"""Revisions: every answer of the optimiser, numbered from 1, never changed.
+
+What a revision shares with the one before it is kept once: a row of `poses` and `edges` says from which revision on it
+holds and up to which (`gsmap.store.schema`). The newest poses are the rows without an end, any other revision's those
+around its number, so that reading one costs no chain of others, and forgetting some leaves nothing to be put together.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, case, func, insert, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    LargeBinary,
+    Row,
+    Select,
+    Table,
+    bindparam,
+    delete,
+    exists,
+    func,
+    insert,
+    or_,
+    select,
+    type_coerce,
+    update,
+)
 
 from gsmap.errors import NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
-from gsmap.store.schema import edges, poses, revisions
+from gsmap.store.columns import Numbers, not_ours
+from gsmap.store.matrices import covariance_bytes, covariances_of_bytes, pose_bytes, poses_of_bytes
+from gsmap.store.schema import REVISION_COUNTS, edges, poses, revisions
 from gsmap.types import EdgeOutcome, PoseGraph, Provenance, ScenePose
 from gsmap.types.plain import plain
 
@@ -25,10 +49,12 @@ class Revision:
         number: from 1.
         num_scenes, num_placed, num_components: scenes it knows, those with a pose, connected components.
         num_used, num_tentative, num_unused, num_undecided: edges by their outcome (an undecided one counts twice).
+            All of these as it was made: what was purged since is counted.
         note: why it was made.
         dropped_at: when `prune` was allowed to reclaim what only it names; None while it is kept.
         key: `RecipeKey.digest` of what it was solved from; one of its own kind in revisions that schema 0001 wrote.
         recipe: digest of its recipe (`gsmap.store.recipes.Recipes.get`); None in those.
+        settings, provenance, notes: as of `gsmap.types.PoseGraph`.
         origin: ``map`` (its id) and ``number`` of the revision that another map solved; None where this one did.
     """
 
@@ -46,6 +72,9 @@ class Revision:
     key: str = ""
     recipe: str | None = None
     origin: dict[str, Any] | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
+    notes: tuple[str, ...] = ()
 
 
 class Revisions:
@@ -73,34 +102,7 @@ class Revisions:
                 "note": note,
                 "created_at": now(),
             }
-            connection.execute(insert(revisions), row)
-            pose_rows = [
-                {
-                    "revision": number,
-                    "scene": scene,
-                    "S_map_scene": from_pose(pose.S_map_scene),
-                    "component": int(pose.component),
-                    "status": pose.status,
-                    "covariance": from_array(pose.covariance),
-                }
-                for scene, pose in graph.poses.items()
-            ]
-            edge_rows = [
-                {
-                    "revision": number,
-                    "target": target,
-                    "source": source,
-                    "use": outcome.use,
-                    "residual_chi2": None if outcome.residual_chi2 is None else float(outcome.residual_chi2),
-                    "reason": outcome.reason,
-                    "undecided": int(outcome.undecided),
-                }
-                for (target, source), outcome in graph.outcomes.items()
-            ]
-            if pose_rows:
-                connection.execute(insert(poses), pose_rows)
-            if edge_rows:
-                connection.execute(insert(edges), edge_rows)
+            put(connection, row, lines_of(graph))
         return number
 
     def current(self) -> int | None:
@@ -112,7 +114,7 @@ class Revisions:
         """The answer of a revision, or of the newest (None before the first).
 
         Raises:
-            NotFoundError: no such revision.
+            NotFoundError: no such revision, or `prune` let it go.
         """
         with self._catalog.read() as connection:
             wanted = _newest(connection) if number is None else number
@@ -121,6 +123,10 @@ class Revisions:
             row = connection.execute(select(revisions).where(revisions.c.number == wanted)).first()
             if row is None:
                 raise NotFoundError(f"no revision {number}: gsmap list MAP revisions shows what there is")
+            if is_dropped(connection, row):
+                raise NotFoundError(
+                    f"revision {number} was dropped by gsmap prune: of it only its line in the list is left"
+                )
             return _pose_graph(connection, row)
 
     def find(self, key: RecipeKey | str) -> int | None:
@@ -131,81 +137,257 @@ class Revisions:
 
     def list(self) -> list[Revision]:
         """All revisions, oldest first."""
-        query = (
-            select(
-                revisions,
-                func.count(poses.c.scene).label("num_scenes"),
-                func.count(poses.c.S_map_scene).label("num_placed"),
-                func.count(poses.c.component.distinct()).label("num_components"),
-            )
-            .outerjoin(poses, poses.c.revision == revisions.c.number)
-            .group_by(revisions.c.number)
-            .order_by(revisions.c.number)
-        )
         with self._catalog.read() as connection:
-            counts: dict[int, Row[Any]] = {row.revision: row for row in connection.execute(_EDGE_COUNTS)}
-            return [_revision(row, counts.get(row.number)) for row in connection.execute(query)]
+            return [_revision(row) for row in connection.execute(select(revisions).order_by(revisions.c.number))]
+
+    def one(self, number: int) -> Revision:
+        """One line of the history.
+
+        Raises:
+            NotFoundError: no such revision.
+        """
+        with self._catalog.read() as connection:
+            row = connection.execute(select(revisions).where(revisions.c.number == number)).first()
+        if row is None:
+            raise NotFoundError(f"no revision {number}: gsmap list MAP revisions shows what there is")
+        return _revision(row)
+
+    def newest(self) -> Revision | None:
+        """The last line of the history; None before the first."""
+        with self._catalog.read() as connection:
+            row = connection.execute(_NEWEST).first()
+        return None if row is None else _revision(row)
+
+    def poses(self, *scenes: str) -> dict[str, ScenePose]:
+        """The newest poses of some scenes (ids), or of all where none is named; no edge is read."""
+        newest = poses.c.until.is_(None)
+        with self._catalog.read() as connection:
+            return _poses(connection, newest & poses.c.scene.in_(scenes) if scenes else newest)
+
+    def outcomes(self, *scenes: str) -> dict[tuple[str, str], EdgeOutcome]:
+        """What the newest revision made of the edges of some scenes (ids), or of all where none is named."""
+        newest = edges.c.until.is_(None)
+        mine = or_(edges.c.target.in_(scenes), edges.c.source.in_(scenes))
+        with self._catalog.read() as connection:
+            return _outcomes(connection, newest & mine if scenes else newest)
+
+    def undecided(self, number: int | None = None) -> dict[int, list[tuple[str, str]]]:
+        """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
+        query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)
+        query = query.order_by(edges.c.target, edges.c.source)
+        if number is not None:
+            query = query.where(_holds(edges, number))
+        found: dict[int, list[tuple[str, str]]] = {}
+        with self._catalog.read() as connection:
+            end = (_newest(connection) or 0) + 1
+            for row in connection.execute(query):
+                those = range(row.since, row.until or end) if number is None else (number,)
+                for one in those:
+                    found.setdefault(one, []).append((row.target, row.source))
+        return found
+
+
+# --- rows that hold for a while --------------------------------------------------------------------------------------
+
+_NEWEST = select(revisions).order_by(revisions.c.number.desc()).limit(1)
+_ENDS: dict[str, tuple[str, ...]] = {"poses": ("scene",), "edges": ("target", "source")}
+Lines = Mapping[str, Mapping[tuple[str, ...], tuple[Any, ...]]]
+"""Of each table the rows of one revision: what follows ``until``, by scene, or by target and source."""
+
+
+def put(connection: Connection, row: Mapping[str, Any], lines: Lines | None) -> None:
+    """Add a revision, numbered after the newest: of its lines only those are written that differ from that one's.
+
+    Args:
+        lines: None of one that was dropped elsewhere, of which no more is left than its row.
+    """
+    number = row["number"]
+    connection.execute(insert(revisions), dict(row) if lines is None else {**row, **_counts(lines)})
+    if lines is None:
+        return
+    for table in (poses, edges):
+        wanted, standing = lines[table.name], _standing(connection, table)
+        ended = [ends for ends, (_, values) in standing.items() if wanted.get(ends) != values]
+        begun = [ends for ends, values in wanted.items() if ends not in standing or standing[ends][1] != values]
+        names = _ENDS[table.name]
+        if ended:
+            mine = [table.c[name] == bindparam(f"_{name}") for name in (*names, "since")]
+            connection.execute(
+                update(table).where(*mine).values(until=number),
+                [
+                    {
+                        f"_{name}": value
+                        for name, value in zip((*names, "since"), (*ends, standing[ends][0]), strict=True)
+                    }
+                    for ends in ended
+                ],
+            )
+        if begun:
+            columns = [column.name for column in table.columns]
+            made = [dict(zip(columns, (*ends, number, None, *wanted[ends]), strict=True)) for ends in begun]
+            connection.execute(insert(table), made)
+
+
+def lines_of(graph: PoseGraph) -> Lines:
+    """What a revision's tables hold of an answer."""
+    return {
+        "poses": {
+            (scene,): (
+                None if pose.S_map_scene is None else pose_bytes(pose.S_map_scene),
+                int(pose.component),
+                pose.status,
+                None if pose.covariance is None else covariance_bytes(pose.covariance),
+            )
+            for scene, pose in graph.poses.items()
+        },
+        "edges": {
+            ends: (
+                outcome.use,
+                None if outcome.residual_chi2 is None else float(outcome.residual_chi2),
+                outcome.reason,
+                int(outcome.undecided),
+            )
+            for ends, outcome in graph.outcomes.items()
+        },
+    }
+
+
+def stored_lines(connection: Connection, row: Row[Any]) -> Lines | None:
+    """What the tables hold of a revision; None of one that was dropped."""
+    if is_dropped(connection, row):
+        return None
+    return {
+        table.name: {
+            ends: values
+            for ends, (_, values) in _rows(connection, table, _where(connection, table, row.number)).items()
+        }
+        for table in (poses, edges)
+    }
+
+
+def is_dropped(connection: Connection, row: Row[Any]) -> bool:
+    """Whether only the line of a revision is left. The newest one's poses are those of the map, and stay."""
+    return row.dropped_at is not None and row.number != _newest(connection)
+
+
+def named_by_kept(after: int = 0) -> Select[Any]:
+    """The scenes that have a pose in any revision that was not dropped, of those numbered after one."""
+    kept = revisions.c.dropped_at.is_(None) & (revisions.c.number > after)
+    return select(poses.c.scene).where(exists().where(kept, holds_in_revision(poses)))
+
+
+def forget_dropped(connection: Connection) -> None:
+    """Delete what only dropped revisions hold."""
+    kept = revisions.c.dropped_at.is_(None) | (revisions.c.number == (_newest(connection) or 0))
+    for table in (poses, edges):
+        connection.execute(delete(table).where(~exists().where(kept, holds_in_revision(table))))
+
+
+def holds_in_revision(table: Table) -> ColumnElement[bool]:
+    """That a row of poses or edges holds in a row of revisions."""
+    return (revisions.c.number >= table.c.since) & or_(table.c.until.is_(None), revisions.c.number < table.c.until)
+
+
+def _holds(table: Table, number: int) -> ColumnElement[bool]:
+    return (table.c.since <= number) & or_(table.c.until.is_(None), table.c.until > number)
+
+
+def _where(connection: Connection, table: Table, number: int) -> ColumnElement[bool]:
+    return table.c.until.is_(None) if number == _newest(connection) else _holds(table, number)
+
+
+def _standing(connection: Connection, table: Table) -> dict[tuple[str, ...], tuple[int, tuple[Any, ...]]]:
+    return _rows(connection, table, table.c.until.is_(None))
+
+
+def _rows(
+    connection: Connection, table: Table, where: ColumnElement[bool]
+) -> dict[tuple[str, ...], tuple[int, tuple[Any, ...]]]:
+    """`since` and values, bytes as they lie, by scenes."""
+    count = len(_ENDS[table.name])
+    query = select(*map(_as_it_lies, table.columns)).where(where).order_by(*table.c[:count])
+    return {tuple(row[:count]): (row[count], tuple(row[count + 2 :])) for row in map(tuple, connection.execute(query))}
+
+
+def _as_it_lies(column: Any) -> Any:
+    """A column whose bytes are not taken apart: many are at once, or none."""
+    return type_coerce(column, LargeBinary).label(column.name) if isinstance(column.type, Numbers) else column
+
+
+def _counts(lines: Lines) -> dict[str, int]:
+    placed = lines["poses"].values()
+    uses = Counter(use for use, *_ in lines["edges"].values())
+    counts = (
+        len(placed),
+        sum(pose is not None for pose, *_ in placed),
+        len({component for _, component, *_ in placed}),
+        uses["used"],
+        uses["tentative"],
+        uses["unused"],
+        sum(undecided for *_, undecided in lines["edges"].values()),
+    )
+    return dict(zip(REVISION_COUNTS, counts, strict=True))
 
 
 def newest_poses(connection: Connection) -> PoseGraph | None:
     """The newest revision's answer, as a transaction sees it; None before the first."""
-    row = connection.execute(select(revisions).order_by(revisions.c.number.desc()).limit(1)).first()
+    row = connection.execute(_NEWEST).first()
     return None if row is None else _pose_graph(connection, row)
-
-
-def _is(condition: Any) -> Any:
-    return func.sum(case((condition, 1), else_=0))
-
-
-_EDGE_COUNTS: Select[Any] = select(
-    edges.c.revision,
-    _is(edges.c.use == "used").label("num_used"),
-    _is(edges.c.use == "tentative").label("num_tentative"),
-    _is(edges.c.use == "unused").label("num_unused"),
-    func.sum(edges.c.undecided).label("num_undecided"),
-).group_by(edges.c.revision)
 
 
 def _newest(connection: Connection) -> int | None:
     return connection.execute(select(func.max(revisions.c.number))).scalar()
 
 
-def _revision(row: Row[Any], count: Row[Any] | None) -> Revision:
+def _revision(row: Row[Any]) -> Revision:
     return Revision(
         number=row.number,
         created_at=row.created_at,
-        num_scenes=row.num_scenes,
-        num_placed=row.num_placed,
-        num_components=row.num_components,
-        num_used=0 if count is None else int(count.num_used),
-        num_tentative=0 if count is None else int(count.num_tentative),
-        num_unused=0 if count is None else int(count.num_unused),
-        num_undecided=0 if count is None else int(count.num_undecided),
         note=row.note,
         dropped_at=row.dropped_at,
         key=row.key,
         recipe=row.recipe,
         origin=row.origin,
+        settings=row.settings,
+        provenance=_provenance(row.provenance),
+        notes=tuple(row.notes),
+        **{name: getattr(row, name) for name in REVISION_COUNTS},
     )
 
 
 def _pose_graph(connection: Connection, row: Row[Any]) -> PoseGraph:
-    placed = {
-        p.scene: ScenePose(p.scene, to_pose(p.S_map_scene), p.component, p.status, to_array(p.covariance))
-        for p in connection.execute(select(poses).where(poses.c.revision == row.number))
-    }
-    lines = connection.execute(select(edges).where(edges.c.revision == row.number))
-    return PoseGraph(
-        poses=placed,
-        outcomes={(e.target, e.source): _outcome(e) for e in lines},
-        settings=row.settings,
-        provenance=_provenance(row.provenance),
-        notes=tuple(row.notes),
+    return replace(
+        PoseGraph({}, {}, row.settings, _provenance(row.provenance), tuple(row.notes)),
+        poses=_poses(connection, _where(connection, poses, row.number)),
+        outcomes=_outcomes(connection, _where(connection, edges, row.number)),
     )
 
 
-def _outcome(row: Row[Any]) -> EdgeOutcome:
-    return EdgeOutcome(row.use, row.residual_chi2, row.reason, bool(row.undecided))
+def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, ScenePose]:
+    query = select(*map(_as_it_lies, poses.columns)).where(where).order_by(poses.c.scene)
+    rows = connection.execute(query).all()
+    with not_ours("poses.S_map_scene"):
+        S_map_scene = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
+    with not_ours("poses.covariance"):
+        covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
+    return {
+        row.scene: ScenePose(
+            row.scene,
+            None if row.S_map_scene is None else next(S_map_scene),
+            row.component,
+            row.status,
+            None if row.covariance is None else next(covariances),
+        )
+        for row in rows
+    }
+
+
+def _outcomes(connection: Connection, where: ColumnElement[bool]) -> dict[tuple[str, str], EdgeOutcome]:
+    query = select(edges).where(where).order_by(edges.c.target, edges.c.source)
+    return {
+        (row.target, row.source): EdgeOutcome(row.use, row.residual_chi2, row.reason, bool(row.undecided))
+        for row in connection.execute(query)
+    }
 
 
 def _provenance(said: dict[str, Any]) -> Provenance:

@@ -134,6 +134,11 @@ class Scenes:
             rows = connection.execute(select(scenes).where(condition).order_by(scenes.c.number))
             return [scene_of(row, tags.get(row.id, ())) for row in rows]
 
+    def names(self) -> dict[str, str]:
+        """The name of every scene by its id, removed ones included."""
+        with self._catalog.read() as connection:
+            return {row.id: row.name for row in connection.execute(select(scenes.c.id, scenes.c.name))}
+
     def get(self, ref: str) -> Scene:
         """One scene by name, id or the beginning of its id; a removed one by its id only.
 

@@ -27,13 +27,13 @@ from gsmap.store.columns import (
     Kind,
     Line,
     Lines,
+    Numbers,
     Pair,
     RelativePath,
     Word,
     a_box,
     a_direction,
     a_graph,
-    a_matrix,
     a_pose,
     a_thinning,
     an_object,
@@ -44,9 +44,28 @@ from gsmap.store.columns import (
     sigmas,
     texts,
 )
+from gsmap.store.matrices import (
+    covariance_bytes,
+    covariance_of_bytes,
+    matrix_bytes,
+    matrix_of_bytes,
+    pose_bytes,
+    pose_of_bytes,
+)
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 
-HEAD = "0009"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0010"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+
+REVISION_COUNTS = (
+    "num_scenes",
+    "num_placed",
+    "num_components",
+    "num_used",
+    "num_tentative",
+    "num_unused",
+    "num_undecided",
+)
+"""What a revision knows of itself when it is made, so that a list of revisions reads no pose."""
 
 metadata = MetaData(
     naming_convention={
@@ -173,16 +192,16 @@ graphs = _table(
 registrations = _table(
     "registrations",
     Column("number", Integer, primary_key=True),
-    _scene("target"),
-    _scene("source"),
+    _scene("target", index=True),
+    _scene("source", index=True),
     Column("pair", Pair, nullable=False, index=True),  # both ids, sorted: the pair in either direction
     Column("key", Key, nullable=False, index=True),  # RecipeKey.digest; empty: a person's own measurement
     _recipe(),
     Column("adopts", Integer, ForeignKey("registrations.number")),  # the earlier row that this one makes current again
     Column("status", Text, nullable=False),
     Column("reason", Text, nullable=False),
-    Column("S_target_source", Json(a_pose)),
-    Column("information", Json(a_matrix)),
+    Column("S_target_source", Numbers(pose_bytes, pose_of_bytes)),
+    Column("information", Numbers(matrix_bytes, matrix_of_bytes)),
     Column("num_inliers", Integer, nullable=False),
     Column("num_correspondences", Integer, nullable=False),
     Column("overlap", Real, nullable=False),
@@ -283,21 +302,26 @@ revisions = _table(
     Column(
         "origin", Json(an_object)
     ),  # {"map": id, "number": n} of a revision that another map solved; null where this one did
+    *(Column(name, Integer, nullable=False, server_default="0") for name in REVISION_COUNTS),
 )
+# Where scenes lie, and what became of edges: a row holds from the revision `since` to the one before `until`, or up to
+# the newest where that is null. A revision adds what differs from the one before it.
 poses = _table(
     "poses",
-    Column("revision", Integer, ForeignKey("revisions.number"), primary_key=True),
     _scene("scene", primary_key=True),
-    Column("S_map_scene", Json(a_pose)),
+    Column("since", Integer, ForeignKey("revisions.number"), primary_key=True),
+    Column("until", Integer, ForeignKey("revisions.number"), index=True),
+    Column("S_map_scene", Numbers(pose_bytes, pose_of_bytes)),
     Column("component", Integer, nullable=False),
     Column("status", Text, nullable=False),
-    Column("covariance", Json(a_matrix)),
+    Column("covariance", Numbers(covariance_bytes, covariance_of_bytes)),
 )
 edges = _table(
     "edges",
-    Column("revision", Integer, ForeignKey("revisions.number"), primary_key=True),
     _scene("target", primary_key=True),
     _scene("source", primary_key=True),
+    Column("since", Integer, ForeignKey("revisions.number"), primary_key=True),
+    Column("until", Integer, ForeignKey("revisions.number"), index=True),
     Column("use", Text, nullable=False, server_default="unused"),
     Column("residual_chi2", Real),
     Column("reason", Text, nullable=False, server_default=""),

@@ -237,6 +237,35 @@ def checkpoint(engine: Engine, file: Path, *, at_bytes: int) -> None:
         digests.fold(file, handle(engine), lambda: _begun(engine), lambda: _folded(engine))
 
 
+def num_free_bytes(engine: Engine) -> int:
+    """Of pages of the database that hold nothing."""
+    with engine.connect() as connection:
+        pages, size = (
+            connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in ("freelist_count", "page_size")
+        )
+    return int(pages or 0) * int(size or 0)
+
+
+def vacuum(engine: Engine, file: Path, *, erase: bool = False) -> bool:
+    """Write the database anew without what deleted rows left, and fold the log in; only under the writer lock.
+
+    Args:
+        erase: overwrite what is left over, too.
+
+    Returns:
+        Whether the log is empty then; not where a reader holds an older state.
+    """
+    raw = engine.raw_connection()
+    try:
+        if erase:
+            _driver(raw).execute("PRAGMA secure_delete = ON")
+        _driver(raw).execute("VACUUM")
+    finally:
+        raw.close()
+    checkpoint(engine, file, at_bytes=1)
+    return not _log_bytes(file)
+
+
 def accept(engine: Engine, file: Path) -> None:
     """Take the pages that there are for what was written, whatever they are; only under the writer lock."""
     if not has_log(file):  # another program changed it

@@ -51,6 +51,28 @@ class Sim3:
         return cls(np.eye(3), np.zeros(3), 1.0)
 
     @classmethod
+    def many(cls, rotations: np.ndarray, translations: np.ndarray, scales: np.ndarray) -> list[Sim3]:
+        """From (N, 3, 3), (N, 3) and (N,), checked all at once; raises `InputError` as for one."""
+        rotations, translations = np.array(rotations, dtype=np.float64), np.array(translations, dtype=np.float64)
+        scales = np.asarray(scales, dtype=np.float64)
+        finite = np.isfinite(rotations).all() and np.isfinite(translations).all() and np.isfinite(scales).all()
+        if not finite or not (scales > 0).all():
+            raise InputError("a pose holds NaN, infinity, or a scale that is not positive")
+        off = np.abs(np.einsum("nij,nkj->nik", rotations, rotations) - np.eye(3)).max(initial=0)
+        if off > 1e-6 or (np.linalg.det(rotations) < 0).any():
+            raise InputError("a pose's rotation is not orthonormal with determinant +1")
+        rotations.flags.writeable = False
+        translations.flags.writeable = False
+        out = []
+        for rotation, translation, scale in zip(rotations, translations, scales.tolist(), strict=True):
+            made = object.__new__(cls)
+            object.__setattr__(made, "rotation", rotation)
+            object.__setattr__(made, "translation", translation)
+            object.__setattr__(made, "scale", scale)
+            out.append(made)
+        return out
+
+    @classmethod
     def from_matrix(cls, matrix: np.ndarray) -> Sim3:
         """From a (4, 4) matrix ``[sR t; 0 1]``. The rotation part is projected to SO(3) if it is within 1e-3 of it."""
         matrix = np.asarray(matrix, dtype=np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import struct
 
 from hostile_world import ALL, Plant, World, case
 
@@ -180,13 +181,27 @@ def json_of_another_shape(w: World) -> None:
 
 @case(ROWS, verbs=ALL)
 def poses_of_another_shape(w: World) -> None:
-    w.set('UPDATE poses SET S_map_scene = \'{"rotation": [1], "translation": [], "scale": "x"}\'')
+    w.set("UPDATE poses SET S_map_scene = ?", b"\0" * 96)
 
 
-@case(r"Sim3|rotation|finite|NaN|scale")
+@case(ROWS)
 def poses_of_nan(w: World) -> None:
-    rows = {"rotation": [[float("nan")] * 3] * 3, "translation": [0, 0, 0], "scale": 1}
-    w.set("UPDATE poses SET S_map_scene = ?", json.dumps(rows))
+    w.set("UPDATE poses SET S_map_scene = ?", struct.pack("<13d", *[float("nan")] * 9, 0, 0, 0, 1))
+
+
+@case(ROWS)
+def poses_that_are_no_rotation(w: World) -> None:
+    w.set("UPDATE poses SET S_map_scene = ?", struct.pack("<13d", *[2.0] * 9, 0, 0, 0, 1))
+
+
+@case(ROWS)
+def covariances_of_infinity(w: World) -> None:
+    w.set("UPDATE poses SET covariance = ?", struct.pack("<28d", *[float("inf")] * 28))
+
+
+@case(ROWS, verbs=("list MAP edges",))
+def information_that_is_not_symmetric(w: World) -> None:
+    w.set("UPDATE registrations SET information = ?", struct.pack("<49d", *range(49)))
 
 
 @case(r"lacks a row, or has it twice", verbs=("export MAP TILES --tile-size 0",))

@@ -540,7 +540,9 @@ def test_prune_keeps_what_a_revision_names(tmp_path):
         dropped = store.prune(keep_revisions=1)
         assert (dropped.scenes, dropped.revisions) == (("scene0",), (1,))
         assert [bool(r.dropped_at) for r in store.revisions.list()] == [True, False]
-        assert store.revisions.get(1).poses[scenes[0].id].status == "placed"  # the record itself stays
+        with pytest.raises(NotFoundError, match="revision 1 was dropped"):
+            store.revisions.get(1)
+        assert [(r.num_scenes, r.num_placed) for r in store.revisions.list()][1] == (1, 1)  # its line stays
         assert store.prune().num_bytes == 0
         assert store.check().ok
         assert len(store.scenes.gaussians("scene1")) == 500

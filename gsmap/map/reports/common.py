@@ -15,7 +15,7 @@ from gsmap.types.rows import SceneRef
 @of_one_state
 def names(store: Store) -> dict[str, str]:
     """The name of every scene by its id, removed ones included."""
-    return ByScene((scene, found.name) for scene, found in scenes_by_id(store).items())
+    return ByScene(store.scenes.names())
 
 
 def scenes_by_id(store: Store) -> dict[str, Scene]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from gsmap.map.one_state import of_one_state
-from gsmap.map.reports.pairs import edge_rows
+from gsmap.map.reports.pairs import edges_of_scene
 from gsmap.map.reports.scenes import row_of_scene
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
@@ -31,8 +31,8 @@ def scene_report(
         graph_note: what is to be known of which graph that is.
         metres: of every component of the newest poses; not told where None.
     """
-    placed = store.revisions.get()
-    pose = placed.poses.get(scene.id) if placed else None
+    placed = store.revisions.poses(scene.id)
+    pose = placed.get(scene.id)
     known = pose is not None and pose.covariance is not None
     facts = store.scenes.facts(scene.id)
     metre = (metres or {}).get(pose.component, Metre()) if pose else None
@@ -76,38 +76,36 @@ def _translation_sigma(pose: ScenePose) -> float:
 
 def prior_row(store: Store, scene: Scene) -> PriorRow | None:
     """What is known of a scene's pose from outside, and what the newest poses made of it."""
-    placed = store.revisions.get()
-    for prior in store.priors.list():
-        if prior.scene == scene.id:
-            outweighed = placed is not None and scene.id in placed.provenance.contradicted_priors
-            return PriorRow(
-                scene=scene.id,
-                scene_name=scene.name,
-                S_map_scene=prior.S_map_scene,
-                sigmas=prior.sigmas,
-                up=prior.up,
-                up_sigma_rad=prior.up_sigma_rad,
-                outcome="not solved yet" if placed is None else "outweighed by the edges" if outweighed else "used",
-            )
-    return None
+    prior, newest = store.priors.of(scene.id), store.revisions.newest()
+    if prior is None:
+        return None
+    outweighed = newest is not None and scene.id in newest.provenance.contradicted_priors
+    return PriorRow(
+        scene=scene.id,
+        scene_name=scene.name,
+        S_map_scene=prior.S_map_scene,
+        sigmas=prior.sigmas,
+        up=prior.up,
+        up_sigma_rad=prior.up_sigma_rad,
+        outcome="not solved yet" if newest is None else "outweighed by the edges" if outweighed else "used",
+    )
 
 
 def _edges_of(store: Store, scene: Scene) -> tuple[SceneEdgeRow, ...]:
     out = []
-    for row in edge_rows(store):
-        if scene.id in (row.target, row.source):
-            at_target = row.source == scene.id
-            out.append(
-                SceneEdgeRow(
-                    scene=row.target if at_target else row.source,
-                    scene_name=row.target_name if at_target else row.source_name,
-                    status=row.status,
-                    used=row.used,
-                    overlap=row.overlap,
-                    num_inliers=row.num_inliers,
-                    reason=row.reason,
-                )
+    for row in edges_of_scene(store, scene):
+        at_target = row.source == scene.id
+        out.append(
+            SceneEdgeRow(
+                scene=row.target if at_target else row.source,
+                scene_name=row.target_name if at_target else row.source_name,
+                status=row.status,
+                used=row.used,
+                overlap=row.overlap,
+                num_inliers=row.num_inliers,
+                reason=row.reason,
             )
+        )
     return tuple(out)
 
 

@@ -11,9 +11,11 @@ from gsmap.map.reports.common import names, one_of
 from gsmap.map.reports.scenes import scene_rows
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
-from gsmap.types import PoseGraph, Registration, Scene
+from gsmap.types import EdgeOutcome, Registration, Scene
 from gsmap.types.rows import EdgeRow, PairEventRow, PairReport
 
+Outcomes = Mapping[tuple[str, str], EdgeOutcome]
+_FEW = 1000  # scenes that one query names; beyond, all outcomes are read
 EDGE_STATUSES = ("accepted", "rejected", "no_match")
 
 
@@ -55,7 +57,10 @@ def edge_rows(
 @of_one_state
 def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
     """The current edges of the pairs of these registrations, in their order."""
-    rows = {frozenset((row.target, row.source)): row for row in _edge_rows(store, store.registrations.current())}
+    made = list(made)
+    current = store.registrations.current_of_pairs((edge.target, edge.source) for edge in made)
+    scenes = {scene for edge in made for scene in (edge.target, edge.source)}
+    rows = {frozenset((row.target, row.source)): row for row in _edge_rows(store, current, *sorted(scenes))}
     return [rows[frozenset((edge.target, edge.source))] for edge in made]
 
 
@@ -63,17 +68,27 @@ def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
 def edge_row(store: Store, a: Scene, b: Scene) -> EdgeRow:
     """The current edge of a pair; one that has none (a lone measurement was withdrawn) is ``never registered``."""
     current = store.registrations.get(a.id, b.id)
-    return EdgeRow(**_never_registered(a, b)) if current is None else _edge_rows(store, [current])[0]
+    return EdgeRow(**_never_registered(a, b)) if current is None else _edge_rows(store, [current], a.id)[0]
 
 
-def _edge_rows(store: Store, edges: Iterable[StoredRegistration]) -> list[EdgeRow]:
-    placed, name_of = store.revisions.get(), names(store)
-    return [_edge_row(stored, placed, name_of) for stored in edges]
+def edges_of_scene(store: Store, scene: Scene) -> list[EdgeRow]:
+    """The current edge of every pair that one scene was tried in."""
+    return _edge_rows(store, store.registrations.current_of(scene.id), scene.id)
 
 
-def _edge_row(stored: StoredRegistration, placed: PoseGraph | None, name_of: Mapping[str, str]) -> EdgeRow:
+def _edge_rows(store: Store, edges: Iterable[StoredRegistration], *scenes: str) -> list[EdgeRow]:
+    """Rows of registrations.
+
+    Args:
+        scenes: ids, at least one of each pair; all where none is named.
+    """
+    outcomes, name_of = store.revisions.outcomes(*(scenes if len(scenes) <= _FEW else ())), names(store)
+    return [_edge_row(stored, outcomes, name_of) for stored in edges]
+
+
+def _edge_row(stored: StoredRegistration, outcomes: Outcomes, name_of: Mapping[str, str]) -> EdgeRow:
     edge = stored.registration
-    outcome = placed.outcomes.get((edge.target, edge.source)) if placed else None
+    outcome = outcomes.get((edge.target, edge.source))
     status, reason = edge.status, edge.reason or (outcome.reason if outcome else "")
     if stored.review == "confirm":
         status, reason = "accepted", "confirmed by a person"
@@ -119,10 +134,10 @@ def pair_report(store: Store, a: Scene, b: Scene) -> PairReport:
     history = tuple(sorted(events, key=lambda event: event.at))
     if current is None:
         return PairReport(**_never_registered(a, b), evidence={}, history=history)
-    placed, edge = store.revisions.get(), current.registration
-    outcome = placed.outcomes.get((edge.target, edge.source)) if placed else None
+    outcomes, edge = store.revisions.outcomes(a.id), current.registration
+    outcome = outcomes.get((edge.target, edge.source))
     return PairReport(
-        **vars(_edge_row(current, placed, names(store))),
+        **vars(_edge_row(current, outcomes, {a.id: a.name, b.id: b.name})),
         exact=edge.exact,
         evidence=edge.evidence,
         residual_chi2=outcome.residual_chi2 if outcome else None,

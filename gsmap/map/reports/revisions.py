@@ -13,7 +13,6 @@ from gsmap.map.reports.pairs import edge_rows
 from gsmap.map.reports.scenes import scene_rows
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
-from gsmap.types import PoseGraph
 from gsmap.types.metre import Metre
 from gsmap.types.rows import IngestRow, PairRef, PoseChangeRow, RevisionRow, UpdateReport
 
@@ -24,10 +23,8 @@ if TYPE_CHECKING:
 @of_one_state
 def revision_rows(store: Store) -> list[RevisionRow]:
     """Every answer of the optimiser, oldest first."""
-    name_of = names(store)
-    return [
-        _revision_row(revision, store.revisions.get(revision.number), name_of) for revision in store.revisions.list()
-    ]
+    name_of, undecided = names(store), store.revisions.undecided()
+    return [_revision_row(revision, undecided.get(revision.number, ()), name_of) for revision in store.revisions.list()]
 
 
 def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionRow]:
@@ -43,28 +40,27 @@ def made_after(rows: Iterable[RevisionRow], after: str | None) -> list[RevisionR
 @of_one_state
 def revision_row(store: Store, number: int) -> RevisionRow:
     """One answer of the optimiser."""
-    found = next(revision for revision in store.revisions.list() if revision.number == number)
-    return _revision_row(found, store.revisions.get(number), names(store))
+    undecided = store.revisions.undecided(number).get(number, ())
+    return _revision_row(store.revisions.one(number), undecided, names(store))
 
 
-def _revision_row(revision: Revision, graph: PoseGraph | None, name_of: Mapping[str, str]) -> RevisionRow:
-    assert graph is not None
-    uses = [outcome.use for outcome in graph.outcomes.values()]
+def _revision_row(revision: Revision, undecided: Sequence[tuple[str, str]], name_of: Mapping[str, str]) -> RevisionRow:
     return RevisionRow(
         number=revision.number,
         created_at=revision.created_at,
         scenes=revision.num_scenes,
         components=revision.num_components,
-        edges_used=uses.count("used"),
-        edges_tentative=uses.count("tentative"),
-        edges_refused=uses.count("unused"),
+        edges_used=revision.num_used,
+        edges_tentative=revision.num_tentative,
+        edges_refused=revision.num_unused,
         undecided=tuple(
-            PairRef(target=a, target_name=name_of[a], source=b, source_name=name_of[b]) for a, b in graph.undecided
+            PairRef(target=a, target_name=name_of[a], source=b, source_name=name_of[b])
+            for a, b in (() if revision.dropped_at else undecided)
         ),
-        solver=graph.provenance.method,
-        contradicted_priors=refs(graph.provenance.contradicted_priors, name_of),
-        settings=graph.settings,
-        notes=graph.notes,
+        solver=revision.provenance.method,
+        contradicted_priors=refs(revision.provenance.contradicted_priors, name_of),
+        settings=revision.settings,
+        notes=revision.notes,
         note=revision.note,
         key=revision.key,
         dropped_at=revision.dropped_at,

@@ -8,7 +8,7 @@ from gsmap.map.dates import is_after, is_until, last_of, parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import one_of
 from gsmap.store import Store
-from gsmap.types import PoseGraph, Scene
+from gsmap.types import Scene, ScenePose
 from gsmap.types.metre import Metre
 from gsmap.types.rows import IngestRow, PoseRow, SceneRow
 
@@ -42,8 +42,7 @@ def scene_rows(
     one_of(status, SCENE_STATUSES)
     since = None if after is None else parsed(after)
     until = None if as_of is None else last_of(as_of)
-    placed = store.revisions.get()
-    nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
+    placed, nodes = store.revisions.poses(), store.graphs.node_counts()
     said = store.scenes.latest_notes()
     rows = [
         row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres)
@@ -63,20 +62,18 @@ def scene_rows(
 @of_one_state
 def scene_row(store: Store, scene: Scene, metres: Mapping[int, Metre]) -> SceneRow:
     """The row of one scene."""
-    nodes = {graph.scene: graph.num_nodes for graph in store.graphs.list()}
-    return row_of_scene(
-        scene, store.revisions.get(), nodes.get(scene.id), store.scenes.latest_notes().get(scene.id, ""), metres
-    )
+    placed, nodes = store.revisions.poses(scene.id), store.graphs.node_counts()
+    return row_of_scene(scene, placed, nodes.get(scene.id), store.scenes.latest_notes().get(scene.id, ""), metres)
 
 
 def row_of_scene(
     scene: Scene,
-    placed: PoseGraph | None,
+    placed: Mapping[str, ScenePose],
     num_nodes: int | None,
     note: str,
     metres: Mapping[int, Metre] | None = None,
 ) -> SceneRow:
-    pose = placed.poses.get(scene.id) if placed else None
+    pose = placed.get(scene.id)
     metre = metres.get(pose.component) if metres and pose else None
     return SceneRow(
         name=scene.name,
@@ -98,8 +95,7 @@ def row_of_scene(
 @of_one_state
 def pose_rows(store: Store) -> list[PoseRow]:
     """Where every placed living scene lies, oldest scene first."""
-    placed = store.revisions.get()
-    poses = placed.poses if placed else {}
+    poses = store.revisions.poses()
     return [
         PoseRow(
             scene=scene.id,

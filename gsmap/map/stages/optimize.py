@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
 
 from gsmap import optimize as solver
 from gsmap.map.dates import parsed
+from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import POLL_S
 from gsmap.map.stages.describe import graph_keys
@@ -21,64 +23,79 @@ from gsmap.types.progress import StageProgress
 
 
 @dataclass(frozen=True, eq=False)
-class PoseInputs:
-    """What decides the poses of a map.
+class PoseBasis:
+    """What names the poses of a map: all that decides them, without the figures of any edge.
 
     Args:
         scenes: ids, in the order they came.
-        edges: those that may be used.
+        same_visits: (target, source) of the edges between captures that are known to be of about one time.
         priors: outside knowledge.
         ups: (3,) direction against gravity in the scene's frame, by scene id, where it is known.
-        key: the recipe with all of these as its inputs.
+        key: the recipe with all of these, and the edges that may be used, as its inputs.
     """
 
     scenes: list[str]
-    edges: list[Edge]
+    same_visits: set[tuple[str, str]]
     priors: list[Prior]
     ups: dict[str, np.ndarray]
     key: RecipeKey
 
 
-def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
-    """Read what decides the poses."""
+@of_one_state
+def pose_basis(store: Store, settings: Settings) -> PoseBasis:
+    """Read what names the poses; a few statements, and microseconds a scene."""
     living, priors = store.scenes.list(), store.priors.list()
-    scenes = [scene.id for scene in living]
-    edges, named = [], []
-    captured = {scene.id: scene.captured_at for scene in living}
+    captured = {scene.id: None if scene.captured_at is None else parsed(scene.captured_at) for scene in living}
+    hours = settings.optimize.aliasing.same_visit_h
+    named, same_visits = [], set()
     # By id, not in the order in which workers happened to finish: the same key whenever they were made.
-    current = store.registrations.current()
-    for stored in sorted(current, key=lambda r: (r.registration.target, r.registration.source)):
-        registration = stored.registration
-        usable = stored.review == "confirm" or (registration.status == "accepted" and stored.review != "reject")
-        if not usable or registration.S_target_source is None or registration.information is None:
-            continue
-        edges.append(
-            Edge(
-                target=registration.target,
-                source=registration.source,
-                S_target_source=registration.S_target_source,
-                information=registration.information,
-                confirmed=stored.review == "confirm",
-                disagreement=registration.evidence.get("disagreement", float("nan")),
-                same_visit=_is_same_visit(
-                    captured[registration.target],
-                    captured[registration.source],
-                    settings.optimize.aliasing.same_visit_h,
-                ),
-            )
-        )
-        named.append(f"{stored.key or stored.number} {stored.review}" + " same visit" * edges[-1].same_visit)
+    for one in store.registrations.standing():
+        if one.usable:
+            same = _is_same_visit(captured[one.target], captured[one.source], hours)
+            named.append(f"{one.key or one.number} {one.review}" + " same visit" * same)
+            if same:
+                same_visits.add((one.target, one.source))
     ups = _ups(store, living, {key.digest for key in graph_keys(store, living, settings).values()})
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
-    key = solver.recipe_key(settings.optimize).of(*scenes, *named, canonical(told), canonical(ups))
-    return PoseInputs(scenes, edges, priors, ups, key)
+    recipe = solver.recipe_key(settings.optimize)
+    key = recipe.of(*(scene.id for scene in living), *named, canonical(told), canonical(ups))
+    return PoseBasis([scene.id for scene in living], same_visits, priors, ups, key)
 
 
-def _is_same_visit(a: str | None, b: str | None, hours: float) -> bool:
+@dataclass(frozen=True, eq=False)
+class PoseInputs(PoseBasis):
+    """What decides the poses of a map.
+
+    Args:
+        edges: those that may be used, by (target, source).
+    """
+
+    edges: list[Edge]
+
+
+@of_one_state
+def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
+    """Read what decides the poses."""
+    basis = pose_basis(store, settings)
+    edges = [
+        Edge(
+            target=stored.registration.target,
+            source=stored.registration.source,
+            S_target_source=stored.registration.S_target_source,
+            information=stored.registration.information,
+            confirmed=stored.review == "confirm",
+            disagreement=stored.registration.evidence.get("disagreement", float("nan")),
+            same_visit=(stored.registration.target, stored.registration.source) in basis.same_visits,
+        )
+        for stored in store.registrations.usable()
+        if stored.registration.S_target_source is not None and stored.registration.information is not None
+    ]
+    return PoseInputs(**vars(basis), edges=edges)
+
+
+def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool:
     """Whether two captures are known to be of about one time."""
-    if a is None or b is None:
-        return False
-    return abs(parsed(a) - parsed(b)).total_seconds() < 3600 * hours
+    return a is not None and b is not None and abs(a - b).total_seconds() < 3600 * hours
 
 
 def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dict[str, np.ndarray]:
@@ -94,11 +111,10 @@ def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
     given = pose_inputs(store, settings)
     progress("optimize", 0.0, "poses")
     previous: PoseGraph | None = store.revisions.get()
+    fixed = {prior.scene for prior in given.priors}
     answer = solver.optimize(given.scenes, given.edges, given.priors, previous, settings.optimize)
-    answer = solver.gravity_align(
-        answer, given.ups, fixed={prior.scene for prior in given.priors}, params=settings.optimize.gravity
-    )
-    number = store.revisions.save(answer, given.key)
+    answer = solver.gravity_align(answer, given.ups, fixed=fixed, params=settings.optimize.gravity)
+    number = store.revisions.save(solver.kept_still(answer, previous, given.edges, settings.optimize), given.key)
     progress("optimize", 1.0, f"revision {number}")
     return number
 
@@ -127,5 +143,5 @@ def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
 
 def is_solved(store: Store, settings: Settings) -> bool:
     """Whether the newest revision is what this recipe makes of what the map knows now."""
-    newest = store.revisions.current()
-    return newest is not None and store.revisions.find(pose_inputs(store, settings).key) == newest
+    newest = store.revisions.newest()
+    return newest is not None and newest.key == pose_basis(store, settings).key.digest

@@ -117,8 +117,10 @@ class _Known:
             changed = {directed(one.target, one.source): one for one in work.store.registrations.standing()}
             self._standing |= {pair: changed[pair] for pair in adopted}
         bar = work.settings.optimize.aliasing.max_disagreement
-        current = {pair: one for pair, one in self._standing.items() if one.said or one.key in self._keys(one)}
-        self.held = [pair for pair, one in current.items() if one.is_edge and (one.said or not one.disagreement > bar)]
+        current = {pair: one for pair, one in self._standing.items() if one.is_told or one.key in self._keys(one)}
+        self.held = [
+            pair for pair, one in current.items() if one.usable and (one.is_told or not one.disagreement > bar)
+        ]
         self.stale = sorted(
             pair
             for pair, one in self._standing.items()
@@ -143,7 +145,7 @@ class _Known:
 
     def _adopt(self, one: Standing) -> bool:
         keys = self._keys(one)
-        if one.key in keys or one.said or keys.isdisjoint(one.keys):
+        if one.key in keys or one.is_told or keys.isdisjoint(one.keys):
             return False
         known = [self._work.store.registrations.find(key) for key in sorted(keys & one.keys)]
         self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))

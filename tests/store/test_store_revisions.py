@@ -1,0 +1,209 @@
+"""A revision adds what differs from the one before; prune gives its room back; what is read of one is exact."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from store_samples import key, make_cameras, make_gaussians
+
+from gsmap.errors import NotFoundError
+from gsmap.geometry.rotations import exp_so3
+from gsmap.store import Store, matrices
+from gsmap.types import EdgeOutcome, PoseGraph, Registration, ScenePose, Sim3
+
+NUM = 12
+
+
+@pytest.fixture
+def store(tmp_path):
+    with Store.create(tmp_path / "m.gsmap") as made:
+        for k in range(NUM):
+            made.scenes.add(make_gaussians(n=8, seed=k), make_cameras(1), name=f"s{k:02d}")
+        yield made
+
+
+def some_pose(rng):
+    return Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3), float(rng.uniform(0.5, 2)))
+
+
+def covariance(rng):
+    root = rng.normal(size=(7, 7))
+    made = root @ root.T
+    return (made + made.T) / 2
+
+
+def histories(store, rng, num=15):
+    """Answers of which each differs from the one before in a few scenes and edges; scenes come and go."""
+    ids = [scene.id for scene in store.scenes.list()]
+    poses, outcomes = {}, {}
+    for _ in range(num):
+        for scene in rng.choice(ids, 2, replace=False).tolist():
+            if scene in poses and rng.uniform() < 0.3:
+                del poses[scene]
+                outcomes = {pair: one for pair, one in outcomes.items() if scene not in pair}
+            else:
+                cov = covariance(rng) if rng.uniform() < 0.7 else None
+                poses[scene] = ScenePose(scene, some_pose(rng), int(rng.integers(2)), "placed", cov)
+        if len(poses) > 1:
+            a, b = sorted(rng.choice(sorted(poses), 2, replace=False).tolist())
+            doubt = bool(rng.uniform() < 0.5)
+            outcomes[a, b] = EdgeOutcome("unused" if doubt else "used", float(rng.uniform()), "why" * doubt, doubt)
+        yield PoseGraph(dict(poses), dict(outcomes), notes=(f"{len(poses)} scenes",))
+
+
+def same(a: PoseGraph, b: PoseGraph) -> None:
+    assert set(a.poses) == set(b.poses)
+    for scene, one in a.poses.items():
+        two = b.poses[scene]
+        np.testing.assert_array_equal(one.S_map_scene.rotation, two.S_map_scene.rotation)
+        np.testing.assert_array_equal(one.S_map_scene.translation, two.S_map_scene.translation)
+        assert one.S_map_scene.scale == two.S_map_scene.scale
+        assert (one.component, one.status) == (two.component, two.status)
+        assert (one.covariance is None) == (two.covariance is None)
+        if one.covariance is not None:
+            np.testing.assert_array_equal(one.covariance, two.covariance)
+    assert (a.outcomes, a.notes) == (b.outcomes, b.notes)
+
+
+def count(store, table):
+    with store.catalog.read() as connection:
+        return connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar()
+
+
+def test_every_revision_is_read_as_it_was_saved(store):
+    made = list(histories(store, np.random.default_rng(0)))
+    for graph in made:
+        store.revisions.save(graph)
+    for number, graph in enumerate(made, 1):
+        same(store.revisions.get(number), graph)
+        line = store.revisions.one(number)
+        assert (line.num_scenes, line.num_components) == (
+            len(graph.poses),
+            len({pose.component for pose in graph.poses.values()}),
+        )
+        uses = [outcome.use for outcome in graph.outcomes.values()]
+        assert (line.num_used, line.num_unused) == (uses.count("used"), uses.count("unused"))
+        assert sorted(store.revisions.undecided(number).get(number, [])) == sorted(graph.undecided)
+    same(store.revisions.get(), made[-1])
+    assert {n: sorted(pairs) for n, pairs in store.revisions.undecided().items()} == {
+        n: sorted(graph.undecided) for n, graph in enumerate(made, 1) if graph.undecided
+    }
+
+
+def test_a_revision_adds_what_differs(store):
+    rng = np.random.default_rng(1)
+    ids = [scene.id for scene in store.scenes.list()]
+    poses = {scene: ScenePose(scene, some_pose(rng), 0, "placed", covariance(rng)) for scene in ids}
+    outcomes = {(a, b): EdgeOutcome("used", 1.0) for a, b in pairwise(ids)}
+    for k in range(30):
+        poses[ids[k % 3]] = replace(poses[ids[k % 3]], S_map_scene=some_pose(rng))
+        store.revisions.save(PoseGraph(dict(poses), outcomes))
+    assert count(store, "poses") == NUM + 29
+    assert count(store, "edges") == NUM - 1
+    assert set(store.revisions.poses(ids[0])) == {ids[0]}
+    assert set(store.revisions.outcomes(ids[0])) == {(ids[0], ids[1])}
+
+
+def test_prune_gives_the_room_of_dropped_revisions_back(store):
+    made = list(histories(store, np.random.default_rng(2), num=60))
+    ids = [scene.id for scene in store.scenes.list()]
+    rng = np.random.default_rng(3)
+    for graph in made:
+        moved = {scene: ScenePose(scene, some_pose(rng), 0, "placed", covariance(rng)) for scene in ids}
+        store.revisions.save(replace(graph, poses=moved))
+    last = store.revisions.get()
+    lines = store.revisions.list()
+    file = store.folder / "map.sqlite"
+    with store.catalog.lock():
+        store.catalog._fold(at_bytes=1)
+    before = file.stat().st_size
+    store.prune(keep_revisions=3)
+    assert file.stat().st_size < before - 100_000
+    assert count(store, "poses") <= 3 * NUM
+    same(store.revisions.get(), last)
+    for number in (58, 59, 60):
+        assert store.revisions.get(number).poses
+    with pytest.raises(NotFoundError, match="revision 57 was dropped"):
+        store.revisions.get(57)
+    for old, now in zip(lines, store.revisions.list(), strict=True):
+        assert replace(now, dropped_at=None) == old
+        assert (now.dropped_at is None) == (now.number > 57)
+    assert store.check().ok
+    assert store.revisions.save(made[0]) == 61
+    same(store.revisions.get(61), made[0])
+
+
+def test_the_newest_poses_are_never_pruned(store):
+    (graph,) = histories(store, np.random.default_rng(4), num=1)
+    store.revisions.save(graph)
+    store.prune(keep_revisions=0)
+    same(store.revisions.get(), graph)
+    same(store.revisions.get(1), graph)
+
+
+def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
+    """The lists of all pairs say of each what the pair itself says, whatever was computed and said in which order."""
+    rng = np.random.default_rng(5)
+    ids = [scene.id for scene in store.scenes.list()][:6]
+    for k in range(150):
+        a, b = sorted(rng.choice(ids, 2, replace=False).tolist())
+        kind = rng.integers(6)
+        if kind < 3:
+            posed = {"S_target_source": some_pose(rng), "information": np.diag(rng.uniform(1, 2, 7))}
+            status = ("accepted", "rejected", "no_match")[kind]
+            store.registrations.save(
+                Registration(a, b, status, **({} if kind == 2 else posed)), key("register", a, b, turn=k)
+            )
+        elif kind == 3:
+            store.registrations.save(Registration(a, b, "accepted", "", some_pose(rng), np.eye(7), proposer="manual"))
+        else:
+            stored = store.registrations.get(a, b)
+            if stored is not None and stored.registration.S_target_source is not None:
+                store.registrations.review(a, b, str(rng.choice(["confirm", "reject"])))
+            elif stored is not None and (stored.review or stored.manual):
+                store.registrations.review(a, b, "withdraw")
+    store.scenes.remove("s05")
+    alone = {}
+    for a in ids[:5]:
+        for b in ids[:5]:
+            if a < b and (stored := store.registrations.get(a, b)) is not None:
+                alone[a, b] = stored
+    listed = {(one.registration.target, one.registration.source): one for one in store.registrations.current()}
+    assert {pair: (one.number, one.review) for pair, one in listed.items()} == {
+        pair: (one.number, one.review) for pair, one in alone.items()
+    }
+    assert any(one.review for one in alone.values())
+    firsts = [store.registrations.history(*pair)[0].number for pair in listed]
+    assert firsts == sorted(firsts)
+    standing = store.registrations.standing()
+    assert [(one.target, one.source) for one in standing] == sorted(alone)
+    for one in standing:
+        stored = alone[one.target, one.source]
+        assert (one.number, one.review, one.key, one.manual) == (
+            stored.number,
+            stored.review,
+            stored.key,
+            stored.manual,
+        )
+        assert one.usable == stored.is_usable
+    usable = store.registrations.usable()
+    assert [one.number for one in usable] == [one.number for one in standing if one.usable]
+    of_one = {one.number for one in store.registrations.current_of(ids[1])}
+    assert of_one == {one.number for pair, one in alone.items() if ids[1] in pair}
+    pairs = sorted(alone)[:4]
+    assert {one.number for one in store.registrations.current_of_pairs([p[::-1] for p in pairs])} == {
+        alone[pair].number for pair in pairs
+    }
+
+
+def test_numbers_come_back_to_the_last_bit():
+    rng = np.random.default_rng(6)
+    S, matrix = some_pose(rng), covariance(rng)
+    back = matrices.pose_of_bytes(matrices.pose_bytes(S))
+    np.testing.assert_array_equal(back.rotation, S.rotation)
+    np.testing.assert_array_equal(back.translation, S.translation)
+    assert back.scale == S.scale
+    assert back.is_rigid == S.is_rigid
+    np.testing.assert_array_equal(matrices.matrix_of_bytes(matrices.matrix_bytes(matrix)), matrix)
+    np.testing.assert_array_equal(matrices.covariance_of_bytes(matrices.covariance_bytes(matrix)), matrix)
