@@ -222,14 +222,16 @@ def _made(
 def make_file(content: Content, recipe: TileRecipe, folder: str, name: str) -> StagedTile:
     """Make one tile, and its file in a folder; or, on a machine that does not have the folder, its bytes: a job."""
     found = content(_within.get())
-    about = (len(found.gaussians), found.truncated, tuple(found.notes))
-    if not len(found.gaussians):
-        return StagedTile("", "", 0, *about)
+    count, notes = len(found.gaussians), tuple(found.notes)
+    if not count:
+        return StagedTile("", "", 0, 0, found.truncated, notes)
     if Path(folder, _MARK).exists():
-        return StagedTile(name, *_written(Path(folder, name), found, recipe), *about)
+        sha256, num_bytes = _written(Path(folder, name), found, recipe)
+        return StagedTile(name, sha256, num_bytes, count, found.truncated, notes)
     with tempfile.TemporaryDirectory(prefix="gsmap-tile-") as elsewhere:
         path = Path(elsewhere, name)
-        return StagedTile(name, *_written(path, found, recipe), *about, content=path.read_bytes())
+        sha256, num_bytes = _written(path, found, recipe)
+        return StagedTile(name, sha256, num_bytes, count, found.truncated, notes, content=path.read_bytes())
 
 
 def _written(path: Path, content: MergeResult, recipe: TileRecipe) -> tuple[str, int]:

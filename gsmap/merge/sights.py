@@ -98,7 +98,7 @@ class SightStore:
 
     def _held(self, name: str, make: Callable[[], Sight]) -> Sight:
         at = (self.folder, name)
-        found = _HELD[at] = _HELD.pop(at, None) or make()  # the newest last
+        found = _HELD[at] = _HELD.pop(at) if at in _HELD else make()  # the newest last
         while len(_HELD) > 1 and sum(sight.num_bytes for sight in _HELD.values()) > _CAN_BE_HELD:
             _HELD.popitem(last=False)
         return found

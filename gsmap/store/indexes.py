@@ -104,7 +104,8 @@ class Indexes:
         told = [[m.scene, m.graph, m.upright, m.metric, float(m.coarseness)] for m in members]
         group_id = digest(arrays.keys, arrays.starts, arrays.nodes, text=f"{key}{told}")
         row = {"key": key, "members": told, "num_nodes": len(arrays.nodes), "group_id": group_id}
-        staging = self._arrays.stage({"keys": arrays.keys, "starts": arrays.starts, "nodes": arrays.nodes})
+        content = {"keys": arrays.keys, "starts": arrays.starts, "nodes": arrays.nodes}
+        staging = self._arrays.stage(content, KIND, group_id)
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             there = connection.execute(select(index_segments.c.number, index_segments.c.key)).all()
             if not set(instead_of) <= {old.number for old in there}:

@@ -8,7 +8,7 @@ around its number, so that reading one costs no chain of others, and forgetting 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -171,13 +171,13 @@ class Revisions:
         with self._catalog.read() as connection:
             return _outcomes(connection, newest & mine if scenes else newest)
 
-    def undecided(self, number: int | None = None) -> dict[int, list[tuple[str, str]]]:
+    def undecided(self, number: int | None = None) -> Mapping[int, Sequence[tuple[str, str]]]:
         """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)
         query = query.order_by(edges.c.target, edges.c.source)
         if number is not None:
             query = query.where(_holds(edges, number))
-        found: dict[int, list[tuple[str, str]]] = {}
+        found: dict[int, Any] = {}
         with self._catalog.read() as connection:
             end = (_newest(connection) or 0) + 1
             for row in connection.execute(query):
@@ -367,7 +367,7 @@ def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, Scen
     query = select(*map(_as_it_lies, poses.columns)).where(where).order_by(poses.c.scene)
     rows = connection.execute(query).all()
     with not_ours("poses.S_map_scene"):
-        S_map_scene = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
+        S_map_scene: Iterator[Any] = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
     with not_ours("poses.covariance"):
         covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
     return {
