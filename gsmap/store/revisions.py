@@ -8,7 +8,7 @@ around its number, so that reading one costs no chain of others, and forgetting 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -369,7 +369,8 @@ def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, Scen
     with not_ours("poses.S_map_scene"):
         S_map_scene: Iterator[Any] = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
     with not_ours("poses.covariance"):
-        covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
+        known = [bytes(row.covariance) for row in rows if row.covariance is not None]
+        covariances = iter(covariances_of_bytes(known))
     return {
         row.scene: ScenePose(
             row.scene,
