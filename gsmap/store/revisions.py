@@ -367,7 +367,8 @@ def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, Scen
     query = select(*map(_as_it_lies, poses.columns)).where(where).order_by(poses.c.scene)
     rows = connection.execute(query).all()
     with not_ours("poses.S_map_scene"):
-        S_map_scene: Iterator[Any] = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
+        placed = [bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]
+        S_map_scene: Iterator[Any] = iter(poses_of_bytes(placed))
     with not_ours("poses.covariance"):
         known = [bytes(row.covariance) for row in rows if row.covariance is not None]
         covariances = iter(covariances_of_bytes(known))
