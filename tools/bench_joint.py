@@ -32,14 +32,12 @@ from pathlib import Path
 
 import numpy as np
 from bench_refine import Capture, overlapping, perturbed, read_folder
+from fit_covariance import working_metres
 from scipy.sparse import lil_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.stats import chi2
 
 from gsmap import optimize
-from gsmap.describe.cloud import surface_cloud
-from gsmap.describe.gravity import estimate_up
-from gsmap.describe.unit import estimate_unit_m, working_unit_m
 from gsmap.evaluate.calibration import nees_of_pose, relative_covariance
 from gsmap.evaluate.registration import pose_error, scene_centroid
 from gsmap.geometry.rotations import skew
@@ -111,12 +109,7 @@ def main() -> None:
 def read_place(folder: Path, options: argparse.Namespace) -> Place:
     """The captures of a folder, and the pairs that are accepted, under one working metre."""
     captures = list(read_folder(folder))
-    working = []
-    for c in captures:
-        cloud = surface_cloud(c.view.gaussians)
-        guess = estimate_unit_m(cloud.points, c.view.cameras, estimate_up(cloud.points, c.view.cameras))
-        working.append(working_unit_m(guess, c.view.cameras))
-    unit_m = float(np.exp(np.mean(np.log(working))))
+    unit_m = float(np.exp(np.mean([np.log(working_metres(c.view.gaussians, c.view.cameras)) for c in captures])))
     captures = [
         replace(c, view=replace(c.view, graph=replace(c.view.graph, working_m=unit_m), scale_policy="known"))
         for c in captures

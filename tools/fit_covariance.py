@@ -181,7 +181,7 @@ def pairs_of(folder: Path, cache: Path) -> list[Pair]:
     kept = cache / f"{folder.name}.pairs"
     if not kept.exists():
         captures, reads = [], list(read_captures(folder))
-        working_m = float(np.exp(np.mean([np.log(_working_m(read.gaussians, read.cameras)) for read in reads])))
+        working_m = float(np.exp(np.mean([np.log(working_metres(read.gaussians, read.cameras)) for read in reads])))
         for read in reads:
             truth = json.loads((folder / "truth" / f"{read.name}.json").read_text())["T_scene_world"]
             metres = Sim3.from_matrix(np.array(truth))
@@ -196,7 +196,7 @@ def pairs_of(folder: Path, cache: Path) -> list[Pair]:
     return found
 
 
-def _working_m(gaussians: Gaussians, cameras: Cameras | None) -> float:
+def working_metres(gaussians: Gaussians, cameras: Cameras | None) -> float:
     """Working metres per metre of a capture."""
     points = surface_cloud(gaussians).points
     return working_unit_m(estimate_unit_m(points, cameras, estimate_up(points, cameras)), cameras)

@@ -177,16 +177,11 @@ def _extrema(
     """Yield (channel, negative, positions (n, 3), responses over threshold (n,)); lengths in cells."""
     from gsmap import _native
 
-    block = np.floor(points / _BLOCK_CELLS).astype(np.int64)
-    labels, counts = cell_labels(block)
-    cores = np.empty((len(counts), 3))
-    cores[labels] = block
     table = _native.landmark_extrema(
         points=np.ascontiguousarray(points, np.float64),
         lab=np.ascontiguousarray(lab, np.float64),
         areas=np.ascontiguousarray(areas, np.float64),
         thresholds=thresholds,
-        cores=cores * _BLOCK_CELLS,
         edge=_BLOCK_CELLS,
         halo=_HALO_CELLS,
         sigma=_SIGMA_CELLS,
