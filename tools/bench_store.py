@@ -3,8 +3,8 @@
     python tools/bench_store.py [FILE.ply] [--gaussians 1000000] [--degree 3] [--repeat 3] [--json out.json]
 
 Without a file the Gaussians are random (worse to compress than real ones). CPU is process time of all threads, best of
-the repeats; MB/s counts the bytes of the arrays in memory. "damage found" flips one bit in the middle of each of some
-16 files that hold an array, one after the other, and reads the scene: how many of them raised an error.
+the repeats; MB/s counts the bytes of the arrays in memory. "damage found" flips some 16 bits, evenly over the files that
+hold arrays, one after the other, and reads the scene: how many of them raised an error.
 """
 
 from __future__ import annotations
@@ -147,18 +147,20 @@ def middle_box(g: Gaussians) -> np.ndarray:
 def damage(folder: Path, read: Callable[[], object]) -> str:
     files = [p for p in folder.rglob("*") if p.is_file() and p.suffix != ".json" and p.stat().st_size > 1000]
     files = files[:: max(1, len(files) // 16)]
+    each = -(-16 // len(files))
     found = 0
     for file in files:
         whole = file.read_bytes()
-        broken = bytearray(whole)
-        broken[len(broken) // 2] ^= 1
-        file.write_bytes(broken)
-        try:
-            read()
-        except Exception:  # whatever a library raises
-            found += 1
+        for i in range(each):
+            broken = bytearray(whole)
+            broken[(2 * i + 1) * len(broken) // (2 * each)] ^= 1
+            file.write_bytes(broken)
+            try:
+                read()
+            except Exception:  # whatever a library raises
+                found += 1
         file.write_bytes(whole)
-    return f"{found} of {len(files)}"
+    return f"{found} of {each * len(files)}"
 
 
 def best(call: Callable[[], object], repeat: int) -> float:

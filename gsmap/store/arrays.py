@@ -20,7 +20,7 @@ import shutil
 import stat
 import threading
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -164,6 +164,19 @@ class Arrays:
     def exists(self, kind: str, name: str) -> bool:
         """Whether anything lies where a group should."""
         return self._place(kind, name).exists()
+
+    def send_model(self, path: str) -> None:
+        """Let the map's home have the copy of a model in its folder, by its path below the map; in a folder it has."""
+
+    def bring_model(self, path: str) -> None:
+        """Have that copy in the map's folder; there it is, unless the home is elsewhere.
+
+        Raises:
+            NotFoundError: the home has none.
+        """
+
+    def drop_models(self, named: Collection[str]) -> None:
+        """Delete the copies of models at the map's home, if that is elsewhere, but those that are named."""
 
     def publish(self, staged: Staged, kind: str, name: str) -> None:
         """Move a staged group into its place; only under `lock`, and only where no row names that place."""

@@ -7,6 +7,7 @@ ones that were used longest ago go first. Anything here may be deleted at any ti
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import os
 import uuid
@@ -71,8 +72,9 @@ def keep(sha256: str, chunks: Iterable[bytes], what: str) -> Path:
 
 
 def drop(sha256: str) -> None:
-    """Forget a file."""
-    (folder() / "files" / sha256).unlink(missing_ok=True)
+    """Forget a file, by its digest or the beginning of it."""
+    for path in (folder() / "files").glob(f"{glob.escape(sha256)}*"):
+        path.unlink(missing_ok=True)
 
 
 def _make_room(root: Path, size_bytes: int) -> None:

@@ -108,7 +108,15 @@ class Home:
             self.place.put(name, _chunks(path), path.stat().st_size)
 
     def bring(self, name: str) -> None:
-        """Bring a file that is named by its content to the desk, unless it is there."""
+        """Bring a file that is named by its content to the desk, unless it is there.
+
+        Raises:
+            NotFoundError: the home has none.
+            CorruptError: such a name would lead elsewhere.
+        """
+        folder, _, file = name.partition("/")
+        if "/" in name.replace("/", "", 1) or {folder, file} & {"", ".", ".."}:
+            raise CorruptError(f"{self.url} has no file called {name!r}: nothing is done with it")
         target = self.desk / name
         if not target.is_file():
             target.parent.mkdir(exist_ok=True)

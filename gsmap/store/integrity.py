@@ -109,7 +109,7 @@ def check(
         named = {row.id: row.kind for row in connection.execute(select(groups).order_by(groups.c.id))}
         manifests = {group: manifest(connection, group) for group in named}
         unread = {group: kind for group, kind in named.items() if (group, manifests[group]) not in read}
-        problems = _row_problems(connection, home)
+        problems = _row_problems(connection, arrays)
         spare = {group for _, group in _waste(connection, None).doomed}
         if catalog.is_sqlite:
             problems += sqlite.integrity_problems(connection)
@@ -242,6 +242,7 @@ def reclaim(
         if not dry_run:
             for group in bodies:
                 arrays.drop(*group)
+            arrays.drop_models(_standing_models(catalog, others))
             for path in forgotten:
                 remove_file(home, FOLDER, path.name)
             for name in abandoned:
@@ -340,8 +341,8 @@ def _comparison_advice(connection: Connection, group: str, location: str | None)
     return f" (changes of an earlier comparison: gsmap prune {quote(location)})" if location else ""
 
 
-def _row_problems(connection: Connection, home: Path) -> list[str]:
-    out = []
+def _row_problems(connection: Connection, arrays: Arrays) -> list[str]:
+    home, out = arrays.root.parent, []
     for row in connection.execute(select(scenes).where(scenes.c.removed_at.is_(None))):
         if row.group_id is None:
             out.append(f"scene {row.name} has no arrays")
@@ -352,6 +353,8 @@ def _row_problems(connection: Connection, home: Path) -> list[str]:
     for row in connection.execute(select(models).where(models.c.removed_at.is_(None))):
         try:
             path = model_path(home, row)
+            if row.copied:
+                arrays.bring_model(row.path)
             opened = open_model(home, row)
         except FileNotFoundError as error:
             out.append(f"model {row.name} is missing: {error.filename}")
@@ -372,11 +375,16 @@ def _revisions_to_drop(connection: Connection, keep: int | None) -> list[int]:
     return [] if keep is None else numbers[: max(0, len(numbers) - max(keep, 0))]
 
 
-def _forgotten_models(catalog: Catalog, others: Others, home: Path) -> list[Path]:
-    """Copies of models that no row of any catalog names any more. What is no plain file is no copy of ours."""
+def _standing_models(catalog: Catalog, others: Others) -> set[str]:
+    """Paths of the models that any catalog names."""
     with catalog.read() as connection:
         standing = set(connection.execute(select(models.c.path).where(models.c.removed_at.is_(None))).scalars())
-    standing |= others.models()
+    return standing | others.models()
+
+
+def _forgotten_models(catalog: Catalog, others: Others, home: Path) -> list[Path]:
+    """Copies of models that no row of any catalog names any more. What is no plain file is no copy of ours."""
+    standing = _standing_models(catalog, others)
     return [path for path in _in_models(home) if is_file(path) and f"{FOLDER}/{path.name}" not in standing]
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,9 @@ from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.store import cache, layout, packed
 from gsmap.store.arrays import Arrays, Staged, StoredFile, stored_file
 from gsmap.store.columns import KINDS, is_digest
+from gsmap.store.homes import Home
 from gsmap.store.layout import CHUNK_ROWS
-from gsmap.store.places import CHUNK_BYTES, SINGLE_PUT_BYTES, ObjectPlace
+from gsmap.store.places import CHUNK_BYTES, SINGLE_PUT_BYTES
 
 _ROOT = "arrays"
 _MAX_REQUESTS = 5  # for the parts of a group that are read, beside the one for its table of contents
@@ -36,17 +37,15 @@ class ObjectArrays(Arrays):
     """The groups of a map whose home is an object store.
 
     Args:
-        root: a folder on this machine that stands for the home; nothing is kept in it.
-        place: the home.
+        home: the map's.
         lock: see `Arrays.lock`.
     """
 
-    def __init__(
-        self, root: Path, place: ObjectPlace, lock: Callable[[float], contextlib.AbstractContextManager[None]]
-    ) -> None:
-        super().__init__(root)
-        self.url = f"{place.url}/{_ROOT}"
-        self._home = place
+    def __init__(self, home: Home, lock: Callable[[float], contextlib.AbstractContextManager[None]]) -> None:
+        super().__init__(home.desk / _ROOT)
+        self.url = f"{home.url}/{_ROOT}"
+        self._remote = home
+        self._home = home.place
         self._lock = lock
         self._sent: set[str] = set()  # by us, and not yet named
 
@@ -159,6 +158,17 @@ class ObjectArrays(Arrays):
                 out.append(str(error))
         return out
 
+    def send_model(self, path: str) -> None:
+        self._remote.send(path, self._remote.desk / path)
+
+    def bring_model(self, path: str) -> None:
+        self._remote.bring(path)
+
+    def drop_models(self, named: Collection[str]) -> None:
+        for key in self._home.list("models/"):
+            if key not in named:
+                self._home.delete(key)
+
     def copied(self, kind: str, name: str, files: Sequence[StoredFile], target: Path) -> Path:
         target.mkdir(parents=True)
         for file in files:
@@ -188,6 +198,7 @@ class ObjectArrays(Arrays):
     def drop(self, kind: str, name: str) -> None:
         for key in self._home.list(self._prefix(kind, name)):
             self._home.delete(key)
+            cache.drop(key.rpartition("/")[2][:32])
 
     def groups(self) -> list[tuple[str, str]]:
         found = {tuple(key.split("/")[1:3]) for key in self._home.list(f"{_ROOT}/")}

@@ -72,7 +72,7 @@ class Store:
         self._remote = place.remote
         self.arrays = Arrays(place.home / "arrays")
         if place.remote is not None:
-            self.arrays = ObjectArrays(place.home / "arrays", place.remote.place, catalog.arrays_lock)
+            self.arrays = ObjectArrays(place.remote, catalog.arrays_lock)
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
         self.recipes = Recipes(catalog)
@@ -82,7 +82,7 @@ class Store:
         self.changes = Changes(catalog, self.arrays)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
-        self.models = Models(catalog, self.arrays, place.remote)
+        self.models = Models(catalog, self.arrays)
         self.exports = Exports(catalog)
         self.branches = Branches(place, catalog, self.arrays)
         self.backups = Backups(catalog)

@@ -341,8 +341,10 @@ class Transfer:
                 if row.copied and not place.is_file():
                     place.parent.mkdir(exist_ok=True)
                     source = model_path(self.source.home, row)
+                    self.source.arrays.bring_model(row.path)
                     os.close(open_file(source))  # a plain file
                     write_whole(place, partial(link_or_copy, source))
+                    self.into.arrays.send_model(row.path)
                 self.ours.execute(insert(models), _content(row))
                 self.counts["models"] += 1
                 self.notes.append(f"model {row.name} came along: graphs made without it are out of date")

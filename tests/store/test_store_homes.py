@@ -142,20 +142,28 @@ def test_what_this_machine_keeps_may_rot(home, tmp_path):
     assert kept.read_bytes() == data
 
 
-def test_prune_and_purge_reclaim_objects(home):
+def test_prune_and_purge_reclaim_objects(home, tmp_path):
     place = home.arrays._home
     first, _ = home.scenes.add(make_gaussians(), make_cameras(), name="a")
     home.graphs.save(graph(first.id), key("describe", first.id))
     home.scenes.add(make_gaussians(seed=1), make_cameras(), name="b")
     place.put(f"arrays/scenes/{'0' * 32}/x", [b"12345"], 5)  # of a writer that died
     assert home.check().orphans == (f"scenes/{'0' * 32}",)
+    (tmp_path / "net.onnx").write_bytes(b"no network")
+    home.models.add("net", tmp_path / "net.onnx", kind="clip")
     assert home.prune().num_orphans == 1
+    assert len(place.list("models/")) == 1
+    home.models.remove("net")
     assert len(place.list("arrays/")) == 3
     home.scenes.remove("a")
     assert home.prune().scenes == ("a",)
+    assert place.list("models/") == {}
     assert len(place.list("arrays/")) == 1
     with gsmap.map.open(home.location) as m:
+        m.store.scenes.gaussians("b")
+        assert len(list((tmp_path / "cache" / "files").iterdir())) == 1
         assert m.purge("b").num_groups == 1
+        assert not list((tmp_path / "cache" / "files").iterdir())
     assert place.list("arrays/") == {}
     assert home.check().ok
 
@@ -263,6 +271,9 @@ def test_what_is_kept_is_bounded(tmp_path, monkeypatch):
 def test_a_backup_a_clone_and_a_merge_leave_the_bucket(home, tmp_path):
     scene, _ = home.scenes.add(make_gaussians(), make_cameras(), name="a")
     home.graphs.save(graph(scene.id), key("describe", scene.id))
+    (tmp_path / "net.onnx").write_bytes(b"no network")
+    home.models.add("net", tmp_path / "net.onnx", kind="clip")
+    next((home.home / "models").iterdir()).unlink()  # as on another machine
     save(home, place_of(tmp_path / "backup"))
     restore(place_of(tmp_path / "backup"), tmp_path / "back")
     clone(home, tmp_path / "clone")
@@ -273,6 +284,7 @@ def test_a_backup_a_clone_and_a_merge_leave_the_bucket(home, tmp_path):
             assert store.check().ok
             assert same(store.scenes.gaussians("a"), home.scenes.gaussians("a"))
             assert store.graphs.load("a").num_nodes == 4
+            assert store.models.get("net").path.read_bytes() == b"no network"
 
 
 def test_a_map_is_merged_into_a_bucket(home, tmp_path):
@@ -310,6 +322,12 @@ def test_a_bucket_named_with_a_password_is_refused(tmp_path):
     for bad in ("s3://user:secret@bucket/site", "s3://bucket/site?key=1", "s3:///site"):
         with pytest.raises(ConfigError, match=r"password|bucket"):
             Store.exists(bad)
+
+
+def test_nothing_is_brought_from_or_to_elsewhere(home):
+    for name in ("../x", "models/../x", "/etc/passwd", "models/", "models"):
+        with pytest.raises(CorruptError, match="no file called"):
+            homes.Home(home.location).bring(name)
 
 
 def test_a_home_that_names_no_database_is_refused(bucket):

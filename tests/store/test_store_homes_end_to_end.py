@@ -61,7 +61,7 @@ def test_a_map_in_a_bucket_is_the_embedded_one_to_the_bit(remote, tmp_path):
         assert set(ours.poses) == set(theirs.poses)
         assert {pose.status for pose in ours.poses.values()} == {"placed"}
         for scene, pose in ours.poses.items():
-            assert np.array_equal(pose.S_map_scene.matrix, theirs.poses[scene].S_map_scene.matrix)
+            assert np.array_equal(pose.S_map_scene.matrix(), theirs.poses[scene].S_map_scene.matrix())
             a, b = (to_arrays(m.store.graphs.load(scene))[0] for m in (here, there))
             assert a.keys() == b.keys()
             assert all(np.array_equal(a[name], b[name]) for name in a)

@@ -197,6 +197,8 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
 
 def _bytes_of(store: Store, file: StoredFile, path: Path) -> Iterator[bytes]:
     top, *rest = file.path.split("/")
+    if top == MODELS:
+        store.arrays.bring_model(file.path)
     if top != ARRAYS:
         return _chunks(path)
     kind, group, *within = rest
