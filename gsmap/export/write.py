@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -222,14 +222,16 @@ def _made(
 def make_file(content: Content, recipe: TileRecipe, folder: str, name: str) -> StagedTile:
     """Make one tile, and its file in a folder; or, on a machine that does not have the folder, its bytes: a job."""
     found = content(_within.get())
-    about = (len(found.gaussians), found.truncated, tuple(found.notes))
+    empty = StagedTile("", "", 0, len(found.gaussians), found.truncated, tuple(found.notes))
     if not len(found.gaussians):
-        return StagedTile("", "", 0, *about)
+        return empty
     if Path(folder, _MARK).exists():
-        return StagedTile(name, *_written(Path(folder, name), found, recipe), *about)
+        digest, num_bytes = _written(Path(folder, name), found, recipe)
+        return replace(empty, name=name, sha256=digest, num_bytes=num_bytes)
     with tempfile.TemporaryDirectory(prefix="gsmap-tile-") as elsewhere:
         path = Path(elsewhere, name)
-        return StagedTile(name, *_written(path, found, recipe), *about, content=path.read_bytes())
+        digest, num_bytes = _written(path, found, recipe)
+        return replace(empty, name=name, sha256=digest, num_bytes=num_bytes, content=path.read_bytes())
 
 
 def _written(path: Path, content: MergeResult, recipe: TileRecipe) -> tuple[str, int]:
