@@ -28,11 +28,14 @@ from typing import Any
 from gsmap.engine.executors import local
 
 
-def burn(index: int, seconds: float, begun: str = "") -> tuple[int, float]:
-    """A coarse job: so many CPU seconds; returns those it took."""
+def burn(index: int, seconds: float, begun: str = "", wait: bool = False) -> tuple[int, float]:
+    """A coarse job: so many CPU seconds, or seconds that it waits; returns those it took."""
     if begun:
         with open(begun, "a") as file:
             file.write(f"{index}\n")
+    if wait:
+        time.sleep(seconds)
+        return index, seconds
     before = time.process_time()
     while time.process_time() - before < seconds:
         sum(i * i for i in range(20_000))
@@ -46,15 +49,20 @@ def main() -> None:
     parser.add_argument("--job-s", type=float, default=1.0)
     parser.add_argument("--soak", type=float, default=600.0, help="seconds; 0 for none")
     parser.add_argument("--kill-every", type=float, default=30.0)
+    parser.add_argument(
+        "--wait", action="store_true", help="jobs wait and compute nothing: for a machine that others use, too"
+    )
     parser.add_argument("--dask", action="store_true", help="on a LocalCluster instead of the local pool")
     arguments = parser.parse_args()
     with started(arguments.dask, arguments.workers) as workers:
         list(workers.run(burn, [(i, 0.01) for i in range(4 * arguments.workers)]))  # they are there now
         wall, cpu, idle = time.monotonic(), cpu_s(), idle_s()
-        took = sum(s for _, (_, s) in workers.run(burn, [(i, arguments.job_s) for i in range(arguments.jobs)]))
+        jobs = [(i, arguments.job_s, "", arguments.wait) for i in range(arguments.jobs)]
+        took = sum(s for _, (_, s) in workers.run(burn, jobs))
         wall, idle = time.monotonic() - wall, idle_s() - idle
+        what = "s of waiting" if arguments.wait else "CPU s"
         print(
-            f"{arguments.jobs} jobs of {arguments.job_s:g} CPU s, {arguments.workers} workers: {wall:.1f} s", end=", "
+            f"{arguments.jobs} jobs of {arguments.job_s:g} {what}, {arguments.workers} workers: {wall:.1f} s", end=", "
         )
         print(f"efficiency {took / (arguments.workers * wall):.2f} by the wall", end=", ")
         print(f"{took / (took + cpu_s() - cpu):.3f} by CPU; {idle:.1f} s of a processor were left idle", flush=True)
@@ -81,7 +89,7 @@ def soak(arguments: argparse.Namespace) -> None:
         def jobs() -> Iterator[tuple[Any, ...]]:
             nonlocal submitted
             while time.monotonic() < deadline:
-                yield submitted, arguments.job_s, str(begun)
+                yield submitted, arguments.job_s, str(begun), arguments.wait
                 submitted += 1
 
         committed = sqlite3.connect(Path(folder, "committed.sqlite"))
