@@ -151,7 +151,8 @@ def export_tiles(
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
         remove_tree(out, _STAGING)  # it may not be ours, and hold links
-        staging.mkdir(parents=True)
+        (out / _STAGING).mkdir()
+        staging.mkdir()
         (staging / _MARK).touch()
         with closing(_made(todo, make, run, recipe, staging, report)) as finished:
             for planned_tile, staged in finished:
