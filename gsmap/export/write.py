@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -151,7 +151,8 @@ def export_tiles(
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
         remove_tree(out, _STAGING)  # it may not be ours, and hold links
-        staging.mkdir(parents=True)
+        (out / _STAGING).mkdir()
+        staging.mkdir()
         (staging / _MARK).touch()
         with closing(_made(todo, make, run, recipe, staging, report)) as finished:
             for planned_tile, staged in finished:
@@ -222,16 +223,16 @@ def _made(
 def make_file(content: Content, recipe: TileRecipe, folder: str, name: str) -> StagedTile:
     """Make one tile, and its file in a folder; or, on a machine that does not have the folder, its bytes: a job."""
     found = content(_within.get())
-    count, notes = len(found.gaussians), tuple(found.notes)
-    if not count:
-        return StagedTile("", "", 0, 0, found.truncated, notes)
+    empty = StagedTile("", "", 0, len(found.gaussians), found.truncated, tuple(found.notes))
+    if not len(found.gaussians):
+        return empty
     if Path(folder, _MARK).exists():
-        sha256, num_bytes = _written(Path(folder, name), found, recipe)
-        return StagedTile(name, sha256, num_bytes, count, found.truncated, notes)
+        digest, num_bytes = _written(Path(folder, name), found, recipe)
+        return replace(empty, name=name, sha256=digest, num_bytes=num_bytes)
     with tempfile.TemporaryDirectory(prefix="gsmap-tile-") as elsewhere:
         path = Path(elsewhere, name)
-        sha256, num_bytes = _written(path, found, recipe)
-        return StagedTile(name, sha256, num_bytes, count, found.truncated, notes, content=path.read_bytes())
+        digest, num_bytes = _written(path, found, recipe)
+        return replace(empty, name=name, sha256=digest, num_bytes=num_bytes, content=path.read_bytes())
 
 
 def _written(path: Path, content: MergeResult, recipe: TileRecipe) -> tuple[str, int]:

@@ -257,7 +257,7 @@ class Map(AbstractContextManager["Map"]):
         wanted = [self.store.scenes.get(ref) for ref in scenes] or unthinned(self.scenes())
         with at_work(self.store, "describe"):
             keys = describe(self.store, wanted, self.settings, self._progress, verify=bool(scenes))
-        return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted]
+        return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted if scene.id in keys]
 
     def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:
         """Register pairs of described scenes.

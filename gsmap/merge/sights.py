@@ -98,7 +98,8 @@ class SightStore:
 
     def _held(self, name: str, make: Callable[[], Sight]) -> Sight:
         at = (self.folder, name)
-        found = _HELD[at] = _HELD.pop(at) if at in _HELD else make()  # the newest last
+        found = make() if at not in _HELD else _HELD.pop(at)
+        _HELD[at] = found  # the newest last
         while len(_HELD) > 1 and sum(sight.num_bytes for sight in _HELD.values()) > _CAN_BE_HELD:
             _HELD.popitem(last=False)
         return found

@@ -44,27 +44,30 @@ class LocalWorkers:
         self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], *, quick: bool = False
     ) -> Iterator[tuple[int, Any]]:
         todo = enumerate(arguments)
-        hint = length_hint(arguments, _MANY)
-        began, done = time.monotonic(), 0
-        while self._pool.size == 1 or (quick and not self._is_worth_it(hint - done, began, done)):
+        count = length_hint(arguments, _MANY)
+        took_s: list[float] = []
+        while self._pool.size == 1 or (quick and not self._is_worth_it(count, took_s)):
             taken = next(todo, None)
             if taken is None:
                 return
-            yield taken[0], job(*taken[1])
-            done += 1
+            began = time.monotonic()
+            result = job(*taken[1])
+            took_s.append(time.monotonic() - began)
+            yield taken[0], result
         first = list(islice(todo, 2))
         if len(first) == 1 and not self._pool.num_idle:
-            (index, args) = first[0]
+            index, args = first[0]
             yield index, job(*args)
             return
         yield from self._pool.run(job, chain(first, todo))
 
-    def _is_worth_it(self, left: int, began: float, done: int) -> bool:
-        """Whether workers would be done with what is left sooner than this process, the time to start them included."""
+    def _is_worth_it(self, count: int, took_s: list[float]) -> bool:
+        """Whether workers would do what is left of so many jobs sooner than this process, their start included."""
         if self._pool.num_idle:
             return True
-        each_s = (time.monotonic() - began) / done if done else 0.0
-        return left * each_s * (1 - 1 / self._pool.size) > self._start_s
+        # The first job also pays for what it imports.
+        saved_s = (count - len(took_s)) * min(took_s, default=0.0) * (1 - 1 / self._pool.size)
+        return len(took_s) > 1 and saved_s > self._start_s
 
     def close(self) -> None:
         self._pool.close()

@@ -39,7 +39,7 @@ def unthinned(scenes: Sequence[Scene]) -> list[Scene]:
 def describe(
     store: Store, scenes: Sequence[Scene], settings: Settings, progress: StageProgress, *, verify: bool = False
 ) -> dict[str, RecipeKey]:
-    """Make the graphs that are missing; returns the key of each scene's graph.
+    """Make the graphs that are missing; returns the key of each scene's graph, but of those that were set aside.
 
     Args:
         verify: read the graphs that are there, and make those again that are damaged, and try again those that were set
@@ -72,4 +72,4 @@ def describe(
         others = [graph.key for graph in store.graphs.list() if graph.scene in keys]
         if beyond_help := store.graphs.damaged(others):
             store.graphs.forget(beyond_help)
-    return keys
+    return {scene: key for scene, key in keys.items() if f"graph {key.digest}" not in store.set_aside.met}
