@@ -42,7 +42,7 @@ def ask(
                 store.indexes.note([_lookup(one, said, params) for one, said in zip(voters, found, strict=True)])
             return
         except CorruptError:
-            damaged = [segment.number for segment in _segments(store, graphs, params) if _is_damaged(segment)]
+            damaged = [segment.id for segment in _segments(store, graphs, params) if _is_damaged(segment)]
             if not damaged:
                 raise
             store.indexes.forget(damaged)
@@ -80,7 +80,7 @@ def _bring_up_to_date(
         old = [segments[k] for k in retrieve.to_merge(sizes, len(new))]
         whole = retrieve.merged([*old, retrieve.new_segment(new)])
         members = [member for member in whole.members if member is not None]
-        store.indexes.put(recipe, members, whole.arrays, [segment.number for segment in old])
+        store.indexes.put(recipe, members, whole.arrays, [segment.id for segment in old])
 
 
 def _segments(store: Store, graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> list[StoredSegment]:
