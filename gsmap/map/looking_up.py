@@ -32,7 +32,7 @@ def ask(
         graphs: the key of the graph of every scene that counts; they are put into the index where they are not.
         asking: ids of those that ask.
     """
-    for _ in range(_PATIENCE):
+    for left in reversed(range(_PATIENCE)):
         try:
             mine = _bring_up_to_date(store, graphs, set(asking), params, progress)
             for start in range(0, len(asking), _AT_ONCE):
@@ -42,19 +42,19 @@ def ask(
                 store.indexes.note([_lookup(one, said, params) for one, said in zip(voters, found, strict=True)])
             return
         except CorruptError:
-            damaged = [segment.number for segment in _segments(store, graphs, params) if _is_damaged(segment)]
-            if not damaged:
+            damaged = [segment.id for segment in _segments(store, graphs, params) if _is_damaged(segment)]
+            if not (damaged and left):
                 raise
             store.indexes.forget(damaged)
-        except NotFoundError as error:  # another process made segments one while they were read
-            stopped = error
-    raise stopped
+        except NotFoundError:  # another process made segments one while they were read
+            if not left:
+                raise
 
 
 def keys_of_lookups(graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> dict[str, str]:
     """The key (digest) under which each scene's lookup is kept."""
     recipe = retrieve.recipe_key(params)
-    return {scene: recipe.of(key.digest).digest for scene, key in graphs.items()}
+    return {scene: recipe.digest_of(key.digest) for scene, key in graphs.items()}
 
 
 def _bring_up_to_date(
@@ -80,7 +80,7 @@ def _bring_up_to_date(
         old = [segments[k] for k in retrieve.to_merge(sizes, len(new))]
         whole = retrieve.merged([*old, retrieve.new_segment(new)])
         members = [member for member in whole.members if member is not None]
-        store.indexes.put(recipe, members, whole.arrays, [segment.number for segment in old])
+        store.indexes.put(recipe, members, whole.arrays, [segment.id for segment in old])
 
 
 def _segments(store: Store, graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> list[StoredSegment]:

@@ -33,13 +33,15 @@ def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene, is_tried: b
         for one in store.indexes.lookups([scene.id]):
             for place, candidate in enumerate(one.candidates, 1):
                 if candidate.scene == other.id and (best is None or place < best[0]):
-                    best = place, scene.name, candidate.score
+                    best = place, scene.name, candidate.score, one.num_left is None
     said = "tried" if is_tried else "never tried"
     if best is not None:
-        place, name, score = best
+        place, name, score, is_new = best
         said += f": no. {place} of what {name} was paired with, score {score:.3g}"
         if not is_tried and place > top_k:
             said += f", of which the first {top_k} are tried"
+        elif not is_tried and is_new:
+            said += ", which the next gsmap update tries"
         elif not is_tried:
             said += f"; both have {settings.retrieve.enough} edges without doubt, which tie them over another scene"
     return WhyStep(name="retrieval", value=said, bar="among the candidates", passed=is_tried)

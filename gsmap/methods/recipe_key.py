@@ -41,6 +41,10 @@ class RecipeKey:
         made.__dict__["recipe"] = self.recipe  # the settings are the same, and turning them into a text takes long
         return made
 
+    def digest_of(self, *inputs: str) -> str:
+        """`digest` of the same recipe for these inputs: for many of them, of which few are needed as keys."""
+        return text_digest(canonical([self.recipe, list(inputs)]))
+
     def to_json(self) -> dict[str, Any]:
         """The recipe without its inputs, as plain values."""
         return {
@@ -59,7 +63,7 @@ class RecipeKey:
     @cached_property
     def digest(self) -> str:
         """32 hex digits of the recipe and its inputs: the name a result is kept under."""
-        return text_digest(canonical([self.recipe, list(self.inputs)]))
+        return self.digest_of(*self.inputs)
 
 
 def text_digest(text: str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from gsmap.errors import CorruptError
 from gsmap.store.arrays import Arrays, StoredFile, digest
@@ -27,15 +27,14 @@ class StoredSegment:
     """A segment of an index, whose arrays are read when they are asked for.
 
     Args:
-        number: unique in the map, growing.
+        id: digest of its content.
         members: its scenes; None in the place of one that does not count.
         num_nodes: of all of them.
     """
 
-    number: int
+    id: str
     members: Sequence[Member | None]
     num_nodes: int
-    _group: str
     _files: tuple[StoredFile, ...]
     _arrays: Arrays
     _catalog: Catalog
@@ -56,8 +55,8 @@ class StoredSegment:
 
     def _read(self, names: Sequence[str], rows: Sequence[tuple[int, int]] | None) -> dict[str, np.ndarray]:
         shapes = {"nodes": (self.num_nodes, None)}
-        with unless_pruned(self._catalog, self._group, "a segment of the index became one with others"):
-            return self._arrays.read(KIND, self._group, self._files, only=names, rows=rows, shapes=shapes)
+        with unless_pruned(self._catalog, self.id, "a segment of the index became one with others"):
+            return self._arrays.read(KIND, self.id, self._files, only=names, rows=rows, shapes=shapes)
 
 
 @dataclass(frozen=True)
@@ -91,12 +90,12 @@ class Indexes:
             rows = connection.execute(query).all()
             return [self._segment(row, manifest(connection, row.group_id)) for row in rows]
 
-    def put(self, key: str, members: Sequence[Member], arrays: IndexArrays, instead_of: Collection[int]) -> bool:
+    def put(self, key: str, members: Sequence[Member], arrays: IndexArrays, instead_of: Collection[str]) -> bool:
         """Keep a segment in place of others, whose arrays go; segments of other recipes go as well.
 
         Args:
             key: of the recipe.
-            instead_of: numbers of the segments that it holds what counts of.
+            instead_of: ids of the segments that it holds what counts of.
 
         Returns:
             Whether it was kept: not where another process has replaced one of those meanwhile.
@@ -107,22 +106,23 @@ class Indexes:
         content = {"keys": arrays.keys, "starts": arrays.starts, "nodes": arrays.nodes}
         staging = self._arrays.stage(content, KIND, group_id)
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
-            there = connection.execute(select(index_segments.c.number, index_segments.c.key)).all()
-            if not set(instead_of) <= {old.number for old in there}:
+            there = connection.execute(select(index_segments.c.group_id, index_segments.c.key)).all()
+            if not set(instead_of) <= {old.group_id for old in there}:
                 return False
-            gone = {old.number for old in there if old.number in instead_of or old.key != key}
+            gone = {old.group_id for old in there if old.group_id in instead_of or old.key != key}
             dropped = self._unname(connection, gone)
             known = manifest(connection, group_id)
             if not known or self._arrays.problems(KIND, group_id, known):
                 publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
-            connection.execute(insert(index_segments), row | {"created_at": now()})
+            if group_id not in {old.group_id for old in there} - gone:  # another process has kept the same
+                connection.execute(insert(index_segments), row | {"created_at": now()})
         self._drop(dropped - {group_id})
         return True
 
-    def forget(self, numbers: Collection[int]) -> None:
+    def forget(self, ids: Collection[str]) -> None:
         """Drop segments: their scenes are put into the index anew when it is asked next."""
         with self._catalog.write() as connection:
-            dropped = self._unname(connection, set(numbers))
+            dropped = self._unname(connection, ids)
         self._drop(dropped)
 
     def asked(self) -> dict[str, tuple[str, int | None]]:
@@ -171,18 +171,15 @@ class Indexes:
         members = [Member(scene, graph, bool(up), bool(metric), c) for scene, graph, up, metric, c in row.members]
         if row.num_nodes < 0:
             raise CorruptError(f"the catalog holds {row.num_nodes} in index_segments.num_nodes: restore it")
-        return StoredSegment(row.number, members, row.num_nodes, row.group_id, files, self._arrays, self._catalog)
+        return StoredSegment(row.group_id, members, row.num_nodes, files, self._arrays, self._catalog)
 
     @staticmethod
-    def _unname(connection: Any, numbers: Collection[int]) -> set[str]:
-        """Delete rows of segments and name their arrays no longer, but for those that other rows name."""
-        mine = index_segments.c.number.in_(sorted(numbers))
-        dropped = set(connection.execute(select(index_segments.c.group_id).where(mine)).scalars())
-        connection.execute(delete(index_segments).where(mine))
-        dropped -= set(connection.execute(select(index_segments.c.group_id)).scalars())
-        for group_id in dropped:
+    def _unname(connection: Connection, ids: Collection[str]) -> set[str]:
+        """Delete segments, and name their arrays no longer."""
+        connection.execute(delete(index_segments).where(index_segments.c.group_id.in_(sorted(ids))))
+        for group_id in ids:
             unname(connection, group_id)
-        return dropped
+        return set(ids)
 
     def _drop(self, group_ids: Collection[str]) -> None:
         """Delete arrays that no row names any more, unless a branch does. A crash before leaves them to `prune`."""

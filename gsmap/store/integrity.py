@@ -311,10 +311,7 @@ def _advice(connection: Connection, kind: str, group: str, location: str | None)
     if kind == CHANGES:
         return _comparison_advice(connection, group, location)
     if kind == INDEXES:
-        again = (
-            "restore the file from a backup" if location is None else f"gsmap register {quote(location)} makes it again"
-        )
-        return f" (the index of retrieval: {again})"
+        return " (the index of retrieval: it is made anew when the next new scene asks it)"
     if kind != "graphs":
         return ""
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)

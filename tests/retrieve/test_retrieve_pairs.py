@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from retrieve_worlds import layer, walk
 
-from gsmap.retrieve import Params, Placed, candidate_pairs
+from gsmap.retrieve import Params, Placed, candidate_pairs, neighbours
 from gsmap.types import SceneGraph
 
 
@@ -94,3 +94,26 @@ def test_gravity_free_landmarks_vote_only_where_a_scene_does_not_know_up():
     other_levelled = layer(rng, 40, descriptor="levelled of another kind")
     knows_too = SceneGraph("b", {"landmarks": other_levelled, "landmarks_gravity_free": plain}, up)
     assert candidate_pairs([knows, knows_too]) == []
+
+
+def test_neighbours_of_many_sizes_are_those_that_touch():
+    """Against comparing all with all."""
+    rng = np.random.default_rng(7)
+    params = Params(num_spatial=1000)
+    placed = {
+        f"s{i:03}": Placed(
+            int(rng.integers(2)), rng.uniform(0, 25, 3), float(np.exp(rng.normal())), rng.uniform(0, 0.3)
+        )
+        for i in range(200)
+    }
+    expected = set()
+    for a, p in placed.items():
+        for b, q in placed.items():
+            gap = np.linalg.norm(p.centre - q.centre) - p.radius - q.radius
+            if a < b and p.component == q.component and gap <= params.reach_sigmas * np.hypot(p.sigma, q.sigma):
+                expected.add((a, b))
+    found = neighbours(placed, params)
+    assert set(found) == expected
+    assert len(found) == len(expected) > 50
+    nearest = neighbours(placed, Params(num_spatial=2))
+    assert set(nearest) < expected

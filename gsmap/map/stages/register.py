@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from functools import cache, partial
-from itertools import combinations, permutations
+from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +112,8 @@ class _Known:
 
     def __init__(self, work: _Work) -> None:
         self._work = work
+        self._graphs = {scene: key.digest for scene, key in work.graphs.items()}
+        self._digests: dict[Pair, str] = {}  # of registrations, by (target, source)
         self._standing = {directed(one.target, one.source): one for one in work.store.registrations.standing()}
         if adopted := [pair for pair, one in self._standing.items() if self._adopt(one)]:
             changed = {directed(one.target, one.source): one for one in work.store.registrations.standing()}
@@ -130,24 +132,32 @@ class _Known:
     def has(self, a: str, b: str) -> bool:
         """Whether it has registered a pair."""
         one = self._standing.get(directed(a, b))
-        return one is not None and not self._keys(one).isdisjoint(one.keys)
+        return one is not None and self._has(one)
 
     def pairs(self) -> set[Pair]:
         """All that it has registered."""
-        return {pair for pair in self._standing if self.has(*pair)}
+        return {pair for pair, one in self._standing.items() if self._has(one)}
 
-    @cache  # noqa: B019  # lives as long as one run of the stage
-    def _keys(self, one: Standing) -> frozenset[str]:
-        """What the pair's registration would be kept under, in either direction."""
-        if not {one.target, one.source} <= set(self._work.graphs):
-            return frozenset()
-        return frozenset(self._work.key(*pair).digest for pair in permutations((one.target, one.source)))
+    def _has(self, one: Standing) -> bool:
+        return any(key in one.keys for key in self._keys(one))
+
+    def _keys(self, one: Standing) -> Iterator[str]:
+        """What the pair's registration would be kept under, in its own direction and in the other."""
+        if one.target in self._graphs and one.source in self._graphs:
+            yield self._digest(one.target, one.source)
+            yield self._digest(one.source, one.target)
+
+    def _digest(self, target: str, source: str) -> str:
+        known = self._digests.get((target, source))
+        if known is None:
+            known = self._work.recipe.digest_of(self._graphs[target], self._graphs[source])
+            self._digests[target, source] = known
+        return known
 
     def _adopt(self, one: Standing) -> bool:
-        keys = self._keys(one)
-        if one.key in keys or one.is_told or keys.isdisjoint(one.keys):
+        if one.is_told or one.key in self._keys(one) or not self._has(one):
             return False
-        known = [self._work.store.registrations.find(key) for key in sorted(keys & one.keys)]
+        known = [self._work.store.registrations.find(key) for key in self._keys(one)]
         self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
         return True
 

@@ -1,0 +1,168 @@
+"""The index: segments hold what was put in, become one as they grow, and say the same in any order."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from retrieve_worlds import UP, layer, turned, walk
+
+from gsmap.errors import CorruptError
+from gsmap.retrieve import Params, look_up, merged, new_segment, to_merge, voters_of
+from gsmap.retrieve import codes as coding
+from gsmap.retrieve.index import InMemory, unpacked
+from gsmap.types import SceneGraph
+from gsmap.types.retrieval import IndexArrays
+
+
+def _voters(graphs):
+    return [voters_of(graph, f"{i:032x}", 400) for i, graph in enumerate(graphs)]
+
+
+def test_distances_of_codes_are_those_of_the_vectors():
+    rng = np.random.default_rng(0)
+    for dim in (24, 48, 112):
+        vectors = rng.normal(size=(200, dim)) * np.r_[np.ones(20), np.full(dim - 20, 0.05)]
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        if dim == 112:  # within the axes that are kept: what lies outside of them is lost by intent
+            with np.load(coding.AXES) as axes:
+                vectors = axes["112.mean"] + 0.5 * vectors[:, :48] @ axes["112.axes"].T
+        codes = coding.encode(vectors).astype(float)
+        told = np.linalg.norm(codes[:, None] - codes[None], axis=2) / coding.SCALE
+        true = np.linalg.norm(vectors[:, None] - vectors[None], axis=2)
+        assert np.quantile(np.abs(told - true), 0.9) < 0.02  # a component beyond 127 / 200 is cut off
+
+
+def test_vectors_of_any_dimension_have_codes_that_tell_them_apart():
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(300, 1024))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    again = vectors + rng.normal(size=vectors.shape) * 0.006
+    a, b = coding.encode(vectors).astype(float), coding.encode(again).astype(float)
+    nearest = np.linalg.norm(a[:, None] - b[None], axis=2).argmin(1)
+    assert (nearest == np.arange(300)).mean() > 0.97
+
+
+def test_sums_of_codes_are_exact_in_any_order():
+    rng = np.random.default_rng(2)
+    a, b = (rng.integers(-127, 128, (50, coding.NUM_DIMS)).astype(np.float32) for _ in range(2))
+    order = rng.permutation(coding.NUM_DIMS)
+    assert (a @ b.T == a[:, order] @ b[:, order].T).all()
+    assert (a @ b.T == a.astype(np.int64) @ b.astype(np.int64).T).all()
+
+
+def test_a_node_is_looked_for_where_its_list_is_and_where_it_nearly_is():
+    rng = np.random.default_rng(3)
+    codes = rng.integers(-60, 60, (500, coding.NUM_DIMS)).astype(np.int8)
+    keys = coding.keys_of(coding.space("d", second=False), np.zeros(500), codes)
+    near = np.clip(codes + rng.integers(-4, 5, codes.shape), -127, 127).astype(np.int8)
+    probes = coding.probes(coding.keys_of(coding.space("d", second=False), np.zeros(500), near), near, 2)
+    assert probes.shape == (500, 4)
+    assert (probes == keys[:, None]).any(1).mean() > 0.97
+    assert len(np.unique(keys)) > 20
+    assert coding.space("d", second=False) != coding.space("d", second=True)
+
+
+def test_merging_keeps_every_node_and_leaves_out_what_does_not_count():
+    graphs = walk(9)
+    voters = _voters(graphs)
+    whole = new_segment(voters)
+    parts = [new_segment(voters[:2]), new_segment(voters[2:3]), new_segment(voters[3:])]
+    one = merged(parts)
+    assert [m.scene for m in one.members] == [m.scene for m in whole.members]
+    assert np.array_equal(one.arrays.keys, whole.arrays.keys)
+    assert np.array_equal(one.arrays.starts, whole.arrays.starts)
+    assert np.array_equal(one.arrays.nodes, whole.arrays.nodes)
+    without = merged([replace(whole, members=[None, *whole.members[1:]])])
+    again = new_segment(voters[1:])
+    assert np.array_equal(without.arrays.nodes, again.arrays.nodes)
+    assert unpacked(without.arrays.nodes).places.max() == 7
+
+
+def test_segments_stay_few_and_are_seldom_written_again():
+    sizes, written = [], 0
+    for _ in range(2000):
+        gone = to_merge(sizes, 1)
+        new = 1 + sum(sizes[k] for k in gone)
+        sizes = [size for k, size in enumerate(sizes) if k not in gone] + [new]
+        written += new
+        assert len(sizes) <= 4
+    assert sum(sizes) == 2000
+    assert written < 2000 * 40
+
+
+def test_any_order_and_any_segments_say_the_same():
+    rng = np.random.default_rng(4)
+    graphs = walk(40)
+    graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
+    voters = _voters(graphs)
+    params = Params(top_k=5)
+    first = look_up(voters, [new_segment(voters)], params)
+    for count in (1, 2, 7):
+        order = rng.permutation(len(voters))
+        segments = [new_segment([voters[k] for k in part]) for part in np.array_split(order, count)]
+        assert look_up(voters, segments, params) == first
+    assert look_up(voters[:3], [new_segment(voters)], params) == first[:3]
+
+
+def test_a_place_turned_and_moved_ranks_before_one_with_the_same_things_elsewhere():
+    rng = np.random.default_rng(5)
+    features, kinds = rng.normal(size=(80, 24)), rng.integers(0, 3, 80)
+    places = rng.uniform(0, 1, (80, 3)) * [6, 5, 2.5]
+
+    def scene(name, positions):
+        seen = features + rng.normal(size=features.shape) * 0.1
+        nodes = layer(rng, 80, embeddings=seen, type_ids=kinds, positions=positions)
+        return SceneGraph(name, {"landmarks": nodes}, UP)
+
+    asking = scene("m", places)
+    moved = scene("z", turned(places + rng.normal(size=places.shape) * 0.02, rng))
+    elsewhere = [scene(f"a{k}", rng.permutation(places)) for k in range(6)]
+    voters = _voters([asking, moved, *elsewhere])
+    (found,) = look_up(voters[:1], [new_segment(voters)], Params())
+    assert found[0].scene == "z"
+    assert found[0].score > 3 * found[1].score
+    # What all say alike, votes do not tell apart.
+    assert max(c.votes for c in found) < 1.5 * min(c.votes for c in found)
+
+
+def test_what_is_everywhere_says_little():
+    """Two rooms share their furniture; forty share the walls, which are most of what is seen."""
+    rng = np.random.default_rng(6)
+    walls, things = rng.normal(size=(60, 24)), rng.normal(size=(25, 20, 24))
+    at_wall, at_thing = rng.uniform(0, 1, (60, 3)) * [6, 5, 2.5], rng.uniform(0, 1, (25, 20, 3)) * [6, 5, 1]
+    graphs = []
+    for k in range(50):
+        room = k // 2
+        e = np.concatenate([walls, things[room]]) + rng.normal(size=(80, 24)) * 0.1
+        p = turned(np.concatenate([at_wall, at_thing[room]]) + rng.normal(size=(80, 3)) * 0.01, rng)
+        nodes = layer(rng, 80, embeddings=e, type_ids=np.zeros(80), positions=p)
+        graphs.append(SceneGraph(f"s{k:02}", {"landmarks": nodes}, UP))
+    voters = _voters(graphs)
+    found = look_up(voters, [new_segment(voters)], Params())
+    firsts = [said[0].scene for said in found]
+    assert sum(first == f"s{k ^ 1:02}" for k, first in enumerate(firsts)) >= 48
+
+
+def test_hostile_lists_and_nodes_are_refused():
+    voters = _voters(walk(3))
+    good = new_segment(voters).arrays
+    members = [one.member for one in voters]
+    backwards = good.starts.copy()
+    backwards[1] = backwards[-1] + 5
+    strange = good.nodes.copy()
+    strange[:, -4:] = np.array([77], "<i4").view(np.uint8)
+    for arrays in (
+        IndexArrays(good.keys[::-1], good.starts, good.nodes),
+        IndexArrays(good.keys, backwards, good.nodes),
+        IndexArrays(good.keys, good.starts[:-1], good.nodes),
+        IndexArrays(good.keys, good.starts, good.nodes[:-3]),
+        IndexArrays(good.keys, good.starts, strange),
+    ):
+        with pytest.raises(CorruptError):
+            look_up(voters, [InMemory(members, arrays)], Params())
+
+
+def test_scenes_without_a_node_are_no_trouble():
+    voters = _voters([SceneGraph(f"s{k}") for k in range(3)])
+    assert look_up(voters, [new_segment(voters)], Params()) == [[], [], []]
+    assert new_segment([]).arrays.starts.tolist() == [0]
