@@ -13,12 +13,13 @@ import contextlib
 import errno
 import fcntl
 import hashlib
+import math
 import os
 import shutil
 import stat
 import threading
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ class Arrays:
         self._held = threading.local()
 
     @contextlib.contextmanager
-    def stage(self, arrays: Mapping[str, np.ndarray]) -> Iterator[Staged]:
+    def stage(self, arrays: Mapping[str, np.ndarray | Column]) -> Iterator[Staged]:
         """Write arrays beside their place and synchronise them; dropped at the end unless `publish` took them."""
         with self._lock_staging(fcntl.LOCK_SH):
             folder = self.staging / uuid.uuid4().hex
@@ -86,6 +87,17 @@ class Arrays:
                 yield Staged(folder, _synchronise(folder))
             finally:
                 with contextlib.suppress(OSError):  # there is nothing where it was published
+                    self._remove_staged(folder.name)
+
+    @contextlib.contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """A folder for files that are needed for a moment, on the disk of the arrays; it is not made yet."""
+        with self._lock_staging(fcntl.LOCK_SH):
+            folder = self.staging / uuid.uuid4().hex
+            try:
+                yield folder
+            finally:
+                with contextlib.suppress(OSError):
                     self._remove_staged(folder.name)
 
     @contextlib.contextmanager
@@ -293,13 +305,51 @@ class Arrays:
             os.close(handle)
 
 
-def digest(*arrays: np.ndarray, text: str = "") -> str:
+@dataclass(frozen=True)
+class Parts:
+    """An array that is read part after part.
+
+    Args:
+        shape, dtype: of the whole.
+        parts: reads it from its first row on.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    parts: Callable[[], Iterator[np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Column:
+    """An array that is written block after block, and is never in memory as a whole.
+
+    Args:
+        shape, dtype: of the whole.
+        block: gives the block that begins at a row; blocks are as long as a chunk, and asked for in order.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    block: Callable[[int], np.ndarray]
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return self.block(rows.start)
+
+
+def digest(*arrays: np.ndarray | Parts, text: str = "") -> str:
     """32 hex digits over the bytes, shapes and types of arrays, and a text."""
     out = hashlib.sha256(text.encode())
     for array in arrays:
-        array = np.ascontiguousarray(array)
         out.update(f"|{array.dtype.str}{array.shape}|".encode())
-        out.update(array.reshape(-1).view(np.uint8).data)
+        for part in array.parts() if isinstance(array, Parts) else (array,):
+            out.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
     return out.hexdigest()[:32]
 
 
