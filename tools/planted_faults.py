@@ -2,6 +2,7 @@
 
     tools/planted_faults.py                  all of tools/faults/*.toml
     tools/planted_faults.py --rooms merge    one room's
+    tools/planted_faults.py --only bends     those with this in their names
     tools/planted_faults.py --quick          one fault in each of five rooms: what CI does
 
 A fault is a small change that ought not to pass unnoticed::
@@ -78,10 +79,11 @@ def read_faults(folder: Path = ROOT / "tools" / "faults") -> list[Fault]:
     ]
 
 
-def chosen(faults: list[Fault], rooms: list[str], quick: bool) -> list[Fault]:
-    """What to plant: of some rooms, or one of each room that the quick run looks at."""
+def chosen(faults: list[Fault], rooms: list[str], quick: bool, only: str = "") -> list[Fault]:
+    """What to plant: of some rooms and names, or one of each room that the quick run looks at."""
     if rooms:
         faults = [f for f in faults if f.room in rooms]
+    faults = [f for f in faults if only in f.name]
     if not quick:
         return faults
     have = list(dict.fromkeys(f.room for f in faults))
@@ -128,10 +130,11 @@ def _ran(fault: Fault, copy: Path) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", nargs="+", default=[], metavar="ROOM")
+    parser.add_argument("--only", default="", metavar="TEXT", help="faults that have this in their names")
     parser.add_argument("--quick", action="store_true", help="one fault in each of five rooms")
     parser.add_argument("--root", type=Path, default=ROOT, help="the checkout to plant them in a copy of")
     args = parser.parse_args()
-    faults = chosen(read_faults(args.root / "tools" / "faults"), args.rooms, args.quick)
+    faults = chosen(read_faults(args.root / "tools" / "faults"), args.rooms, args.quick, args.only)
     if not faults:
         print("there are no such faults in tools/faults", file=sys.stderr)
         return 1

@@ -18,6 +18,8 @@ from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import object_layer, resolved
 from gsmap.describe.objects.things import Params as ThingParams
 from gsmap.describe.objects.things import find_things
+from gsmap.describe.precision import Params as PrecisionParams
+from gsmap.describe.precision import rounded
 from gsmap.describe.unit import Params as UnitParams
 from gsmap.describe.unit import estimate_unit_m, landmark_units, working_unit_m
 from gsmap.errors import ConfigError
@@ -29,7 +31,7 @@ from gsmap.types.progress import Progress, silent
 from gsmap.types.scene import SCALE_POLICIES
 from gsmap.types.views import SceneContext
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Params:
         landmark: how landmarks are found.
         object: how objects are found.
         thing: how things are told apart.
+        precision: how finely positions, embeddings and colours are told.
         few_nodes: a scene none of whose layers has as many nodes gets a note.
     """
 
@@ -58,6 +61,7 @@ class Params:
     landmark: LandmarkParams = field(default_factory=LandmarkParams)
     object: ObjectParams = field(default_factory=ObjectParams)
     thing: ThingParams = field(default_factory=ThingParams)
+    precision: PrecisionParams = field(default_factory=PrecisionParams)
     few_nodes: int = 20
 
 
@@ -71,12 +75,12 @@ def recipe_key(params: Params | None = None, models: Mapping[str, ModelSpec] | N
     version = {"describe": VERSION}
     settings: dict[str, object] = {
         "layers": [name for name in ("landmarks", "objects", "things") if getattr(params, name)],
-        **{name: plain(getattr(params, name)) for name in ("surface", "gravity", "unit", "few_nodes")},
+        **{name: plain(getattr(params, name)) for name in ("surface", "gravity", "unit", "precision", "few_nodes")},
     }
     backend = ""
     if params.landmarks:
         version["landmarks"] = landmarks.VERSION
-        settings["landmark"] = plain(params.landmark)
+        settings["landmark"] = landmarks.settings(params.landmark)
     if params.objects:
         chosen = resolved(params.object, models)
         version |= chosen.versions
@@ -154,4 +158,5 @@ def describe(
         progress(0.95, "things")
         found = find_things(gaussians, cloud, up, 1.0 if "landmarks" in units else unit_m, params.thing)
     progress(1.0, "described")
-    return SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found, working_m)
+    graph = SceneGraph(scene_id, layers, up, unit_m, tuple(notes), found, working_m)
+    return rounded(graph, params.precision)

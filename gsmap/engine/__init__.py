@@ -1,42 +1,124 @@
-"""Where stage jobs run: the executors, and the choice of one."""
+"""Where stage jobs run: the executors, the choice of one, and workers that are kept from stage to stage."""
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
 from gsmap.methods import MethodParams, family
+from gsmap.methods.executor import SetAside, Workers
 
-__all__ = ["Params", "run_jobs"]
+__all__ = ["Kept", "Params", "SetAside", "run_jobs"]
+
+AUTO = "auto"
 
 
 @dataclass(frozen=True)
 class Params:
-    """Where jobs run.
+    """Where jobs run. A map's own settings choose none: whoever runs gsmap does.
 
     Args:
-        executor: ``local`` (a pool of processes on this machine), or one that another package adds.
+        executor: ``local`` (processes of this machine), ``dask`` (a cluster that runs), or one that another package
+            adds; ``auto`` takes what ``GSMAP_EXECUTOR`` says, ``local`` else.
         executors: settings of each executor.
     """
 
-    executor: str = "local"
+    executor: str = AUTO
     executors: MethodParams = field(default_factory=lambda: MethodParams("executor"))
 
     def __post_init__(self) -> None:
-        family("executor").get(self.executor)
+        if self.executor != AUTO:
+            family("executor").get(self.executor)
+
+    def chosen(self) -> tuple[str, Any]:
+        """Name and settings of the executor that is used.
+
+        Raises:
+            ConfigError: there is none of that name.
+        """
+        name = self.executor if self.executor != AUTO else os.environ.get("GSMAP_EXECUTOR") or "local"
+        family("executor").get(name)
+        return name, self.executors[name]
 
 
 def run_jobs(
-    job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params | None = None
+    job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params | None = None, *, quick: bool = False
 ) -> Iterator[tuple[int, Any]]:
-    """Yield ``(index, job(*arguments))`` as each is done; see `gsmap.methods.executor`.
+    """Yield ``(index, job(*arguments))`` as each is done; see `gsmap.methods.executor.Workers.run`.
+
+    Workers that it starts stay for the next call as long as anything keeps them (`Kept`).
 
     Raises:
         ConfigError: there is no such executor.
-        GsmapError: a worker died; what was yielded before stands.
     """
-    params = params or Params()
-    executor = family("executor").get(params.executor)
-    found: Iterator[tuple[int, Any]] = executor.run_jobs(job, arguments, params.executors[params.executor])
-    return found
+    name, settings = (params or Params()).chosen()
+    workers = _KEPT.take(name, settings)
+    try:
+        yield from workers.run(job, arguments, quick=quick)
+    finally:
+        _KEPT.give_back(name, settings, workers)
+
+
+class Kept(AbstractContextManager["Kept"]):
+    """While one of these is open, workers are kept; an open map has one. With the last one all of them end."""
+
+    def __init__(self) -> None:
+        self._open = True
+        _KEPT.begin()
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        if self._open:
+            self._open = False
+            _KEPT.end()
+
+
+class _Keeper:
+    """The idle workers of this process, by executor and settings."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()  # a finalizer may call within any call
+        self._keepers = 0
+        self._idle: list[tuple[str, Any, Workers]] = []
+
+    def begin(self) -> None:
+        with self._lock:
+            self._keepers += 1
+
+    def end(self) -> None:
+        with self._lock:
+            self._keepers -= 1
+            ended = [] if self._keepers else self._idle
+            if not self._keepers:
+                self._idle = []
+        for _, _, workers in ended:
+            workers.close()
+
+    def take(self, name: str, settings: Any) -> Workers:
+        with self._lock:
+            for i, (its_name, its_settings, workers) in enumerate(self._idle):
+                if (its_name, its_settings) == (name, settings):
+                    del self._idle[i]
+                    return workers
+        started: Workers = family("executor").get(name).start(settings)
+        return started
+
+    def give_back(self, name: str, settings: Any, workers: Workers) -> None:
+        with self._lock:
+            # One set of workers at most: those that an export in another thread leaves would only take memory.
+            if self._keepers and not any(kept[:2] == (name, settings) for kept in self._idle):
+                self._idle.append((name, settings, workers))
+                return
+        workers.close()
+
+
+_KEPT = _Keeper()

@@ -1,8 +1,8 @@
 """A pool of processes of which none outlives this one, and which is ended by killing: no running job is waited for.
 
 The pools of the standard library wait for what runs when they are left, and their workers for ever when their parent is
-killed. Workers start afresh ("spawn"): a forked child inherits threads and locks of torch and OpenMP that no longer run
-in it.
+killed; one worker that dies ends them. Workers start afresh ("spawn"): a forked child inherits threads and locks of
+torch and OpenMP that no longer run in it.
 """
 
 from __future__ import annotations
@@ -11,18 +11,43 @@ import os
 import pickle
 import signal
 import subprocess
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import dataclass
 from multiprocessing import Pipe, spawn
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 from gsmap.errors import GsmapError
+from gsmap.methods.executor import SetAside
 
 _WORKER = Path(__file__).with_name("worker.py")
 _NOT_TO_WORKERS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 """A terminal and a service manager signal the whole group: what becomes of a worker is for its parent to say."""
+
+_REMEMBERED = 4
+"""Jobs of a worker by which its next one is chosen: about as many as it keeps what it read for."""
+
+_LOSSES = 2
+"""A job that took so many processes with it is set aside."""
+
+_FALSE_STARTS = 3
+"""Workers that may end before they have begun, one after another."""
+
+
+class WorkerDied(Exception):
+    """The process of a worker has ended; says how."""
+
+
+@dataclass(eq=False)
+class _Task:
+    """A job that was taken, which of its arguments may name what it reads, and how many workers it was lost with."""
+
+    index: int
+    arguments: tuple[Any, ...]
+    reads: frozenset[Hashable]
+    losses: int = 0
 
 
 class Worker:
@@ -30,6 +55,8 @@ class Worker:
 
     def __init__(self) -> None:
         self.connection, theirs = Pipe()
+        self.has_begun = False
+        self.read: deque[frozenset[Hashable]] = deque(maxlen=_REMEMBERED)
         command = spawn.get_command_line()  # of which the interpreter and its options are wanted
         command = [*command[: command.index("-c")], str(_WORKER), str(theirs.fileno()), str(os.getpid())]
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _NOT_TO_WORKERS)  # which the process inherits
@@ -40,75 +67,176 @@ class Worker:
             theirs.close()
         about = spawn.get_preparation_data("gsmap worker")  # the search path, the folder, and what `__main__` is
         about.pop("authkey", None)  # a secret, and of no use here
-        self._send(pickle.dumps(about))
+        self._unsent = [pickle.dumps(about)]
 
-    def begin(self, job: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-        self._send(pickle.dumps((job, arguments), pickle.HIGHEST_PROTOCOL))
-
-    def result(self) -> Any:
-        """What the job returned; waits for it.
+    def begin(self, job: Callable[..., Any], arguments: tuple[Any, ...], reads: frozenset[Hashable]) -> None:
+        """Send a job; the worker must have none.
 
         Raises:
-            GsmapError: the process died.
-            Exception: what the job raised.
+            WorkerDied: the process ended before.
+        """
+        self._unsent.append(pickle.dumps((job, arguments), pickle.HIGHEST_PROTOCOL))
+        try:
+            while self._unsent:
+                self.connection.send_bytes(self._unsent.pop(0))
+        except OSError as error:
+            raise self._died() from error
+        self.read.append(reads)
+
+    def answer(self) -> tuple[bool, Any] | None:
+        """Whether the job returned, and what it returned or raised; None if the worker has only begun. Waits for it.
+
+        Raises:
+            WorkerDied: the process ended.
         """
         try:
-            returned, value = pickle.loads(self.connection.recv_bytes())
+            message = self.connection.recv_bytes()
         except (EOFError, OSError) as error:
-            raise _died() from error
-        if not returned:
-            raise value
-        return value
+            raise self._died() from error
+        if not message:
+            self.has_begun = True
+            return None
+        returned, value = pickle.loads(message)
+        return returned, value
+
+    def is_alive(self) -> bool:
+        return self._process.poll() is None
 
     def kill(self) -> None:
         self._process.kill()
         self._process.wait()
         self.connection.close()
 
-    def _send(self, message: bytes) -> None:
-        try:
-            self.connection.send_bytes(message)
-        except OSError as error:
-            raise _died() from error
+    def _died(self) -> WorkerDied:
+        self._process.kill()  # one that closed its socket is of no use either
+        code = self._process.wait()
+        self.connection.close()
+        if code == -signal.SIGKILL:
+            return WorkerDied("its process was killed, most likely for lack of memory")
+        return WorkerDied(f"its process ended by {signal.Signals(-code).name if code < 0 else f'exit code {code}'}")
 
 
-class Pool(AbstractContextManager["Pool"]):
-    """At most ``size`` workers, started as jobs come; all are killed at the end of the block."""
+class Pool:
+    """At most ``size`` workers, started as jobs come and kept from run to run until the pool is closed."""
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._workers: dict[Connection, Worker] = {}
+        self._idle: list[Worker] = []
 
-    def __exit__(self, *error: object) -> None:
-        for worker in self._workers.values():
+    @property
+    def num_idle(self) -> int:
+        """Workers that are there and wait for jobs."""
+        for worker in [worker for worker in self._idle if not worker.is_alive()]:
+            self._idle.remove(worker)
             worker.kill()
+        return len(self._idle)
 
-    def run(self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
-        """Yield ``(index, result)`` as each is done; the next arguments are taken when a worker is free for them."""
-        todo = enumerate(arguments)
-        at: dict[Connection, int] = {}
+    def close(self) -> None:
+        while self._idle:
+            self._idle.pop().kill()
 
-        def begin(worker: Worker | None) -> bool:
-            taken = next(todo, None)
-            if taken is None:
+    def run(
+        self, job: Callable[..., Any], numbered: Iterable[tuple[int, tuple[Any, ...]]]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield ``(index, result)`` of each ``(index, arguments)`` as it is done: see `gsmap.methods.executor.Workers`
+
+        As many arguments as there may be workers are taken ahead, so that each worker is given a job whose scenes it
+        has read. A job that was lost with its worker is tried again when nothing else runs: if memory was short, it
+        has all there is.
+        """
+        todo = iter(numbered)
+        ahead: deque[_Task] = deque()
+        again: deque[_Task] = deque()
+        at: dict[Connection, tuple[Worker, _Task]] = {}
+        false_starts = 0
+
+        def lost(worker: Worker, task: _Task, died: WorkerDied) -> bool:
+            """Whether the job is to be set aside; else it will be tried again."""
+            nonlocal false_starts
+            if not worker.has_begun:
+                false_starts += 1
+                if false_starts > _FALSE_STARTS:
+                    raise GsmapError(f"worker processes end before they do anything: {died}") from died
+                (again if task.losses else ahead).appendleft(task)
                 return False
-            if worker is None:
-                worker = Worker()
-                self._workers[worker.connection] = worker
-            at[worker.connection], arguments = taken
-            worker.begin(job, arguments)
-            return True
+            task.losses += 1
+            if task.losses < _LOSSES:
+                again.append(task)
+            return task.losses >= _LOSSES
 
-        while len(at) < self.size and begin(None):
-            pass
-        while at:
-            for connection in wait(list(at)):
-                assert isinstance(connection, Connection)
-                index, worker = at.pop(connection), self._workers[connection]
-                result = worker.result()
-                begin(worker)
-                yield index, result
+        def begin_all() -> None:
+            while len(at) < self.size:
+                while len(ahead) < self.size and (taken := next(todo, None)) is not None:
+                    ahead.append(_Task(*taken, _reads(taken[1])))
+                if not ahead and (at or not again):
+                    return
+                worker, task = self._matched(ahead) if ahead else (self._any(), again.popleft())
+                try:
+                    worker.begin(job, task.arguments, task.reads)
+                except WorkerDied as died:  # while it had no job
+                    worker.has_begun = False
+                    lost(worker, task, died)
+                except BaseException:
+                    worker.kill()
+                    raise
+                else:
+                    at[worker.connection] = worker, task
+
+        try:
+            begin_all()
+            while at:
+                done: list[tuple[int, Any]] = []
+                raised: BaseException | None = None
+                for connection in wait(list(at)):
+                    assert isinstance(connection, Connection)
+                    worker, task = at[connection]
+                    try:
+                        answer = worker.answer()
+                    except WorkerDied as died:
+                        del at[connection]
+                        if lost(worker, task, died):
+                            done.append((task.index, SetAside(f"{died}, like the one that had tried it before")))
+                        continue
+                    if answer is None:
+                        continue
+                    del at[connection]
+                    self._idle.append(worker)
+                    false_starts = 0
+                    if answer[0]:
+                        done.append((task.index, answer[1]))
+                    else:
+                        raised = raised or answer[1]
+                if raised is None:
+                    begin_all()
+                yield from done
+                if raised is not None:
+                    raise raised
+        finally:
+            for worker, _ in at.values():
+                worker.kill()
+
+    def _any(self) -> Worker:
+        return self._idle.pop() if self.num_idle else Worker()
+
+    def _matched(self, ahead: deque[_Task]) -> tuple[Worker, _Task]:
+        """Of idle workers and jobs ahead those that share most of what is read, earlier ones first; or a new worker."""
+        if not self.num_idle:
+            return Worker(), ahead.popleft()
+        known = [set().union(*worker.read) for worker in self._idle]
+        shared = {(i, j): len(task.reads & read) for j, task in enumerate(ahead) for i, read in enumerate(known)}
+        i, j = max(shared, key=shared.__getitem__)
+        task = ahead[j]
+        del ahead[j]
+        return self._idle.pop(i), task
 
 
-def _died() -> GsmapError:
-    return GsmapError("a worker process died, most likely for lack of memory: run again with GSMAP_WORKERS=1")
+def _reads(arguments: tuple[Any, ...]) -> frozenset[Hashable]:
+    """The texts and tuples among the arguments of a job but the first, which is the map of all of them."""
+    found = set()
+    for argument in arguments[1:]:
+        if isinstance(argument, (str, tuple)):
+            try:
+                found.add(argument)
+            except TypeError:  # something within cannot be hashed
+                continue
+    return frozenset(found)

@@ -52,11 +52,12 @@ def work(socket: int) -> None:
     current._inheriting = True  # type: ignore[attr-defined]
     spawn.prepare(pickle.loads(received.get()))
     del current._inheriting  # type: ignore[attr-defined]
+    parent.send_bytes(b"")  # it has begun: what ends it from now on is a job
     while True:
-        parent.send_bytes(_answer(received.get()))
+        parent.send_bytes(answer(received.get()))
 
 
-def _answer(message: bytes) -> bytes:
+def answer(message: bytes) -> bytes:
     """What a job returned or raised, as the parent can load it: ``(True, result)`` or ``(False, error)``."""
     import pickle
     import traceback

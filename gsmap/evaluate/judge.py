@@ -184,9 +184,11 @@ class _Judge:
     def _true(self, target: str, source: str) -> Sim3:
         return self.truth[target] @ self.truth[source].inverse()
 
-    def _of_truth(self, source: str) -> np.ndarray:
-        """(7, 7) how well the truth of a pair is known, on the source's side."""
+    def _of_truth(self, source: str) -> np.ndarray | None:
+        """(7, 7) how well the truth of a pair is known, on the source's side; None where it is exact."""
         params, scene = self.params, self.scenes[source]
+        if not (params.truth_sigma_deg or params.truth_sigma_m):
+            return None
         sigma = params.truth_sigma_m * self.truth[source].scale
         return truth_covariance(float(np.radians(params.truth_sigma_deg)), sigma, scene.centroid)
 

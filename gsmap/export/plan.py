@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError
+from gsmap.export.cells import Boxes, CellSet, Grid
 from gsmap.types import Sim3
 
 
@@ -18,17 +19,13 @@ class Params:
 
     Args:
         moved_m: a tile is made again when a scene moved farther than this within it.
-        max_tiles: an export of more tiles than this is refused.
-        workers: tiles that are merged at once, each in a thread of its own; memory grows with it.
+        max_tiles: an export of more tiles than this is refused; tiles that no scene reaches into do not count.
     """
 
     moved_m: float = 0.005
     max_tiles: int = 1_000_000
-    workers: int = 1
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"an export needs at least one worker, got {self.workers}")
         if not self.moved_m >= 0:
             raise ConfigError(f"moved_m must not be negative, got {self.moved_m}")
 
@@ -89,73 +86,55 @@ def plan_tiles(
     components = components or dict.fromkeys(poses, 0)
     tiles: list[PlannedTile] = []
     for component in sorted({components[s] for s in poses}):
-        members = {s: _Box(poses[s], scene_bounds[s]) for s in sorted(poses) if components[s] == component}
-        extent = _around([box.map_bounds for box in members.values()])
-        if bbox is not None:
-            extent = np.array([np.maximum(extent[0], bbox[0]), np.minimum(extent[1], bbox[1])])
-            if not (extent[1] > extent[0]).all():
-                continue
+        members = [scene for scene in sorted(poses) if components[scene] == component]
+        boxes = Boxes.of([poses[scene] for scene in members], [scene_bounds[scene] for scene in members])
         metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
-        edge, reach = tile_size_m / metres, reach_m / metres
-        cells: Sequence[tuple[int, int, int] | None] = [None]
-        if tile_size_m:
-            cells = _cells(extent * metres, tile_size_m, max_tiles)
-        for cell in cells:
-            if cell is None:
-                bounds = extent if bbox is None else bbox
-                name = "map"
-            else:
-                bounds = np.array([np.multiply(cell, edge), np.multiply(np.add(cell, 1), edge)])
-                name = "tile_" + "_".join(f"{c:+04d}" for c in cell)
-                if bbox is not None:
-                    bounds = np.array([np.maximum(bounds[0], bbox[0]), np.minimum(bounds[1], bbox[1])])
-            if not any(box.touches(bounds) for box in members.values()):
-                continue
-            near = np.array([bounds[0] - reach, bounds[1] + reach])
-            touching = {s: poses[s] for s, box in members.items() if box.touches(near)}
+        reach = reach_m / metres
+        for cell, bounds, reaching in (
+            _in_cells(boxes, Grid(tile_size_m / metres, bbox, max_tiles), reach)
+            if tile_size_m
+            else _in_one(boxes, bbox, reach)
+        ):
+            name = "map" if cell is None else "tile_" + "_".join(f"{c:+04d}" for c in cell)
             place = json.dumps([tile_size_m, cell, None if bbox is None else bbox.tolist()])
-            tiles.append(PlannedTile(component, name, bounds, touching, place, metres))
+            near = {members[row]: poses[members[row]] for row in reaching}
+            tiles.append(PlannedTile(component, name, bounds, near, place, metres))
     if not tiles and bbox is not None:
-        whole = _around([_Box(poses[s], scene_bounds[s]).map_bounds for s in poses])
+        whole = Boxes.of(list(poses.values()), [scene_bounds[scene] for scene in poses]).around
         raise InputError(
             f"the box {_text(bbox)} lies outside the map, which spans {_text(whole)}: choose a box that touches it"
         )
     return tiles
 
 
-class _Box:
-    """A scene's box of Gaussians, oriented as the scene lies in the map."""
-
-    def __init__(self, S_map_scene: Sim3, bounds: np.ndarray) -> None:
-        bounds = np.asarray(bounds, dtype=np.float64)
-        self.half = S_map_scene.scale * (bounds[1] - bounds[0]) / 2
-        self.center = S_map_scene.apply((bounds[0] + bounds[1]) / 2)
-        self.axes = S_map_scene.rotation
-        reach = np.abs(self.axes) @ self.half
-        # A touch larger, so that Gaussians on the very border lie inside however their means round.
-        pad = 1e-5 * (1 + np.abs(self.center).max() + reach.max())
-        self.map_bounds = np.array([self.center - reach - pad, self.center + reach + pad])
-
-    def touches(self, box: np.ndarray) -> bool:
-        """Whether the oriented box meets an axis-aligned one, by the face normals of both (never a false no)."""
-        if (self.map_bounds[0] > box[1]).any() or (self.map_bounds[1] < box[0]).any():
-            return False
-        offset = self.axes.T @ ((box[0] + box[1]) / 2 - self.center)
-        return bool((np.abs(offset) <= self.half + np.abs(self.axes.T) @ ((box[1] - box[0]) / 2) + 1e-5).all())
+_Tiles = Iterator[tuple[tuple[int, ...] | None, np.ndarray, list[int]]]
 
 
-def _cells(extent: np.ndarray, tile_size_m: float, max_tiles: int) -> list[tuple[int, int, int]]:
-    with np.errstate(over="ignore", invalid="ignore"):
-        low, high = np.floor(extent[0] / tile_size_m), np.ceil(extent[1] / tile_size_m)
-        count = np.prod(high - low)
-    if not count <= max_tiles:
-        raise ConfigError(
-            f"tiles of {tile_size_m} m would be {count:.3g} over {_text(extent)}: use larger tiles or a box"
-        )
-    first, last = low.astype(int), high.astype(int)
-    return [
-        (x, y, z) for x in range(first[0], last[0]) for y in range(first[1], last[1]) for z in range(first[2], last[2])
-    ]
+def _in_one(boxes: Boxes, bbox: np.ndarray | None, reach: float) -> _Tiles:
+    """All of a component as one tile: no cell, its bounds, and the rows of the boxes that reach into it."""
+    bounds = boxes.around if bbox is None else bbox
+    everyone = np.arange(len(boxes))
+    low, high = (np.tile(corner, (len(boxes), 1)) for corner in bounds)
+    if boxes.touch(everyone, low, high).any():
+        yield None, bounds, np.flatnonzero(boxes.touch(everyone, low - reach, high + reach)).tolist()
+
+
+def _in_cells(boxes: Boxes, grid: Grid, reach: float) -> _Tiles:
+    """Every cell that a box touches, in order, with its bounds and the rows of the boxes that reach into it."""
+    which, cells = grid.reached(boxes)
+    holding = CellSet.of(cells)
+    if not len(holding):
+        return
+    if len(holding) > grid.most:
+        raise grid.too_many(boxes)
+    if reach > 0:
+        which, cells = grid.reached(boxes, reach, holding)
+    mine = holding.find(cells)
+    order = np.lexsort((which, mine))
+    rows = np.split(which[order], np.cumsum(np.bincount(mine, minlength=len(holding)))[:-1])
+    low, high = grid.bounds(holding.cells, holding.cells + 1)
+    for k, cell in enumerate(holding.cells.tolist()):
+        yield tuple(cell), np.array([low[k], high[k]]), rows[k].tolist()
 
 
 def _checked_box(bbox: np.ndarray) -> np.ndarray:
@@ -163,10 +142,6 @@ def _checked_box(bbox: np.ndarray) -> np.ndarray:
     if bbox.shape != (2, 3) or not np.isfinite(bbox).all() or not (bbox[1] > bbox[0]).all():
         raise InputError(f"a box needs x0 y0 z0 below x1 y1 z1 on every axis, got {_text(bbox)}: it is empty")
     return bbox
-
-
-def _around(boxes: list[np.ndarray]) -> np.ndarray:
-    return np.array([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
 
 
 def _text(box: np.ndarray) -> str:

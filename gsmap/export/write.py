@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+import secrets
+import tempfile
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -28,13 +30,18 @@ from gsmap.export.manifest import FILE_NAME, Manifest
 from gsmap.export.plan import Params, PlannedTile
 from gsmap.export.recipe import TileRecipe, dirty_reason
 from gsmap.formats import tiles3d
+from gsmap.methods.executor import SetAside
 from gsmap.types import MergeResult, Tile
 from gsmap.types.metre import Metre
 from gsmap.types.progress import Progress, silent
 
 _STAGING = ".partial"
-Make = Callable[[PlannedTile, Progress], MergeResult]
+_MARK = "this-export"
+Content = Callable[[Progress], MergeResult]
+Run = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 _At = tuple[int, str]  # component and name of a tile
+
+_within: ContextVar[Progress] = ContextVar("progress of a tile that is made in this process", default=silent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +54,7 @@ class ExportResult:
         reused: how many it found made.
         removed: how many that are no longer in the plan it took away.
         notes: what a person should know about the tiles that it made.
+        set_aside: the tiles that could not be made since they end the process that makes them, and why.
     """
 
     tiles: list[Tile]
@@ -54,17 +62,45 @@ class ExportResult:
     reused: int
     removed: int
     notes: tuple[str, ...] = ()
+    set_aside: tuple[tuple[PlannedTile, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class StagedTile:
+    """The file of a tile that was made, not yet in its place.
+
+    Args:
+        name: of the file, in the folder that was given for it; empty where the tile holds nothing.
+        sha256, num_bytes: of the file.
+        num_gaussians, truncated, notes: as in `gsmap.types.Tile`.
+        content: the file itself, where it was made on a machine that does not have the folder; None else.
+    """
+
+    name: str
+    sha256: str
+    num_bytes: int
+    num_gaussians: int
+    truncated: bool
+    notes: tuple[str, ...]
+    content: bytes | None = None
+
+
+def run_here(job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
+    """Do jobs in this process, one after the other."""
+    for index, args in enumerate(arguments):
+        yield index, job(*args)
 
 
 def export_tiles(
     plan: Sequence[PlannedTile],
-    make: Make,
+    make: Callable[[PlannedTile], Content],
     out: str | os.PathLike[str],
     *,
     map_id: str,
     recipe: TileRecipe,
     metres: Mapping[int, Metre] | None = None,
     params: Params | None = None,
+    run: Run = run_here,
     made: Callable[[Tile], None] | None = None,
     progress: Progress | None = None,
 ) -> ExportResult:
@@ -76,14 +112,15 @@ def export_tiles(
 
     Args:
         plan: from `plan_tiles`.
-        make: makes one tile's content; called from ``params.workers`` threads.
+        make: of a tile what makes its content, given where to report progress: can be pickled if ``run`` needs that.
         out: folder; made if missing; one folder per component inside.
         map_id: a folder keeps to one map.
         recipe: how tiles are made and written; where it differs from a tile's, that tile is made again.
         metres: how long a metre is in each component's frame, to be told in the manifest.
-        params: from which movement on a tile is made again, and how many are made at once.
+        params: from which movement on a tile is made again.
+        run: makes tiles, here or elsewhere (`gsmap.engine.run_jobs`).
         made: told each new tile once its file is in place; called from the calling thread.
-        progress: told the fraction of tiles done and what is being done; called from several threads, one at a time.
+        progress: told the fraction of tiles done and what is being done.
 
     Raises:
         ConfigError: the folder belongs to another map or holds other files.
@@ -103,6 +140,8 @@ def export_tiles(
     retold, manifest.metres = manifest.metres != dict(metres or {}), dict(metres or {})
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
+    aside: list[tuple[PlannedTile, str]] = []
+    staging = out / _STAGING / secrets.token_hex(16)  # what another export's workers may still write lies elsewhere
     try:
         if not (todo or gone or retold or manifest.doomed) and out.exists():
             return ExportResult([old[at] for at in sorted(planned)], 0, reused, 0)
@@ -110,10 +149,14 @@ def export_tiles(
         if not (out / FILE_NAME).exists():
             manifest.save(out)  # whose folder it is, before anything lies in it
         remove_tree(out, _STAGING)  # it may not be ours, and hold links
-        (out / _STAGING).mkdir()
-        work = _finished(todo, lambda t: _make(t, make, out, recipe, report), params.workers, report.give_up)
-        with closing(work) as finished:
-            for at, tile, num_bytes in finished:
+        staging.mkdir(parents=True)
+        (staging / _MARK).touch()
+        with closing(_made(todo, make, run, recipe, staging, report)) as finished:
+            for planned_tile, staged in finished:
+                if isinstance(staged, SetAside):
+                    aside.append((planned_tile, staged.reason))
+                    continue
+                at, tile, num_bytes = _placed(planned_tile, staged, out, staging, recipe)
                 if made is not None:
                     made(tile)  # first: a tile that the manifest names is not made, and so not told, again
                 if at in old and old[at].path not in ("", tile.path):
@@ -139,8 +182,8 @@ def export_tiles(
         for left in leftovers(out):
             with suppress(OSError, CorruptError):
                 remove_tree(out, *left)
-    tiles = [manifest.tiles[at] for at in sorted(planned)]
-    return ExportResult(tiles, len(todo), reused, len(gone), manifest.notes + _told(news))
+    tiles = [manifest.tiles[at] for at in sorted(planned) if at in manifest.tiles]
+    return ExportResult(tiles, len(news), reused, len(gone), manifest.notes + _told(news), tuple(aside))
 
 
 def _must_make(
@@ -151,36 +194,82 @@ def _must_make(
     return tile is None or not manifest.has_file(out, tile)
 
 
-def _make(planned: PlannedTile, make: Make, out: Path, recipe: TileRecipe, report: _Report) -> tuple[_At, Tile, int]:
-    """Make one tile, put its file in place, and describe it."""
-    content = make(planned, report.within_tile)
-    path, digest, num_bytes = "", "", 0
-    if len(content.gaussians):
+def _made(
+    todo: Sequence[PlannedTile],
+    make: Callable[[PlannedTile], Content],
+    run: Run,
+    recipe: TileRecipe,
+    staging: Path,
+    report: _Report,
+) -> Generator[tuple[PlannedTile, StagedTile | SetAside], None, None]:
+    """Each tile with its staged file, or why there is none; to be closed, which gives up those that are being made."""
+    arguments = ((make(planned), recipe, str(staging.absolute()), _staged_name(planned, recipe)) for planned in todo)
+    results = run(make_file, arguments)
+    token = _within.set(report.within_tile)
+    try:
+        for index, staged in results:
+            yield todo[index], staged
+    finally:
+        _within.reset(token)
+        if isinstance(results, Generator):
+            results.close()
+
+
+def make_file(content: Content, recipe: TileRecipe, folder: str, name: str) -> StagedTile:
+    """Make one tile, and its file in a folder; or, on a machine that does not have the folder, its bytes: a job."""
+    found = content(_within.get())
+    about = (len(found.gaussians), found.truncated, tuple(found.notes))
+    if not len(found.gaussians):
+        return StagedTile("", "", 0, *about)
+    if Path(folder, _MARK).exists():
+        return StagedTile(name, *_written(Path(folder, name), found, recipe), *about)
+    with tempfile.TemporaryDirectory(prefix="gsmap-tile-") as elsewhere:
+        path = Path(elsewhere, name)
+        return StagedTile(name, *_written(path, found, recipe), *about, content=path.read_bytes())
+
+
+def _written(path: Path, content: MergeResult, recipe: TileRecipe) -> tuple[str, int]:
+    """Digest and size of the file that is at the path now."""
+    try:
+        _write(path, content, recipe)
+    except GsmapError as error:
+        # A full disk is a matter of the folder, not of what was written.
+        raise error.__cause__ if isinstance(error.__cause__, OSError) else error from None
+    return _synced_digest(path)
+
+
+def _staged_name(planned: PlannedTile, recipe: TileRecipe) -> str:
+    return f"component_{planned.component}_{planned.name}.{recipe.suffix}"
+
+
+def _placed(
+    planned: PlannedTile, staged: StagedTile, out: Path, staging: Path, recipe: TileRecipe
+) -> tuple[_At, Tile, int]:
+    """Put the file of a tile in its place, and describe it."""
+    path = ""
+    if staged.name:
         path = f"component_{planned.component}/{planned.name}.{recipe.suffix}"
-        staged = out / _STAGING / path.replace("/", "_")
-        try:
-            _write(staged, content, recipe)
-        except GsmapError as error:
-            # A full disk is a matter of the folder, not of what was written.
-            raise error.__cause__ if isinstance(error.__cause__, OSError) else error from None
-        digest, num_bytes = _synced_digest(staged)
+        file = staging / _staged_name(planned, recipe)
+        if staged.content is not None:
+            file.write_bytes(staged.content)
+            _synced_digest(file)
         refuse_links(out, *path.split("/")[:-1])
         make_folder((out / path).parent)
-        os.replace(staged, out / path)
+        os.replace(file, out / path)
         sync_folder((out / path).parent)
     tile = Tile(
         key=recipe.key(planned),
         component=planned.component,
         bounds=planned.bounds,
         poses=dict(planned.poses),
-        num_gaussians=len(content.gaussians),
+        num_gaussians=staged.num_gaussians,
         recipe=recipe.merge.to_json(),
-        truncated=content.truncated,
+        truncated=staged.truncated,
         path=path,
-        sha256=digest,
-        notes=tuple(content.notes),
+        sha256=staged.sha256,
+        notes=staged.notes,
     )
-    return (planned.component, planned.name), tile, num_bytes
+    return (planned.component, planned.name), tile, staged.num_bytes
 
 
 def _write(path: Path, content: MergeResult, recipe: TileRecipe) -> None:
@@ -229,45 +318,16 @@ def _told(news: dict[_At, Tile]) -> tuple[str, ...]:
     return tuple(f"{at[0] if len(at) == 1 else f'{len(at)} tiles'}: {note}" for note, at in about.items())
 
 
-def _finished(
-    todo: Sequence[PlannedTile],
-    make: Callable[[PlannedTile], tuple[_At, Tile, int]],
-    workers: int,
-    give_up: Callable[[], None],
-) -> Generator[tuple[_At, Tile, int], None, None]:
-    """Results of ``make`` as they come; the first error ends it: what has not begun never does, the rest gives up."""
-    if workers == 1 or len(todo) < 2:
-        yield from map(make, todo)
-        return
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="gsmap-tile")
-    try:
-        for future in as_completed([pool.submit(make, planned) for planned in todo]):
-            yield future.result()
-    finally:
-        give_up()
-        pool.shutdown(cancel_futures=True)
-
-
 class _Report:
-    """Progress over all tiles, from any thread."""
+    """Progress over all tiles."""
 
     def __init__(self, progress: Progress, total: int, done: int) -> None:
         self._progress, self._total, self._done = progress, total, done
-        self._lock = Lock()
-        self._given_up = False
-
-    def give_up(self) -> None:
-        """End the making of tiles that are still being made: their result is not wanted any more."""
-        self._given_up = True
 
     def within_tile(self, fraction: float, text: str) -> None:
-        if self._given_up:
-            raise GsmapError("this tile was given up")
-        with self._lock:
-            at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
-            self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")
+        at = min(self._done + min(max(fraction, 0.0), 1.0), self._total)
+        self._progress(at / self._total, f"tile {min(self._done + 1, self._total)} of {self._total}: {text}")
 
     def tile_done(self) -> None:
-        with self._lock:
-            self._done += 1
-            self._progress(self._done / self._total, f"tile {self._done} of {self._total}")
+        self._done += 1
+        self._progress(self._done / self._total, f"tile {self._done} of {self._total}")

@@ -17,6 +17,9 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     cells = cells - cells.min(0)
     sides = cells.max(0) + 1
+    if np.prod(sides, dtype=np.float64) >= 2.0**62:  # strays very far out: one number a cell would not hold them
+        _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        return label.reshape(-1), counts
     key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
     _, label, counts = np.unique(key, return_inverse=True, return_counts=True)
     return label.reshape(-1), counts

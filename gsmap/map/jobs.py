@@ -1,19 +1,26 @@
-"""What a worker runs: a scene described, a pair registered or compared. Each opens the map to read, returns types."""
+"""What a worker runs: a scene described, a pair registered or compared, a tile made. Each opens the map to read."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any
 
 from gsmap import change as changing
 from gsmap import describe as describing
 from gsmap import register as registering
+from gsmap.export import PlannedTile
+from gsmap.geometry.metres import in_metres, resized
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.merge.placed import pulled_inside
+from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.register import SceneView
 from gsmap.store import Store, branches, sqlite
-from gsmap.types import ChangeReport, PlacedScene, Registration, SceneGraph, Sim3
+from gsmap.types import ChangeReport, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
 from gsmap.types.model import ModelSpec
+from gsmap.types.progress import Progress
 
 
 def _store(path: str) -> Store:
@@ -75,3 +82,52 @@ def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> Pl
     return PlacedScene(
         transform_gaussians(gaussians, S_map_scene), transform_cameras(cameras, S_map_scene), scene_id, captured_at
     )
+
+
+@dataclass(frozen=True, eq=False)
+class TileMaker:
+    """Makes the content of a tile, wherever it is called.
+
+    Args:
+        location: of the map.
+        tile: which one.
+        method, params: the merger and its settings.
+        is_cut: only what lies within the tile's bounds belongs to it; else everything does.
+        budget_s: ceiling on the wall seconds that it may take.
+        captured_at: the date of each of its scenes.
+    """
+
+    location: str
+    tile: PlannedTile
+    method: str
+    params: Any
+    is_cut: bool
+    budget_s: float | None
+    captured_at: Mapping[str, str | None]
+
+    def __call__(self, progress: Progress) -> MergeResult:
+        """Merged in metres, in the map's unit when it is done."""
+        scenes, metres = _store(self.location).scenes, self.tile.metres_per_unit
+        lazy = [
+            LazyScene(
+                scene,
+                in_metres(pose, metres),
+                partial(scenes.gaussians, scene),
+                scenes.cameras(scene),
+                self.captured_at[scene],
+            )
+            for scene, pose in self.tile.poses.items()
+        ]
+        bounds = self.tile.bounds if self.is_cut else None
+        found = merge_tile(
+            lazy,
+            self.method,
+            self.params,
+            bounds=None if bounds is None else bounds * metres,
+            budget_s=self.budget_s,
+            progress=progress,
+        )
+        if metres == 1.0:
+            return found
+        merged = resized(found.gaussians, 1 / metres)
+        return replace(found, gaussians=replace(merged, means=pulled_inside(merged.means, bounds)))

@@ -1,13 +1,18 @@
-"""Jobs that several processes share: each does those that no other is doing, and all end when all are done."""
+"""Jobs that several processes share: each does those that no other is doing, and all end when all are done.
+
+A job that twice ends the process it runs in is set aside: it is left out, here and in later runs, until a person asks
+for it by name.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from gsmap.engine import SetAside
 from gsmap.errors import GsmapError
 from gsmap.store import Store
 from gsmap.types.progress import StageProgress
@@ -31,8 +36,10 @@ class SharedJobs:
         stage: the verb, for others to read, and for the progress.
         kind: ``graph``, ``edge`` or ``comparison``; a job is leased as ``KIND KEY``.
         jobs: the arguments of each by the key (digest) of its result, the most wanted first.
+        about: of each of them, the ids of the scenes it reads.
         done: tells from the catalog of which keys the results are there, whoever made them.
         progress: told what is done, and, once for each, whose work is waited for.
+        again: also do what was set aside before, as a person asks for; else it is left out.
     """
 
     def __init__(
@@ -41,13 +48,19 @@ class SharedJobs:
         stage: str,
         kind: str,
         jobs: Mapping[str, tuple[Any, ...]],
+        about: Mapping[str, Sequence[str]],
         done: Callable[[Collection[str]], set[str]],
         progress: StageProgress,
+        *,
+        again: bool = False,
     ) -> None:
         self._leases, self._stage, self._kind, self._progress = store.leases, stage, kind, progress
+        self._set_aside, self._about = store.set_aside, about
         self._done = done
         self._keys = list(jobs)
         self._todo = dict(jobs)  # not done as far as is known, and not begun here
+        if jobs:
+            self._leave_out(again)
         self._ours: list[str] = []
         self._saved: list[str] = []  # still leased
         self._count, self._began = 0, time.monotonic()
@@ -64,10 +77,13 @@ class SharedJobs:
         """
         while self._todo:
             begun: list[str] = []
-            running = run(self._begin(begun))
+            running = run(_Counted(self._begin(begun), self._todo))
             try:
                 for index, result in running:
-                    yield begun[index], result
+                    if isinstance(result, SetAside):
+                        self._put_aside(begun[index], result.reason)
+                    else:
+                        yield begun[index], result
             finally:
                 if isinstance(running, Generator):
                     running.close()  # its workers end now, and not when somebody collects what is left of it
@@ -81,6 +97,24 @@ class SharedJobs:
         self._saved.append(key)
         self._count += 1
         self._tell(text)
+
+    def _leave_out(self, again: bool) -> None:
+        """Drop the jobs that were set aside before; or take them back, if they are asked for."""
+        before = {one.what: one for one in self._set_aside.list()}
+        known = [key for key in self._keys if self._lease(key) in before]
+        if again and known:
+            self._set_aside.forget([self._lease(key) for key in known])
+            return
+        for key in known:
+            one = before[self._lease(key)]
+            self._set_aside.met[one.what] = one
+            del self._todo[key]
+
+    def _put_aside(self, key: str, reason: str) -> None:
+        about = " ".join(self._about[key])
+        self._set_aside.add(self._lease(key), about, reason)
+        _log.warning("%s of %s is set aside: %s", self._kind, about, reason)
+        self.saved(key, f"set aside: {reason}")
 
     def num_kept(self) -> int:
         """How many of the results are in the catalog."""
@@ -102,7 +136,7 @@ class SharedJobs:
         """The arguments of jobs that are leased to this process, as long as there are any that nobody does."""
 
         def done(leases: Collection[str]) -> set[str]:
-            return {self._lease(key) for key in self._done([lease.partition(" ")[2] for lease in leases])}
+            return {self._lease(key) for key in self._settled([lease.partition(" ")[2] for lease in leases])}
 
         while self._todo:
             worth = int(_WORTH_S * self._count / (time.monotonic() - self._began + 1e-3))
@@ -125,11 +159,17 @@ class SharedJobs:
                 begun.append(key)
                 yield args
 
+    def _settled(self, keys: Collection[str]) -> set[str]:
+        """Which of the jobs need no doing: those that are done, and those that others set aside meanwhile."""
+        done = self._done(keys)
+        aside = {one.what for one in self._set_aside.list()}
+        return done | {key for key in keys if self._lease(key) in aside}
+
     def _wait(self) -> None:
         """Until all is done, or others have dropped something."""
         told: set[str] = set()
         while True:
-            for key in self._done(list(self._todo)):
+            for key in self._settled(list(self._todo)):
                 del self._todo[key]
             holders = {lease.what: lease for lease in self._leases.list()}
             waited_for = [holders.get(self._lease(key)) for key in self._todo]
@@ -140,6 +180,19 @@ class SharedJobs:
                     told.add(holder.token)
                     self._tell(f"waiting for {holder.who}: {len(waited_for)} left")
             time.sleep(POLL_S)
+
+
+class _Counted:
+    """The arguments of jobs, and how many are left as far as is known (`operator.length_hint`)."""
+
+    def __init__(self, arguments: Iterator[tuple[Any, ...]], left: Sized) -> None:
+        self._arguments, self._left = arguments, left
+
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        return self._arguments
+
+    def __length_hint__(self) -> int:
+        return len(self._left)
 
 
 @contextmanager

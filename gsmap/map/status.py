@@ -63,6 +63,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add("tentative", len(tentative), f"gsmap list {at} scenes --status tentative", "scenes on edges no cycle confirms")
     undecided = [pair for pair in (graph.undecided if graph else ()) if set(pair) <= living]
     add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
+    todo += set_aside_rows(store)
     add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
@@ -83,6 +84,27 @@ def status(store: Store, settings: Settings) -> MapStatus:
         metres=tuple(metre_row(component, one) for component, one in metres.items()),
         at_work=at_work_rows(store.leases.others()),
     )
+
+
+def set_aside_rows(store: Store) -> list[TodoRow]:
+    """What was set aside, one row a job, with the command that tries it again."""
+    at, names = shlex.quote(store.location), {scene.id: scene.name for scene in store.scenes.list()}
+    rows = []
+    for one in store.set_aside.list():
+        kind = one.what.partition(" ")[0]
+        if kind == "tile":
+            verb, about = f"gsmap export {at} {shlex.quote(one.about)}", f"a tile in {one.about}"
+        else:
+            scenes = [names[scene] for scene in one.about.split() if scene in names]
+            if len(scenes) != len(one.about.split()) or kind not in _TRIES_AGAIN:
+                continue  # of a scene that was removed
+            about = ":".join(scenes)
+            verb = f"gsmap {_TRIES_AGAIN[kind]} {at} {shlex.quote(about)}"
+        rows.append(TodoRow(what="set_aside", count=1, verb=verb, meaning=f"{about} is set aside: {one.reason}"))
+    return rows
+
+
+_TRIES_AGAIN = {"graph": "describe", "edge": "register", "comparison": "changes"}
 
 
 def at_work_rows(leases: Sequence[Lease]) -> tuple[AtWorkRow, ...]:

@@ -38,7 +38,7 @@ def families() -> dict[str, Family]:
             "gsmap.merge.mergers",
             ("STEPS", "RENDERS", "reach_m", "reading_m", "min_cameras", "uses_dates", "merge"),
         ),
-        Family("executor", "gsmap.engine.executors", ("run_jobs",)),
+        Family("executor", "gsmap.engine.executors", ("start",)),
         Family("format", "gsmap.formats", (), _FORMATS, any_of=("read", "write"), has_params=False),
     )
     return {family.name: family for family in found}

@@ -4,8 +4,6 @@
 // is single-threaded and deterministic: the limit counts steps of work (words of bits touched), never time.
 #include "clique.h"
 
-#include <nanobind/ndarray.h>
-
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
@@ -13,7 +11,8 @@
 #include <tuple>
 #include <vector>
 
-namespace nb = nanobind;
+#include "arrays.h"
+
 using Word = std::uint64_t;
 
 namespace {
@@ -301,12 +300,9 @@ void bind_clique(nb::module_ &m) {
                 nb::gil_scoped_release release;
                 found = maximum_clique(bits.data(), int(n), int(words), floor, step_limit);
             }
-            auto &members = std::get<0>(found);
-            auto *out = new std::int32_t[members.size() + 1];
-            std::copy(members.begin(), members.end(), out);
-            nb::capsule owner(out, [](void *p) noexcept { delete[] static_cast<std::int32_t *>(p); });
-            return nb::make_tuple(nb::ndarray<nb::numpy, std::int32_t, nb::ndim<1>>(out, {members.size()}, owner),
-                                  std::get<1>(found), std::get<2>(found));
+            auto &[members, exact, steps] = found;
+            const std::size_t size = members.size();
+            return nb::make_tuple(gsmap::numpy_of(std::move(members), {size}), exact, steps);
         },
         nb::arg("bits"), nb::arg("floor"), nb::arg("step_limit"),
         "Largest clique of more than `floor` vertices: (members, exact, steps of work).");

@@ -1,8 +1,6 @@
 // Consistency graphs of point correspondences, and the votes of their pairs for a scale.
 #include "correspondences.h"
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
 #include <cstring>
@@ -10,16 +8,14 @@
 #include <stdexcept>
 #include <vector>
 
+#include "arrays.h"
 #include "rasteriser_view.h"
-
-namespace nb = nanobind;
 
 namespace gsmap {
 namespace {
 
 using Word = std::uint64_t;
-using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Numbers = std::optional<nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>>;
+using Heights = std::optional<Numbers>;
 using Ids = nb::ndarray<const std::int32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 
 // What Python gave, checked, in floats about the mean: these keep 1e-6 of the extent, wherever the origin lies.
@@ -28,7 +24,7 @@ struct Table {
     Correspondences rows;
 
     Table(const Points &target, const Points &source, const Ids &target_ids, const Ids &source_ids,
-          const Numbers &target_heights, const Numbers &source_heights, double scale) {
+          const Heights &target_heights, const Heights &source_heights, double scale) {
         std::size_t n = target.shape(0);
         if (source.shape(0) != n || target_ids.shape(0) != n || source_ids.shape(0) != n ||
             target_heights.has_value() != source_heights.has_value() ||
@@ -54,10 +50,9 @@ struct Table {
     }
 };
 
-// Bit rows of the graph in which correspondences i and j agree.
+// Bit rows, zero before, of the graph in which correspondences i and j agree.
 void consistency_graph(const Correspondences &c, const AgreeTest &test, Word *out) {
     int words = (c.n + 63) / 64;
-    std::memset(out, 0, std::size_t(c.n) * words * sizeof(Word));
     std::vector<std::uint8_t> ok(words * 64 + 1, 0);  // of the pairs (i, j > i)
     for (int i = 0; i < c.n; ++i) {
         kernels->agree(c, i, test, ok.data());
@@ -94,19 +89,18 @@ void ratio_histogram(const Correspondences &c, const VoteTest &test, std::int64_
 void bind_correspondences(nb::module_ &m) {
     m.def(
         "consistency_graph",
-        [](Points target, Points source, Ids target_ids, Ids source_ids, Numbers target_heights, Numbers source_heights,
+        [](Points target, Points source, Ids target_ids, Ids source_ids, Heights target_heights, Heights source_heights,
            double scale, float slack, float relative_slack, float ratio, float min_distance, float height_slack,
            float height_slope) {
             Table table(target, source, target_ids, source_ids, target_heights, source_heights, scale);
             std::size_t n = target.shape(0), words = (n + 63) / 64;
-            auto *out = new Word[n * words + 1];
-            nb::capsule owner(out, [](void *p) noexcept { delete[] static_cast<Word *>(p); });
+            std::vector<Word> out(n * words);
             {
                 nb::gil_scoped_release release;
                 consistency_graph(table.rows,
-                                  {slack, relative_slack, ratio, min_distance, height_slack, height_slope}, out);
+                                  {slack, relative_slack, ratio, min_distance, height_slack, height_slope}, out.data());
             }
-            return nb::ndarray<nb::numpy, Word, nb::ndim<2>>(out, {n, words}, owner);
+            return numpy_of(std::move(out), {n, words});
         },
         nb::arg("target"), nb::arg("source"), nb::arg("target_ids"), nb::arg("source_ids"),
         nb::arg("target_heights").none(), nb::arg("source_heights").none(), nb::arg("scale"), nb::arg("slack"),
@@ -114,17 +108,16 @@ void bind_correspondences(nb::module_ &m) {
         nb::arg("height_slope"), "Bit rows (n, ceil(n / 64)) of the graph in which correspondences agree.");
     m.def(
         "ratio_histogram",
-        [](Points target, Points source, Ids target_ids, Ids source_ids, Numbers target_heights, Numbers source_heights,
+        [](Points target, Points source, Ids target_ids, Ids source_ids, Heights target_heights, Heights source_heights,
            float min_distance, float rise_tolerance, float limit, int bins) {
             if (bins < 1) throw std::invalid_argument("a histogram needs a bin");
             Table table(target, source, target_ids, source_ids, target_heights, source_heights, 1.0);
-            auto *counts = new std::int64_t[bins]();
-            nb::capsule owner(counts, [](void *p) noexcept { delete[] static_cast<std::int64_t *>(p); });
+            std::vector<std::int64_t> counts(bins);
             {
                 nb::gil_scoped_release release;
-                ratio_histogram(table.rows, {min_distance, rise_tolerance, limit, bins}, counts);
+                ratio_histogram(table.rows, {min_distance, rise_tolerance, limit, bins}, counts.data());
             }
-            return nb::ndarray<nb::numpy, std::int64_t, nb::ndim<1>>(counts, {std::size_t(bins)}, owner);
+            return numpy_of(std::move(counts), {std::size_t(bins)});
         },
         nb::arg("target"), nb::arg("source"), nb::arg("target_ids"), nb::arg("source_ids"),
         nb::arg("target_heights").none(), nb::arg("source_heights").none(), nb::arg("min_distance"),

@@ -1,7 +1,4 @@
 // Landmarks: extrema of colour and density on a block of a grid.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -9,13 +6,10 @@
 #include <stdexcept>
 #include <vector>
 
-namespace nb = nanobind;
+#include "arrays.h"
 
 namespace gsmap {
 namespace {
-
-using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 
 constexpr int SEGMENT = 16;  // cells along the last axis that are worked on, or left out, together
 constexpr int WINDOW = 2;    // a maximum is one among so many cells to either side
@@ -300,15 +294,6 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
     return found;
 }
 
-template <class T>
-nb::ndarray<nb::numpy, T> array_of(std::vector<std::size_t> shape, T *&data) {
-    std::size_t size = 1;
-    for (std::size_t n : shape) size *= n;
-    data = new T[size + 1]();
-    nb::capsule owner(data, [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner);
-}
-
 }  // namespace
 
 void bind_landmarks(nb::module_ &m) {
@@ -341,10 +326,8 @@ void bind_landmarks(nb::module_ &m) {
                     }
                 }
             }
-            double *table;
-            auto out = array_of<double>({rows.size() / 6, 6}, table);
-            std::copy(rows.begin(), rows.end(), table);
-            return out;
+            const std::size_t count = rows.size() / 6;
+            return numpy_of(std::move(rows), {count, 6});
         },
         nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("cores"),
         nb::arg("edge"), nb::arg("halo"), nb::arg("sigma"), nb::arg("surround"),

@@ -7,7 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "bindings.h"
+#include "arrays.h"
 #include "point_tree.h"
 #include "threads.h"
 
@@ -19,18 +19,10 @@ constexpr int kMostNeighbours = 64;
 constexpr double kBeyond = 1.5, kStill = 0.05;  // of the radius, see Partner
 constexpr double kLeastNoise = 0.03;  // of the radius: planes that fit better than this leave colour its say
 
-using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Rows = nb::ndarray<const int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Kept = nb::ndarray<double, nb::shape<-1, 5>, nb::c_contig, nb::device::cpu>;
 using Frame = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 using Vector = nb::ndarray<const double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
-
-template <class T> auto made(std::vector<T> &&values, std::initializer_list<std::size_t> shape) {
-    auto *kept = new std::vector<T>(std::move(values));
-    nb::capsule owner(kept, [](void *p) noexcept { delete static_cast<std::vector<T> *>(p); });
-    return nb::ndarray<nb::numpy, T>(kept->data(), shape, owner);
-}
 
 template <class Body> void over_blocks(int64_t n, const Body &body) {
     parallel_for((n + kBlock - 1) / kBlock,
@@ -200,6 +192,8 @@ struct Partner {
     }
 };
 
+static_assert(sizeof(Partner) == 5 * sizeof(double), "rows of five numbers, see icp_equations");
+
 struct Pair {
     double moved[3], lever[3], offset[3], plane;
     int32_t row;
@@ -325,7 +319,7 @@ void bind_surface(nb::module_ &m) {
                         }
                     });
                 }
-                return std::make_tuple(made(std::move(distance), {std::size_t(n)}), made(std::move(row), {std::size_t(n)}));
+                return std::make_tuple(numpy_of(std::move(distance), {std::size_t(n)}), numpy_of(std::move(row), {std::size_t(n)}));
             },
             nb::arg("at"), nb::arg("radius"),
             "Distance (n,) to and row (n,) of the point nearest to each; inf and 0 where none is nearer than the radius.")
@@ -338,7 +332,7 @@ void bind_surface(nb::module_ &m) {
                     nb::gil_scoped_release release;
                     out = normals(tree, k);
                 }
-                return made(std::move(out), {std::size_t(tree.size()), 3});
+                return numpy_of(std::move(out), {std::size_t(tree.size()), 3});
             },
             nb::arg("k"), "Unit normals (n, 3) of the planes through the k nearest of each point; signs mean nothing.")
         .def(
@@ -352,7 +346,7 @@ void bind_surface(nb::module_ &m) {
                     nb::gil_scoped_release release;
                     out = tangent_gradients(tree, normals.data(), values.data(), k, ridge_m);
                 }
-                return made(std::move(out), {std::size_t(tree.size()), 3});
+                return numpy_of(std::move(out), {std::size_t(tree.size()), 3});
             },
             nb::arg("normals"), nb::arg("values"), nb::arg("k"), nb::arg("ridge_m"),
             "Change (n, 3) of a value per metre within each point's tangent plane, over its k nearest.");
@@ -387,8 +381,8 @@ void bind_surface(nb::module_ &m) {
             const double many = out.count ? double(out.count) : 1.0;
             std::vector<double> middle(out.sums.lever, out.sums.lever + 3);
             for (double &v : middle) v /= many;
-            return std::make_tuple(made(std::move(system), {7, 7}), made(std::move(gradient), {7}), out.count, out.noise,
-                                   made(std::move(middle), {3}), std::sqrt(out.sums.squares / many));
+            return std::make_tuple(numpy_of(std::move(system), {7, 7}), numpy_of(std::move(gradient), {7}), out.count, out.noise,
+                                   numpy_of(std::move(middle), {3}), std::sqrt(out.sums.squares / many));
         },
         nb::arg("tree"), nb::arg("normals"), nb::arg("lightness"), nb::arg("gradients").none(), nb::arg("points"),
         nb::arg("own_lightness"), nb::arg("rows"), nb::arg("partners"), nb::arg("pose"), nb::arg("centre"),

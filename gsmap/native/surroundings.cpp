@@ -1,21 +1,14 @@
 // What surrounds a landmark: colours and counts of the points in rings, or in shells.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 #include <stdexcept>
 #include <vector>
 
-namespace nb = nanobind;
+#include "arrays.h"
 
 namespace gsmap {
 namespace {
-
-using Points = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Numbers = nb::ndarray<const double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 
 // Points sorted into square columns of a plane, so that those near a place are found in few runs.
 struct Columns {
@@ -94,15 +87,6 @@ void surroundings(const Points &positions, const Points &points, const Points &v
     }
 }
 
-template <class T>
-nb::ndarray<nb::numpy, T> array_of(std::vector<std::size_t> shape, T *&data) {
-    std::size_t size = 1;
-    for (std::size_t n : shape) size *= n;
-    data = new T[size + 1]();
-    nb::capsule owner(data, [](void *p) noexcept { delete[] static_cast<T *>(p); });
-    return nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner);
-}
-
 }  // namespace
 
 void bind_surroundings(nb::module_ &m) {
@@ -111,16 +95,14 @@ void bind_surroundings(nb::module_ &m) {
         [](Points positions, Points points, Points values, Numbers radii, Numbers heights) {
             if (values.shape(0) != points.shape(0) || radii.shape(0) < 1 || heights.shape(0) == 1)
                 throw std::invalid_argument("surroundings need a value for each point, a radius, and heights or none");
-            const std::size_t count = positions.shape(0), bins = radii.shape(0) * std::max<std::size_t>(
-                                                                                      heights.shape(0), 2) -
-                                                                 radii.shape(0);
-            double *sums, *counts;
-            auto sums_out = array_of<double>({count, bins, 3}, sums), counts_out = array_of<double>({count, bins}, counts);
+            const std::size_t levels = std::max<std::size_t>(heights.shape(0), 2) - 1;
+            const std::size_t count = positions.shape(0), bins = radii.shape(0) * levels;
+            std::vector<double> sums(count * bins * 3), counts(count * bins);
             if (points.shape(0)) {
                 nb::gil_scoped_release release;
-                surroundings(positions, points, values, radii, heights, sums, counts);
+                surroundings(positions, points, values, radii, heights, sums.data(), counts.data());
             }
-            return nb::make_tuple(sums_out, counts_out);
+            return nb::make_tuple(numpy_of(std::move(sums), {count, bins, 3}), numpy_of(std::move(counts), {count, bins}));
         },
         nb::arg("positions"), nb::arg("points"), nb::arg("values"), nb::arg("radii"), nb::arg("heights"),
         "Sums (M, bins, 3) of the values and counts (M, bins) of the points around each position.");

@@ -20,6 +20,7 @@ _LEAST_HELD = 0.1  # of a motion, whatever the probe says: farther out than it r
 # Pairs follow errors of the surfaces as they follow motions, which cancels; but then the residuals show less of the
 # errors than there is, which does not. Half of it, in made worlds whose errors are known.
 _CANCELS = 0.5
+_WIDTH = 0.3  # of the radius: pairs this far from the planes count a quarter, as in refining
 _CLIP = 3.0  # standard deviations: what moved between captures is no error of the surfaces
 
 
@@ -243,8 +244,8 @@ def _pull(target: Surface, points: np.ndarray, centred: Sim3, centre: Sim3, para
 
 
 def _weights(residual: np.ndarray, params: Params) -> np.ndarray:
-    """Geman-McClure, as in refining."""
-    weights: np.ndarray = 1.0 / (1.0 + (residual / (0.3 * params.radius_m)) ** 2) ** 2
+    """Geman-McClure."""
+    weights: np.ndarray = 1.0 / (1.0 + (residual / (_WIDTH * params.radius_m)) ** 2) ** 2
     return weights
 
 

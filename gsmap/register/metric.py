@@ -74,8 +74,7 @@ class MetricPair:
 
 def working_unit_m(target: SceneView, source: SceneView, *, with_scale: bool) -> float:
     """Working metres per target unit; scenes that have one unit have one working metre, between both of theirs."""
-    metric = not with_scale and "landmarks" in target.graph.layers  # made under the scene's own unit
-    if metric or (target.scale_policy == source.scale_policy == "known"):
+    if _is_metre(target, with_scale) or (target.scale_policy == source.scale_policy == "known"):
         return float(np.sqrt(target.graph.working_m * source.graph.working_m))
     return target.graph.working_m if target.scale_policy == "known" else target.graph.unit_m
 
@@ -87,5 +86,9 @@ def own_working_m(view: SceneView) -> float:
 
 def target_unit_m(target: SceneView, *, with_scale: bool) -> float:
     """Metres per target unit: 1 where metres are plausible and nothing else is asked for, else the guess."""
-    metric = not with_scale and "landmarks" in target.graph.layers  # made under the scene's own unit
-    return 1.0 if metric or target.scale_policy == "known" else target.graph.unit_m
+    return 1.0 if _is_metre(target, with_scale) or target.scale_policy == "known" else target.graph.unit_m
+
+
+def _is_metre(target: SceneView, with_scale: bool) -> bool:
+    """Whether the target's own unit is taken for the metre: its graph holds landmarks made under it."""
+    return not with_scale and "landmarks" in target.graph.layers

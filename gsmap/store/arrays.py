@@ -1,8 +1,9 @@
 """Immutable groups of arrays on disk (zarr v3), staged beside, synchronised, renamed into place.
 
-A group is a folder ``arrays/KIND/ID``. It appears by one rename once all its bytes are on the disk, and counts only
-once a committed row of the catalog names it. Every chunk is checksummed (zarr's default codecs return wrong data for
-flipped bits, and zeros for a missing file), and the digest of every file goes into the catalog.
+A group is a folder ``arrays/KIND/ID`` with one archive in it (`gsmap.store.packed`). It appears by one rename once all
+its bytes are on the disk, and counts only once a committed row of the catalog names it. Every chunk is checksummed
+(zarr's default codecs return wrong data for flipped bits, and zeros for a missing file), and the digest of every file
+goes into the catalog.
 
 This class is the seam for arrays elsewhere than in a local folder: nothing else knows where or how they lie.
 """
@@ -22,7 +23,6 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,12 +37,11 @@ from gsmap.durable import (
     sync_folder,
 )
 from gsmap.errors import CorruptError
-from gsmap.store import layout
+from gsmap.store import layout, packed
 from gsmap.store.columns import KINDS, is_digest
 from gsmap.store.explained import explained
-from gsmap.store.layout import CHUNK_ROWS, SHARD_ROWS
+from gsmap.store.layout import CHUNK_ROWS
 
-_ZSTD_LEVEL = 1
 _NOT_ITS_BYTES = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
@@ -83,7 +82,8 @@ class Arrays:
         with self._lock_staging(fcntl.LOCK_SH):
             folder = self.staging / uuid.uuid4().hex
             try:
-                _write(folder, arrays)
+                folder.mkdir()
+                packed.write(folder / packed.FILE, arrays, chunk_rows=CHUNK_ROWS)
                 yield Staged(folder, _synchronise(folder))
             finally:
                 with contextlib.suppress(OSError):  # there is nothing where it was published
@@ -172,7 +172,7 @@ class Arrays:
         """Read arrays of a group.
 
         Args:
-            files: its manifest; a missing or short file is found before zarr turns it into zeros.
+            files: its manifest; what is missing or short is found before anything is read.
             only: names of the arrays to read.
             rows: ranges ``[start, stop)`` of rows, in order; all where None.
             shapes: what the catalog says of the arrays; None for a length that it does not know.
@@ -180,8 +180,6 @@ class Arrays:
         Raises:
             CorruptError: a file is missing, short, or fails its checksum, or gsmap does not write arrays so.
         """
-        import zarr
-
         place = self._place(kind, name)
         present = files_below(place)
         for file in files:
@@ -190,17 +188,15 @@ class Arrays:
                 raise CorruptError(f"{path} is no plain file (a link, pipe or device): gsmap made none; remove it")
             if found is None or found.st_size != file.size_bytes:
                 raise CorruptError(f"{path} is missing or cut off: {layout.mend(kind)}")
-        names = _arrays_in(files) if only is None else only
-        layout.check(place, {file.path: file.size_bytes for file in files}, names, shapes)
         try:
-            group = zarr.open_group(str(place), mode="r", zarr_format=3, use_consolidated=False)
-            return {name: _rows(group[name], rows) for name in names}
-        except Exception as error:  # zarr and its codecs raise whatever they stumbled over
-            if isinstance(error, OSError) and error.errno in _NOT_ITS_BYTES:
+            with _opened(place, kind, files) as body:
+                names = body.array_names() if only is None else only
+                return body.read(body.laid_out(names, shapes), rows)
+        except OSError as error:
+            if error.errno in _NOT_ITS_BYTES:
                 with explained(place):
                     raise
-            said = f"{place} cannot be read ({type(error).__name__}: {error})"
-            raise CorruptError(f"{said}: {layout.mend(kind)}") from error
+            raise CorruptError(f"{place} cannot be read ({error}): {layout.mend(kind)}") from error
 
     def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
         """What differs from the manifest, after reading every byte."""
@@ -219,7 +215,8 @@ class Arrays:
                 out.append(problem)
         if not out:
             try:
-                layout.check(place, {file.path: file.size_bytes for file in files}, _arrays_in(files))
+                with _opened(place, kind, files) as body:
+                    body.laid_out(body.array_names(), heads=True)
             except CorruptError as error:
                 out.append(str(error))
         extra = sorted(set(present) - {file.path for file in files})
@@ -353,29 +350,6 @@ def digest(*arrays: np.ndarray | Parts, text: str = "") -> str:
     return out.hexdigest()[:32]
 
 
-def _write(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    import zarr
-    from zarr.codecs import ZstdCodec
-
-    group = zarr.create_group(str(folder), zarr_format=3)
-    for name, array in arrays.items():
-        long = len(array) > CHUNK_ROWS
-        chunk = (min(CHUNK_ROWS, max(1, len(array))), *(max(1, n) for n in array.shape[1:]))
-        shard = (min(SHARD_ROWS, -(-len(array) // CHUNK_ROWS) * CHUNK_ROWS), *chunk[1:]) if long else None
-        made = group.create_array(
-            name,
-            shape=array.shape,
-            dtype=array.dtype,
-            chunks=chunk,
-            shards=shard,
-            compressors=[ZstdCodec(level=_ZSTD_LEVEL, checksum=True)],
-            fill_value=0,
-            config={"write_empty_chunks": True},  # a chunk that is not there must be an error, not zeros
-        )
-        if array.size:
-            made[...] = array
-
-
 def link_or_copy(source: Path, target: Path) -> None:
     """Another name for a file that is never written again, or a copy where the disk has no such thing."""
     try:
@@ -402,17 +376,35 @@ def _take(place: Path, target: Path, files: Sequence[StoredFile]) -> Path:
     return target
 
 
-def _arrays_in(files: Sequence[StoredFile]) -> list[str]:
-    """The names of a group's arrays, by its manifest."""
-    found = (file.path.rpartition("/") for file in files)
-    return sorted(above for above, _, name in found if name == "zarr.json" and above)
+class _Files:
+    """The files of a group that is a folder; the one that was read last stays open until the end."""
+
+    def __init__(self, place: Path) -> None:
+        self._place = place
+        self._open: tuple[str, int] | None = None
+
+    def read(self, file: str, start: int, stop: int) -> bytes:
+        if self._open is None or self._open[0] != file:
+            self.close()
+            self._open = file, open_file(self._place / file)
+        return os.pread(self._open[1], stop - start, start)
+
+    def expect(self, file: str, ranges: Sequence[layout.Range]) -> None:
+        """Nothing: the disk is near."""
+
+    def close(self) -> None:
+        if self._open is not None:
+            os.close(self._open[1])
+            self._open = None
 
 
-def _rows(array: Any, rows: Sequence[tuple[int, int]] | None) -> np.ndarray:
-    if rows is None:
-        return np.asarray(array[...])
-    parts = [np.asarray(array[start:stop]) for start, stop in rows]
-    return np.concatenate(parts) if parts else np.zeros((0, *array.shape[1:]), array.dtype)
+@contextlib.contextmanager
+def _opened(place: Path, kind: str, files: Sequence[StoredFile]) -> Iterator[layout.Body]:
+    reader = _Files(place)
+    try:
+        yield layout.Body(str(place), kind, {file.path: file.size_bytes for file in files}, reader)
+    finally:
+        reader.close()
 
 
 def _synchronise(folder: Path) -> tuple[StoredFile, ...]:

@@ -27,7 +27,7 @@ from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.catalog import Catalog, now, open_engine
 from gsmap.store.copying import copy_catalog, empty_catalog, make_own
 from gsmap.store.explained import explained
-from gsmap.store.schema import exports, files, groups, leases, models, revisions, scenes, tiles
+from gsmap.store.schema import exports, files, groups, leases, models, revisions, scenes, set_aside, tiles
 
 FOLDER = "branches"
 MARKER = "branch.json"
@@ -188,7 +188,7 @@ class Branches:
                 (staged / MARKER).write_text(json.dumps(told))
                 sync_file(staged / MARKER)
                 # Who is at work on it and where it was exported to is of the map.
-                make_own(staged, (leases, tiles, exports), id=uuid.uuid4().hex)
+                make_own(staged, (leases, set_aside, tiles, exports), id=uuid.uuid4().hex)
                 sync_folder(staged)
                 os.rename(staged, folder)
                 sync_folder(folder.parent)

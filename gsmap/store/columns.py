@@ -253,9 +253,14 @@ def a_graph(value: Any) -> bool:
         and texts(value.get("notes"))
         and isinstance(things, dict)
         and isinstance(things.get("count"), int)
+        and _kept_arrays(value.get("arrays", {}))
         and _numbers(things.get("unit_m"))
         and all(isinstance(x, dict) and isinstance(x.get("count"), int) and an_object(x.get("rest")) for x in layers)
     )
+
+
+def _kept_arrays(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(how, dict) for how in value.values())
 
 
 def _numbers(value: Any, *shape: int) -> bool:

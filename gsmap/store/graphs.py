@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from sqlalchemy import Connection, Row, delete, insert, select
 
 from gsmap.errors import InputError
@@ -15,16 +14,13 @@ from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
-from gsmap.store.matrices import from_array, to_array
 from gsmap.store.scene_refs import resolve
 from gsmap.store.schema import graphs, scenes
-from gsmap.types import NodeLayer, SceneGraph, Things
-from gsmap.types.plain import plain
+from gsmap.types import SceneGraph
 
 KIND = "graphs"
-
-_THINGS = ("members", "positions", "extents", "colours", "samples", "sample_colours", "sample_counts")
 
 
 @dataclass(frozen=True)
@@ -71,23 +67,7 @@ class Graphs:
         """
         if graph.scene_id not in key.inputs:
             raise InputError(f"the key of a graph must name its scene {graph.scene_id} among its inputs")
-        arrays: dict[str, np.ndarray] = {}
-        layers: dict[str, dict[str, Any]] = {}
-        for i, (name, nodes) in enumerate(graph.layers.items()):
-            parts = {field.name: getattr(nodes, field.name) for field in fields(nodes)}
-            arrays |= {f"{i}.{part}": value for part, value in parts.items() if isinstance(value, np.ndarray)}
-            rest = {part: value for part, value in parts.items() if not isinstance(value, np.ndarray)}
-            layers[name] = {"count": len(nodes), "rest": plain(rest)}
-        about: dict[str, Any] = {
-            "up": from_array(graph.up),
-            "unit_m": float(graph.unit_m),
-            "working_m": float(graph.working_m),
-            "notes": list(graph.notes),
-            "layers": layers,
-        }
-        if graph.things is not None:
-            arrays |= {f"things.{name}": getattr(graph.things, name) for name in _THINGS}
-            about["things"] = {"count": len(graph.things), "unit_m": float(graph.things.unit_m)}
+        arrays, about = to_arrays(graph)
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
@@ -128,23 +108,11 @@ class Graphs:
             if row is None:
                 return None
             files = manifest(connection, row.group_id)
+        shapes = shapes_of(row.about)
+        only = None if shapes is None else list(shapes)
         with unless_pruned(self._catalog, row.group_id, f"the graph of scene {row.scene[:12]} was dropped or replaced"):
-            arrays = self._arrays.read(KIND, row.group_id, files)
-        layers = {}
-        for i, (name, layer) in enumerate(row.about["layers"].items()):
-            own: dict[str, Any] = {
-                part.split(".", 1)[1]: array for part, array in arrays.items() if part.startswith(f"{i}.")
-            }
-            layers[name] = NodeLayer(**own, **layer["rest"])
-        things = None
-        if (about := row.about.get("things")) is not None:
-            parts: dict[str, Any] = {name: arrays[f"things.{name}"] for name in _THINGS}
-            things = Things(**parts, unit_m=about["unit_m"])
-        up = to_array(row.about["up"])
-        unit_m = row.about["unit_m"]
-        # Graphs of older releases: the metre wherever it was plausible.
-        working_m = row.about.get("working_m", 1.0 if "landmarks" in layers else unit_m)
-        return SceneGraph(row.scene, layers, up, unit_m, tuple(row.about["notes"]), things, working_m)
+            arrays = self._arrays.read(KIND, row.group_id, files, only=only, shapes=shapes)
+        return from_arrays(row.scene, row.about, arrays)
 
     def num_bytes(self, ref: str) -> int:
         """Of the arrays of all graphs of a scene, as they were written."""

@@ -1,27 +1,34 @@
-"""The one way in which gsmap lays arrays out as zarr, checked before zarr reads any.
+"""The one way in which gsmap lays arrays out as zarr, checked before anything is unpacked.
 
 zarr would run whatever codec a file names, make an array of whatever shape it claims, and unpack whatever lies in a
 chunk. A map may come from a stranger, so what differs from what `gsmap.store.arrays` writes is refused first: other
 codecs, chunks that are missing or would not unpack to their size, shapes that the catalog contradicts, arrays far
-larger than anything real packs to.
+larger than anything real packs to. What is left to do then is to unpack zstd frames, which zarr is not needed for (it
+would take a millisecond an array).
+
+A group is one archive (`gsmap.store.packed`); in maps of gsmap before 0.3 it is a folder of a file for every key.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import struct
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
-from gsmap.durable import open_file
+import numpy as np
+
 from gsmap.errors import CorruptError
+from gsmap.store import packed
 
 CHUNK_ROWS = 16_384
-SHARD_ROWS = 16 * CHUNK_ROWS
+_SHARD_ROWS = 16 * CHUNK_ROWS  # in groups that are folders
 Shape = tuple[int | None, ...]
+Range = tuple[int, int]
 
 _ITEM_BYTES = {f"{kind}{bits}": bits // 8 for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
 _ITEM_BYTES |= {"bool": 1, "float16": 2, "float32": 4, "float64": 8}
@@ -37,34 +44,233 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _MAX_FRAME_HEADER = 18
 
 
-def check(
-    place: Path, sizes: Mapping[str, int], names: Collection[str], shapes: Mapping[str, Shape] | None = None
-) -> None:
-    """Refuse arrays that gsmap did not write so; almost nothing is read.
+@dataclass(frozen=True)
+class Span:
+    """A range of bytes of one file of a group."""
+
+    file: str
+    start: int
+    size: int
+
+
+class Reader(Protocol):
+    """Bytes of the files of one group, wherever it lies."""
+
+    def read(self, file: str, start: int, stop: int) -> bytes:
+        """The bytes ``[start, stop)`` of a file; fewer where it is shorter."""
+
+    def expect(self, file: str, ranges: Sequence[Range]) -> None:
+        """These ranges of a file are read next: where every read is a request, a few larger ones do."""
+
+
+class Body:
+    """The keys of a group and where their bytes are.
 
     Args:
-        place: the group's folder.
-        sizes: bytes of every file that the catalog names in it; each is a plain file of that size.
-        names: of the arrays to be read.
-        shapes: what is known of the shapes of some; None for a length that is not.
+        at: the group, for messages.
+        kind: of it, for advice.
+        sizes: bytes of every file of the group; each is a plain file of that size.
 
     Raises:
-        CorruptError: with the array, and what is wrong.
+        CorruptError: the group is an archive that gsmap did not write.
     """
-    at = place
-    try:
-        group = _metadata(place, "zarr.json", sizes)
-        if group.get("node_type") != "group" or group.get("zarr_format") != 3 or group.get("consolidated_metadata"):
-            raise ValueError("it is not a plain zarr v3 group")
-        total = 0
+
+    def __init__(self, at: str, kind: str, sizes: Mapping[str, int], reader: Reader) -> None:
+        self.at = at
+        self.kind = kind
+        self.num_bytes = sum(sizes.values())
+        self._reader = reader
+        self._crc32: dict[str, int] = {}
+        self.keys = {path: Span(path, 0, size) for path, size in sizes.items()}
+        if set(sizes) == {packed.FILE}:
+            size = sizes[packed.FILE]
+            reader.expect(packed.FILE, [(max(0, size - packed.TAIL_BYTES), size)])
+            with self._explained(at):
+                found = packed.members(size, lambda start, stop: self._bytes(Span(packed.FILE, start, stop - start)))
+            self._crc32 = {name: member.crc32 for name, member in found.items()}
+            self.keys = {name: Span(packed.FILE, member.start, member.size) for name, member in found.items()}
+
+    def _bytes(self, span: Span) -> bytes:
+        found = self._reader.read(span.file, span.start, span.start + span.size)
+        if len(found) != span.size:
+            raise ValueError(f"{span.file} is shorter than it was")
+        return found
+
+    def metadata(self, key: str) -> dict[str, Any]:
+        span = self.keys.get(key)
+        if span is None or span.size > _MAX_METADATA_BYTES:
+            raise ValueError("it has no zarr metadata")
+        text = self._bytes(span)
+        if zlib.crc32(text) != self._crc32.get(key, zlib.crc32(text)):
+            raise ValueError("its zarr metadata differs from what was written")
+        found = json.loads(text)
+        if not isinstance(found, dict):
+            raise ValueError("its zarr metadata is no object")
+        return found
+
+    def array_names(self) -> list[str]:
+        found = (key.rpartition("/") for key in self.keys)
+        return sorted(above for above, _, name in found if name == "zarr.json" and above)
+
+    @contextmanager
+    def _explained(self, at: str) -> Iterator[None]:
+        try:
+            yield
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, struct.error) as error:
+            said = str(error) if type(error) is ValueError else f"its zarr metadata makes no sense ({error!r})"
+            raise CorruptError(f"{at}: {said}; gsmap did not write that: {mend(self.kind)}") from error
+
+    def laid_out(
+        self, names: Collection[str], shapes: Mapping[str, Shape] | None = None, *, heads: bool = False
+    ) -> dict[str, Array]:
+        """How arrays are laid out; refused where gsmap did not write them so. Almost nothing is read.
+
+        Args:
+            names: of the arrays to be read.
+            shapes: what is known of the shapes of some; None for a length that is not.
+            heads: also look at what each chunk says it unpacks to, as `Array.read` does.
+
+        Raises:
+            CorruptError: with the array, and what is wrong.
+        """
+        out = {}
+        with self._explained(self.at):
+            group = self.metadata("zarr.json")
+            if group.get("node_type") != "group" or group.get("zarr_format") != 3 or group.get("consolidated_metadata"):
+                raise ValueError("it is not a plain zarr v3 group")
         for name in names:
-            at = place / name
-            total += _check_array(place, name, sizes, (shapes or {}).get(name))
-        if total > _ALWAYS_ALLOWED_BYTES + _MAX_PACKED * sum(sizes.values()):
-            raise ValueError(f"its arrays would take {total:.3g} bytes, far more than such files can hold")
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, struct.error) as error:
-        said = str(error) if type(error) is ValueError else f"its zarr metadata makes no sense ({error!r})"
-        raise CorruptError(f"{at}: {said}; gsmap did not write that: {mend(place.parent.name)}") from error
+            with self._explained(f"{self.at}/{name}"):
+                array = out[name] = self._array(name, (shapes or {}).get(name))
+                if heads:
+                    for frame in array.frames:
+                        array.check_head(self._bytes(replace(frame, size=min(frame.size, _MAX_FRAME_HEADER))))
+        total = sum(array.num_bytes for array in out.values())
+        with self._explained(self.at):
+            if total > _ALWAYS_ALLOWED_BYTES + _MAX_PACKED * self.num_bytes:
+                raise ValueError(f"its arrays would take {total:.3g} bytes, far more than such files can hold")
+        return out
+
+    def _array(self, name: str, known: Shape | None) -> Array:
+        about = self.metadata(f"{name}/zarr.json")
+        if not _KEYS <= set(about) <= _MAY_HAVE or about["node_type"] != "array" or about["zarr_format"] != 3:
+            raise ValueError("it is not a plain zarr v3 array")
+        if about["chunk_key_encoding"] != _CHUNK_KEYS or about.get("storage_transformers"):
+            raise ValueError("its chunks lie elsewhere than gsmap puts them")
+        shape, kind = about["shape"], about["data_type"]
+        if not isinstance(kind, str) or kind not in _ITEM_BYTES:
+            raise ValueError(f"its values are {kind!r}, not plain numbers")
+        if not _lengths(shape, least=0) or not 1 <= len(shape) <= _MAX_DIMENSIONS:
+            raise ValueError(f"its shape is {shape!r}")
+        if known is not None and not _same(shape, known):
+            wanted = ", ".join("any" if length is None else str(length) for length in known)
+            raise ValueError(f"its shape is {shape}, but the catalog says ({wanted})")
+        grid = about["chunk_grid"]
+        outer = grid["configuration"]["chunk_shape"]
+        inner, sharded = _chunks_in(about["codecs"], outer)
+        rows = [max(1, length) for length in shape[1:]]
+        if grid["name"] != "regular" or not all(_lengths(c, least=1) and c[1:] == rows for c in (outer, inner)):
+            raise ValueError(f"its chunks {outer!r} are not rows")
+        if inner[0] > CHUNK_ROWS or outer[0] > _SHARD_ROWS or outer[0] % inner[0]:
+            raise ValueError(f"its chunks {inner} in {outer} are not of gsmap's sizes")
+        out = Array(tuple(shape), np.dtype(kind), inner[0], [])
+        if not out.num_bytes:
+            return out
+        files = -(-shape[0] // outer[0])
+        if files > len(self.keys):
+            raise ValueError(f"its shape is {shape}, but most of its chunks are missing")
+        for i in range(files):
+            span = self.keys.get("/".join([name, "c", str(i), *("0" for _ in rows)]))
+            if span is None:
+                raise ValueError(f"its chunk {i} is missing")
+            used = -(-min(outer[0], shape[0] - i * outer[0]) // inner[0])
+            out.frames.extend(self._in_shard(span, used, outer[0] // inner[0]) if sharded else [span])
+        return out
+
+    def _in_shard(self, span: Span, used: int, count: int) -> list[Span]:
+        """The frames of the first ``used`` of a shard's ``count`` chunks."""
+        end = span.size - 16 * count - 4
+        index = self._bytes(Span(span.file, span.start + end, 16 * count)) if end > 0 else b""
+        places = list(struct.iter_unpack("<QQ", index))[:used]
+        if len(places) < used or any(start + length > end for start, length in places):
+            raise ValueError(f"{span.file.rpartition('/')[2]} of its shards lacks chunks")
+        return [Span(span.file, span.start + start, length) for start, length in places]
+
+    def read(self, arrays: Mapping[str, Array], rows: Sequence[Range] | None = None) -> dict[str, np.ndarray]:
+        """Rows of arrays that `laid_out` found sound: ranges ``[start, stop)`` in order, all where None.
+
+        Raises:
+            CorruptError: a chunk fails its checksum, or unpacks to other than its size.
+        """
+        wanted: dict[str, list[Range]] = {}
+        for array in arrays.values():
+            for frame in (array.frames[i] for i in array.chunks_of(rows)):
+                wanted.setdefault(frame.file, []).append((frame.start, frame.start + frame.size))
+        for file, ranges in wanted.items():
+            self._reader.expect(file, ranges)
+        out = {}
+        for name, array in arrays.items():
+            with self._explained(f"{self.at}/{name}"):
+                out[name] = array.read(self._bytes, rows)
+        return out
+
+
+@dataclass(frozen=True)
+class Array:
+    """How one array is laid out: a zstd frame for every ``chunk_rows`` rows."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    chunk_rows: int
+    frames: list[Span]
+
+    @property
+    def num_bytes(self) -> int:
+        """In memory."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def chunk_bytes(self) -> int:
+        return self.chunk_rows * math.prod(self.shape[1:]) * self.dtype.itemsize
+
+    def chunks_of(self, rows: Sequence[Range] | None) -> list[int]:
+        """The chunks that hold rows."""
+        if rows is None or not self.frames:
+            return list(range(len(self.frames)))
+        last = self.shape[0] - 1
+        spans = (range(a // self.chunk_rows, min(b - 1, last) // self.chunk_rows + 1) for a, b in rows if a < b)
+        return sorted({i for span in spans for i in span})
+
+    def check_head(self, frame: bytes) -> None:
+        if _unpacked_bytes(frame) != self.chunk_bytes:
+            raise ValueError("a chunk of it would not unpack to its size")
+
+    def read(self, bytes_of: Callable[[Span], bytes], rows: Sequence[Range] | None) -> np.ndarray:
+        """Ranges ``[start, stop)`` of rows, in order; all where None."""
+        count = self.shape[0]
+        ranges = [(0, count)] if rows is None else [(start, min(stop, count)) for start, stop in rows]
+        out = np.zeros((sum(max(0, stop - start) for start, stop in ranges), *self.shape[1:]), self.dtype)
+        if not self.frames:
+            return out
+        at, held, chunk = 0, -1, out
+        for start, stop in ranges:
+            for i in range(start // self.chunk_rows, -(-stop // self.chunk_rows)):
+                if i != held:
+                    held, chunk = i, self._unpacked(bytes_of(self.frames[i]))
+                first = i * self.chunk_rows
+                part = chunk[max(start - first, 0) : stop - first]
+                out[at : at + len(part)] = part
+                at += len(part)
+        return out
+
+    def _unpacked(self, frame: bytes) -> np.ndarray:
+        from numcodecs import zstd
+
+        self.check_head(frame)
+        try:
+            content = zstd.decompress(frame)
+        except RuntimeError as error:
+            raise ValueError(f"a chunk of it differs from what was written ({error})") from error
+        return np.frombuffer(content, self.dtype).reshape(self.chunk_rows, *self.shape[1:])
 
 
 def mend(kind: str) -> str:
@@ -76,57 +282,20 @@ def mend(kind: str) -> str:
     return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"
 
 
-def _check_array(place: Path, name: str, sizes: Mapping[str, int], known: Shape | None) -> int:
-    """Check one array; returns its bytes in memory."""
-    about = _metadata(place, f"{name}/zarr.json", sizes)
-    if not _KEYS <= set(about) <= _MAY_HAVE or about["node_type"] != "array" or about["zarr_format"] != 3:
-        raise ValueError("it is not a plain zarr v3 array")
-    if about["chunk_key_encoding"] != _CHUNK_KEYS or about.get("storage_transformers"):
-        raise ValueError("its chunks lie elsewhere than gsmap puts them")
-    shape, kind = about["shape"], about["data_type"]
-    if not isinstance(kind, str) or kind not in _ITEM_BYTES:
-        raise ValueError(f"its values are {kind!r}, not plain numbers")
-    if not _lengths(shape, least=0) or not 1 <= len(shape) <= _MAX_DIMENSIONS:
-        raise ValueError(f"its shape is {shape!r}")
-    if known is not None and not _same(shape, known):
-        wanted = ", ".join("any" if length is None else str(length) for length in known)
-        raise ValueError(f"its shape is {shape}, but the catalog says ({wanted})")
-    grid = about["chunk_grid"]
-    outer = grid["configuration"]["chunk_shape"]
-    inner, sharded = _chunks_in(about["codecs"], outer)
-    rows = [max(1, length) for length in shape[1:]]
-    if grid["name"] != "regular" or not all(_lengths(c, least=1) and c[1:] == rows for c in (outer, inner)):
-        raise ValueError(f"its chunks {outer!r} are not rows")
-    if inner[0] > CHUNK_ROWS or outer[0] > SHARD_ROWS or outer[0] % inner[0]:
-        raise ValueError(f"its chunks {inner} in {outer} are not of gsmap's sizes")
-    item = _ITEM_BYTES[kind]
-    num_bytes: int = math.prod(shape) * item
-    if not num_bytes:
-        return 0
-    files = -(-shape[0] // outer[0])
-    if files > len(sizes):
-        raise ValueError(f"its shape is {shape}, but most of its chunks are missing")
-    for i in range(files):
-        key = "/".join([name, "c", str(i), *("0" for _ in rows)])
-        if key not in sizes:
-            raise ValueError(f"its chunk {i} is missing")
-        used = -(-min(outer[0], shape[0] - i * outer[0]) // inner[0])
-        _check_file(place / key, sizes[key], math.prod(inner) * item, used, outer[0] // inner[0] if sharded else 0)
-    return num_bytes
-
-
 def _chunks_in(codecs: Any, outer: list[int]) -> tuple[list[int], bool]:
-    """The shape of what is packed by itself, and whether several such lie in one file; other codecs are refused."""
+    """The shape of what is packed by itself, and whether several such lie in one key; other codecs are refused."""
     names = _names_of(codecs)
-    if names == ["bytes", "zstd"]:
+    if names == ["bytes", "zstd"] and _little(codecs[0]):
         return outer, False
     if names == ["sharding_indexed"]:
         shard = codecs[0]["configuration"]
         index = _names_of(shard["index_codecs"])
         at_end = shard.get("index_location", "end") == "end"
-        if _names_of(shard["codecs"]) == ["bytes", "zstd"] and index == ["bytes", "crc32c"] and at_end:
+        inner = shard["codecs"]
+        plain = _names_of(inner) == ["bytes", "zstd"] and index == ["bytes", "crc32c"]
+        if plain and at_end and _little(inner[0]) and _little(shard["index_codecs"][0]):
             return shard["chunk_shape"], True
-        names += [*_names_of(shard["codecs"]), *index]
+        names += [*_names_of(inner), *index]
     raise ValueError(f"its codecs are {', '.join(names)[:100]}, which are not gsmap's")
 
 
@@ -134,27 +303,13 @@ def _names_of(codecs: Any) -> list[str]:
     return [str(codec["name"]) for codec in codecs]
 
 
-def _check_file(path: Path, size: int, chunk_bytes: int, used: int, in_shard: int) -> None:
-    """Look into a chunk's file: all that is used of it unpacks to exactly the bytes of a chunk."""
-    handle = open_file(path)
-    try:
-        places: Sequence[tuple[int, int]] = [(0, size)]
-        if in_shard:
-            index = 16 * in_shard
-            found = os.pread(handle, index, size - index - 4) if size > index + 4 else b""
-            places = list(struct.iter_unpack("<QQ", found))[:used]
-            if len(places) < used or any(start + length > size - index - 4 for start, length in places):
-                raise ValueError(f"{path.name} of its shards lacks chunks")
-        for start, _ in places:
-            if _unpacked_bytes(os.pread(handle, _MAX_FRAME_HEADER, start)) != chunk_bytes:
-                raise ValueError("a chunk of it would not unpack to its size")
-    finally:
-        os.close(handle)
+def _little(codec: Any) -> bool:
+    return bool(codec.get("configuration", {}).get("endian", "little") == "little")
 
 
 def _unpacked_bytes(head: bytes) -> int:
     """What a zstd frame says it unpacks to (RFC 8878, 3.1.1.1); -1 where it does not say."""
-    if head[:4] != _ZSTD_MAGIC:
+    if head[:4] != _ZSTD_MAGIC or len(head) < 5:
         return -1
     flags = head[4]
     single, kind = flags >> 5 & 1, flags >> 6
@@ -163,16 +318,6 @@ def _unpacked_bytes(head: bytes) -> int:
     if not length or len(head) < at + length:
         return -1
     return int.from_bytes(head[at : at + length], "little") + (256 if kind == 1 else 0)
-
-
-def _metadata(place: Path, path: str, sizes: Mapping[str, int]) -> dict[str, Any]:
-    if sizes.get(path, _MAX_METADATA_BYTES + 1) > _MAX_METADATA_BYTES:
-        raise ValueError("it has no zarr metadata")
-    with open(open_file(place / path), "rb") as file:
-        found = json.loads(file.read())
-    if not isinstance(found, dict):
-        raise ValueError("its zarr metadata is no object")
-    return found
 
 
 def _lengths(value: Any, least: int) -> bool:

@@ -42,6 +42,7 @@ from gsmap.store.schema import (
     revisions,
     scene_facts,
     scenes,
+    set_aside,
     tiles,
 )
 from gsmap.store.store import Store
@@ -252,6 +253,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     drop("priors", priors, priors.c.scene == scene)
     drop("facts", scene_facts, scene_facts.c.scene == scene)
     drop("leases", leases, leases.c.what.contains(scene))
+    drop("set_aside", set_aside, set_aside.c.about.contains(scene))
     made_with_it = [
         tile.number for tile in connection.execute(select(tiles.c.number, tiles.c.poses)) if scene in tile.poses
     ]

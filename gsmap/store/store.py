@@ -33,6 +33,7 @@ from gsmap.store.recipes import Recipes
 from gsmap.store.registrations import Registrations
 from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
+from gsmap.store.set_aside import SetAsides
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
 
@@ -41,9 +42,9 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``changes``,
-    ``revisions``, ``priors``, ``models``, ``exports``, ``branches``, ``backups`` and ``leases``. Every method that
-    changes something is one transaction, durable when it returns; `transaction` makes several of them one. Killed
-    anywhere, the map opens whole. Threads may share a store; processes open their own.
+    ``revisions``, ``priors``, ``models``, ``exports``, ``branches``, ``backups``, ``leases`` and ``set_aside``. Every
+    method that changes something is one transaction, durable when it returns; `transaction` makes several of them one.
+    Killed anywhere, the map opens whole. Threads may share a store; processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -78,6 +79,7 @@ class Store:
         self.branches = Branches(place, catalog, self.arrays)
         self.backups = Backups(catalog)
         self.leases = Leases(catalog)
+        self.set_aside = SetAsides(catalog)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], *, catalog_url: str | None = None) -> Store:

@@ -117,7 +117,7 @@ def _look_around(room: Room, door: Door | None, count: int, rng: np.random.Gener
         x, y = room.center + reach * way
         yaw = yaw0 + turn * 4 * np.pi * i / count + sway * np.sin(3 * angle)
         pitch = -0.12 + 0.26 * np.sin(tilt0 + 5 * angle)
-        out.append(_pose(x, y, _HEAD_M + 0.12 * np.sin(2 * angle + tilt0), yaw, pitch))
+        out.append(look_along(x, y, _HEAD_M + 0.12 * np.sin(2 * angle + tilt0), yaw, pitch))
     return out
 
 
@@ -133,11 +133,11 @@ def _pass_door(place: Place, a: int, b: int, count: int, rng: np.random.Generato
     for i in range(count):
         x, y = door.xy + normal * (-0.5 + 1.0 * (i + 0.5) / count)
         back = np.pi if i % 2 else 0.0
-        out.append(_pose(x, y, _HEAD_M, heading + back + rng.uniform(-0.35, 0.35), -0.1))
+        out.append(look_along(x, y, _HEAD_M, heading + back + rng.uniform(-0.35, 0.35), -0.1))
     return out
 
 
-def _pose(x: float, y: float, z: float, yaw: float, pitch: float) -> np.ndarray:
+def look_along(x: float, y: float, z: float, yaw: float, pitch: float) -> np.ndarray:
     """Camera-to-place pose at a point, looking along yaw (from +x, about +z) and pitch (up positive)."""
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])

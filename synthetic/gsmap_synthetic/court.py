@@ -17,7 +17,7 @@ from gsmap.errors import ConfigError
 from gsmap.types.progress import Progress
 from gsmap_synthetic import textures as tx
 from gsmap_synthetic.bake import bake
-from gsmap_synthetic.capture import _pose
+from gsmap_synthetic.capture import look_along
 from gsmap_synthetic.furniture import colour, palette, timber
 from gsmap_synthetic.make import DemoCapture, make_captures
 from gsmap_synthetic.place import Place
@@ -247,7 +247,7 @@ def stroll(place: Place, at_m: float, count: int, seed: int = 0, *, width_m: flo
         x, y = middle + radii * [np.cos(angle), np.sin(angle)]
         yaw = yaw0 + turn * 4 * np.pi * i / count + 0.25 * np.sin(3 * angle)
         pitch = 0.02 + 0.2 * np.sin(tilt0 + 5 * angle)
-        out.append(_pose(x, y, _HEAD_M + 0.12 * np.sin(2 * angle + tilt0), yaw, pitch))
+        out.append(look_along(x, y, _HEAD_M + 0.12 * np.sin(2 * angle + tilt0), yaw, pitch))
     return np.stack(out)
 
 

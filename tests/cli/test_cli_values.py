@@ -83,10 +83,10 @@ def test_merged_parts_are_registered_across_only(
     jobs: dict[str, list[Any]] = {"describe": [], "register": []}
     for stage, module in (("describe", describe), ("register", register)):
 
-        def spied(work: Any, given: Any, *more: Any, stage: str = stage, run: Any = module.run_jobs) -> Any:
+        def spied(work: Any, given: Any, *more: Any, stage: str = stage, run: Any = module.run_jobs, **how: Any) -> Any:
             given = list(given)
             jobs[stage] += given
-            return run(work, given, *more)
+            return run(work, given, *more, **how)
 
         monkeypatch.setattr(module, "run_jobs", spied)
     assert cli("update", west).code == 0

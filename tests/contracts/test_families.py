@@ -300,9 +300,14 @@ def test_embedder(name: str, world: World) -> None:
 @pytest.mark.parametrize("name", of("executor"))
 def test_executor(name: str) -> None:
     method = family("executor").get(name)
-    assert dict(method.run_jobs(divmod, [(7, 2), (9, 4)], method.Params())) == {0: (3, 1), 1: (2, 1)}
-    with pytest.raises(ZeroDivisionError):
-        list(method.run_jobs(divmod, [(7, 0)], method.Params()))
+    workers = method.start(method.Params())
+    try:
+        assert dict(workers.run(divmod, [(7, 2), (9, 4)])) == {0: (3, 1), 1: (2, 1)}
+        assert dict(workers.run(divmod, iter([(7, 2), (9, 4)]), quick=True)) == {0: (3, 1), 1: (2, 1)}
+        with pytest.raises(ZeroDivisionError):
+            list(workers.run(divmod, [(7, 0)]))
+    finally:
+        workers.close()
 
 
 @pytest.mark.parametrize("name", of("format"))

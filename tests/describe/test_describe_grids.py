@@ -1,5 +1,7 @@
 """The native kernels of landmarks against what they compute, written plainly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from describe_places import room
@@ -105,6 +107,17 @@ def test_surroundings_are_the_means_of_what_lies_in_each_ring(cloud):
             inside = shell == i
             expected = values[inside].mean(0) if inside.any() else np.zeros(3)
             np.testing.assert_allclose(shells[row, i, :3], expected, atol=1e-9)
+
+
+def test_strays_a_hundred_thousand_kilometres_out_change_no_landmark_of_the_room():
+    gaussians, cameras = room(n=6000)
+    graphs = []
+    for far in (50.0, 1e8):
+        means = gaussians.means.copy()
+        means[:40] = np.repeat(far * np.array([[1.0, -0.7, 0.9], [0.6, -1.0, 0.8]]), 20, axis=0)
+        graphs.append(describe("x", replace(gaussians, means=means), cameras, Params(objects=False, things=False)))
+    for near, far in zip(*(g.layers["landmarks"].positions for g in graphs), strict=True):
+        np.testing.assert_allclose(near, far, atol=5e-3)
 
 
 def test_nothing_around_is_no_error():

@@ -1,5 +1,6 @@
 """Landmarks: the same place gives the same nodes, whatever its frame, unit and lighting."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -8,12 +9,12 @@ from describe_places import moved, room
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gsmap.describe import Params, describe
+from gsmap.describe import Params, describe, recipe_key
 from gsmap.describe.cloud import surface_cloud
 from gsmap.describe.gravity import estimate_up
 from gsmap.describe.landmarks import layer as landmarks
+from gsmap.describe.landmarks.context import METRICS, embed, metric, metric_digest
 from gsmap.describe.landmarks.context import Params as ContextParams
-from gsmap.describe.landmarks.context import embed, metric
 from gsmap.describe.landmarks.layer import landmark_layer
 from gsmap.describe.unit import LEVEL_STEP, LEVELS, estimate_unit_m
 from gsmap.errors import ConfigError
@@ -230,3 +231,17 @@ def test_the_fitted_metric_maps_embeddings_and_holds_for_the_bins_it_was_fitted_
         np.testing.assert_allclose(fitted, moved / np.linalg.norm(moved, axis=1, keepdims=True), atol=1e-9)
     with pytest.raises(ConfigError, match="default of colour_weight alone"):
         ContextParams(colour_weight=0.71, fitted=True)
+
+
+def test_a_metric_that_is_fitted_anew_makes_other_graphs_that_compare_with_no_older_ones(monkeypatch):
+    keys = {}
+    for fitted in (False, True):
+        params = landmarks.Params(context=ContextParams(fitted=fitted))
+        for digest in ("as shipped", "anew"):
+            monkeypatch.setattr(landmarks, "metric_digest", lambda digest=digest: digest)
+            keys[fitted, digest] = recipe_key(Params(landmark=params)).digest, landmarks.descriptor_id(params)
+    assert keys[False, "as shipped"] == keys[False, "anew"]
+    for of in (0, 1):
+        assert len({key[of] for key in keys.values()}) == 3
+    monkeypatch.undo()
+    assert metric_digest() == hashlib.sha256(METRICS.read_bytes()).hexdigest()[:32]

@@ -41,7 +41,7 @@ class Slow:
 
 
 def main() -> None:
-    from gsmap.engine.executors.local import Params, run_jobs
+    from gsmap.engine.executors.local import Params, start
 
     word, seconds = sys.argv[1], float(sys.argv[2])
     print("begun", flush=True)
@@ -62,7 +62,7 @@ def main() -> None:
         finally:
             time.sleep(seconds)
     job = {"sleep": sleep, "compute": compute, "hog": hog}[word]
-    for _ in run_jobs(job, [(seconds,)] * 6, Params(workers=2)):
+    for _ in start(Params(workers=2)).run(job, [(seconds,)] * 6):
         pass
 
 

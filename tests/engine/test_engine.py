@@ -5,13 +5,26 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-from collections.abc import Callable, Generator, Iterator
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gsmap import engine
-from gsmap.engine.executors.local import Params, run_jobs
+from gsmap.engine import SetAside
+from gsmap.engine.executors.local import Params, start
 from gsmap.errors import ConfigError, GsmapError
+
+
+def run_jobs(job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params) -> Iterator[Any]:
+    """As one stage does that keeps no workers."""
+    workers = start(params)
+    try:
+        yield from workers.run(job, arguments)
+    finally:
+        workers.close()
 
 
 def square(x: int) -> tuple[int, int]:
@@ -21,6 +34,35 @@ def square(x: int) -> tuple[int, int]:
 def die(x: int) -> int:
     os.kill(os.getpid(), signal.SIGKILL)
     return x
+
+
+def die_of_three(x: int) -> int:
+    return die(x) if x == 3 else x
+
+
+def die_once(x: int, folder: str) -> int:
+    """The first of jobs dies when it is tried first; the others say when they ended."""
+    if x == 0:
+        tried = Path(folder, "tried")
+        if not tried.exists():
+            tried.touch()
+            die(x)
+        Path(folder, "began").write_text(f"0 {time.monotonic()}\n")
+        return x
+    time.sleep(0.05)
+    with open(Path(folder, "ended"), "a") as file:
+        file.write(f"{x} {time.monotonic()}\n")
+    return x
+
+
+def where(place: str, scene: str, i: int) -> tuple[str, int]:
+    time.sleep(0.02)
+    return scene, os.getpid()
+
+
+def take_a_little(x: int) -> int:
+    time.sleep(0.02)
+    return os.getpid()
 
 
 def refuse(x: int) -> int:
@@ -54,9 +96,77 @@ def test_same_results_for_one_and_many_workers() -> None:
     assert os.getpid() not in {pid for _, pid in spread.values()}
 
 
-def test_a_dead_worker_is_an_error() -> None:
-    with pytest.raises(GsmapError, match="worker process died"):
-        list(run_jobs(die, [(1,), (2,)], Params(workers=2)))
+def test_a_job_that_kills_its_worker_twice_is_set_aside_and_the_rest_is_done() -> None:
+    found = dict(run_jobs(die_of_three, [(i,) for i in range(6)], Params(workers=2)))
+    assert {i: value for i, value in found.items() if i != 3} == {0: 0, 1: 1, 2: 2, 4: 4, 5: 5}
+    assert isinstance(found[3], SetAside)
+    assert "killed, most likely for lack of memory" in found[3].reason
+
+
+def test_a_job_whose_worker_was_killed_once_is_done_when_nothing_else_runs(tmp_path: Path) -> None:
+    """What it needs may be what others had: it is tried again alone."""
+    found = dict(run_jobs(die_once, [(i, str(tmp_path)) for i in range(6)], Params(workers=2)))
+    assert found == {i: i for i in range(6)}
+    began = {int(line.split()[0]): float(line.split()[1]) for line in (tmp_path / "began").read_text().splitlines()}
+    ended = {int(line.split()[0]): float(line.split()[1]) for line in (tmp_path / "ended").read_text().splitlines()}
+    assert began[0] >= max(ended[i] for i in range(1, 6))
+
+
+def test_workers_that_cannot_begin_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not a reason to set jobs aside."""
+    monkeypatch.setattr("gsmap.engine.pool._WORKER", Path("/nowhere/worker.py"))
+    with pytest.raises(GsmapError, match="end before they do anything"):
+        list(run_jobs(square, [(1,), (2,)], Params(workers=2)))
+
+
+def test_an_idle_worker_that_died_costs_no_job() -> None:
+    workers = start(Params(workers=2))
+    try:
+        processes = {process for _, (_, process) in workers.run(square, [(i,) for i in range(4)])}
+        for process in processes:
+            os.kill(process, signal.SIGKILL)
+        time.sleep(0.1)
+        assert sorted(value for _, (value, _) in workers.run(square, [(i,) for i in range(4)])) == [0, 1, 4, 9]
+    finally:
+        workers.close()
+
+
+def test_workers_are_kept_while_a_map_is_open() -> None:
+    params = engine.Params(executors=engine.Params().executors.with_params("local", Params(workers=2)))
+
+    def processes() -> set[int]:
+        return {process for _, (_, process) in engine.run_jobs(square, [(i,) for i in range(6)], params)}
+
+    with engine.Kept():
+        first = processes()
+        assert processes() <= first
+        with engine.Kept():
+            assert processes() <= first
+        assert processes() <= first
+    for process in first:
+        with pytest.raises(ProcessLookupError):
+            os.kill(process, 0)
+    assert not processes() & first
+
+
+def test_jobs_run_where_what_they_read_was_read() -> None:
+    """Two scenes, each in half of the jobs, and two workers: each reads one of them."""
+    jobs = [("map", scene, i) for i in range(8) for scene in ("hall", "attic")]
+    found = dict(run_jobs(where, jobs, Params(workers=2)))
+    processes = {scene: {process for told, process in found.values() if told == scene} for scene in ("hall", "attic")}
+    assert len(processes["hall"] | processes["attic"]) == 2
+    assert sum(len(each) for each in processes.values()) <= 3  # who has nothing left to do takes of the other's
+
+
+@pytest.mark.parametrize(("jobs", "here"), [(4, True), (400, False)])
+def test_quick_jobs_start_workers_only_where_it_pays(jobs: int, here: bool) -> None:
+    workers = start(Params(workers=2))
+    try:
+        found = dict(workers.run(take_a_little, [(i,) for i in range(jobs)], quick=True))
+    finally:
+        workers.close()
+    assert set(found) == set(range(jobs))
+    assert (set(found.values()) == {os.getpid()}) == here
 
 
 def test_a_job_s_own_error_comes_through() -> None:
@@ -102,7 +212,7 @@ def test_arguments_are_taken_as_there_is_room(workers: int) -> None:
             yield (i,)
 
     for done, _ in enumerate(run_jobs(square, arguments(), Params(workers=workers)), 1):
-        assert len(taken) <= done + workers
+        assert len(taken) <= done + 2 * workers  # as many ahead as run
 
 
 def test_workers_end_when_nobody_wants_the_rest() -> None:

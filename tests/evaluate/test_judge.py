@@ -278,6 +278,15 @@ def test_a_truth_that_is_not_exact_is_allowed_for() -> None:
     assert np.median(values) == pytest.approx(chi2.ppf(0.5, 6), rel=0.15)
 
 
+def test_an_exact_truth_judges_information_as_it_is() -> None:
+    """An edge that knows nothing of one direction says so: its error there costs nothing."""
+    scenes = [scene("a", at(0)), scene("b", at(5))]
+    nothing_along_x = INFORMATION.copy()
+    nothing_along_x[3, 3] = 0.0
+    edges = [replace(edge("a", "b", at(-9, y=0.02)), information=nothing_along_x)]
+    assert judge(scenes, edges, None, overlaps(scenes)).nees[0].median == pytest.approx(4.0)
+
+
 def test_a_report_says_how_exact_its_truth_is_taken_to_be() -> None:
     scenes = [scene("a", at(0)), scene("b", at(5))]
     edges = [replace(edge("a", "b", at(-5.1)), information=INFORMATION)]

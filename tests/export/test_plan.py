@@ -5,6 +5,7 @@ import pytest
 
 from gsmap.errors import ConfigError, InputError
 from gsmap.export import TileRecipe, dirty_reason, plan_tiles
+from gsmap.export.cells import Boxes
 from gsmap.geometry.rotations import exp_so3
 from gsmap.merge import recipe_key
 from gsmap.types import Sim3, Tile
@@ -53,6 +54,75 @@ def test_an_oriented_box_leaves_out_corners_it_does_not_reach():
     assert "tile_+001_+008_+000" not in names
 
 
+def by_hand(poses, bounds, edge, reach, bbox):
+    """The same tiles from every cell of the box around all scenes, each tried with every scene."""
+
+    def touches(scene, low, high):
+        half = poses[scene].scale * np.ptp(bounds[scene], axis=0) / 2
+        axes, middle = poses[scene].rotation, poses[scene].apply(bounds[scene].mean(0))
+        around = np.abs(axes) @ half
+        offset = axes.T @ ((low + high) / 2 - middle)
+        return (
+            (middle - around <= high).all()
+            and (middle + around >= low).all()
+            and (np.abs(offset) <= half + np.abs(axes.T) @ ((high - low) / 2)).all()
+        )
+
+    found = {}
+    for cell in np.ndindex(12, 12, 12):
+        low, high = (np.add(cell, corner) * edge - 6 * edge for corner in (0, 1))
+        if bbox is not None:
+            low, high = np.maximum(low, bbox[0]), np.minimum(high, bbox[1])
+        if (high > low).all() and any(touches(scene, low, high) for scene in poses):
+            near = {scene for scene in poses if touches(scene, low - reach, high + reach)}
+            found["tile_" + "_".join(f"{c - 6:+04d}" for c in cell)] = (near, np.array([low, high]))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_plan_is_that_of_every_cell_tried_with_every_scene(seed):
+    rng = np.random.default_rng(seed)
+    poses = {f"s{i}": Sim3(exp_so3(rng.normal(size=3)), rng.uniform(-6, 6, 3), rng.uniform(0.5, 1.5)) for i in range(4)}
+    bounds = {scene: np.sort(rng.uniform(-3, 3, (2, 3)), axis=0) for scene in poses}
+    bbox = np.array([[-7.3, -5.1, -9.0], [6.2, 8.4, 3.3]]) if seed % 2 else None
+    tiles = plan_tiles(poses, bounds, tile_size_m=2.5, reach_m=1.7, bbox=bbox)
+    expected = by_hand(poses, bounds, 2.5, 1.7, bbox)
+    assert [tile.name for tile in tiles] == list(expected)
+    for tile in tiles:
+        near, box = expected[tile.name]
+        assert set(tile.poses) == near
+        np.testing.assert_allclose(tile.bounds, box)
+
+
+def test_tiles_without_content_do_not_count():
+    """A street of 16 km along the diagonal, and one scene far away: the box around them has millions of cells."""
+    poses = {f"s{i:04d}": at(2.83 * i, 2.83 * i) for i in range(4000)} | {"stray": at(-3e5, 7e5, 2e5)}
+    tiles = plan_tiles(poses, dict.fromkeys(poses, 4 * BOX), tile_size_m=10.0)
+    assert 4_000 < len(tiles) < 16_000
+    assert {scene for tile in tiles for scene in tile.poses} == set(poses)
+    with pytest.raises(ConfigError, match=r"larger tiles.*export.max_tiles"):
+        plan_tiles(poses, dict.fromkeys(poses, 4 * BOX), tile_size_m=10.0, max_tiles=len(tiles) - 1)
+
+
+def test_a_plan_takes_work_by_the_scene(monkeypatch):
+    """Ten times the scenes: ten times the boxes that are compared, however much lies between them."""
+    compared = []
+    touch = Boxes.touch
+
+    def counting(self, which, low, high):
+        compared.append(len(which))
+        return touch(self, which, low, high)
+
+    monkeypatch.setattr(Boxes, "touch", counting)
+    counts = []
+    for num in (100, 1000):
+        compared.clear()
+        poses = {f"s{i:04d}": at(30.0 * i, 40.0 * i, turn_rad=0.1 * i) for i in range(num)}
+        plan_tiles(poses, dict.fromkeys(poses, 4 * BOX), tile_size_m=10.0, reach_m=11.0)
+        counts.append(sum(compared))
+    assert counts[1] < 11 * counts[0]
+
+
 def test_components_are_planned_apart():
     poses = {"a": at(0), "b": at(0)}
     tiles = plan_tiles(poses, dict.fromkeys(poses, BOX), tile_size_m=0, components={"a": 0, "b": 3})
@@ -65,6 +135,10 @@ def test_a_box_cuts_tiles_and_must_touch_the_map():
     tiles = plan_tiles(poses, {"a": BOX}, tile_size_m=4.0, bbox=box)
     assert len(tiles) == 8
     assert sum(np.prod(t.bounds[1] - t.bounds[0]) for t in tiles) == pytest.approx(1.0)
+    two = plan_tiles(
+        poses | {"b": at(90)}, dict.fromkeys("ab", BOX), tile_size_m=4.0, components={"a": 0, "b": 1}, bbox=box
+    )
+    assert [t.component for t in two] == [0] * 8  # nothing of the other lies in the box
     with pytest.raises(InputError, match="outside the map"):
         plan_tiles(poses, {"a": BOX}, tile_size_m=4.0, bbox=box + 50)
     with pytest.raises(InputError, match="empty"):

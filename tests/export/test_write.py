@@ -1,5 +1,8 @@
 import errno
+import hashlib
 import json
+import pickle
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from gsmap.errors import ConfigError, InputError, StoreError
 from gsmap.export import Params, TileRecipe, export_tiles, plan_tiles
 from gsmap.merge import recipe_key
 from gsmap.merge.tile import LazyScene, merge_tile
+from gsmap.methods.executor import SetAside
 from gsmap.types import Gaussians, Sim3
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -41,7 +45,10 @@ class Street:
         )
         self.made = []
 
-        def make(planned, progress):
+        def make(planned):
+            return partial(content, planned)
+
+        def content(planned, progress):
             if len(self.made) == self.fail_at:
                 raise KeyboardInterrupt
             self.made.append(planned.name)
@@ -142,10 +149,34 @@ def test_a_full_disk_leaves_no_half_tile(street, monkeypatch):
     assert street.export().reused == 2
 
 
-def test_workers_make_the_same_files(street):
+def test_tiles_made_elsewhere_are_the_same_files(street):
+    """On a machine that does not have the folder: it sends the bytes."""
+
+    def elsewhere(job, arguments):
+        for index, (content, recipe, folder, name) in reversed(list(enumerate(arguments))):
+            yield index, pickle.loads(pickle.dumps(job(content, recipe, folder + "-not-here", name)))
+
     one = street.export()
-    other = Street(street.out.parent / "threads").export(params=Params(workers=3))
+    other = Street(street.out.parent / "sent").export(run=elsewhere)
     assert [(t.path, t.sha256) for t in one.tiles] == [(t.path, t.sha256) for t in other.tiles]
+    for tile in other.tiles:
+        if tile.path:
+            content = (street.out.parent / "sent" / tile.path).read_bytes()
+            assert hashlib.sha256(content).hexdigest() == tile.sha256
+
+
+def test_a_tile_that_cannot_be_made_is_left_out_and_tried_again_by_the_next_export(street):
+    def all_but_one(job, arguments):
+        for index, args in enumerate(arguments):
+            yield index, SetAside("killed") if index == 1 else job(*args)
+
+    whole = Street(street.out.parent / "whole").export()
+    result = street.export(run=all_but_one)
+    ((tile, reason),) = result.set_aside
+    assert (reason, result.recomputed, len(result.tiles)) == ("killed", len(whole.tiles) - 1, len(whole.tiles) - 1)
+    again = street.export()
+    assert (street.made, again.recomputed, again.set_aside) == ([tile.name], 1, ())
+    assert [(t.path, t.sha256) for t in again.tiles] == [(t.path, t.sha256) for t in whole.tiles]
 
 
 def test_one_file_and_another_format_replace_what_was_there(street):
@@ -185,8 +216,8 @@ def test_folders_of_others_are_left_alone(street):
 def test_bad_options_are_refused_before_anything_is_written(street):
     with pytest.raises(ConfigError, match="choose one of"):
         street.export(format="obj")
-    with pytest.raises(ConfigError, match="worker"):
-        street.export(params=Params(workers=0))
+    with pytest.raises(ConfigError, match="moved_m"):
+        street.export(params=Params(moved_m=-1))
     assert not street.out.exists()
     (street.out.parent / "file").write_text("mine")
     with pytest.raises(StoreError, match="cannot write the export"):

@@ -22,6 +22,16 @@ def test_many_cells_are_told_apart():
     np.testing.assert_array_equal(counts, np.bincount(labels))
 
 
+def test_cells_of_strays_far_out_are_told_apart():
+    """So far that one number a cell, in 64 bits, gives several cells the same: x wraps round."""
+    far = 2**32 - 1
+    cells = np.array([[0, 0, 0], [far, far, far], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 0, 1], [0, 2, 0]])
+    labels, counts = cell_labels(cells)
+    order = sorted({tuple(cell) for cell in cells.tolist()})
+    assert [order[label] for label in labels] == [tuple(cell) for cell in cells.tolist()]
+    assert counts.tolist() == [2, 1, 1, 1, 1, 1]
+
+
 def test_means_are_those_of_each_group():
     rng = np.random.default_rng(1)
     values, labels = rng.normal(size=(200, 4)), rng.permutation(np.arange(200) % 13)

@@ -77,12 +77,12 @@ def a_graph_whose_arrays_lie_elsewhere(w: World) -> None:
 
 @case(ROWS)
 def a_file_of_a_group_with_an_absolute_path(w: World) -> None:
-    w.set("UPDATE files SET path = ? WHERE path = 'zarr.json'", str(w.home / "thesis.txt"))
+    w.set("UPDATE files SET path = ? WHERE path = 'arrays.zip'", str(w.home / "thesis.txt"))
 
 
 @case(ROWS)
 def a_file_of_a_group_that_leads_upwards(w: World) -> None:
-    w.set("UPDATE files SET path = '../../../../home/thesis.txt' WHERE path = 'means/zarr.json'")
+    w.set("UPDATE files SET path = '../../../../home/thesis.txt' WHERE path = 'arrays.zip'")
 
 
 @case(r"models.path.*gsmap did not write that", works=("list MAP scenes",))

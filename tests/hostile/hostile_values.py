@@ -87,7 +87,7 @@ def a_map_to_take_in_whose_model_is_an_absolute_path(w: World) -> None:
 
 @case(r"the catalog holds|gsmap did not", verbs=TAKEN_IN)
 def a_map_to_take_in_whose_files_lead_upwards(w: World) -> None:
-    w.set("UPDATE files SET path = '../../../../home/thesis.txt' WHERE path = 'means/zarr.json'")
+    w.set("UPDATE files SET path = '../../../../home/thesis.txt' WHERE path = 'arrays.zip'")
 
 
 @case(r"the catalog holds|gsmap did not", verbs=TAKEN_IN)

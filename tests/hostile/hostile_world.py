@@ -7,6 +7,7 @@ import hashlib
 import os
 import shutil
 import sqlite3
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ from gsmap import formats
 from gsmap.change import recipe_key
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.methods import RecipeKey
-from gsmap.store import Store, digests
+from gsmap.store import Store, digests, packed
 from gsmap.types import (
     Cameras,
     Change,
@@ -156,6 +157,19 @@ class World:
             table = "scenes" if kind == "scenes" else "graphs"
             found = connection.execute(f"SELECT group_id FROM {table}").fetchone()
         return self.map / "arrays" / kind / str(found[0])
+
+    def older_form(self, kind: str = "scenes") -> list[Path]:
+        """Make all groups of a kind folders of a file for every key, as gsmap before 0.3 kept them; their folders."""
+        groups = sorted((self.map / "arrays" / kind).iterdir())
+        for group in groups:
+            with zipfile.ZipFile(group / packed.FILE) as archive:
+                archive.extractall(group)
+                names = archive.namelist()
+            (group / packed.FILE).unlink()
+            self.set("DELETE FROM files WHERE group_id = ?", group.name)
+            for name in names:
+                self.restated(group / name)
+        return groups
 
     @contextlib.contextmanager
     def sql(self) -> Iterator[sqlite3.Connection]:

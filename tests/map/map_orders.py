@@ -136,7 +136,9 @@ def pairs_remembered() -> Iterator[Callable[[], AbstractContextManager[None]]]:
     run_jobs = register_stage.run_jobs
     anew = False
 
-    def remembering(function: Any, jobs: Iterable[tuple[Any, ...]], params: Any) -> Iterator[tuple[int, Any]]:
+    def remembering(
+        function: Any, jobs: Iterable[tuple[Any, ...]], params: Any, **how: Any
+    ) -> Iterator[tuple[int, Any]]:
         asked: list[tuple[Any, ...]] = []
 
         def noted() -> Iterator[tuple[Any, ...]]:
@@ -145,13 +147,13 @@ def pairs_remembered() -> Iterator[Callable[[], AbstractContextManager[None]]]:
                 yield job
 
         if anew:
-            for i, edge in run_jobs(function, noted(), params):
+            for i, edge in run_jobs(function, noted(), params, **how):
                 known[asked[i]] = edge
                 yield i, edge
             return
         for i, job in enumerate(noted()):
             if asked[i] not in known:
-                ((_, known[asked[i]]),) = run_jobs(function, [job], params)
+                ((_, known[asked[i]]),) = run_jobs(function, [job], params, **how)
             yield i, known[asked[i]]
 
     @contextmanager

@@ -125,7 +125,7 @@ def test_a_pair_that_is_named_is_compared_whatever_lies_between(site: Map, seen:
 
 def test_damaged_arrays_of_a_pair_that_is_named_are_made_again(site: Map, seen: Seen) -> None:
     site.changes()
-    for path in site.store.home.glob("arrays/changes/*/voxels/zarr.json"):
+    for path in site.store.home.glob("arrays/changes/*/arrays.zip"):
         path.write_bytes(b"")
     names(site, seen)
     site.changes()

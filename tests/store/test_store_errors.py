@@ -203,20 +203,18 @@ def test_a_log_that_cannot_be_folded_in_costs_nothing(tmp_path, monkeypatch, cap
 
 def test_a_disk_that_cannot_read_is_no_damage(store, two_scenes, monkeypatch):
     """Reading arrays fails as the disk does; check names the file and goes on."""
-    import zarr
-
     from gsmap.store import arrays
 
     def refuse(*arguments, **more):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     with monkeypatch.context() as patch:
-        patch.setattr(zarr, "open_group", refuse)
+        patch.setattr(arrays.os, "pread", refuse)
         with pytest.raises(DiskError, match="Input/output error"):
             store.scenes.gaussians("scene0")
     with monkeypatch.context() as patch:
         patch.setattr(arrays.hashlib, "file_digest", refuse)
         problems = store.check().problems
-    assert len(problems) > 10
+    assert len(problems) >= 2
     assert all("cannot be read" in problem for problem in problems)
     assert store.check().ok

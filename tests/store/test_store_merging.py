@@ -132,12 +132,12 @@ def test_again_it_adds_nothing(store, other):
 
 def test_arrays_are_linked_and_their_bytes_compared(store, other):
     scene = add(other, 1)
-    victim = next(p for p in (other.home / "arrays/scenes" / scene).rglob("c/*") if p.is_file())
+    victim = next(p for p in (other.home / "arrays/scenes" / scene).rglob("*.zip") if p.is_file())
     merge(store, other)
     linked = store.home / victim.relative_to(other.home)
     assert linked.samefile(victim)
     second = add(other, 2)
-    victim = next(p for p in (other.home / "arrays/scenes" / second).rglob("c/*") if p.is_file())
+    victim = next(p for p in (other.home / "arrays/scenes" / second).rglob("*.zip") if p.is_file())
     data = bytearray(victim.read_bytes())
     data[-1] ^= 1
     victim.write_bytes(data)

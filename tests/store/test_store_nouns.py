@@ -95,7 +95,7 @@ def test_a_damaged_graph_is_mended_by_saving_it_again(store, two_scenes):
     kept = store.graphs.save(graph, made)
     assert store.graphs.damaged([made, key("describe", "other")]) == set()
     (place,) = (store.folder / "arrays" / "graphs").iterdir()
-    broken = next(path for path in place.rglob("zarr.json") if path.parent != place)
+    broken = next(place.rglob("*.zip"))
     content = broken.read_bytes()
     for spoil in (broken.unlink, lambda: broken.write_bytes(b"x" * len(content)), lambda: shutil.rmtree(place)):
         spoil()
@@ -115,7 +115,7 @@ def test_a_damaged_graph_that_another_replaces_is_no_problem_any_more(store, two
     scene, made = two_scenes[0].id, key("describe", two_scenes[0].id)
 
     def spoil():
-        for path in store.folder.glob("arrays/graphs/*/zarr.json"):
+        for path in store.folder.glob("arrays/graphs/*/arrays.zip"):
             path.write_bytes(b"")
         return store.check().problems
 
@@ -139,7 +139,7 @@ def test_a_damaged_graph_of_a_tag_or_of_a_removed_scene(store, two_scenes):
     store.graphs.save(SceneGraph(scene, {"objects": layer()}), key("describe", scene))
     store.branches.make("v1", tag=True)
     store.scenes.remove("scene0")
-    for path in store.folder.glob("arrays/graphs/*/zarr.json"):
+    for path in store.folder.glob("arrays/graphs/*/arrays.zip"):
         path.unlink()
     of_map, of_tag = store.check().problems
     assert f"gsmap restore-scene {store.location} {scene[:12]}, then gsmap describe {store.location} scene0" in of_map

@@ -190,8 +190,7 @@ def test_no_gaussians_and_odd_camera_names(store):
 def test_damage_is_found_on_reading_and_mended_by_ingesting_again(store):
     g, c = make_gaussians(), make_cameras()
     scene, _ = store.scenes.add(g, c, name="a")
-    means = store.folder / "arrays" / "scenes" / scene.id / "means"
-    file = next(p for p in means.rglob("*") if p.is_file() and "json" not in p.name)
+    file = store.folder / "arrays" / "scenes" / scene.id / "arrays.zip"
     for harm in (
         lambda: file.unlink(),
         lambda: file.write_bytes(file.read_bytes()[:-9]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, fields
 from functools import cache
 from itertools import pairwise
@@ -147,10 +148,17 @@ def metric(dim: int) -> np.ndarray:
 
     The inverse root of their scatter, with a share of the identity (`tools/fit_descriptor.py`, which writes the file):
     directions in which true partners differ much count little (Mikolajczyk and Matas 2007; Hua, Brown and Winder 2007).
+    `metric_digest` is part of the recipe of graphs that use it: a metric that is fitted anew needs no new version.
     """
     with np.load(METRICS) as stored:
         out: np.ndarray = stored[str(dim)].astype(np.float64)
         return out
+
+
+@cache
+def metric_digest() -> str:
+    """32 hex digits (SHA-256) of the file that holds the fitted metrics."""
+    return hashlib.sha256(METRICS.read_bytes()).hexdigest()[:32]
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

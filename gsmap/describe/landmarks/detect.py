@@ -178,17 +178,15 @@ def _extrema(
     from gsmap import _native
 
     block = np.floor(points / _BLOCK_CELLS).astype(np.int64)
-    # One number a block, in the order of their rows.
-    low = block.min(0)
-    span = block.max(0) - low + 1
-    keys = np.unique(((block[:, 0] - low[0]) * span[1] + block[:, 1] - low[1]) * span[2] + block[:, 2] - low[2])
-    cores = low + np.stack(np.unravel_index(keys, tuple(span)), axis=1)
+    labels, counts = cell_labels(block)
+    cores = np.empty((len(counts), 3))
+    cores[labels] = block
     table = _native.landmark_extrema(
         points=np.ascontiguousarray(points, np.float64),
         lab=np.ascontiguousarray(lab, np.float64),
         areas=np.ascontiguousarray(areas, np.float64),
         thresholds=thresholds,
-        cores=cores.astype(np.float64) * _BLOCK_CELLS,
+        cores=cores * _BLOCK_CELLS,
         edge=_BLOCK_CELLS,
         halo=_HALO_CELLS,
         sigma=_SIGMA_CELLS,

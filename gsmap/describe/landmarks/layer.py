@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from gsmap.describe.landmarks.context import Params as ContextParams
-from gsmap.describe.landmarks.context import cylinder_context, embed, shell_context
+from gsmap.describe.landmarks.context import cylinder_context, embed, metric_digest, shell_context
 from gsmap.describe.landmarks.detect import Octaves, find_blobs, thinned
 from gsmap.describe.landmarks.detect import Params as DetectParams
 from gsmap.geometry.directions import level_frame
@@ -32,12 +33,20 @@ class Params:
     context: ContextParams = field(default_factory=ContextParams)
 
 
+def settings(params: Params) -> dict[str, Any]:
+    """The parameters as plain values, and the digest of the fitted metric where it is used."""
+    out: dict[str, Any] = plain(params)
+    if params.context.fitted:
+        out["context"]["metric"] = metric_digest()
+    return out
+
+
 def descriptor_id(params: Params, *, upright: bool = True) -> str:
     """What two comparable landmark layers share; contexts with and without a vertical do not compare.
 
     How many landmarks are kept, and how strong they must be, does not keep layers from being compared.
     """
-    decides = {"cell_m": params.detect.cell_m, "octaves": params.detect.octaves, "context": plain(params.context)}
+    decides = {"cell_m": params.detect.cell_m, "octaves": params.detect.octaves, "context": settings(params)["context"]}
     name = "landmarks" if upright else "landmarks_gravity_free"
     return RecipeKey("describe", name, {"landmarks": VERSION}, decides).recipe
 

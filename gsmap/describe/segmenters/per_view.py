@@ -13,25 +13,10 @@ from gsmap.types.views import Mask, SceneContext, View
 
 VERSION = 1
 MODELS: tuple[str, ...] = ()
+Params = builtin.Params
 
 
-@dataclass(frozen=True)
-class Params(builtin.Params):
-    """How coarse the parts are.
-
-    Args:
-        num_samples: about how many points the surface is thinned to before it is cut.
-        scale: Felzenszwalb's k: larger makes larger parts.
-        min_share: parts of less than this share of the samples join their most similar neighbour.
-        min_area: masks of a smaller share of the image are dropped.
-        lightness_weight: of a difference in L*, against one in a* or b*: light and shade part a surface less than a
-            change of hue.
-        lab_scale: the difference of colour, L*a*b* units, that counts as much as an edge of weight 1.
-        turn_weight: of an edge between normals at a right angle.
-    """
-
-
-def make(context: SceneContext, params: Params) -> PerViewSegmenter:
+def make(context: SceneContext, params: builtin.Params) -> PerViewSegmenter:
     """Cut the surface of a scene; see `gsmap.methods.segmenter`."""
     return PerViewSegmenter(builtin.make(context, params))
 

@@ -1,45 +1,80 @@
-"""Jobs in a pool of processes on this machine; in this process where there is one worker or one job."""
+"""Jobs in a pool of processes on this machine; in this process where that is as fast."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain, islice
+from operator import length_hint
 from typing import Any
 
 from gsmap.engine.pool import Pool
 from gsmap.errors import ConfigError
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
 class Params:
     """Args:
     workers: processes that compute at once; 0 takes every processor this process may use, or ``GSMAP_WORKERS``.
+    start_s: CPU seconds that it takes to start one: quick jobs are spread only where more than that is gained.
     """
 
     workers: int = 0
+    start_s: float = 0.9
 
     def __post_init__(self) -> None:
         if self.workers < 0:
             raise ConfigError(f"the number of workers must not be negative, got {self.workers}")
+        if not self.start_s >= 0:
+            raise ConfigError(f"start_s must not be negative, got {self.start_s}")
 
 
-def run_jobs(
-    job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], params: Params | None = None
-) -> Iterator[tuple[int, Any]]:
-    """See `gsmap.methods.executor`; in the order of the arguments where there is one worker or one job."""
-    workers = (params or Params()).workers or default_workers()
-    todo = iter(arguments)
-    first = list(islice(todo, 2)) if workers > 1 else []
-    if len(first) > 1:
-        with Pool(workers) as pool:
-            yield from pool.run(job, chain(first, todo))
-        return
-    for index, args in enumerate(chain(first, todo)):
-        yield index, job(*args)
+class LocalWorkers:
+    """See `gsmap.methods.executor.Workers`; in the order of the arguments where there is one worker or one job."""
+
+    def __init__(self, params: Params) -> None:
+        self._start_s = params.start_s
+        self._pool = Pool(params.workers or default_workers())
+
+    def run(
+        self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], *, quick: bool = False
+    ) -> Iterator[tuple[int, Any]]:
+        todo = enumerate(arguments)
+        hint = length_hint(arguments, _MANY)
+        began, done = time.monotonic(), 0
+        while self._pool.size == 1 or (quick and not self._is_worth_it(hint - done, began, done)):
+            taken = next(todo, None)
+            if taken is None:
+                return
+            yield taken[0], job(*taken[1])
+            done += 1
+        first = list(islice(todo, 2))
+        if len(first) == 1 and not self._pool.num_idle:
+            (index, args) = first[0]
+            yield index, job(*args)
+            return
+        yield from self._pool.run(job, chain(first, todo))
+
+    def _is_worth_it(self, left: int, began: float, done: int) -> bool:
+        """Whether workers would be done with what is left sooner than this process, the time to start them included."""
+        if self._pool.num_idle:
+            return True
+        each_s = (time.monotonic() - began) / done if done else 0.0
+        return left * each_s * (1 - 1 / self._pool.size) > self._start_s
+
+    def close(self) -> None:
+        self._pool.close()
+
+
+_MANY = 1_000_000  # jobs of which nobody told how many there are
+
+
+def start(params: Params) -> LocalWorkers:
+    return LocalWorkers(params)
 
 
 def default_workers() -> int:

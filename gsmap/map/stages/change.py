@@ -107,7 +107,7 @@ def compare(store: Store, asked: Wanted, settings: Settings, progress: StageProg
     todo = set(keys) - done(keys)
     jobs = {key: _job(store, asked, settings, keys[key]) for key in keys if key in todo}
     names = {scene.id: scene.name for scene in store.scenes.list()}
-    shared = SharedJobs(store, "changes", "comparison", jobs, done, progress)
+    shared = SharedJobs(store, "changes", "comparison", jobs, keys, done, progress, again=verify)
     results = shared.results(lambda arguments: run_jobs(compare_scenes, arguments, settings.engine))
     kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are compared and kept")
     with kept, closing(results):

@@ -42,7 +42,8 @@ def describe(
     """Make the graphs that are missing; returns the key of each scene's graph.
 
     Args:
-        verify: read the graphs that are there, and make those again that are damaged; else none of them is read.
+        verify: read the graphs that are there, and make those again that are damaged, and try again those that were set
+            aside; else none of them is read.
     """
     keys = graph_keys(store, scenes, settings)
     damaged = store.graphs.damaged(keys.values()) if verify else set()
@@ -58,7 +59,8 @@ def describe(
     def done(wanted: Collection[str]) -> set[str]:
         return store.graphs.kept(wanted) - store.graphs.damaged(damaged.intersection(wanted))
 
-    shared = SharedJobs(store, "describe", "graph", jobs, done, progress)
+    about = {keys[scene.id].digest: (scene.id,) for scene in missing}
+    shared = SharedJobs(store, "describe", "graph", jobs, about, done, progress, again=verify)
     results = shared.results(lambda arguments: run_jobs(describe_scene, arguments, settings.engine))
     there = len(scenes) - len(missing)
     kept = noting(lambda: f"{there + shared.num_kept()} of {len(scenes)} scenes are described and kept")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -12,20 +13,20 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
 from gsmap.export.tileset import is_stale, write_tilesets
-from gsmap.geometry.metres import in_metres, resized
 from gsmap.map.dates import is_until, last_of, undated_note
+from gsmap.map.jobs import TileMaker
 from gsmap.map.metres import map_metres, metre_notes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_prefer, with_steps
-from gsmap.merge.placed import pulled_inside
-from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.store import Store
-from gsmap.types import MergeResult, PoseGraph, Scene, ScenePose, Tile
+from gsmap.texts import escaped
+from gsmap.types import PoseGraph, Scene, ScenePose, Tile
 from gsmap.types.metre import Metre
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress
@@ -201,15 +202,17 @@ def _export(
     with noting(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
         result = export_tiles(
             planned.tiles,
-            partial(_make, store, planned, request),
+            partial(_maker, store, planned, request),
             out,
             map_id=store.id,
             recipe=planned.recipe,
             metres=planned.metres,
             params=settings.export,
+            run=lambda job, arguments: run_jobs(job, arguments, settings.engine),
             made=noted,
             progress=progress,
         )
+    _put_aside(store, out, planned, result)
     if planned.recipe.is_tileset and is_stale(out, result.tiles):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
         write_tilesets(out, result.tiles, request.tile_size_m, in_metres_of)
@@ -228,6 +231,33 @@ def _export(
     if refused:
         _log.warning("%s: the map does not know all of this export, so gsmap status cannot watch %s", refused, out)
     return result
+
+
+def _maker(store: Store, planned: Planned, request: Request, tile: PlannedTile) -> TileMaker:
+    return TileMaker(
+        store.location,
+        tile,
+        planned.method,
+        planned.params,
+        is_cut=request.tile_size_m > 0 or request.bbox is not None,
+        budget_s=request.budget_s,
+        captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
+    )
+
+
+def _put_aside(store: Store, out: Path, planned: Planned, result: ExportResult) -> None:
+    """Let the map know which tiles could not be made, and of no others in this folder."""
+    about = escaped(str(out.resolve()))
+    now = {f"tile {planned.recipe.key(tile)}": (tile, reason) for tile, reason in result.set_aside}
+    for tile, reason in now.values():
+        _log.warning("tile component_%d/%s is set aside: %s", tile.component, tile.name, reason)
+    if not store.catalog.writable:
+        return
+    with suppress(DiskFullError, ReadOnlyError):
+        if before := {one.what for one in store.set_aside.list() if one.about == about} - now.keys():
+            store.set_aside.forget(before)
+        for what, (tile, reason) in now.items():
+            store.set_aside.add(what, about, f"component_{tile.component}/{tile.name}: {reason}")
 
 
 def dirty_tiles(store: Store, settings: Settings) -> dict[str, tuple[int, Request]]:
@@ -291,31 +321,3 @@ def _as_of(scenes: dict[str, Scene], as_of: str) -> tuple[dict[str, Scene], tupl
     if not found:
         raise NotFoundError(f"no capture with a place in the map is dated {as_of} or earlier{note and f'; {note}'}")
     return found, (note,) if note else ()
-
-
-def _make(store: Store, planned: Planned, request: Request, tile: PlannedTile, progress: Progress) -> MergeResult:
-    """The merged content of one tile: merged in metres, in the map's unit when it is done."""
-    metres = tile.metres_per_unit
-    lazy = [
-        LazyScene(
-            scene,
-            in_metres(pose, metres),
-            partial(store.scenes.gaussians, scene),
-            store.scenes.cameras(scene),
-            planned.scenes[scene].captured_at,
-        )
-        for scene, pose in tile.poses.items()
-    ]
-    bounds = None if request.tile_size_m == 0 and request.bbox is None else tile.bounds
-    found = merge_tile(
-        lazy,
-        planned.method,
-        planned.params,
-        bounds=None if bounds is None else bounds * metres,
-        budget_s=request.budget_s,
-        progress=progress,
-    )
-    if metres == 1.0:
-        return found
-    merged = resized(found.gaussians, 1 / metres)
-    return replace(found, gaussians=replace(merged, means=pulled_inside(merged.means, bounds)))

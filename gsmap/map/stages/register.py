@@ -49,8 +49,9 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     }
     newest = store.registrations.newest()  # what is named is registered again: only what comes later counts
     after = 0 if pairs in ("auto", "all") else newest
-    shared = SharedJobs(store, "register", "edge", jobs, partial(store.registrations.kept, after=after), progress)
-    results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine))
+    done, named = partial(store.registrations.kept, after=after), pairs not in ("auto", "all")
+    shared = SharedJobs(store, "register", "edge", jobs, edges, done, progress, again=named)
+    results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
     names = {scene.id: scene.name for scene in scenes}
     kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
     with kept, closing(results):

@@ -15,6 +15,7 @@ VERSION = 3
 SCALES = True
 
 _WIDTH = 0.3  # of the radius: distances to planes of this count a quarter
+_HARDLY_FINER = 0.9  # of the last radius: another pass would tell nothing new
 _FEWEST = 10  # cells and pairs; fewer tell nothing of a pose
 
 
@@ -74,14 +75,14 @@ def refine(
     if len(source) < _FEWEST or len(target) < _FEWEST:
         return start
     centre = source.coarse[0].mean(0)
-    before, noise = np.inf, 0.0
+    last, noise = np.inf, 0.0
     tolerances = (*[params.tolerance] * (len(params.radii_m) - 1), params.last_tolerance)
     for radius, count, tolerance in zip(params.radii_m, params.max_points, tolerances, strict=True):
-        if before <= params.colour_radius_m:
-            radius = min(before, max(radius, params.least_sigmas * noise))
-            if radius > 0.9 * before:
+        if last <= params.colour_radius_m:
+            radius = min(last, max(radius, params.least_sigmas * noise))
+            if radius > _HARDLY_FINER * last:
                 continue
-        before = radius
+        last = radius
         there, back = _Laid(target, source, count // 2), _Laid(source, target, count // 2, backward=True)
         for _ in range(params.iterations):
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
@@ -89,7 +90,7 @@ def refine(
             other = back.equations(pose.inverse(), centre, radius, params)
             if min(found.count, other.count) < _FEWEST:
                 return pose
-            share = found.count / other.count
+            share = found.count / other.count  # either way counts as much, however many cells found a partner
             system, gradient = found.system + share * other.system, found.gradient + share * other.gradient
             step = np.zeros(7)
             dim = 7 if with_scale else 6

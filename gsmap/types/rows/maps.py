@@ -23,8 +23,9 @@ class TodoRow(Row):
             scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews or priors are
             newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes; ``undecided``
             edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``; ``duplicates``, pairs that
-            are one capture twice; ``isolated`` scenes.
-        count: how many; 1 for ``unsolved`` and ``stale_poses``.
+            are one capture twice; ``isolated`` scenes; ``set_aside``, work that twice ended the process it ran in and
+            is left out until it is asked for by name.
+        count: how many; 1 for ``unsolved``, ``stale_poses`` and ``set_aside``.
         verb: the command that helps.
         meaning: the same in words.
     """

@@ -1,0 +1,197 @@
+"""Which cells of a grid oriented boxes reach into: those of each box by itself, so that empty space costs nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import ConfigError
+from gsmap.types import Sim3
+
+_FARTHEST = 2**40  # cells from the origin; beyond, a grid's numbers are no longer exact in float64
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """B boxes of Gaussians, oriented as their scenes lie in the map.
+
+    Args:
+        centers, halves: (B, 3) middle and half the edges, map unit.
+        axes: (B, 3, 3) the scenes' rotations.
+        bounds: (B, 2, 3) the axis-aligned boxes around them, a touch larger, so that Gaussians on the very border lie
+            inside however their means round.
+    """
+
+    centers: np.ndarray
+    halves: np.ndarray
+    axes: np.ndarray
+    bounds: np.ndarray
+
+    @classmethod
+    def of(cls, poses: Sequence[Sim3], scene_bounds: Sequence[np.ndarray]) -> Boxes:
+        """From ``S_map_scene`` and the (2, 3) box of each scene in its own frame."""
+        count = len(poses)
+        low, high = np.asarray(scene_bounds, dtype=np.float64).reshape(count, 2, 3).transpose(1, 0, 2)
+        scales = np.array([pose.scale for pose in poses])[:, None]
+        axes = np.array([pose.rotation for pose in poses]).reshape(count, 3, 3)
+        halves = scales * (high - low) / 2
+        centers = scales * np.einsum("bij,bj->bi", axes, (low + high) / 2)
+        centers = centers + np.array([pose.translation for pose in poses]).reshape(count, 3)
+        reach = np.einsum("bij,bj->bi", np.abs(axes), halves)
+        pad = 1e-5 * (1 + np.abs(centers).max(1, initial=0) + reach.max(1, initial=0))[:, None]
+        return cls(centers, halves, axes, np.stack([centers - reach - pad, centers + reach + pad], axis=1))
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    @property
+    def around(self) -> np.ndarray:
+        """(2, 3) the box around all of them."""
+        return np.array([self.bounds[:, 0].min(0), self.bounds[:, 1].max(0)])
+
+    def touch(self, which: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """(K,) whether box ``which[k]`` meets the axis-aligned one from ``low[k]`` to ``high[k]`` (K, 3).
+
+        By the face normals of both, so that there is never a false no.
+        """
+        met = ((self.bounds[which, 0] <= high) & (self.bounds[which, 1] >= low)).all(1)
+        near = np.flatnonzero(met)
+        which, low, high = which[near], low[near], high[near]
+        turned = self.axes[which]
+        offset = np.einsum("kji,kj->ki", turned, (low + high) / 2 - self.centers[which])
+        reach = self.halves[which] + np.einsum("kji,kj->ki", np.abs(turned), (high - low) / 2)
+        met[near] = (np.abs(offset) <= reach + 1e-5).all(1)
+        return met
+
+
+@dataclass(frozen=True, eq=False)
+class CellSet:
+    """Cells, each once, in the order of x, then y, then z.
+
+    Args:
+        cells: (K, 3) int64.
+        values: the numbers that occur on each axis, sorted.
+        keys: (K,) of each cell, from the places of its numbers among those.
+    """
+
+    cells: np.ndarray
+    values: tuple[np.ndarray, ...]
+    keys: np.ndarray
+
+    @classmethod
+    def of(cls, cells: np.ndarray) -> CellSet:
+        values = tuple(np.unique(cells[:, axis]) for axis in range(3))
+        keys, first = np.unique(_key(values, cells)[0], return_index=True)
+        return cls(cells[first], values, keys)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def find(self, cells: np.ndarray) -> np.ndarray:
+        """(K,) place of each of these (K, 3) among ours; -1 where it is none."""
+        keys, known = _key(self.values, cells)
+        places = np.minimum(np.searchsorted(self.keys, keys), len(self) - 1)
+        return np.where(known & (self.keys[places] == keys), places, -1)
+
+    def coarser(self, level: int) -> CellSet:
+        """The blocks of 2^level cells that hold any."""
+        return self if level == 0 else CellSet.of(self.cells >> level)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A grid of cubes through the map's origin.
+
+    Args:
+        edge: of a cell, map unit.
+        bbox: (2, 3) only what lies within, by which cells are cut; None for all.
+        most: more cells than this are refused.
+    """
+
+    edge: float
+    bbox: np.ndarray | None
+    most: int
+
+    def bounds(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Corners (K, 3) of blocks of cells from ``low`` to below ``high`` (K, 3), cut by the box."""
+        a, b = low * self.edge, high * self.edge
+        return (a, b) if self.bbox is None else (np.maximum(a, self.bbox[0]), np.minimum(b, self.bbox[1]))
+
+    def reached(self, boxes: Boxes, reach: float = 0.0, within: CellSet | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The cells, of a set or of all, that each box touches when they are grown by ``reach``.
+
+        A box is put into the few cubes of 2^k cells around it, these are halved, and halves that it does not touch are
+        left out, down to single cells; all boxes at once.
+
+        Returns:
+            (K,) row of the box and (K, 3) int64 cell of every touch.
+
+        Raises:
+            ConfigError: more cells than may be.
+        """
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            if self.bbox is None and not (np.prod(2 * boxes.halves / self.edge, axis=1) <= self.most).all():
+                raise self.too_many(boxes)  # by volume alone
+        first, last = self._ranges(boxes, reach)
+        sizes = np.maximum(last - first, 0)
+        boxed = np.flatnonzero((sizes > 0).all(1))
+        level = np.zeros(len(boxes), dtype=np.int64)
+        level[boxed] = np.ceil(np.log2(sizes[boxed].max(1))).astype(np.int64)
+        which, low = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.int64)
+        for k in range(int(level[boxed].max(initial=0)), -1, -1):
+            width = 1 << k
+            new = boxed[level[boxed] == k]
+            begun = _corners(first[new] // width * width, width)
+            which, low = np.r_[which, np.repeat(new, 8)], np.r_[low, begun]
+            inside = ((low < last[which]) & (low + width > first[which])).all(1)
+            if within is not None:
+                inside &= within.coarser(k).find(low >> k) >= 0
+            which, low = which[inside], low[inside]
+            corners = self.bounds(low, low + width)
+            met = boxes.touch(which, corners[0] - reach, corners[1] + reach)
+            which, low = which[met], low[met]
+            if len(low) > self.most and len(CellSet.of(low)) > self.most:
+                raise self.too_many(boxes)
+            if k:
+                which, low = np.repeat(which, 8), _corners(low, width // 2)
+        return which, low
+
+    def _ranges(self, boxes: Boxes, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """(B, 3) first cell and the one after the last of the box around each box."""
+        low, high = boxes.bounds[:, 0] - reach, boxes.bounds[:, 1] + reach
+        if self.bbox is not None:
+            low, high = np.maximum(low, self.bbox[0]), np.minimum(high, self.bbox[1])
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            first, last = np.floor(low / self.edge), np.ceil(high / self.edge)
+            near = (np.abs(first) < _FARTHEST).all() and (np.abs(last) < _FARTHEST).all()
+        if not near:
+            raise self.too_many(boxes)
+        return first.astype(np.int64), last.astype(np.int64)
+
+    def too_many(self, boxes: Boxes) -> ConfigError:
+        """The error of boxes that reach into more cells than may be."""
+        low, high = boxes.around
+        spans = " x ".join(f"{side:.6g}" for side in high - low)
+        return ConfigError(
+            f"tiles of {self.edge:.6g} (map unit) would be more than {self.most} over {spans}: use larger tiles or a "
+            "box, or set export.max_tiles"
+        )
+
+
+def _key(values: tuple[np.ndarray, ...], cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A number for each cell, and whether each of its own occurs on its axis."""
+    key, known = np.zeros(len(cells), dtype=np.int64), np.ones(len(cells), dtype=bool)
+    for axis, of_axis in enumerate(values):
+        places = np.minimum(np.searchsorted(of_axis, cells[:, axis]), len(of_axis) - 1)
+        known &= of_axis[places] == cells[:, axis]
+        key = key * len(of_axis) + places
+    return key, known
+
+
+def _corners(low: np.ndarray, width: int) -> np.ndarray:
+    """(8 K, 3) the lowest cells of the eight blocks of a width from each (K, 3) on."""
+    steps = np.indices((2, 2, 2)).reshape(3, 8).T * width
+    found: np.ndarray = (low[:, None] + steps).reshape(-1, 3)
+    return found

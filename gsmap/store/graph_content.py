@@ -1,0 +1,134 @@
+"""A scene graph as arrays and as what the catalog says of them.
+
+Arrays of one name and width of all layers lie one after another in one array: a graph then has a dozen arrays, not
+seven for each layer. Landmarks of one capture share positions between layers, which pack to nothing so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import CorruptError
+from gsmap.store.layout import Shape
+from gsmap.store.matrices import from_array, to_array
+from gsmap.store.narrow import narrow, shape_of, widen
+from gsmap.types import NodeLayer, SceneGraph, Things
+from gsmap.types.plain import plain
+
+_THINGS = ("members", "positions", "extents", "colours", "samples", "sample_colours", "sample_counts")
+_NODES = tuple(field.name for field in fields(NodeLayer) if field.type == "np.ndarray")
+
+
+def to_arrays(graph: SceneGraph) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """What is written of a graph, by the names of its arrays, and what its row says beside that."""
+    parts: dict[str, list[np.ndarray]] = {}
+    layers: dict[str, dict[str, Any]] = {}
+    around = all(_is_around(nodes) for nodes in graph.layers.values())
+    for name, nodes in graph.layers.items():
+        own = {field.name: getattr(nodes, field.name) for field in fields(nodes)}
+        layer = layers[name] = {
+            "count": len(nodes),
+            "widths": [nodes.embeddings.shape[1], nodes.features.shape[1]],
+            "features_embed": nodes.embeddings.tobytes() == nodes.features.tobytes(),
+            "rest": {part: plain(value) for part, value in own.items() if part not in _NODES},
+        }
+        if around:
+            own["extents"] = _around(nodes)
+        for part, key in _keys(layer).items():
+            parts.setdefault(key, []).append(own[part])
+    whole = {key: np.concatenate(found) for key, found in parts.items()}
+    about: dict[str, Any] = {
+        "up": from_array(graph.up),
+        "unit_m": float(graph.unit_m),
+        "working_m": float(graph.working_m),
+        "notes": list(graph.notes),
+        "layers": layers,
+        "extents_around_positions": around,
+    }
+    if graph.things is not None:
+        whole |= {f"things.{name}": getattr(graph.things, name) for name in _THINGS}
+        about["things"] = {"count": len(graph.things), "unit_m": float(graph.things.unit_m)}
+    kept = {key: narrow(array) for key, array in whole.items()}
+    about["arrays"] = {key: how for key, (_, how) in kept.items()}
+    return {key: array for key, (array, _) in kept.items()}, about
+
+
+def shapes_of(about: Mapping[str, Any]) -> dict[str, Shape] | None:
+    """What a graph's row says of its arrays; None in rows of gsmap before 0.3, which does not say.
+
+    Raises:
+        CorruptError: what no graph says.
+    """
+    if "arrays" not in about:
+        return None
+    return {key: shape_of(how) for key, how in about["arrays"].items()}
+
+
+def from_arrays(scene_id: str, about: Mapping[str, Any], stored: Mapping[str, np.ndarray]) -> SceneGraph:
+    """The graph again.
+
+    Raises:
+        CorruptError: arrays and row do not fit together.
+    """
+    up, unit_m, known = to_array(about["up"]), about["unit_m"], about.get("arrays")
+    # Graphs of older releases: the metre wherever it was plausible.
+    working_m = about.get("working_m", 1.0 if "landmarks" in about["layers"] else unit_m)
+    try:
+        whole = stored if known is None else {key: widen(array, known[key]) for key, array in stored.items()}
+        layers = _older_layers(about, whole) if known is None else _layers(about, whole)
+        things = None
+        if (told := about.get("things")) is not None:
+            own: dict[str, Any] = {name: whole[f"things.{name}"] for name in _THINGS}
+            things = Things(**own, unit_m=told["unit_m"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise CorruptError(f"the graph of scene {scene_id[:12]} does not fit its row ({error!r})") from error
+    return SceneGraph(scene_id, layers, up, unit_m, tuple(about["notes"]), things, working_m)
+
+
+def _layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[str, NodeLayer]:
+    taken = dict.fromkeys(whole, 0)
+    out = {}
+    for name, layer in about["layers"].items():
+        own: dict[str, Any] = {}
+        for part, key in _keys(layer).items():
+            own[part] = whole[key][taken[key] : taken[key] + layer["count"]]
+            taken[key] += layer["count"]
+        own.setdefault("embeddings", own["features"])
+        if about["extents_around_positions"]:
+            own["extents"] = own["extents"] + own["positions"][:, None]
+        out[name] = NodeLayer(**own, **layer["rest"])
+    return out
+
+
+def _older_layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[str, NodeLayer]:
+    """Of graphs of gsmap before 0.3: arrays of their own for every layer, called by its number."""
+    out = {}
+    for i, (name, layer) in enumerate(about["layers"].items()):
+        own: dict[str, Any] = {key.split(".", 1)[1]: array for key, array in whole.items() if key.startswith(f"{i}.")}
+        out[name] = NodeLayer(**own, **layer["rest"])
+    return out
+
+
+def _keys(layer: Mapping[str, Any]) -> dict[str, str]:
+    """The array that each part of a layer lies in; an object's embedding is its feature, and is not kept twice."""
+    embeddings, features = layer["widths"]
+    own = {part: f"nodes.{part}" for part in _NODES}
+    own |= {"embeddings": f"nodes.embeddings.{embeddings}", "features": f"nodes.features.{features}"}
+    if layer["features_embed"]:
+        del own["embeddings"]
+    return own
+
+
+def _around(nodes: NodeLayer) -> np.ndarray:
+    """Extents relative to positions: a landmark's is the same to all sides."""
+    out: np.ndarray = nodes.extents - nodes.positions[:, None]
+    return out
+
+
+def _is_around(nodes: NodeLayer) -> bool:
+    """Whether extents relative to positions lose nothing, as where both are rounded (`gsmap.describe.precision`)."""
+    return bool((_around(nodes) + nodes.positions[:, None]).tobytes() == nodes.extents.tobytes())

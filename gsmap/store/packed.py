@@ -1,0 +1,140 @@
+"""A group of arrays in one file: a zip archive whose members are the keys of a zarr v3 group, none of them compressed.
+
+`zarr.storage.ZipStore` opens it, and so does any unzip. gsmap writes it in one go and in an order that suits reads of a
+part: the chunks of all long arrays row block after row block, so that what a box of a scene needs lies together; then
+arrays of a single chunk; then the metadata; then the archive's table of contents. Its tail tells where everything is.
+
+The table is checked where it is read, since a map may come from a stranger: members lie one after the other, stored as
+they are, within the file.
+"""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FILE = "arrays.zip"
+TAIL_BYTES = 64 << 10
+"""What is read of the end at first: it holds the table and the metadata of a scene of some two million Gaussians."""
+
+_ZSTD_LEVEL = 1
+_NEVER = (1980, 1, 1, 0, 0, 0)  # the same arrays are the same bytes, whenever they are written
+_END, _END_64, _LOCATOR = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), struct.Struct("<4sLQL")
+_ENTRY, _LOCAL = struct.Struct("<4s6H3L5H2L"), struct.Struct("<4s5H3L2H")
+_MAX_TABLE_BYTES = 64 << 20  # of half a million chunks: 1.6 billion Gaussians
+_UTF8 = 0x800
+
+Read = Callable[[int, int], bytes]
+
+
+@dataclass(frozen=True)
+class Member:
+    """A member of an archive: its bytes are ``[start, start + size)`` of the file, with this CRC-32."""
+
+    start: int
+    size: int
+    crc32: int
+
+
+def write(path: Path, arrays: Mapping[str, np.ndarray], *, chunk_rows: int) -> None:
+    """Write arrays in chunks of ``chunk_rows`` rows; memory beyond theirs is that of a row block."""
+    import zarr
+    from zarr.codecs import ZstdCodec
+    from zarr.storage import MemoryStore
+
+    keys: dict[str, Any] = {}
+    group = zarr.create_group(MemoryStore(keys), zarr_format=3)
+    made = {
+        name: group.create_array(
+            name,
+            shape=array.shape,
+            dtype=array.dtype,
+            chunks=(min(chunk_rows, max(1, len(array))), *(max(1, n) for n in array.shape[1:])),
+            compressors=[ZstdCodec(level=_ZSTD_LEVEL, checksum=True)],
+            fill_value=0,
+            config={"write_empty_chunks": True},  # a chunk that is not there must be an error, not zeros
+        )
+        for name, array in arrays.items()
+    }
+    described = dict(keys)
+    keys.clear()
+    with zipfile.ZipFile(path, "x", zipfile.ZIP_STORED) as archive:
+
+        def drain(found: dict[str, Any]) -> None:
+            for key, value in found.items():
+                archive.writestr(zipfile.ZipInfo(key, _NEVER), value.to_bytes())
+            found.clear()
+
+        for long in (True, False):
+            chosen = [name for name, array in arrays.items() if array.size and (len(array) > chunk_rows) == long]
+            for start in range(0, max((len(arrays[name]) for name in chosen), default=0), chunk_rows):
+                for name in chosen:
+                    if start < len(arrays[name]):
+                        made[name][start : start + chunk_rows] = arrays[name][start : start + chunk_rows]
+                drain(keys)
+        drain(described)
+
+
+def members(size: int, read: Read) -> dict[str, Member]:
+    """The members of an archive by name.
+
+    Args:
+        size: of the file.
+        read: ``read(start, stop)`` gives that range of it.
+
+    Raises:
+        ValueError: gsmap did not write it so.
+    """
+    end = size - _END.size
+    if end < 0:
+        raise ValueError("it is too short for an archive")
+    mark, _, _, _, count, table_bytes, table, comment = _END.unpack(read(end, size))
+    if mark != b"PK\5\6" or comment:
+        raise ValueError("it does not end as an archive does")
+    if 0xFFFF in (count,) or 0xFFFFFFFF in (table_bytes, table):
+        end -= _LOCATOR.size
+        mark, _, where, _ = _LOCATOR.unpack(read(end, end + _LOCATOR.size)) if end >= 0 else (b"", 0, 0, 0)
+        end -= _END_64.size
+        if mark != b"PK\6\7" or where != end or end < 0:
+            raise ValueError("it does not end as a long archive does")
+        mark, *_, count, table_bytes, table = _END_64.unpack(read(end, end + _END_64.size))
+        if mark != b"PK\6\6":
+            raise ValueError("it does not end as a long archive does")
+    if table + table_bytes != end or table_bytes > _MAX_TABLE_BYTES:
+        raise ValueError("its table of contents does not lie at its end")
+    return _entries(read(table, end), count, table)
+
+
+def _entries(table: bytes, count: int, end: int) -> dict[str, Member]:
+    """The members that a table of contents lists; they end where it begins."""
+    out: dict[str, Member] = {}
+    at = lies = 0
+    for _ in range(count):
+        if at + _ENTRY.size > len(table):
+            raise ValueError("its table of contents is cut off")
+        entry = _ENTRY.unpack_from(table, at)
+        mark, _, _, flags, method, _, _, crc, packed, size, named, more, comment, disk, _, _, start = entry
+        at += _ENTRY.size
+        name = table[at : at + named].decode()
+        extra = table[at + named : at + named + more]
+        at += named + more + comment
+        if size == 0xFFFFFFFF:
+            raise ValueError("it has a member of over 4 GB")
+        if start == 0xFFFFFFFF and len(extra) == 12 and extra[:4] == b"\1\0\x08\0":
+            start, extra = int.from_bytes(extra[4:], "little"), b""
+        if mark != b"PK\1\2" or flags & ~_UTF8 or method or packed != size or comment or disk or extra or name in out:
+            raise ValueError("its table of contents has entries that gsmap does not make")
+        if start != lies:
+            raise ValueError("its members do not lie one after the other")
+        body = start + _LOCAL.size + named
+        out[name] = Member(body, size, crc)
+        lies = body + size
+    if at != len(table) or lies != end:
+        raise ValueError("its table of contents does not tell all that is in it")
+    return out
