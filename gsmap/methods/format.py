@@ -18,7 +18,8 @@ class Format(Protocol):
         ".xyz" = "my_package.xyz"
 
     A format has `VERSION` and ``read``, ``write`` or both (`ReadableFormat`, `WritableFormat`); one that is read may
-    also say more of a file (`DescribedFormat`), and read it in chunks (`StreamedFormat`). It has no ``Params``: options are keyword arguments of ``write``.
+    also say more of a file (`DescribedFormat`), and read it in chunks (`StreamedFormat`). It has no ``Params``: options
+    are keyword arguments of ``write``.
 
     Frames: right-down-front, the axes of a trained ``.ply``, in the file's own unit; a format of other axes turns its
     Gaussians, spherical harmonics included (`gsmap.formats.axes`).

@@ -14,7 +14,6 @@ import contextlib
 import errno
 import fcntl
 import hashlib
-import math
 import os
 import shutil
 import stat
@@ -77,7 +76,7 @@ class Arrays:
         self._held = threading.local()
 
     @contextlib.contextmanager
-    def stage(self, arrays: Mapping[str, np.ndarray | Column]) -> Iterator[Staged]:
+    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column]) -> Iterator[Staged]:
         """Write arrays beside their place and synchronise them; dropped at the end unless `publish` took them."""
         with self._lock_staging(fcntl.LOCK_SH):
             folder = self.staging / uuid.uuid4().hex
@@ -314,30 +313,6 @@ class Parts:
     shape: tuple[int, ...]
     dtype: np.dtype
     parts: Callable[[], Iterator[np.ndarray]]
-
-
-@dataclass(frozen=True)
-class Column:
-    """An array that is written block after block, and is never in memory as a whole.
-
-    Args:
-        shape, dtype: of the whole.
-        block: gives the block that begins at a row; blocks are as long as a chunk, and asked for in order.
-    """
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    block: Callable[[int], np.ndarray]
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
-
-    def __getitem__(self, rows: slice) -> np.ndarray:
-        return self.block(rows.start)
 
 
 def digest(*arrays: np.ndarray | Parts, text: str = "") -> str:

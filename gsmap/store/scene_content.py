@@ -10,9 +10,10 @@ from sqlalchemy import Row
 
 from gsmap.errors import InputError
 from gsmap.store import compact
-from gsmap.store.arrays import Column, Parts, digest
+from gsmap.store.arrays import Parts, digest
 from gsmap.store.boxes import chunk_boxes
 from gsmap.store.layout import Shape
+from gsmap.store.packed import Column
 from gsmap.stream import blocks
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
 from gsmap.types.gaussians import FIELDS
