@@ -1,6 +1,7 @@
 """The ``gsmap`` program: collects the verbs and turns errors into one line and an exit code.
 
-Exit codes: 0 ok, 1 failed, 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP (`gsmap.cli.stopping`).
+Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 done but for jobs that were set aside; 130 after Ctrl-C, 143 after SIGTERM,
+129 after SIGHUP (`gsmap.cli.stopping`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import start_logging
+from gsmap.cli.console import left, start_logging
 from gsmap.errors import ConfigError, GsmapError
 from gsmap.texts import escaped
 from gsmap.version import __version__
@@ -106,8 +107,14 @@ def run(arguments: list[str] | None = None) -> None:
     Args:
         arguments: in place of those of the process.
     """
+    left()
     try:
         build()(arguments)
+    except SystemExit as ended:
+        if ended.code or not (count := left()):
+            raise
+        code = 3
+        message = f"{count} {'job is' if count == 1 else 'jobs are'} set aside: gsmap status MAP says which, and why"
     except ConfigError as error:
         code, message = 2, str(error)
     except GsmapError as error:

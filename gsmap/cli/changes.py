@@ -6,7 +6,19 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, AsOf, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import (
+    AsJson,
+    AsOf,
+    Executor,
+    MapPath,
+    Preset,
+    Scheduler,
+    Sets,
+    opened,
+    print_rows,
+    print_table,
+    say,
+)
 
 
 def command(
@@ -31,13 +43,15 @@ def command(
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
+    executor: Executor = None,
+    scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
     """Show what changed from each capture to the next; what has not been compared yet is.
 
     Example: `gsmap changes site.gsmap --since 2024-05-31`
     """
-    with opened(map, bars=True, sets=sets, preset=preset) as m:
+    with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         report = m.changes(
             pair, since=since, between=between, as_of=as_of, min_confidence=min_confidence, pictures=pictures
         )

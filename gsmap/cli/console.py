@@ -42,6 +42,14 @@ AsOf = Annotated[
 Preset = Annotated[
     str | None, typer.Option("--preset", help="Start from this preset, for this run: `default` or `paper`.")
 ]
+Executor = Annotated[
+    str | None,
+    typer.Option("--executor", help="Where jobs run: local (this machine) or dask (a cluster); GSMAP_EXECUTOR else."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="URL", help="Of a Dask cluster, tcp://HOST:8786; GSMAP_SCHEDULER else."),
+]
 
 _DIGESTS = {"id", "scene", "target", "source", "sha256", "key", "descriptor_id"}
 _DIGEST = re.compile(r"[0-9a-f]{32,64}")
@@ -187,7 +195,14 @@ def short(value: Any) -> str:
 
 @contextmanager
 def opened(
-    path: str, *, create: bool = False, bars: bool = False, sets: Sequence[str] | None = None, preset: str | None = None
+    path: str,
+    *,
+    create: bool = False,
+    bars: bool = False,
+    sets: Sequence[str] | None = None,
+    preset: str | None = None,
+    executor: str | None = None,
+    scheduler: str | None = None,
 ) -> Iterator[Map]:
     """A map, open until the verb is done.
 
@@ -195,16 +210,32 @@ def opened(
         create: make it where it is missing.
         bars: show how far long work is.
         sets, preset: settings for this run, as ``--set`` and ``--preset`` give them.
+        executor, scheduler: where jobs run.
     """
     import gsmap.map
     from gsmap.settings import parse
 
     values = dict(parse(one) for one in sets or ())
+    if scheduler is not None:
+        values |= {"engine.executors.dask.scheduler": scheduler, "engine.executor": "dask"}
+    if executor is not None:
+        values["engine.executor"] = executor
     open_map = gsmap.map.open_or_create if create else gsmap.map.open
     with progress_bars() if bars else _no_bars() as progress, open_map(path, progress=progress) as m:
         if values or preset is not None:
             m.with_settings(values, preset)
         yield m
+        _left.extend(m.store.set_aside.met)
+
+
+_left: list[str] = []  # what they would have made
+
+
+def left() -> int:
+    """Jobs that verbs of this process have set aside or left out; forgets them."""
+    count = len(_left)
+    _left.clear()
+    return count
 
 
 @contextmanager

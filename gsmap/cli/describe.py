@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows
+from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows
 
 
 def command(
@@ -16,12 +16,14 @@ def command(
     ] = None,
     sets: Sets = None,
     preset: Preset = None,
+    executor: Executor = None,
+    scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
     """Make the scene graph of every scene that lacks one, and of scenes that are named also where it is damaged.
 
     Example: `gsmap describe site.gsmap`
     """
-    with opened(map, bars=True, sets=sets, preset=preset) as m:
+    with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         rows = m.describe(*(scenes or ()))
     print_rows("describe", rows, json, "graphs")

@@ -6,7 +6,19 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, AsOf, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import (
+    AsJson,
+    AsOf,
+    Executor,
+    MapPath,
+    Preset,
+    Scheduler,
+    Sets,
+    opened,
+    print_rows,
+    print_table,
+    say,
+)
 
 
 def command(
@@ -46,13 +58,15 @@ def command(
     ] = False,
     sets: Sets = None,
     preset: Preset = None,
+    executor: Executor = None,
+    scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
     """Write merged tiles; only what changed since the last export to OUT is computed.
 
     Example: `gsmap export site.gsmap tiles --format spz --as-of 2024-05-31`
     """
-    with opened(map, bars=True, sets=sets, preset=preset) as m:
+    with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         report = m.export(
             out,
             format=format,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows
+from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows
 
 
 def command(
@@ -23,6 +23,8 @@ def command(
     ] = "auto",
     sets: Sets = None,
     preset: Preset = None,
+    executor: Executor = None,
+    scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
     """Register candidate pairs of scenes that lack an edge.
@@ -30,6 +32,6 @@ def command(
     Example: `gsmap register site.gsmap --pairs monday:tuesday`
     """
     named = pairs in ("auto", "all") or (":" in pairs and not Path(pairs).is_file())
-    with opened(map, bars=True, sets=sets, preset=preset) as m:
+    with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         rows = m.register(pairs if named else Path(pairs))
     print_rows("register", rows, json, "edges")

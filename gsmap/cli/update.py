@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.cli.console import AsJson, Executor, MapPath, Preset, Scheduler, Sets, opened, print_rows, print_table, say
 from gsmap.cli.ingest import CapturedAt
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ def command(
     captured_at: CapturedAt = None,
     sets: Sets = None,
     preset: Preset = None,
+    executor: Executor = None,
+    scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
     """Make MAP if it is missing, ingest the files, then describe, register and optimize whatever is missing.
@@ -31,7 +33,7 @@ def command(
     from gsmap.ingest import given_date
 
     given_date(captured_at)  # refuses what is none before a map is made
-    with opened(map, create=True, bars=True, sets=sets, preset=preset) as m:
+    with opened(map, create=True, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         report = m.update(*(paths or ()), captured_at=captured_at)
     for row in report.ingested:
         for note in row.notes:

@@ -2,7 +2,7 @@
 
 Everything is rounded to multiples of powers of two, which small integers hold without loss (`gsmap.store.narrow`).
 Landmarks are placed to centimetres, and one place's embeddings differ by tenths between captures: a millimetre and a
-128th are far below that.
+256th are far below that.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ class Params:
 
     Args:
         length_m: positions and extents, in working metres; the nearest power of two of the scene's unit is taken.
-        embedding: components of the unit vectors that tell landmarks apart; a power of two.
+        embedding: components of the unit vectors that tell landmarks apart; a power of two. They are cut off at 128
+            such steps, so that a byte holds each: of a real landmark's, seven in a million are larger than half.
         lab: colours of things, L*a*b* units; a power of two.
         digits: significant binary digits of the numbers of any size: weights, and features of nodes.
     """
 
     length_m: float = 0.001
-    embedding: float = 1 / 128
+    embedding: float = 1 / 256
     lab: float = 0.5
     digits: int = 11
 
@@ -43,8 +44,7 @@ def _layer(layer: NodeLayer, step: float, params: Params) -> NodeLayer:
     features = _significant(layer.features, params.digits)
     # An object's embedding is its feature; an image encoder's features all lie in one narrow cone.
     same = np.array_equal(layer.embeddings, layer.features)
-    # A byte has 256 steps, one too few for both -1 and 1.
-    embeddings = features if same else np.minimum(_to(layer.embeddings, params.embedding), 1 - params.embedding)
+    embeddings = features if same else _to(_within(layer.embeddings, params.embedding), params.embedding)
     positions = _to(layer.positions, step)
     around = layer.extents - layer.positions[:, None]  # of a landmark the same to all sides, and so it stays
     return replace(
@@ -71,6 +71,12 @@ def _things(things: Things, step: float, params: Params) -> Things:
 def _to(values: np.ndarray, step: float) -> np.ndarray:
     """Multiples of a power of two; those are exact."""
     out: np.ndarray = np.round(values / step) * step + 0.0  # no -0
+    return out
+
+
+def _within(values: np.ndarray, step: float) -> np.ndarray:
+    """Cut off at what a signed byte holds in such steps."""
+    out: np.ndarray = np.clip(values, -128 * step, 127 * step)
     return out
 
 

@@ -6,8 +6,8 @@ Pure but for the output folder: what a tile holds comes from a callable, so noth
     recipe = TileRecipe(gsmap.merge.recipe_key(method, params), format="spz", dates=dates)
     result = export_tiles(plan, make, out, map_id=map_id, recipe=recipe)
 
-where ``make(planned)(progress)`` returns `gsmap.merge.tile.merge_tile` of the scenes in ``planned.poses`` within
-``planned.bounds``. Tiles are jobs: ``run=`` says where they are made.
+where ``make(planned, folder)(progress)`` returns `gsmap.merge.tile.merge_tile` of the scenes in ``planned.poses``
+within ``planned.bounds``. Tiles are jobs: ``run=`` says where they are made.
 """
 
 from gsmap.export.plan import Params, PlannedTile, plan_tiles

@@ -20,10 +20,12 @@ class Params:
     Args:
         moved_m: a tile is made again when a scene moved farther than this within it.
         max_tiles: an export of more tiles than this is refused; tiles that no scene reaches into do not count.
+        shared_bytes: what renders of the captures, which tiles share while they are made, may take in the folder.
     """
 
     moved_m: float = 0.005
     max_tiles: int = 1_000_000
+    shared_bytes: int = 4 << 30
 
     def __post_init__(self) -> None:
         if not self.moved_m >= 0:

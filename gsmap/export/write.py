@@ -37,6 +37,7 @@ from gsmap.types.progress import Progress, silent
 
 _STAGING = ".partial"
 _MARK = "this-export"
+_SHARED = "shared"
 Content = Callable[[Progress], MergeResult]
 Run = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 _At = tuple[int, str]  # component and name of a tile
@@ -93,7 +94,7 @@ def run_here(job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> I
 
 def export_tiles(
     plan: Sequence[PlannedTile],
-    make: Callable[[PlannedTile], Content],
+    make: Callable[[PlannedTile, str], Content],
     out: str | os.PathLike[str],
     *,
     map_id: str,
@@ -112,7 +113,8 @@ def export_tiles(
 
     Args:
         plan: from `plan_tiles`.
-        make: of a tile what makes its content, given where to report progress: can be pickled if ``run`` needs that.
+        make: of a tile, and a path below which nothing lies yet and files may be kept until all tiles are made, what
+            makes its content, given where to report progress; can be pickled if ``run`` needs that.
         out: folder; made if missing; one folder per component inside.
         map_id: a folder keeps to one map.
         recipe: how tiles are made and written; where it differs from a tile's, that tile is made again.
@@ -196,14 +198,16 @@ def _must_make(
 
 def _made(
     todo: Sequence[PlannedTile],
-    make: Callable[[PlannedTile], Content],
+    make: Callable[[PlannedTile, str], Content],
     run: Run,
     recipe: TileRecipe,
     staging: Path,
     report: _Report,
 ) -> Generator[tuple[PlannedTile, StagedTile | SetAside], None, None]:
     """Each tile with its staged file, or why there is none; to be closed, which gives up those that are being made."""
-    arguments = ((make(planned), recipe, str(staging.absolute()), _staged_name(planned, recipe)) for planned in todo)
+    folder = str(staging.absolute())
+    shared = os.path.join(folder, _SHARED)
+    arguments = ((make(planned, shared), recipe, folder, _staged_name(planned, recipe)) for planned in todo)
     results = run(make_file, arguments)
     token = _within.set(report.within_tile)
     try:

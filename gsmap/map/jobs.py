@@ -15,6 +15,7 @@ from gsmap.export import PlannedTile
 from gsmap.geometry.metres import in_metres, resized
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge.placed import pulled_inside
+from gsmap.merge.sights import SightStore
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.register import SceneView
 from gsmap.store import Store, branches, sqlite
@@ -95,6 +96,7 @@ class TileMaker:
         is_cut: only what lies within the tile's bounds belongs to it; else everything does.
         budget_s: ceiling on the wall seconds that it may take.
         captured_at: the date of each of its scenes.
+        store: where what views show is kept for other tiles.
     """
 
     location: str
@@ -104,6 +106,7 @@ class TileMaker:
     is_cut: bool
     budget_s: float | None
     captured_at: Mapping[str, str | None]
+    store: SightStore
 
     def __call__(self, progress: Progress) -> MergeResult:
         """Merged in metres, in the map's unit when it is done."""
@@ -115,6 +118,7 @@ class TileMaker:
                 partial(scenes.gaussians, scene),
                 scenes.cameras(scene),
                 self.captured_at[scene],
+                self.store,
             )
             for scene, pose in self.tile.poses.items()
         ]

@@ -66,6 +66,10 @@ class Settled:
         out: np.ndarray = shows[np.ix_(rows, columns)]
         return out
 
+    def is_disputed(self, scene: int) -> bool:
+        """Whether any picture of a scene may show what is not so, or not show what is."""
+        return len(self.losers[scene]) + len(self.rivals[scene]) > 0
+
     def notes(self) -> list[str]:
         """Remarks on what was dropped."""
         return [
@@ -222,7 +226,8 @@ def _left(scene: PlacedScene, stays: np.ndarray, gains: np.ndarray) -> PlacedSce
     if stays.all() and (gains == 1).all():
         return scene
     gaussians = scene.gaussians[stays]
-    return replace(scene, gaussians=gaussians if (gains == 1).all() else apply_gain(gaussians, gains))
+    # Its views as they were rendered before show what is gone.
+    return replace(scene, sights=None, gaussians=gaussians if (gains == 1).all() else apply_gain(gaussians, gains))
 
 
 def _in_one_exposure(looks: Looks, gains: np.ndarray) -> Looks:

@@ -11,6 +11,7 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.projection import in_image, project
 from gsmap.merge.changes import Settled, newest_first
 from gsmap.merge.placed import inside, share_in_view
+from gsmap.merge.sights import surface_axes
 from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians, PlacedScene
 from gsmap.types.progress import Progress
@@ -29,14 +30,18 @@ class Params:
         margin_px: pictures are cropped to what counts and this much around it, for the windows of SSIM.
         max_views: of more views than that, those are reproduced that together see the tile best, newer ones first; so
             that neither memory (3 MB a view of 960 pixels) nor time grows with the captures of a place.
+        sight_m: a view shows what lies at least so near its camera.
     """
 
     min_share: float = 0.02
     enough_share: float = 0.25
     margin_px: int = 6
     max_views: int = 360
+    sight_m: float = 20.0
 
     def __post_init__(self) -> None:
+        if not self.sight_m > 0:
+            raise ConfigError(f"sight_m must be positive, got {self.sight_m}")
         if self.max_views < 1:
             raise ConfigError(f"max_views must be positive, got {self.max_views}")
 
@@ -88,7 +93,7 @@ def render_references(
     near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
     pieces = [scene.gaussians if n.all() else scene.gaussians[n] for scene, n in zip(scenes, near, strict=True)]
     todo = [
-        (i, scene.cameras[int(c)].resized(longest_side_px))
+        (i, int(c), scene.cameras[int(c)].resized(longest_side_px))
         for i, (scene, piece) in enumerate(zip(scenes, pieces, strict=True))
         if scene.cameras is not None
         for c in np.flatnonzero(share_in_view(scene.cameras, piece.means) > 0)
@@ -97,16 +102,37 @@ def render_references(
     cameras, images, weights, kept, shares = [], [], [], [], []
     pixels, sure = ([np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes] for _ in range(2))
     largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
-    for done, (i, camera) in enumerate(todo):
+    sights = [
+        scene.sights(longest_side_px, params.sight_m)
+        if scene.sights is not None and (settled is None or not settled.is_disputed(i))
+        else None
+        for i, scene in enumerate(scenes)
+    ]
+    todo.sort(key=lambda one: (one[0], () if (shared := sights[one[0]]) is None else shared.cell(one[1]), one[1]))
+    for done, (i, c, camera) in enumerate(todo):
         progress(done / len(todo), "rendering the captures")
-        seen = render(scenes[i].gaussians, camera, max_weight=True)
-        disputed = None if settled is None else settled.overruled_pixels(i, camera)
-        _count(seen, disputed, pixels[i], sure[i], largest[i])
-        whole = pieces[i] is scenes[i].gaussians
-        local = seen if whole else render(pieces[i], camera, depth=False, dominant_id=False)
-        weight = local.alpha[0] * inside_pixels(camera, seen.depth[0], bounds, halo_m / 2)
+        disputed = None
+        if (shared := sights[i]) is not None:
+            sight = shared.of(c)
+            shared.count(sight, pixels[i], largest[i])
+            if not shared.touches(sight, bounds, halo_m / 2):
+                continue
+            depth = shared.depth(sight)
+        else:
+            seen = render(scenes[i].gaussians, camera, max_weight=True)
+            disputed = settled.overruled_pixels(i, camera) if settled is not None and settled.is_disputed(i) else None
+            _count(seen, disputed, pixels[i], sure[i], largest[i])
+            depth = seen.depth[0]
+        counts = inside_pixels(camera, depth, bounds, halo_m / 2)
         if disputed is not None:
-            weight = weight * ~disputed
+            counts &= ~disputed
+        if counts.mean() < params.min_share:  # a weight is at most 1
+            continue
+        if shared is None and pieces[i] is scenes[i].gaussians:
+            local = seen
+        else:
+            local = render(pieces[i], camera, depth=False, dominant_id=False)
+        weight = local.alpha[0] * counts
         share = float(weight.mean())
         if share < params.min_share:
             continue
@@ -123,8 +149,8 @@ def render_references(
         scene=np.array(kept, dtype=np.int64),
         view_weights=np.minimum(1.0, np.array(shares) / params.enough_share),
         visible_pixels=[
-            _visible_pixels(np.where(s > 0, p, 0), w, whole=bounds is None)
-            for p, s, w in zip(pixels, sure, largest, strict=True)
+            _visible_pixels(np.where(s > 0, p, 0) if shared is None else p, w, whole=bounds is None)
+            for p, s, w, shared in zip(pixels, sure, largest, sights, strict=True)
         ],
     )
 
@@ -133,8 +159,8 @@ _SAMPLE = 600  # points by which views are chosen, where there are too many
 
 
 def _best_views(
-    todo: list[tuple[int, Cameras]], scenes: Sequence[PlacedScene], pieces: Sequence[Gaussians], count: int
-) -> list[tuple[int, Cameras]]:
+    todo: list[tuple[int, int, Cameras]], scenes: Sequence[PlacedScene], pieces: Sequence[Gaussians], count: int
+) -> list[tuple[int, int, Cameras]]:
     """At most ``count`` of the views: one after another which adds most to what the others see, in their order.
 
     A view adds to each point in its picture what it has in pixels a metre there, less for every view that has the point
@@ -146,7 +172,7 @@ def _best_views(
     points = together[:: max(1, len(together) // _SAMPLE)].astype(np.float64)
     age = {i: rank for rank, i in enumerate(newest_first(scenes))}
     sharpness = np.zeros((len(todo), len(points)), dtype=np.float32)
-    for row, (i, camera) in enumerate(todo):
+    for row, (i, _, camera) in enumerate(todo):
         pixels, depth = project(points, camera.T_camera_frame[0], camera.intrinsics_px[0])
         seen = in_image(pixels, depth, camera.sizes_px[0], near=0.1)
         # What is nearer than a metre is not seen that much better.
@@ -217,19 +243,10 @@ def inside_pixels(camera: Cameras, depth: np.ndarray, bounds: np.ndarray | None,
     """(H, W) bool, whether the surface seen in each pixel of a depth map lies in the bounds grown by a band."""
     if bounds is None:
         return np.ones(depth.shape, dtype=bool)
-    return inside(surface_points(camera, depth).reshape(-1, 3), bounds, band_m).reshape(depth.shape) & (depth > 0)
-
-
-def surface_points(camera: Cameras, depth: np.ndarray) -> np.ndarray:
-    """(H, W, 3) points of a depth map of one camera, in the camera's frame's parent."""
-    height, width = depth.shape
-    fx, fy, cx, cy = camera.intrinsics_px[0]
-    x = (np.arange(width) + 0.5 - cx) / fx
-    y = (np.arange(height) + 0.5 - cy) / fy
-    rays = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones(depth.shape)], axis=-1)
-    T = camera.T_frame_camera[0]
-    points: np.ndarray = (rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3]
-    return points
+    found: np.ndarray = depth > 0
+    for low, high, along in zip(bounds[0] - band_m, bounds[1] + band_m, surface_axes(camera, depth), strict=True):
+        found &= (along >= low) & (along < high)
+    return found
 
 
 def _joined(cameras: list[Cameras]) -> Cameras:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from gsmap.geometry.boxes import moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import checked_params, merge, merger
 from gsmap.merge.placed import inside, overlapping
+from gsmap.merge.sights import PlacedSights, Sights, SightStore, keys_of
 from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
 from gsmap.types.progress import Progress
 
@@ -27,6 +29,7 @@ class LazyScene:
         load: the Gaussians whose means lie in a box (2, 3) of the scene's frame, or more of them; all for None.
         cameras: its cameras, scene frame.
         captured_at: ISO 8601 time with zone, or None.
+        store: where what its views show is kept for other tiles.
     """
 
     scene_id: str
@@ -34,6 +37,7 @@ class LazyScene:
     load: Callable[[np.ndarray | None], Gaussians]
     cameras: Cameras | None = None
     captured_at: str | None = None
+    store: SightStore = field(default_factory=SightStore)
 
     def centroid(self) -> np.ndarray | None:
         """(3,) mean of all of its means, map frame; None where it holds nothing."""
@@ -86,11 +90,24 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, margin_m: float, min_came
     box = np.array([bounds[0] - margin_m, bounds[1] + margin_m])
     if cameras is not None and min_cameras > 0:
         box = _with_cameras(box, cameras.centers, min_cameras)
+    read = scene.load(_box_in(S.inverse(), box))
+    gaussians = transform_gaussians(read, S)
+    near = inside(gaussians.means, box)
+    sights = None
     if cameras is not None:
-        cameras = cameras[inside(cameras.centers, box)]
-    gaussians = transform_gaussians(scene.load(_box_in(S.inverse(), box)), S)
-    near = gaussians[inside(gaussians.means, box)]
-    return PlacedScene(near, cameras, scene.scene_id, scene.captured_at, scene.centroid)
+        rows = np.flatnonzero(inside(cameras.centers, box))
+        cameras = cameras[rows]
+        sights = partial(_sights, scene, rows, keys_of(read.means)[near])
+    return PlacedScene(gaussians[near], cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
+
+
+def _sights(
+    scene: LazyScene, rows: np.ndarray, keys: np.ndarray, longest_side_px: int, around_m: float
+) -> PlacedSights:
+    assert scene.cameras is not None
+    around = around_m / scene.S_map_scene.scale
+    sights = Sights(scene.scene_id, scene.load, scene.cameras, around, longest_side_px, scene.store)
+    return PlacedSights(sights, scene.S_map_scene, rows, keys)
 
 
 def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarray:

@@ -37,7 +37,9 @@ class RecipeKey:
 
     def of(self, *inputs: str) -> RecipeKey:
         """The same recipe for these inputs."""
-        return replace(self, inputs=inputs)
+        made = replace(self, inputs=inputs)
+        made.__dict__["recipe"] = self.recipe  # read once for all that is made so
+        return made
 
     def to_json(self) -> dict[str, Any]:
         """The recipe without its inputs, as plain values."""

@@ -1,5 +1,29 @@
 """Retrieval: which of many scenes, views and objects are worth a closer look."""
 
-from gsmap.retrieve.pairs import VERSION, Params, Placed, candidate_pairs
+from gsmap.retrieve.index import Segment, merged, new_segment, to_merge
+from gsmap.retrieve.lookup import VERSION, look_up
+from gsmap.retrieve.neighbours import Placed, neighbours
+from gsmap.retrieve.pairs import candidate_pairs
+from gsmap.retrieve.params import Params
+from gsmap.retrieve.recipe import index_recipe, recipe_key
+from gsmap.retrieve.rounds import Rounds, directed
+from gsmap.retrieve.voters import Voters, voters_of
 
-__all__ = ["VERSION", "Params", "Placed", "candidate_pairs"]
+__all__ = [
+    "VERSION",
+    "Params",
+    "Placed",
+    "Rounds",
+    "Segment",
+    "Voters",
+    "candidate_pairs",
+    "directed",
+    "index_recipe",
+    "look_up",
+    "merged",
+    "neighbours",
+    "new_segment",
+    "recipe_key",
+    "to_merge",
+    "voters_of",
+]

@@ -19,7 +19,7 @@ from gsmap.errors import CorruptError, InputError
 from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
-KINDS = ("scenes", "graphs", "changes")
+KINDS = ("scenes", "graphs", "changes", "indexes")
 """Of groups of arrays: the folders below ``arrays``."""
 
 
@@ -261,6 +261,31 @@ def a_graph(value: Any) -> bool:
 
 def _kept_arrays(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(how, dict) for how in value.values())
+
+
+def members(value: Any) -> bool:
+    """Of a segment of a retrieval index."""
+    return isinstance(value, list) and all(
+        isinstance(one, list)
+        and len(one) == 5
+        and all(isinstance(text, str) and is_digest(text) for text in one[:2])
+        and all(isinstance(flag, bool) for flag in one[2:4])
+        and _numbers(one[4])
+        and one[4] > 0
+        for one in value
+    )
+
+
+def candidates(value: Any) -> bool:
+    """Of a scene that asked a retrieval index."""
+    return isinstance(value, list) and all(
+        isinstance(one, list)
+        and len(one) == 3
+        and isinstance(one[0], str)
+        and is_digest(one[0])
+        and _numbers(one[1:], 2)
+        for one in value
+    )
 
 
 def _numbers(value: Any, *shape: int) -> bool:

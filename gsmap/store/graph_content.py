@@ -101,6 +101,8 @@ def _layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[s
         if about["extents_around_positions"]:
             own["extents"] = own["extents"] + own["positions"][:, None]
         out[name] = NodeLayer(**own, **layer["rest"])
+        if len(out[name]) != layer["count"]:
+            raise ValueError(f"layer {name} has {len(out[name])} nodes of {layer['count']}")
     return out
 
 

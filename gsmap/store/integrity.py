@@ -22,9 +22,21 @@ from gsmap.store.change_rows import KIND as CHANGES
 from gsmap.store.change_rows import newest_of_all
 from gsmap.store.explained import PRUNE_MAY, explained
 from gsmap.store.groups import manifest
+from gsmap.store.indexes import KIND as INDEXES
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
-from gsmap.store.schema import CHUNK_BOXES, comparisons, files, graphs, groups, models, poses, revisions, scenes
+from gsmap.store.schema import (
+    CHUNK_BOXES,
+    comparisons,
+    files,
+    graphs,
+    groups,
+    index_segments,
+    models,
+    poses,
+    revisions,
+    scenes,
+)
 from gsmap.types.progress import Progress
 
 _AGAIN = "what was to be reclaimed and is still there goes with the next prune"
@@ -249,6 +261,7 @@ def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
     # Of a pair the newest comparison counts, as long as both of its scenes can be read.
     lost = set(connection.execute(select(scenes.c.id).where(gone)).scalars())
     claimed |= {row.group_id for row in newest_of_all(connection) if not {row.older, row.newer} & lost}
+    claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
     known = {(g.kind, g.id) for g in connection.execute(select(groups))}
     return _Waste(
         dropped,
@@ -276,6 +289,11 @@ def _advice(connection: Connection, kind: str, group: str, location: str | None)
     """What a damaged group is of, and what makes it whole; empty where the message says so already."""
     if kind == CHANGES:
         return _comparison_advice(connection, group, location)
+    if kind == INDEXES:
+        again = (
+            "restore the file from a backup" if location is None else f"gsmap register {quote(location)} makes it again"
+        )
+        return f" (the index of retrieval: {again})"
     if kind != "graphs":
         return ""
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)

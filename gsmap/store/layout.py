@@ -278,6 +278,7 @@ def mend(kind: str) -> str:
     again = {
         "graphs": "make the graph again (gsmap describe MAP SCENE)",
         "changes": "compare its two scenes again (gsmap changes MAP A:B)",
+        "indexes": "make it again (gsmap register MAP)",
     }
     return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"
 

@@ -25,7 +25,8 @@ def narrow(values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
     """What to store of an array, and how it is to be read again (plain, for JSON): `widen` is the inverse."""
     step = _step(values) if values.dtype.kind == "f" else 1.0
     found = values
-    for dtype in sorted((*_WHOLE, *_FLOATS), key=lambda t: (t.itemsize, t.kind == "f")):
+    candidates = (*_WHOLE, *_FLOATS) if values.dtype.kind == "f" else _WHOLE
+    for dtype in sorted(candidates, key=lambda t: (t.itemsize, t.kind == "f")):
         if dtype.itemsize >= values.dtype.itemsize:
             break
         kept = _as(values, dtype, step if dtype.kind in "ui" else 1.0)

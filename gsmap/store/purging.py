@@ -33,7 +33,9 @@ from gsmap.store.schema import (
     files,
     graphs,
     groups,
+    index_segments,
     leases,
+    lookups,
     poses,
     priors,
     purges,
@@ -258,12 +260,14 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
         tile.number for tile in connection.execute(select(tiles.c.number, tiles.c.poses)) if scene in tile.poses
     ]
     drop("tiles", tiles, tiles.c.number.in_(made_with_it))
+    _forget_lookups(connection, scene)
     drop("graphs", graphs, graphs.c.scene == scene)
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
     claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
     claimed |= set(connection.execute(select(graphs.c.group_id)).scalars())
     claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
     sizes = select(files.c.group_id, func.sum(files.c.size_bytes)).where(files.c.group_id.in_(unclaimed))
     bodies = {group: int(size) for group, size in connection.execute(sizes.group_by(files.c.group_id))}
@@ -276,6 +280,19 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
         connection.execute(update(revisions).where(mine).values(notes=[*notes, said]))
     counts["revisions"] = len(affected)
     return counts, bodies
+
+
+def _forget_lookups(connection: Connection, scene: str) -> None:
+    """Drop what retrieval knows of a scene: segments that hold it, which are made anew, and its place in lookups."""
+    parts = connection.execute(select(index_segments.c.number, index_segments.c.members)).all()
+    with_it = [part.number for part in parts if any(member[0] == scene for member in part.members)]
+    connection.execute(delete(index_segments).where(index_segments.c.number.in_(with_it)))
+    connection.execute(delete(lookups).where(lookups.c.scene == scene))
+    for one in connection.execute(select(lookups.c.scene, lookups.c.candidates)).all():
+        others = [candidate for candidate in one.candidates if candidate[0] != scene]
+        if len(others) < len(one.candidates):
+            mine = lookups.c.scene == one.scene
+            connection.execute(update(lookups).where(mine).values(candidates=others))
 
 
 def _names(connection: Connection, row: Row[Any]) -> set[str]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from sqlalchemy import Connection, Row, func, insert, select
+import numpy as np
+from sqlalchemy import Connection, Row, Select, case, func, insert, select
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
@@ -60,6 +61,27 @@ class Review:
     registration: int
     note: str
     created_at: str
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What stands of a pair, without its pose.
+
+    Args:
+        key: of its current registration; empty for a person's own measurement.
+        keys: of all that were computed for it.
+        is_edge: whether it ties its scenes: accepted, or confirmed, and not rejected by a person.
+        said: whether a person measured or confirmed it.
+        disagreement: of what both scenes saw; NaN where that is not known.
+    """
+
+    target: str
+    source: str
+    key: str
+    keys: frozenset[str]
+    is_edge: bool
+    said: bool
+    disagreement: float
 
 
 class Registrations:
@@ -145,6 +167,36 @@ class Registrations:
                 pairs.setdefault(row.pair, []).append(row)
         chosen = [_decide(mine, words.get(pair, [])) for pair, mine in pairs.items()]
         return [_stored(choice.row, choice.word) for choice in chosen if choice.row is not None]
+
+    def standing(self) -> list[Standing]:
+        """What stands of each pair of living scenes, by the pair's first registration: `current`, read far quicker."""
+        r = registrations.c
+        evidence = case((r.status == "accepted", r.evidence))
+        light: Select[Any] = select(
+            r.number, r.target, r.source, r.pair, r.key, r.status, r.proposer, evidence.label("evidence")
+        )
+        with self._catalog.read() as connection:
+            alive = living_ids(connection)
+            rows = connection.execute(light.order_by(r.number)).all()
+            said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all()
+        words = {pair: [_review(row) for row in mine] for pair, mine in groupby(said, lambda row: str(row.pair))}
+        pairs: dict[str, list[Row[Any]]] = {}
+        for row in rows:
+            if row.target in alive and row.source in alive:
+                pairs.setdefault(row.pair, []).append(row)
+        found = []
+        for pair, mine in pairs.items():
+            choice = _decide(mine, words.get(pair, []))
+            if (current := choice.row) is None:
+                continue
+            row, word = current, choice.word
+            review = None if word is None else word.review
+            is_edge = review == "confirm" or (row.status == "accepted" and review != "reject")
+            keys = frozenset(one.key for one in mine if one.key)
+            doubt = float((row.evidence or {}).get("disagreement", np.nan))
+            known = row.proposer == MANUAL or review == "confirm"
+            found.append(Standing(row.target, row.source, row.key, keys, is_edge, known, doubt))
+        return found
 
     def get(self, a: str, b: str) -> StoredRegistration | None:
         """The current registration of a pair (scene refs, either direction); None where there is none."""

@@ -37,6 +37,8 @@ from gsmap.store.columns import (
     a_pose,
     a_thinning,
     an_object,
+    candidates,
+    members,
     numbers,
     poses_by_scene,
     sigmas,
@@ -44,7 +46,7 @@ from gsmap.store.columns import (
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 
-HEAD = "0007"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0009"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 metadata = MetaData(
     naming_convention={
@@ -89,7 +91,7 @@ about = _table(
 groups = _table(
     "groups",
     Column("id", Digest, primary_key=True),  # digest of the content
-    Column("kind", Kind, nullable=False),  # scenes, graphs, changes
+    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes
     Column("created_at", Text, nullable=False),
 )
 files = _table(
@@ -201,6 +203,25 @@ reviews = _table(
     Column("note", Lines, nullable=False),
     Column("created_at", Text, nullable=False),
     CheckConstraint("review in ('confirm', 'reject', 'withdraw')", name="review"),
+)
+
+# What retrieval derives from graphs, and makes anew where it is lost.
+index_segments = _table(
+    "index_segments",
+    Column("number", Integer, primary_key=True),
+    Column("key", Key, nullable=False),  # of the recipe: what an index keeps of a graph
+    Column("members", Json(members), nullable=False),  # each: scene, key of its graph, upright, metric, coarseness
+    Column("num_nodes", Integer, nullable=False),
+    Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
+    Column("created_at", Text, nullable=False),
+)
+lookups = _table(
+    "lookups",
+    _scene("scene", primary_key=True),
+    Column("key", Key, nullable=False),  # RecipeKey.digest of how it asked, and of its graph
+    Column("candidates", Json(candidates), nullable=False),  # best first; each: scene, score, votes
+    Column("num_left", Integer),  # of these, not tried when there was enough; null until the list was gone down
+    Column("created_at", Text, nullable=False),
 )
 
 # Two captures of a place, looked at for what changed. Nothing is overwritten; of a pair the newest one counts.

@@ -25,6 +25,7 @@ from gsmap.store.copying import empty_catalog
 from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
+from gsmap.store.indexes import Indexes
 from gsmap.store.integrity import Check, Pruned
 from gsmap.store.leases import Leases
 from gsmap.store.models import Models
@@ -41,7 +42,7 @@ from gsmap.version import __version__
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
-    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``registrations``, ``changes``,
+    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``indexes``, ``registrations``, ``changes``,
     ``revisions``, ``priors``, ``models``, ``exports``, ``branches``, ``backups``, ``leases`` and ``set_aside``. Every
     method that changes something is one transaction, durable when it returns; `transaction` makes several of them one.
     Killed anywhere, the map opens whole. Threads may share a store; processes open their own.
@@ -70,6 +71,7 @@ class Store:
         self.scenes = Scenes(catalog, self.arrays)
         self.recipes = Recipes(catalog)
         self.graphs = Graphs(catalog, self.arrays)
+        self.indexes = Indexes(catalog, self.arrays)
         self.registrations = Registrations(catalog)
         self.changes = Changes(catalog, self.arrays)
         self.revisions = Revisions(catalog)

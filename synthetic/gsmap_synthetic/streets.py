@@ -27,6 +27,7 @@ def make_street(
     rooms: int = 15,
     decorations: int = 5,
     repeats: Repeats = "decoration",
+    floor: int = 0,
     texel_m: float = 0.012,
     progress: Callable[[float, str], None] | None = None,
 ) -> Place:
@@ -38,6 +39,7 @@ def make_street(
         decorations: after this many rooms the decorations come again, in the same order.
         repeats: what comes again: the ``decoration`` exactly (with the same furniture, which stands elsewhere), the
             whole ``room``, or ``nothing``: the control.
+        floor: of the building: every floor has the decorations of the others, and its furniture stands elsewhere.
         texel_m: how fine the baked colours are.
 
     Raises:
@@ -54,6 +56,8 @@ def make_street(
     count = rooms if repeats == "nothing" else min(decorations, rooms)
     seeds, layouts = rng.integers(1 << 30, size=count), rng.integers(1 << 30, size=rooms)
     door_m = rng.uniform(0.25, 0.75, count) * (size[1] - 1.4) + 0.7
+    if floor:
+        layouts = np.random.default_rng([seed, 11, floor]).integers(1 << 30, size=rooms)
     plan, doors = [], []
     for k in range(rooms):
         at, which = k * pitch, k % count

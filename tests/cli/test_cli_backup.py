@@ -67,7 +67,7 @@ def test_what_goes_wrong_is_one_line(site: Path, tmp_path: Path, cli: Run) -> No
 
 def test_damage_that_cannot_be_mended_is_exit_code_1(site: Path, tmp_path: Path, cli: Run) -> None:
     cli("backup", site, tmp_path / "b")
-    broken = _object_of(tmp_path / "b", site, "*/means/c/0/0")
+    broken = _object_of(tmp_path / "b", site, "*/arrays.zip")
     broken.write_bytes(b"x" * broken.stat().st_size)
     mended = cli("backup", site, tmp_path / "b", "--verify", "--json")
     assert (mended.code, mended.json["problems"]) == (0, [])

@@ -60,7 +60,7 @@ class Row:
             ]
             return merge_tile(lazy, method, params, bounds=planned.bounds)
 
-        return export_tiles(plan, lambda planned: partial(make, planned), self.out, map_id="row", recipe=recipe)
+        return export_tiles(plan, lambda planned, folder: partial(make, planned), self.out, map_id="row", recipe=recipe)
 
     def entries(self):
         return json.loads((self.out / "tiles.json").read_text())["tiles"]
@@ -175,7 +175,7 @@ def test_notes_recipe_and_key_are_in_the_manifest_and_in_the_answer(row):
 def test_a_note_about_one_tile_names_it(row):
     plan = plan_tiles(row.poses, dict.fromkeys(row.poses, BOX), tile_size_m=4)
 
-    def make(planned):
+    def make(planned, folder):
         notes = ("the roof is missing",) if planned is plan[2] else ()
         return lambda progress: MergeResult(row.scenes["a"], np.zeros(len(row.scenes["a"]), np.int32), notes=notes)
 

@@ -45,7 +45,7 @@ class Street:
         )
         self.made = []
 
-        def make(planned):
+        def make(planned, folder):
             return partial(content, planned)
 
         def content(planned, progress):

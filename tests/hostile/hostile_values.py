@@ -99,7 +99,7 @@ def a_map_to_take_in_whose_groups_lead_upwards(w: World) -> None:
 @case(r"no plain file|is a link|missing", verbs=TAKEN_IN)
 def a_map_to_take_in_whose_chunks_are_links(w: World) -> None:
     for group in (w.map / "arrays" / "scenes").iterdir():
-        chunk = group / "means" / "c" / "0" / "0"
+        chunk = group / "arrays.zip"
         shutil.move(chunk, w.home / f"chunk_{group.name}")
         chunk.symlink_to(w.home / f"chunk_{group.name}")
 

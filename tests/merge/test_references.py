@@ -3,7 +3,8 @@ from synthetic_walls import cameras_facing, two_scenes, wall
 
 from gsmap.merge import PlacedScene
 from gsmap.merge.exposure import apply_gain, balance_exposure
-from gsmap.merge.references import Params, render_references, surface_points, view_schedule
+from gsmap.merge.references import Params, render_references, view_schedule
+from gsmap.merge.sights import surface_axes
 from gsmap.render import render
 
 
@@ -14,7 +15,7 @@ def quiet(fraction, text):
 def test_surface_points_lie_on_the_wall():
     camera = cameras_facing([0.2])
     seen = render(wall(0, -1.5, 1.5), camera)
-    points = surface_points(camera, seen.depth[0])[seen.alpha[0] > 0.95]
+    points = np.stack(surface_axes(camera, seen.depth[0]), axis=-1)[seen.alpha[0] > 0.95]
     assert len(points) > 500
     assert np.abs(points[:, 2]).max() < 0.03
     assert points[:, 0].min() < 0 < points[:, 0].max()

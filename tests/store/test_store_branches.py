@@ -197,9 +197,9 @@ def test_the_same_content_in_two_branches_is_one_group(store, monkeypatch):
     scene = add(store, 0)
     place = store.home / "arrays" / "scenes" / scene
     inode = place.stat().st_ino
-    from gsmap.store import arrays
+    from gsmap.store import packed
 
-    monkeypatch.setattr(arrays, "_ZSTD_LEVEL", 9)  # another version would write other bytes
+    monkeypatch.setattr(packed, "_ZSTD_LEVEL", 9)  # another version would write other bytes
     with Store.open(at(store, "b")) as branch:
         assert add(branch, 0) == scene
         assert place.stat().st_ino == inode

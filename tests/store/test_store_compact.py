@@ -127,7 +127,7 @@ def test_files_of_a_thinned_scene_that_a_copy_has_too_are_told_of(store, tmp_pat
     store.scenes.thin("a", np.arange(50) < 40)
     store.reclaim()
     shutil.copytree(store.folder, tmp_path / "linked", copy_function=os.link)
-    assert purging.begin(store, scene.id).receipt["linked_files"] > 5
+    assert purging.begin(store, scene.id).receipt["linked_files"] == 1
 
 
 def test_a_graph_of_the_compact_gaussians_goes_when_the_scene_is_whole_again(store):

@@ -187,7 +187,7 @@ def test_what_people_wrote_of_others_is_told_of(place):
         report = m.purge(NAME)
         assert [text.split()[:4] for text in report.mentions] == [["a", "note", "of", "scene"]]
         assert report.backups == ("s3://bucket/site 20240531",)
-        assert report.linked_files > 5
+        assert report.linked_files >= 1
         assert m.show_scene("hall").name == "hall"
 
 

@@ -85,7 +85,7 @@ def test_nobody_is_at_work_on_a_restored_map(site, place, tmp_path):
 def test_a_damaged_object_is_never_restored(site, place, tmp_path, harm):
     with Store.open(site) as store:
         made = save(store, place).snapshot
-    file = next(f for f in Backup.at(place).files(made) if f.path.endswith("means/c/0/0"))
+    file = next(f for f in Backup.at(place).files(made) if f.path.endswith("arrays.zip"))
     path = place.root / object_name(file.sha256)
     data = bytearray(path.read_bytes())
     if harm == "flip":
@@ -175,7 +175,7 @@ def test_snapshots_that_say_what_is_not_so(site, place, tmp_path):
     with Store.open(site, "r") as store:
         map_id = store.id
     files = files_of(site)
-    lacking = {path: data for path, data in files.items() if not path.endswith("means/c/0/0")}
+    lacking = {path: data for path, data in files.items() if not path.endswith("arrays.zip")}
     other = {**files, "map.sqlite": b"no database"}
     for i, (content, changed) in enumerate(
         [

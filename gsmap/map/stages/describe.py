@@ -27,7 +27,7 @@ def graph_keys(store: Store, scenes: Sequence[Scene], settings: Settings) -> dic
 
 def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
     """Ids of the scenes that have no graph under their key, in the order of the keys; no array is read."""
-    present = {stored.key for stored in store.graphs.list()}
+    present = store.graphs.kept(keys.values())
     return [scene for scene, key in keys.items() if key.digest not in present]
 
 

@@ -24,6 +24,7 @@ from gsmap.map.metres import map_metres, metre_notes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_prefer, with_steps
+from gsmap.merge.sights import SightStore
 from gsmap.store import Store
 from gsmap.texts import escaped
 from gsmap.types import PoseGraph, Scene, ScenePose, Tile
@@ -202,7 +203,7 @@ def _export(
     with noting(lambda: f"{num_made} {'tile is' if num_made == 1 else 'tiles are'} made and kept"):
         result = export_tiles(
             planned.tiles,
-            partial(_maker, store, planned, request),
+            partial(_maker, store, planned, request, settings),
             out,
             map_id=store.id,
             recipe=planned.recipe,
@@ -233,7 +234,9 @@ def _export(
     return result
 
 
-def _maker(store: Store, planned: Planned, request: Request, tile: PlannedTile) -> TileMaker:
+def _maker(
+    store: Store, planned: Planned, request: Request, settings: Settings, tile: PlannedTile, folder: str
+) -> TileMaker:
     return TileMaker(
         store.location,
         tile,
@@ -242,6 +245,7 @@ def _maker(store: Store, planned: Planned, request: Request, tile: PlannedTile) 
         is_cut=request.tile_size_m > 0 or request.bbox is not None,
         budget_s=request.budget_s,
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
+        store=SightStore(folder, settings.export.shared_bytes),
     )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
-from functools import partial
-from itertools import combinations
+from functools import cache, partial
+from itertools import combinations, permutations
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,16 @@ import numpy as np
 from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map.jobs import register_scenes
+from gsmap.map.looking_up import ask, keys_of_lookups
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import SharedJobs, noting
 from gsmap.map.stages.describe import graph_keys, without_graph
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
-from gsmap.retrieve import Placed, candidate_pairs
+from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import StoredRegistration
-from gsmap.types import PoseGraph, Registration, Scene, SceneGraph, Sim3
+from gsmap.store.registrations import Standing, StoredRegistration
+from gsmap.types import PoseGraph, Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
 
 Pair = tuple[str, str]
@@ -37,51 +39,152 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     the same whichever scene came first.
     """
     scenes = store.scenes.list()
-    graphs = graph_keys(store, scenes, settings)
-    recipe = recipe_key(settings.register)
-    wanted = _wanted(store, pairs, graphs, settings)
-    if pairs in ("auto", "all"):
-        wanted = _lacking(store, wanted, graphs, recipe)
-    edges = {_key(recipe, graphs, a, b).digest: (a, b) for a, b in wanted}
-    jobs = {
-        key: (store.location, (a, graphs[a].digest), (b, graphs[b].digest), settings.register)
-        for key, (a, b) in edges.items()
+    work = _Work(store, scenes, graph_keys(store, scenes, settings), settings, progress)
+    if pairs == "auto":
+        return _register_candidates(work)
+    if pairs == "all":
+        everything = list(combinations(sorted(work.described), 2))
+        known = _Known(work)
+        return work.register([pair for pair in everything if not known.has(*pair)], after=0)
+    # What is named is registered again: only what comes later counts.
+    return work.register(_named(store, pairs, work), after=store.registrations.newest(), again=True)
+
+
+class _Work:
+    """What registering needs to know of a map.
+
+    Args:
+        graphs: the key of each living scene's graph.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        scenes: Sequence[Scene],
+        graphs: Mapping[str, RecipeKey],
+        settings: Settings,
+        progress: StageProgress,
+    ) -> None:
+        self.store, self.scenes, self.graphs, self.settings, self.progress = store, scenes, graphs, settings, progress
+        self.recipe = recipe_key(settings.register)
+        self.lacking = set(without_graph(store, graphs))
+        self.described = {scene: key for scene, key in graphs.items() if scene not in self.lacking}
+
+    def key(self, target: str, source: str) -> RecipeKey:
+        """What names the registration of a pair; the other direction is another registration."""
+        return self.recipe.of(self.graphs[target].digest, self.graphs[source].digest)
+
+    def register(self, pairs: Sequence[Pair], after: int, *, again: bool = False) -> list[Registration]:
+        """Register pairs, but for those that others do meanwhile.
+
+        Args:
+            after: registrations up to this number do not count.
+            again: also those that were set aside.
+        """
+        store, settings = self.store, self.settings
+        edges = {self.key(a, b).digest: (a, b) for a, b in pairs}
+        jobs = {
+            key: (store.location, (a, self.graphs[a].digest), (b, self.graphs[b].digest), settings.register)
+            for key, (a, b) in edges.items()
+        }
+        done = partial(store.registrations.kept, after=after)
+        shared = SharedJobs(store, "register", "edge", jobs, edges, done, self.progress, again=again)
+        results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
+        names = {scene.id: scene.name for scene in self.scenes}
+        kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
+        with kept, closing(results):
+            for key, edge in results:
+                store.registrations.save(edge, self.key(*edges[key]))
+                shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
+        found = [store.registrations.find(key) for key in edges]
+        return [stored.registration for stored in found if stored is not None]
+
+
+class _Known:
+    """What the present recipe knows of pairs, in either direction: older maps hold both.
+
+    What it made before, under settings that were changed meanwhile, is made current again.
+
+    Args:
+        held: pairs whose edge stands and is not in doubt.
+        stale: pairs of described scenes that other settings, or another version, registered.
+    """
+
+    def __init__(self, work: _Work) -> None:
+        self._work = work
+        self._standing = {directed(one.target, one.source): one for one in work.store.registrations.standing()}
+        if adopted := [pair for pair, one in self._standing.items() if self._adopt(one)]:
+            changed = {directed(one.target, one.source): one for one in work.store.registrations.standing()}
+            self._standing |= {pair: changed[pair] for pair in adopted}
+        bar = work.settings.optimize.aliasing.max_disagreement
+        current = {pair: one for pair, one in self._standing.items() if one.said or one.key in self._keys(one)}
+        self.held = [pair for pair, one in current.items() if one.is_edge and (one.said or not one.disagreement > bar)]
+        self.stale = sorted(
+            pair
+            for pair, one in self._standing.items()
+            if pair not in current and set(pair) <= set(work.described) and not self.has(*pair)
+        )
+
+    def has(self, a: str, b: str) -> bool:
+        """Whether it has registered a pair."""
+        one = self._standing.get(directed(a, b))
+        return one is not None and not self._keys(one).isdisjoint(one.keys)
+
+    def pairs(self) -> set[Pair]:
+        """All that it has registered."""
+        return {pair for pair in self._standing if self.has(*pair)}
+
+    @cache  # noqa: B019  # lives as long as one run of the stage
+    def _keys(self, one: Standing) -> frozenset[str]:
+        """What the pair's registration would be kept under, in either direction."""
+        if not {one.target, one.source} <= set(self._work.graphs):
+            return frozenset()
+        return frozenset(self._work.key(*pair).digest for pair in permutations((one.target, one.source)))
+
+    def _adopt(self, one: Standing) -> bool:
+        keys = self._keys(one)
+        if one.key in keys or one.said or keys.isdisjoint(one.keys):
+            return False
+        known = [self._work.store.registrations.find(key) for key in sorted(keys & one.keys)]
+        self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
+        return True
+
+
+def _register_candidates(work: _Work) -> list[Registration]:
+    """Register what retrieval proposes, round by round, and what other settings had registered.
+
+    Only scenes that have not been looked up by this recipe are, and nothing is read of the others.
+    """
+    store, params = work.store, work.settings.retrieve
+    known, asked, keys = _Known(work), store.indexes.asked(), keys_of_lookups(work.described, params)
+    new = sorted(scene for scene in work.described if asked.get(scene, ("", None))[0] != keys[scene])
+    if new:
+        ask(store, work.described, new, params, work.progress)
+    ties = Counter(scene for pair in known.held for scene in pair)
+    # Whose list was not gone down to its end, and who has lost edges since.
+    short = {s for s, (_, left) in asked.items() if s in keys and (left is None or (left and ties[s] < params.enough))}
+    lookups = store.indexes.lookups(short.union(new))
+    lists = {
+        one.scene: [directed(one.scene, c.scene) for c in one.candidates[: params.top_k] if c.scene in work.described]
+        for one in lookups
     }
-    newest = store.registrations.newest()  # what is named is registered again: only what comes later counts
-    after = 0 if pairs in ("auto", "all") else newest
-    done, named = partial(store.registrations.kept, after=after), pairs not in ("auto", "all")
-    shared = SharedJobs(store, "register", "edge", jobs, edges, done, progress, again=named)
-    results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
-    names = {scene.id: scene.name for scene in scenes}
-    kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
-    with kept, closing(results):
-        for key, edge in results:
-            store.registrations.save(edge, _key(recipe, graphs, *edges[key]))
-            shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
-    found = [store.registrations.find(key) for key in edges]
-    return [stored.registration for stored in found if stored is not None]
-
-
-def _key(recipe: RecipeKey, graphs: Mapping[str, RecipeKey], target: str, source: str) -> RecipeKey:
-    """What names the registration of a pair; the other direction is another registration."""
-    return recipe.of(graphs[target].digest, graphs[source].digest)
-
-
-def _lacking(store: Store, pairs: Sequence[Pair], graphs: Mapping[str, RecipeKey], recipe: RecipeKey) -> list[Pair]:
-    """Those of the pairs that this recipe has not registered, in either direction: older maps hold both."""
-    current = {frozenset((r.registration.target, r.registration.source)): r for r in store.registrations.current()}
-    lacking = []
-    for pair in pairs:
-        stands = current.get(frozenset(pair))
-        keys = _key(recipe, graphs, *pair), _key(recipe, graphs, *reversed(pair))
-        if stands is not None and stands.key in {key.digest for key in keys}:
-            continue
-        known = store.registrations.find(keys[0]) or store.registrations.find(keys[1])
-        if known is None:
-            lacking.append(pair)
-        elif stands is not None and not stands.manual:
-            store.registrations.adopt(known.number)
-    return lacking
+    beside: dict[str, list[Pair]] = {}
+    for pair in neighbours({s: at for s, at in placed_scenes(store).items() if s in work.described}, params):
+        beside.setdefault(pair[0], []).append(pair)
+    bar = work.settings.optimize.aliasing.max_disagreement
+    rounds = Rounds([*lists.values(), *beside.values()], known.pairs(), known.held, params)
+    rounds.tried |= set(known.stale)
+    pairs, made = known.stale + rounds.next(), list[Registration]()
+    while pairs:
+        found = work.register(pairs, after=0)
+        made += found
+        for edge in found:
+            if edge.status == "accepted" and not edge.evidence.get("disagreement", np.nan) > bar:
+                rounds.hold(edge.target, edge.source)
+        pairs = rounds.next()
+    if lists:
+        store.indexes.leave({scene: len(set(mine) - rounds.tried) for scene, mine in lists.items()})
+    return made
 
 
 def stale(current: Iterable[StoredRegistration], graphs: Mapping[str, RecipeKey], settings: Settings) -> list[Pair]:
@@ -94,7 +197,11 @@ def stale(current: Iterable[StoredRegistration], graphs: Mapping[str, RecipeKey]
     recipe = recipe_key(settings.register)
     computed = [stored for stored in current if not stored.manual and stored.review != "confirm"]
     ends = [(stored.registration.target, stored.registration.source, stored.key) for stored in computed]
-    return [(a, b) for a, b, key in ends if {a, b} <= set(graphs) and key != _key(recipe, graphs, a, b).digest]
+    return [
+        (a, b)
+        for a, b, key in ends
+        if {a, b} <= set(graphs) and key != recipe.of(graphs[a].digest, graphs[b].digest).digest
+    ]
 
 
 def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np.ndarray, note: str) -> None:
@@ -180,22 +287,8 @@ def _pair_on(store: Store, text: str) -> tuple[Scene, Scene]:
     return pair_of(store, text)
 
 
-def _directed(a: str, b: str) -> Pair:
-    """A pair of scene ids as (target, source): by content, so that no order of ingestion gives another edge."""
-    return (a, b) if a < b else (b, a)
-
-
-def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], settings: Settings) -> list[Pair]:
-    """The scene pairs that are asked for, each as (target, source), in a fixed order, each once."""
-    lacking = set(without_graph(store, graphs))
-    described = [scene for scene in graphs if scene not in lacking]
-    if pairs == "all":
-        return list(combinations(sorted(described), 2))
-    if pairs == "auto":
-        loaded = [_graph(store, graphs[scene]) for scene in described]
-        candidates = candidate_pairs(loaded, placed=placed_scenes(store), params=settings.retrieve)
-        again = {_directed(*pair) for pair in stale(store.registrations.current(), graphs, settings)} - set(candidates)
-        return candidates + sorted(pair for pair in again if not set(pair) & lacking)
+def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> list[Pair]:
+    """The scene pairs that are named, each as (target, source), in a fixed order, each once."""
     if isinstance(pairs, Path):
         named = read_pairs(store, pairs)
     elif isinstance(pairs, str):
@@ -205,11 +298,11 @@ def _wanted(store: Store, pairs: Pairs, graphs: Mapping[str, RecipeKey], setting
     chosen: list[Pair] = []
     for a, b in named:
         for scene in _two(a, b):
-            if scene.id not in graphs:
+            if scene.id not in work.graphs:
                 raise NotFoundError(f"scene {scene.name} was removed: ingest it again first")
-            if scene.id in lacking:
+            if scene.id in work.lacking:
                 raise NotFoundError(f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first")
-        chosen.append(_directed(a.id, b.id))
+        chosen.append(directed(a.id, b.id))
     return list(dict.fromkeys(chosen))
 
 
@@ -225,9 +318,3 @@ def placed_scenes(store: Store) -> dict[str, Placed]:
             sigma = 0.0 if pose.covariance is None else S.scale * float(np.sqrt(np.diag(pose.covariance)[3:6].max()))
             placed[scene] = Placed(pose.component, S.apply(bounds[scene].mean(0)), radius, sigma)
     return placed
-
-
-def _graph(store: Store, key: RecipeKey) -> SceneGraph:
-    graph = store.graphs.load(key.inputs[0], key)
-    assert graph is not None
-    return graph

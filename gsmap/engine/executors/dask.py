@@ -1,0 +1,201 @@
+"""Jobs on a cluster that runs: Dask's, by the address of its scheduler; on how many machines is Dask's matter.
+
+The scheduler holds no work and no results to speak of: jobs are submitted as there is room, each result is taken,
+compressed, as soon as it is there, and what is done stands in the map's catalog. So any part of the cluster may end.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import queue
+import time
+import uuid
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from gsmap.engine.worker import answer
+from gsmap.errors import ConfigError, GsmapError, MissingDependencyError
+from gsmap.methods.executor import SetAside
+
+VERSION = 1
+
+_ATTEMPTS = 2
+"""A job that was begun so often and never ended took its workers with it: it is set aside."""
+
+_BEGUN = "gsmap-begun"  # where the scheduler keeps how often a job was begun
+_LOOK_S = 1.0  # how often it is looked whether there are more workers now
+
+
+@dataclass(frozen=True)
+class Params:
+    """Args:
+    scheduler: its address, such as ``tcp://host:8786``; empty takes what ``GSMAP_SCHEDULER`` says.
+    ahead: jobs submitted beyond one for each thread of the workers, as a share of these.
+    at_least: jobs submitted however few workers there are, so that a cluster that grows on demand sees some.
+    timeout_s: how long the scheduler is waited for.
+    """
+
+    scheduler: str = ""
+    ahead: float = 0.25
+    at_least: int = 4
+    timeout_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not self.ahead >= 0:
+            raise ConfigError(f"ahead must not be negative, got {self.ahead}")
+        if self.at_least < 1 or not self.timeout_s > 0:
+            raise ConfigError(f"at_least and timeout_s must be positive, got {self.at_least} and {self.timeout_s}")
+
+
+class DaskWorkers:
+    """See `gsmap.methods.executor.Workers`."""
+
+    def __init__(self, address: str, params: Params) -> None:
+        self._address, self._params = address, params
+        self._client: Any = None
+
+    def run(
+        self, job: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], *, quick: bool = False
+    ) -> Iterator[tuple[int, Any]]:
+        todo = enumerate(arguments)
+        taken = next(todo, None)
+        if taken is None:
+            return
+        client, run = self._connected(), uuid.uuid4().hex
+        done: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        running: dict[Any, tuple[int, bytes]] = {}
+
+        def submit(index: int, message: bytes) -> None:
+            key = f"gsmap-{run}-{index}"
+            future = client.submit(do, run, key, message, key=f"{key}-{uuid.uuid4().hex[:8]}", pure=False)
+            running[future] = index, message
+            future.add_done_callback(done.put)
+
+        try:
+            room, looked = self._room(), time.monotonic()
+            while running or taken is not None:
+                while taken is not None and len(running) < room:
+                    submit(taken[0], pickle.dumps((job, taken[1]), pickle.HIGHEST_PROTOCOL))
+                    taken = next(todo, None)
+                try:
+                    future = done.get(timeout=_LOOK_S)
+                except queue.Empty:
+                    future = None
+                if time.monotonic() - looked > _LOOK_S:
+                    room, looked = self._room(), time.monotonic()
+                if future is None:
+                    continue
+                index, message = running.pop(future)
+                result = self._result(future)
+                if result is None:  # the scheduler forgot it
+                    submit(index, message)
+                    continue
+                returned, value = result
+                if not returned:
+                    raise value
+                yield index, value
+        finally:
+            self._forget(run, list(running))
+
+    def close(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            client.close()
+
+    def _connected(self) -> Any:
+        if self._client is None:
+            try:
+                from distributed import Client
+            except ImportError as error:
+                raise MissingDependencyError(
+                    "the executor dask needs the package distributed: pip install 'gsmap[cluster]'"
+                ) from error
+            try:
+                self._client = Client(self._address, timeout=self._params.timeout_s, set_as_default=False, name="gsmap")
+            except (OSError, ValueError, TimeoutError) as error:
+                raise GsmapError(f"no Dask scheduler answers at {self._address} ({error}): is it running?") from error
+        return self._client
+
+    def _room(self) -> int:
+        """How many jobs may be submitted at once."""
+        try:
+            threads = sum(self._client.nthreads().values())
+        except Exception as error:  # whatever a connection that is lost raises
+            raise self._lost() from error
+        return max(threads + math.ceil(self._params.ahead * threads), self._params.at_least)
+
+    def _result(self, future: Any) -> tuple[bool, Any] | None:
+        """Whether a job returned, and what it returned or raised; None where it must be submitted again.
+
+        Raises:
+            GsmapError: the scheduler is gone.
+        """
+        from distributed import CancelledError, KilledWorker
+
+        try:
+            packed = future.result(timeout=self._params.timeout_s)
+        except KilledWorker as error:
+            return True, SetAside(f"the workers that tried it died, most likely for lack of memory ({error})")
+        except (CancelledError, TimeoutError) as error:
+            if self._client is None or self._client.status != "running":
+                raise self._lost() from error
+            return None
+        except (ImportError, pickle.UnpicklingError) as error:
+            raise GsmapError(
+                f"a worker of {self._address} could not load its job ({error}): the same gsmap must be installed there"
+            ) from error
+        returned, value = pickle.loads(zlib.decompress(packed))
+        return returned, value
+
+    def _lost(self) -> GsmapError:
+        self._client = None
+        return GsmapError(
+            f"the Dask scheduler at {self._address} was lost; what was finished is kept, run the same command again"
+        )
+
+    def _forget(self, run: str, futures: list[Any]) -> None:
+        client = self._client
+        if client is None or client.status != "running":
+            return
+        if futures:
+            client.cancel(futures, force=True)
+        client.set_metadata([_BEGUN, run], {})
+
+
+def start(params: Params) -> DaskWorkers:
+    address = params.scheduler or os.environ.get("GSMAP_SCHEDULER", "")
+    if not address:
+        raise ConfigError(
+            "the executor dask needs the address of its scheduler: --scheduler tcp://HOST:8786, or GSMAP_SCHEDULER"
+        )
+    return DaskWorkers(address, params)
+
+
+def do(run: str, key: str, message: bytes) -> bytes:
+    """Do a job on a worker: the answer, compressed. What was begun twice and never ended is not begun again."""
+    from distributed import get_worker
+    from distributed.utils import sync
+
+    worker = get_worker()
+
+    def begun(times: int | None = None) -> int:
+        """How often the job was begun, as the scheduler knows; or tell it."""
+        keys = [_BEGUN, run, key]
+        if times is None:
+            found: int = sync(worker.loop, worker.scheduler.get_metadata, keys=keys, default=0)
+            return found
+        sync(worker.loop, worker.scheduler.set_metadata, keys=keys, value=times)
+        return times
+
+    before = begun()
+    if before >= _ATTEMPTS:
+        reason = f"{before} workers that tried it died, most likely for lack of memory"
+        return zlib.compress(pickle.dumps((True, SetAside(reason))), 1)
+    begun(before + 1)
+    packed = zlib.compress(answer(message), 1)
+    begun(0)  # what is lost from now on is not its fault
+    return packed

@@ -1,0 +1,201 @@
+"""What retrieval derives from graphs: segments of an index, and what it said of scenes. Losing it costs time only."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Row, delete, insert, select, update
+
+from gsmap.errors import CorruptError
+from gsmap.store.arrays import Arrays, StoredFile, digest
+from gsmap.store.branches import Others
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.store.groups import manifest, publish, unless_pruned, unname
+from gsmap.store.scene_refs import living_ids
+from gsmap.store.schema import index_segments, lookups
+from gsmap.types.retrieval import Candidate, IndexArrays, Member
+
+KIND = "indexes"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSegment:
+    """A segment of an index, whose arrays are read when they are asked for.
+
+    Args:
+        number: unique in the map, growing.
+        members: its scenes; None in the place of one that does not count.
+        num_nodes: of all of them.
+    """
+
+    number: int
+    members: Sequence[Member | None]
+    num_nodes: int
+    _group: str
+    _files: tuple[StoredFile, ...]
+    _arrays: Arrays
+    _catalog: Catalog
+
+    def lists(self) -> tuple[np.ndarray, np.ndarray]:
+        """(W,) int64 keys of its lists, and (W + 1,) where each begins in the rows.
+
+        Raises:
+            CorruptError: bytes on disk are missing or differ.
+            NotFoundError: another process made it one with others meanwhile.
+        """
+        found = self._read(("keys", "starts"), None)
+        return found["keys"], found["starts"]
+
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        """(stop - start, B) uint8 nodes; see `lists` for the errors."""
+        return self._read(("nodes",), [(start, stop)])["nodes"]
+
+    def _read(self, names: Sequence[str], rows: Sequence[tuple[int, int]] | None) -> dict[str, np.ndarray]:
+        shapes = {"nodes": (self.num_nodes, None)}
+        with unless_pruned(self._catalog, self._group, "a segment of the index became one with others"):
+            return self._arrays.read(KIND, self._group, self._files, only=names, rows=rows, shapes=shapes)
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """What an index said of a scene.
+
+    Args:
+        scene: its id.
+        key: `RecipeKey.digest` of how it was asked, and of the scene's graph.
+        candidates: best first.
+        num_left: how many of them were not tried when last there was enough; None until the list was gone down.
+    """
+
+    scene: str
+    key: str
+    candidates: tuple[Candidate, ...]
+    num_left: int | None = None
+
+
+class Indexes:
+    """The retrieval index of a map, and the lookups in it."""
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
+        self._catalog = catalog
+        self._arrays = arrays
+
+    def segments(self, key: str) -> list[StoredSegment]:
+        """The segments that a recipe made, oldest first; nothing of their arrays is read."""
+        query = select(index_segments).where(index_segments.c.key == key).order_by(index_segments.c.number)
+        with self._catalog.read() as connection:
+            rows = connection.execute(query).all()
+            return [self._segment(row, manifest(connection, row.group_id)) for row in rows]
+
+    def put(self, key: str, members: Sequence[Member], arrays: IndexArrays, instead_of: Collection[int]) -> bool:
+        """Keep a segment in place of others, whose arrays go; segments of other recipes go as well.
+
+        Args:
+            key: of the recipe.
+            instead_of: numbers of the segments that it holds what counts of.
+
+        Returns:
+            Whether it was kept: not where another process has replaced one of those meanwhile.
+        """
+        told = [[m.scene, m.graph, m.upright, m.metric, float(m.coarseness)] for m in members]
+        group_id = digest(arrays.keys, arrays.starts, arrays.nodes, text=f"{key}{told}")
+        row = {"key": key, "members": told, "num_nodes": len(arrays.nodes), "group_id": group_id}
+        staging = self._arrays.stage({"keys": arrays.keys, "starts": arrays.starts, "nodes": arrays.nodes})
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+            there = connection.execute(select(index_segments.c.number, index_segments.c.key)).all()
+            if not set(instead_of) <= {old.number for old in there}:
+                return False
+            gone = {old.number for old in there if old.number in instead_of or old.key != key}
+            dropped = self._unname(connection, gone)
+            known = manifest(connection, group_id)
+            if not known or self._arrays.problems(KIND, group_id, known):
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
+            connection.execute(insert(index_segments), row | {"created_at": now()})
+        self._drop(dropped - {group_id})
+        return True
+
+    def forget(self, numbers: Collection[int]) -> None:
+        """Drop segments: their scenes are put into the index anew when it is asked next."""
+        with self._catalog.write() as connection:
+            dropped = self._unname(connection, set(numbers))
+        self._drop(dropped)
+
+    def asked(self) -> dict[str, tuple[str, int | None]]:
+        """By scene, the key of its lookup and how many of its candidates were not tried (`Lookup.num_left`)."""
+        query = select(lookups.c.scene, lookups.c.key, lookups.c.num_left)
+        with self._catalog.read() as connection:
+            return {row.scene: (row.key, row.num_left) for row in connection.execute(query)}
+
+    def lookups(self, scenes: Collection[str]) -> list[Lookup]:
+        """What the index said of these scenes (ids), of those that have asked."""
+        query = select(lookups).where(lookups.c.scene.in_(sorted(scenes))).order_by(lookups.c.scene)
+        with self._catalog.read() as connection:
+            return [_lookup(row) for row in connection.execute(query)]
+
+    def note(self, found: Sequence[Lookup]) -> None:
+        """Keep what the index said, each in place of what it said of that scene before; removed scenes' go."""
+        rows = [
+            {
+                "scene": one.scene,
+                "key": one.key,
+                "candidates": [[c.scene, c.score, c.votes] for c in one.candidates],
+                "num_left": one.num_left,
+                "created_at": now(),
+            }
+            for one in found
+        ]
+        with self._catalog.write() as connection:
+            alive = living_ids(connection)
+            known = set(connection.execute(select(lookups.c.scene)).scalars())
+            gone = sorted((known - set(alive)) | {one.scene for one in found} & known)
+            if gone:
+                connection.execute(delete(lookups).where(lookups.c.scene.in_(gone)))
+            if rows := [row for row in rows if row["scene"] in alive]:
+                connection.execute(insert(lookups), rows)
+
+    def leave(self, num_left: Mapping[str, int]) -> None:
+        """Note how many of a scene's candidates were not tried, where that is not what is noted."""
+        with self._catalog.write() as connection:
+            query = select(lookups.c.scene, lookups.c.num_left).where(lookups.c.scene.in_(sorted(num_left)))
+            for row in connection.execute(query).all():
+                if row.num_left != num_left[row.scene]:
+                    mine = lookups.c.scene == row.scene
+                    connection.execute(update(lookups).where(mine).values(num_left=num_left[row.scene]))
+
+    def _segment(self, row: Row[Any], files: tuple[StoredFile, ...]) -> StoredSegment:
+        members = [Member(scene, graph, bool(up), bool(metric), c) for scene, graph, up, metric, c in row.members]
+        if row.num_nodes < 0:
+            raise CorruptError(f"the catalog holds {row.num_nodes} in index_segments.num_nodes: restore it")
+        return StoredSegment(row.number, members, row.num_nodes, row.group_id, files, self._arrays, self._catalog)
+
+    @staticmethod
+    def _unname(connection: Any, numbers: Collection[int]) -> set[str]:
+        """Delete rows of segments and name their arrays no longer, but for those that other rows name."""
+        mine = index_segments.c.number.in_(sorted(numbers))
+        dropped = set(connection.execute(select(index_segments.c.group_id).where(mine)).scalars())
+        connection.execute(delete(index_segments).where(mine))
+        dropped -= set(connection.execute(select(index_segments.c.group_id)).scalars())
+        for group_id in dropped:
+            unname(connection, group_id)
+        return dropped
+
+    def _drop(self, group_ids: Collection[str]) -> None:
+        """Delete arrays that no row names any more, unless a branch does. A crash before leaves them to `prune`."""
+        if not group_ids:
+            return
+        others = Others(self._arrays.root.parent, self._catalog.folder)
+        with explained(self._catalog.folder), self._arrays.lock():
+            with self._catalog.read() as connection:
+                free = [group for group in sorted(group_ids) if not manifest(connection, group)]
+            for group in free:
+                if not others.manifests(group):
+                    self._arrays.drop(KIND, group)
+
+
+def _lookup(row: Row[Any]) -> Lookup:
+    candidates = tuple(Candidate(scene, float(score), float(votes)) for scene, score, votes in row.candidates)
+    return Lookup(row.scene, row.key, candidates, row.num_left)
