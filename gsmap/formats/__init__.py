@@ -46,7 +46,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         return found
 
 
-def open_source(path: str | os.PathLike[str]) -> GaussianSource:
+def stream(path: str | os.PathLike[str]) -> GaussianSource:
     """The Gaussians of a file of any known format, read a chunk at a time where the format can; else all at once.
 
     Raises:
@@ -54,10 +54,10 @@ def open_source(path: str | os.PathLike[str]) -> GaussianSource:
     """
     path = Path(path)
     module = _load(_layout(path, _suffix(path, "read")))
-    if not hasattr(module, "open_source"):
+    if not hasattr(module, "stream"):
         return read(path)
     with _explained(path, "read"), np.errstate(all="ignore"):
-        return _FileSource(path, module.open_source(path))
+        return _FileSource(path, module.stream(path))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
     staged = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # a name that nobody can have put a link at
     try:
         with _explained(path, "write"):
-            module.write(staged, gaussians if hasattr(module, "open_source") else gaussians.load(), **options)
+            module.write(staged, gaussians if hasattr(module, "stream") else gaussians.load(), **options)
             os.replace(staged, path)
     finally:
         with contextlib.suppress(OSError):

@@ -71,15 +71,15 @@ class Header:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a 3DGS ``.ply``; see `open`.
+    """Read a 3DGS ``.ply``; see `stream`.
 
     Raises:
         InputError: not a PLY, truncated, or not a splat.
     """
-    return open_source(path).load()
+    return stream(path).load()
 
 
-def open_source(path: str | os.PathLike[str]) -> PlySource:
+def stream(path: str | os.PathLike[str]) -> PlySource:
     """A 3DGS ``.ply``, to be read a chunk at a time.
 
     A file without ``f_dc`` but with ``red green blue`` takes its colours from those, one without ``scale_2`` (2DGS)

@@ -93,7 +93,7 @@ def read_capture(
 ) -> Capture:
     """Read and check one capture that `find_captures` found; see `read_captures`."""
     given_date(captured_at)  # refuses what is none before a large file is read
-    gaussians = formats.open_source(found.path)
+    gaussians = formats.stream(found.path)
     about = formats.info(found.path)
     source = Path(cameras) if cameras is not None else found.cameras
     capture = take_capture(

@@ -59,7 +59,7 @@ class DescribedFormat(ReadableFormat, Protocol):
 class StreamedFormat(ReadableFormat, Protocol):
     """A format of files that need not fit in memory; where it has ``write``, that takes a `GaussianSource` too."""
 
-    def open_source(self, path: str | os.PathLike[str], /) -> GaussianSource:
+    def stream(self, path: str | os.PathLike[str], /) -> GaussianSource:
         """As ``read``, a chunk at a time; what is wrong with the file as a whole is said when it is opened.
 
         Raises:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap.errors import InputError
-from gsmap.formats import info, open_source, ply, read, write
+from gsmap.formats import info, ply, read, stream, write
 from gsmap.geometry.sh import SH_C0
 from gsmap.types import Gaussians
 
@@ -287,7 +287,7 @@ def test_lines_without_data_among_ascii_rows_are_left_out_in_silence(tmp_path):
 def test_a_file_that_is_written_to_while_it_is_read_is_refused(tmp_path):
     path = tmp_path / "a.ply"
     write(path, some(100))
-    source = open_source(path)
+    source = stream(path)
     assert source.num_gaussians == 100
     assert len(list(source.chunks())) == 1
     before = path.stat()
@@ -302,5 +302,5 @@ def test_a_file_that_is_written_to_while_it_is_read_is_refused(tmp_path):
 def test_a_ply_is_copied_chunk_by_chunk(tmp_path, monkeypatch):
     write(tmp_path / "a.ply", some(degree=1))
     monkeypatch.setattr(ply.PlySource, "load", None)
-    write(tmp_path / "b.ply", open_source(tmp_path / "a.ply"))
+    write(tmp_path / "b.ply", stream(tmp_path / "a.ply"))
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

@@ -327,8 +327,8 @@ def a_graph_whose_row_says_otherwise(w: World) -> None:
 
 @case(r"gsmap did not write that", verbs=("look MAP",))
 def a_graph_of_types_that_there_are_none_of(w: World) -> None:
-    w.set("UPDATE graphs SET about = replace(about, '\"is\": \"f8\"', '\"is\": \"O\"')")
-    w.set("UPDATE graphs SET about = replace(about, '\"is\":\"f8\"', '\"is\":\"O\"')")
+    w.set('UPDATE graphs SET about = replace(about, \'"is": "f8"\', \'"is": "O"\')')
+    w.set('UPDATE graphs SET about = replace(about, \'"is":"f8"\', \'"is":"O"\')')
 
 
 @case(r"no text", verbs=("look MAP", "export MAP TILES --tile-size 0 --merge union"))
