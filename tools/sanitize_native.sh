@@ -24,5 +24,5 @@ export PYTHONPATH=$BUILD/tree GSMAP_TEST_INSTALLED=1 ASAN_OPTIONS=detect_leaks=0
 LD_PRELOAD="$(${CXX:-g++} -print-file-name=libasan.so) $(${CXX:-g++} -print-file-name=libubsan.so)"
 export LD_PRELOAD
 "$PYTHON" -P -c "import gsmap._native as m; assert 'sanitize' in m.__file__, m.__file__"
-exec "$PYTHON" -P -m pytest -q -p no:cacheprovider tests/render tests/register/test_register_surface.py \
-    tests/describe/test_describe_grids.py tests/geometry/test_neighbours.py "$@"
+exec "$PYTHON" -P -m pytest -q -p no:cacheprovider tests/render tests/register/test_register_clique.py \
+    tests/register/test_register_surface.py tests/describe/test_describe_grids.py tests/geometry/test_neighbours.py "$@"

@@ -9,7 +9,7 @@ from gsmap.errors import ConfigError
 from gsmap.ingest import parse_date
 from gsmap.store import Store, schema
 from gsmap.store import backup as _backup
-from gsmap.store.backup.places import place_of
+from gsmap.store.places import place_of
 from gsmap.types.progress import Progress, silent
 from gsmap.types.rows import BackupReport, CloneReport, RestoreReport, SnapshotRow
 

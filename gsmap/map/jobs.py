@@ -18,7 +18,7 @@ from gsmap.merge.placed import pulled_inside
 from gsmap.merge.sights import SightStore
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.register import SceneView
-from gsmap.store import Store, branches, sqlite
+from gsmap.store import Store, branches, homes, sqlite
 from gsmap.types import ChangeReport, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress
@@ -37,7 +37,7 @@ def _opened(location: str, inode: int) -> Store:
 def _catalog_file(path: str) -> tuple[str, int]:
     """The absolute location of a map, and which file its catalog is: where jobs run in a person's own process, another
     map may come to lie at the same path. (A file that is held open keeps its inode to itself.)"""
-    location = os.path.abspath(path)
+    location = path if homes.is_remote(path) else os.path.abspath(path)
     try:
         return location, (branches.find(location).folder / sqlite.FILE).stat().st_ino
     except FileNotFoundError:  # its catalog is a database elsewhere

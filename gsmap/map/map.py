@@ -196,6 +196,7 @@ class Map(AbstractContextManager["Map"]):
 
         with self.store.catalog.lock():
             write_settings(self.store.folder, values or {}, preset=preset, drop=tuple(unset))
+            self.store.send_settings()
         self.__dict__.pop("settings", None)
 
     def setting_rows(self) -> list[SettingRow]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,8 @@ from gsmap.evaluate import judge
 from gsmap.map import visits
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
+
+_log = logging.getLogger("gsmap.settings")
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -97,7 +100,15 @@ def read_settings(folder: Path) -> tuple[str, dict[str, Any]]:
         ConfigError: ``settings.toml`` cannot be read.
     """
     values = load(folder / FILE_NAME)
+    for name in [name for name in values if _is_of_the_run(name)]:
+        _log.warning("%s: %s is left out: where jobs run is for whoever runs gsmap to say", folder / FILE_NAME, name)
+        del values[name]
     return str(values.pop(PRESET, "default")), values
+
+
+def _is_of_the_run(name: str) -> bool:
+    """Whether a setting may lead to another machine: a map may come from a stranger."""
+    return name.startswith("engine.") and not name.startswith("engine.executors.local.")
 
 
 def map_settings(folder: Path, run_preset: str | None, run_values: Mapping[str, Any]) -> Settings:
@@ -141,6 +152,11 @@ def write_settings(
     Raises:
         ConfigError: no such preset or setting, or a value that does not fit.
     """
+    if of_run := [name for name in values if _is_of_the_run(name)]:
+        raise ConfigError(
+            f"{of_run[0]} is not kept with a map: say it with each run (--executor, --scheduler), or by GSMAP_EXECUTOR "
+            "and GSMAP_SCHEDULER"
+        )
     old_preset, old = read_settings(folder)
     kept = {name: value for name, value in old.items() if name not in drop}
     if preset is not None:

@@ -6,8 +6,9 @@ import os
 from pathlib import Path
 
 from gsmap.errors import ConfigError, NotFoundError
-from gsmap.store import Store
+from gsmap.store import Store, homes
 from gsmap.store import trust as trusting
+from gsmap.store.explained import called
 from gsmap.types.rows import TrustReport
 
 
@@ -19,7 +20,7 @@ def catalog_of(path: str | os.PathLike[str]) -> TrustReport:
         ConfigError: its catalog lies in its own folder.
         CorruptError: it names something else than a PostgreSQL database.
     """
-    found = _remembered(Path(path))
+    found = _remembered(_folder(path))
     return TrustReport(
         map=str(path),
         server=found.server,
@@ -36,19 +37,28 @@ def trust(path: str | os.PathLike[str]) -> TrustReport:
         NotFoundError, ConfigError, CorruptError: as `catalog_of`.
         StoreError: what the user trusts cannot be written down.
     """
-    folder = Path(path)
+    folder = _folder(path)
     found = _remembered(folder)
     map_id = found.map_id
     if map_id is None:  # an older gsmap made it: the database knows
-        map_id = Store.id_at(folder, found.url)
+        map_id = Store.id_at(path, found.url)
         trusting.write(folder, found.url, map_id)
     trusting.trust(map_id, found.url)
     return catalog_of(path)
 
 
+def _folder(path: str | os.PathLike[str]) -> Path:
+    """Where a map's ``catalog.url`` lies; that of a bucket is brought here."""
+    if not homes.is_remote(path):
+        return homes.local(path)
+    home = homes.Home(os.fspath(path))
+    home.lay_out()
+    return home.desk
+
+
 def _remembered(folder: Path) -> trusting.Remembered:
     if not folder.is_dir():
-        raise NotFoundError(f"no map at {folder}")
+        raise NotFoundError(f"no map at {called(folder)}")
     if not (folder / trusting.URL_FILE).exists():
         raise ConfigError(f"{folder} keeps its catalog in its own folder, if it is a map: there is nothing to trust")
     return trusting.remembered(folder)

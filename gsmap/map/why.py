@@ -20,16 +20,35 @@ from gsmap.types.rows import PairReport, WhyReport, WhyStep
 def why(store: Store, settings: Settings, a: Scene, b: Scene) -> WhyReport:
     """Every step of a pair, from what is stored of it; nothing is computed again."""
     pair = pair_report(store, a, b)
-    steps = _steps(pair, settings)
+    steps = [_retrieval(store, settings, a, b, pair.status != "never registered"), *_steps(pair, settings)]
     advice = _advice(pair, settings, {step.name: step for step in steps})
     ends = {name: getattr(pair, name) for name in ("target", "target_name", "source", "source_name")}
     return WhyReport(**ends, status=pair.status, reason=pair.reason, steps=tuple(steps), advice=advice)
 
 
+def _retrieval(store: Store, settings: Settings, a: Scene, b: Scene, is_tried: bool) -> WhyStep:
+    """Whether retrieval proposed the pair, at which place of whose list, and why it was not tried where it was not."""
+    top_k, best = settings.retrieve.top_k, None
+    for scene, other in ((a, b), (b, a)):
+        for one in store.indexes.lookups([scene.id]):
+            for place, candidate in enumerate(one.candidates, 1):
+                if candidate.scene == other.id and (best is None or place < best[0]):
+                    best = place, scene.name, candidate.score
+    said = "tried" if is_tried else "never tried"
+    if best is not None:
+        place, name, score = best
+        said += f": no. {place} of what {name} was paired with, score {score:.3g}"
+        if not is_tried and place > top_k:
+            said += f", of which the first {top_k} are tried"
+        elif not is_tried:
+            said += f"; both have {settings.retrieve.enough} edges without doubt, which tie them over another scene"
+    return WhyStep(name="retrieval", value=said, bar="among the candidates", passed=is_tried)
+
+
 def _steps(pair: PairReport, settings: Settings) -> list[WhyStep]:
     if pair.status == "never registered":
-        return [WhyStep(name="retrieval", value="never tried", bar="among the candidates", passed=False)]
-    steps = [WhyStep(name="retrieval", value="tried", bar="among the candidates", passed=True)]
+        return []
+    steps = []
     if pair.proposer:
         steps += _evidence(pair, settings.register.verdict, settings.optimize.aliasing.max_disagreement)
     steps.append(WhyStep(name="verdict", value=pair.status, bar="accepted", passed=pair.status == "accepted"))

@@ -30,18 +30,14 @@ class Params:
         margin_px: pictures are cropped to what counts and this much around it, for the windows of SSIM.
         max_views: of more views than that, those are reproduced that together see the tile best, newer ones first; so
             that neither memory (3 MB a view of 960 pixels) nor time grows with the captures of a place.
-        sight_m: a view shows what lies at least so near its camera.
     """
 
     min_share: float = 0.02
     enough_share: float = 0.25
     margin_px: int = 6
     max_views: int = 360
-    sight_m: float = 20.0
 
     def __post_init__(self) -> None:
-        if not self.sight_m > 0:
-            raise ConfigError(f"sight_m must be positive, got {self.sight_m}")
         if self.max_views < 1:
             raise ConfigError(f"max_views must be positive, got {self.max_views}")
 
@@ -103,7 +99,7 @@ def render_references(
     pixels, sure = ([np.zeros(len(scene.gaussians), dtype=np.int64) for scene in scenes] for _ in range(2))
     largest = [np.zeros(len(scene.gaussians), dtype=np.float32) for scene in scenes]
     sights = [
-        scene.sights(longest_side_px, params.sight_m)
+        scene.sights(longest_side_px)
         if scene.sights is not None and (settled is None or not settled.is_disputed(i))
         else None
         for i, scene in enumerate(scenes)

@@ -25,6 +25,10 @@ from gsmap.types import Cameras, Gaussians, Sim3
 _CAN_BE_HELD = 256 << 20
 """Bytes of sights that a process keeps in memory where it has no folder for them."""
 
+_CELL = 0.25
+"""Edge of the cells by which cameras are taken together, so that what is around them is read once for many; as a share
+of how far they look."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sight:
@@ -128,8 +132,7 @@ class Sights:
         scene_id: which capture.
         load: its Gaussians whose means lie in a box (2, 3) of its frame, or more of them.
         cameras: all of its cameras, its frame.
-        around: length, in its unit: a view shows what lies at least so near its camera. Cameras are taken together by a
-            grid of this edge, so that what is around them is read once for many.
+        around: length, in its unit: a view shows what lies at least so near its camera on each axis.
         longest_side_px: size of the pictures.
         store: where sights are kept.
     """
@@ -149,7 +152,7 @@ class Sights:
 
     def cell(self, camera: int) -> tuple[int, ...]:
         """By which cameras are taken together."""
-        return tuple(int(v) for v in np.floor(self.cameras.centers[camera] / self.around))
+        return tuple(int(v) for v in np.floor(self.cameras.centers[camera] / (_CELL * self.around)))
 
     def _seen(self, camera: int) -> Sight:
         gaussians, keys = self._around(camera)
@@ -167,7 +170,8 @@ class Sights:
         cell = self.cell(camera)
         if self._near is None or self._near[0] != cell:
             self._near = None  # two of them need not be held at once
-            box = np.array([np.array(cell) - 1, np.array(cell) + 2]) * self.around
+            low = np.array(cell) * _CELL * self.around
+            box = np.array([low - self.around, low + (1 + _CELL) * self.around])
             found = self.load(box)
             found = found[((found.means >= box[0]) & (found.means < box[1])).all(1)]
             self._near = cell, found, keys_of(found.means)

@@ -56,14 +56,17 @@ def merge_tile(
 ) -> MergeResult:
     """Read what lies around a tile, bring it to the map frame and merge it; see `gsmap.merge.merge`.
 
-    Memory is bounded by what lies within the merger's ``reading_m`` of the tile. ``origin`` of the result counts in
-    ``scenes``.
+    Memory is bounded by what lies within the merger's ``reading_m`` of the tile, and around one camera of one scene.
+    ``origin`` of the result counts in ``scenes``.
     """
     if not scenes:
         raise InputError("nothing to merge: no scene touches the tile")
     how, params = merger(method), checked_params(method, params)
-    margin_m, min_cameras = how.reading_m(params), how.min_cameras(params)
-    placed = [_read(scene, bounds, margin_m, min_cameras) for scene in scenes]
+    dated = len({scene.captured_at for scene in scenes} - {None}) > 1
+    reading = _Reading(
+        how.reach_m(params), how.reading_m(params, dated), how.looking_m(params), how.min_cameras(params)
+    )
+    placed = [_read(scene, bounds, reading) for scene in scenes]
     result = merge(placed, method, params, bounds=bounds, budget_s=budget_s, progress=progress)
     return replace(result, notes=(*result.notes, *_undated(placed))) if how.uses_dates(params) else result
 
@@ -82,27 +85,44 @@ def _undated(placed: Sequence[PlacedScene]) -> list[str]:
     ]
 
 
-def _read(scene: LazyScene, bounds: np.ndarray | None, margin_m: float, min_cameras: int) -> PlacedScene:
+@dataclass(frozen=True)
+class _Reading:
+    """What a merger wants of every scene; see `gsmap.methods.merger.Merger`."""
+
+    reach_m: float
+    reading_m: float
+    looking_m: float
+    min_cameras: int
+
+
+def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> PlacedScene:
     S = scene.S_map_scene
     cameras = None if scene.cameras is None else transform_cameras(scene.cameras, S)
     if bounds is None:
         return PlacedScene(transform_gaussians(scene.load(None), S), cameras, scene.scene_id, scene.captured_at)
-    box = np.array([bounds[0] - margin_m, bounds[1] + margin_m])
-    if cameras is not None and min_cameras > 0:
-        box = _with_cameras(box, cameras.centers, min_cameras)
+    box = np.array([bounds[0] - reading.reading_m, bounds[1] + reading.reading_m])
+    rows = None
+    if cameras is not None:
+        near = np.array([bounds[0] - reading.looking_m, bounds[1] + reading.looking_m])
+        around = _with_cameras(near, cameras.centers, reading.min_cameras)
+        found = np.flatnonzero(inside(cameras.centers, around))
+        cameras = cameras[found]
+        if inside(cameras.centers, near).all() and reading.looking_m > 0:
+            rows = found
+        if rows is None or reading.reading_m > reading.reach_m:  # the Gaussians themselves tell what cameras see
+            box = np.array([np.minimum(box[0], around[0]), np.maximum(box[1], around[1])])
     read = scene.load(_box_in(S.inverse(), box))
     gaussians = transform_gaussians(read, S)
-    near = inside(gaussians.means, box)
+    inner = inside(gaussians.means, box)
     sights = None
-    if cameras is not None:
-        rows = np.flatnonzero(inside(cameras.centers, box))
-        cameras = cameras[rows]
-        sights = partial(_sights, scene, rows, keys_of(read.means)[near])
-    return PlacedScene(gaussians[near], cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
+    if rows is not None:
+        around_m = reading.looking_m + reading.reach_m + float((bounds[1] - bounds[0]).max())
+        sights = partial(_sights, scene, around_m, rows, keys_of(read.means)[inner])
+    return PlacedScene(gaussians[inner], cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
 
 
 def _sights(
-    scene: LazyScene, rows: np.ndarray, keys: np.ndarray, longest_side_px: int, around_m: float
+    scene: LazyScene, around_m: float, rows: np.ndarray, keys: np.ndarray, longest_side_px: int
 ) -> PlacedSights:
     assert scene.cameras is not None
     around = around_m / scene.S_map_scene.scale

@@ -36,7 +36,7 @@ def families() -> dict[str, Family]:
         Family(
             "merger",
             "gsmap.merge.mergers",
-            ("STEPS", "RENDERS", "reach_m", "reading_m", "min_cameras", "uses_dates", "merge"),
+            ("STEPS", "RENDERS", "reach_m", "reading_m", "looking_m", "min_cameras", "uses_dates", "merge"),
         ),
         Family("executor", "gsmap.engine.executors", ("start",)),
         Family("format", "gsmap.formats", (), _FORMATS, any_of=("read", "write"), has_params=False),

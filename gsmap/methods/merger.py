@@ -38,17 +38,25 @@ class Merger(Protocol):
         """
         ...
 
-    def reading_m(self, params: Any) -> float:
-        """How far beyond a tile's bounds Gaussians and cameras are read, in metres; at least `reach_m`.
+    def reading_m(self, params: Any, dated: bool) -> float:
+        """How far beyond a tile's bounds Gaussians are read, in metres; at least `reach_m`.
 
-        More than that where Gaussians farther away only stand in cameras' ways.
+        More than that where Gaussians farther away stand in cameras' ways, and `PlacedScene.sights` does not do.
+
+        Args:
+            dated: whether captures of several dates come near the tile.
         """
         ...
 
-    def min_cameras(self, params: Any) -> int:
-        """How many of a scene's cameras are read at least, the nearest ones, however far from a tile they stand.
+    def looking_m(self, params: Any) -> float:
+        """How far beyond a tile's bounds cameras are looked for, in metres."""
+        ...
 
-        0 where what lies within `reading_m` is enough. The Gaussians between such cameras and the tile are read too.
+    def min_cameras(self, params: Any) -> int:
+        """How many of a scene's cameras are given at least, the nearest ones, however far from a tile they stand.
+
+        0 where those within `looking_m` are enough. Where more is read than `reach_m`, so are the Gaussians between
+        such cameras and the tile.
         """
         ...
 
@@ -68,8 +76,9 @@ class Merger(Protocol):
 
         Args:
             scenes: at least one, in the order of their ids, map frame. For a tile each holds at least its Gaussians
-                and cameras within `reading_m` of the bounds; what must be known of the whole capture it can be asked
-                for (`PlacedScene.whole_centroid`).
+                within `reading_m` of the bounds, and its cameras within `looking_m`; what must be known of the whole
+                capture it can be asked for (`PlacedScene.whole_centroid`), and what its views show
+                (`PlacedScene.sights`).
             params: an instance of ``Params``.
             bounds: (2, 3) float64 lowest and highest corner of the tile; None for everything.
             budget_s: ceiling on the wall seconds it may take (None for no ceiling); closed forms ignore it.

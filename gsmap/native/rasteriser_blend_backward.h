@@ -54,6 +54,16 @@ template <bool kDepth> INLINE void backward_block(const Round &round, BackwardBl
     }
 }
 
+// Whether the gradient of every pixel of a block is zero.
+template <bool kDepth> bool is_zero(const BackwardBlock &s) {
+    bool some = false;
+    for (int i = 0; i < kPixels; i++) {
+        some |= s.gr[i] != 0.f || s.gg[i] != 0.f || s.gb[i] != 0.f || s.ga[i] != 0.f || s.rest[i] != 0.f;
+        if (kDepth) some |= s.gd[i] != 0.f;
+    }
+    return !some;
+}
+
 template <bool kDepth>
 void backward_tile(const TileWork &work, const Image &image, const ImageGradient &gradient, float *slots) {
     Round round;
@@ -89,6 +99,8 @@ void backward_tile(const TileWork &work, const Image &image, const ImageGradient
     });
 
     uint32_t blocks = blocks_in_image(work);
+    for (int b = 0; b < kBlocks; b++)  // what no loss looks at adds nothing but zeros
+        if (is_zero<kDepth>(block[b])) blocks &= ~(1u << b);
     for (int64_t first = 0; first < work.count; first += kRound) {
         const int n = int(work.count - first < kRound ? work.count - first : kRound);
         round.gather(work, first, n);

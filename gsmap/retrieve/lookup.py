@@ -35,7 +35,7 @@ def look_up(voters: Sequence[Voters], segments: Sequence[Segment], params: Param
     found = [_Matches() for _ in voters]
     for block in _blocks(voters, segments, members, params):
         for asker, matches in zip(voters, found, strict=True):
-            _search(asker, block, members.place_of.get(asker.member.scene, -1), matches, params)
+            _search(asker, block, members, matches, params)
     return [_ranked(asker, matches, members, params) for asker, matches in zip(voters, found, strict=True)]
 
 
@@ -53,6 +53,10 @@ class _Members:
         self.places = [np.full(len(segment.members), -1, dtype=np.int32) for segment in segments]
         for scene, (number, place, _) in first.items():
             self.places[number][place] = self.place_of[scene]
+
+    def are_few(self, params: Params) -> bool:
+        """Whether every scene is to be paired with every other."""
+        return len(self.members) - 1 <= params.top_k
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +134,9 @@ class _Matches:
         self.seen: set[int] = set()  # places of scenes with nodes in the same lists, however unlike
 
 
-def _search(asker: Voters, block: _Block, own: int, found: _Matches, params: Params) -> None:
+def _search(asker: Voters, block: _Block, members: _Members, found: _Matches, params: Params) -> None:
     """Compare a scene's nodes with those of the lists they look into."""
+    own, is_small = members.place_of.get(asker.member.scene, -1), members.are_few(params)
     probes = codes.probes(asker.asking.keys, asker.asking.codes, params.turned_signs)
     at = np.searchsorted(block.keys, probes)
     there = (at < len(block.keys)) & (block.keys[np.minimum(at, len(block.keys) - 1)] == probes)
@@ -153,7 +158,8 @@ def _search(asker: Voters, block: _Block, own: int, found: _Matches, params: Par
             bar = np.minimum(
                 bar, np.partition(squared, params.votes_per_node - 1, axis=1)[:, params.votes_per_node - 1]
             )
-        found.seen.update(np.unique(block.nodes.places[rows]).tolist())
+        if is_small:
+            found.seen.update(block.nodes.places[rows].tolist())
         q, e = np.nonzero(squared <= bar[:, None])
         found.nodes.append(mine[q])
         found.places.append(block.nodes.places[rows][e])
@@ -166,13 +172,16 @@ def _ranked(asker: Voters, found: _Matches, members: _Members, params: Params) -
         return []
     node, place = np.concatenate(found.nodes), np.concatenate(found.places)
     squared, theirs = np.concatenate(found.squared), np.concatenate(found.positions)
-    # Of each node the best match in each scene, then the nearest scenes; equals by place: no order decides.
-    order = np.lexsort((*theirs.T, squared, place, node))
+    # Of each node its nearest matches, and of these the best one in each scene. Squared distances are whole numbers
+    # below 2 ** 23; equals come by scene, and within a scene as they lie in its lists: no order of arrival decides.
+    order = np.argsort((node << 44) | (squared.astype(np.int64) << 20) | place, kind="stable")
     node, place, squared, theirs = node[order], place[order], squared[order], theirs[order]
-    best = np.r_[True, (node[1:] != node[:-1]) | (place[1:] != place[:-1])] if len(node) else np.zeros(0, bool)
+    first = np.searchsorted(node, node)
+    last = np.minimum(first + params.votes_per_node, np.searchsorted(node, node, side="right")) - 1
+    best = np.zeros(len(node), dtype=bool)
+    best[np.unique(node * len(members.members) + place, return_index=True)[1]] = True
+    best &= squared <= squared[last]
     node, place, squared, theirs = node[best], place[best], squared[best], theirs[best]
-    order = np.lexsort((place, squared, node))
-    node, place, squared, theirs = node[order], place[order], squared[order], theirs[order]
     worth = _worth(node, squared, len(members.members), params)
     votes = np.bincount(place, weights=worth, minlength=len(members.members))
     chosen = np.argsort(-np.round(votes, 6), kind="stable")[: params.checked_scenes]
@@ -182,7 +191,7 @@ def _ranked(asker: Voters, found: _Matches, members: _Members, params: Params) -
         Candidate(members.members[k].scene, round(float(score), 4), round(float(votes[k]), 4))
         for k, score in zip(chosen, scores, strict=True)
     ]
-    if len(members.members) - 1 <= params.top_k:  # a small map: whatever can be compared at all is worth a try
+    if members.are_few(params):  # a small map: whatever can be compared at all is worth a try
         rest = found.seen.difference(chosen.tolist()) - {members.place_of.get(asker.member.scene, -1)}
         out += [Candidate(members.members[k].scene, 0.0, 0.0) for k in sorted(rest)]
     return sorted(out, key=lambda c: (-c.score, -c.votes, c.scene))

@@ -30,14 +30,14 @@ class Params:
         reach_sigmas: two placed scenes may touch within this many standard deviations of their distance.
     """
 
-    top_k: int = 10
+    top_k: int = 12
     enough: int = 4
     nodes_per_scene: int = 400
-    votes_per_node: int = 64
+    votes_per_node: int = 32
     min_similarity: float = 0.6
     equal_similarity: float = 0.02
-    turned_signs: int = 3
-    matches: int = 60
+    turned_signs: int = 2
+    matches: int = 40
     checked_scenes: int = 100
     tolerance_m: float = 0.15
     apart_m: float = 0.5

@@ -5,7 +5,8 @@ its bytes are on the disk, and counts only once a committed row of the catalog n
 (zarr's default codecs return wrong data for flipped bits, and zeros for a missing file), and the digest of every file
 goes into the catalog.
 
-This class is the seam for arrays elsewhere than in a local folder: nothing else knows where or how they lie.
+This class is the seam for arrays elsewhere than in a local folder: nothing else knows where or how they lie. Those of
+`gsmap.store.object_arrays` lie in an object store.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from gsmap.store.columns import KINDS, is_digest
 from gsmap.store.explained import explained
 from gsmap.store.layout import CHUNK_ROWS
 
+_PIECE_BYTES = 1 << 20
 _NOT_ITS_BYTES = (errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
@@ -72,12 +74,17 @@ class Arrays:
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self.url = str(root)
         self.staging = root / "staging"
         self._held = threading.local()
 
     @contextlib.contextmanager
-    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column]) -> Iterator[Staged]:
-        """Write arrays beside their place and synchronise them; dropped at the end unless `publish` took them."""
+    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column], kind: str, name: str) -> Iterator[Staged]:
+        """Write arrays beside their place and synchronise them; dropped at the end unless `publish` took them.
+
+        Args:
+            kind, name: of the group that they are to be.
+        """
         with self._lock_staging(fcntl.LOCK_SH):
             folder = self.staging / uuid.uuid4().hex
             try:
@@ -118,7 +125,7 @@ class Arrays:
             try:
                 folder.mkdir()
                 yield {
-                    group: Staged(_take(source._place(*group), folder / "-".join(group), files), tuple(files))
+                    group: Staged(source.copied(*group, files, folder / "-".join(group)), tuple(files))
                     for group, files in groups.items()
                 }
             finally:
@@ -146,6 +153,28 @@ class Arrays:
         finally:
             self._held.depth = 0
             os.close(handle)
+
+    def copied(self, kind: str, name: str, files: Sequence[StoredFile], target: Path) -> Path:
+        """Another copy of a group in a folder that is made for it, every byte compared; returns ``target``.
+
+        Raises:
+            CorruptError: a file is missing, or differs from what was written.
+        """
+        return _take(self._place(kind, name), target, files)
+
+    def chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
+        """The bytes of a file, in order.
+
+        Raises:
+            FileNotFoundError: there is none.
+        """
+        with open(open_file(self._place(kind, name) / file.path), "rb") as opened:
+            while chunk := opened.read(_PIECE_BYTES):
+                yield chunk
+
+    def exists(self, kind: str, name: str) -> bool:
+        """Whether anything lies where a group should."""
+        return self._place(kind, name).exists()
 
     def publish(self, staged: Staged, kind: str, name: str) -> None:
         """Move a staged group into its place; only under `lock`, and only where no row names that place."""
@@ -387,12 +416,17 @@ def _synchronise(folder: Path) -> tuple[StoredFile, ...]:
     out = []
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         with open(path, "rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
             os.fsync(file.fileno())
-        out.append(StoredFile(str(path.relative_to(folder)), path.stat().st_size, sha256))
+        out.append(stored_file(folder, str(path.relative_to(folder))))
     for path in [*(p for p in folder.rglob("*") if p.is_dir()), folder]:
         sync_folder(path)
     return tuple(out)
+
+
+def stored_file(folder: Path, path: str) -> StoredFile:
+    """A file below a folder as a manifest has it."""
+    with open(folder / path, "rb") as file:
+        return StoredFile(path, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
 
 
 def _names(folder: Path) -> list[str]:

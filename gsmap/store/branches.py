@@ -22,11 +22,12 @@ from sqlalchemy import Connection, func, select
 from gsmap.durable import is_file, is_folder, make_folder, remove_tree, sync_file, sync_folder
 from gsmap.errors import ConfigError, NotFoundError, StoreError
 from gsmap.settings import FILE_NAME as SETTINGS
-from gsmap.store import sqlite, trust
+from gsmap.store import homes, sqlite, trust
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.catalog import Catalog, now, open_engine
 from gsmap.store.copying import copy_catalog, empty_catalog, make_own
 from gsmap.store.explained import explained
+from gsmap.store.homes import Home
 from gsmap.store.schema import exports, files, groups, leases, models, revisions, scenes, set_aside, tiles
 
 FOLDER = "branches"
@@ -44,16 +45,20 @@ class Place:
         folder: where the catalog, ``settings.toml`` and the writer lock lie.
         branch: name of the branch or tag; empty for the map itself.
         is_tag: its catalog is not to be written.
+        remote: the map's home where that is a bucket; the folders are its desk then.
     """
 
     home: Path
     folder: Path
     branch: str = ""
     is_tag: bool = False
+    remote: Home | None = None
 
     @property
     def location(self) -> str:
         """The string that opens it again."""
+        if self.remote is not None:
+            return self.remote.url
         return f"{self.home}@{self.branch}" if self.branch else str(self.home)
 
 
@@ -89,7 +94,10 @@ def find(path: str | os.PathLike[str]) -> Place:
         ConfigError: the map is there, and what follows ``@`` cannot be a branch's name.
         NotFoundError: the map has no such branch.
     """
-    folder = Path(path)
+    if homes.is_remote(path):
+        remote = Home(os.fspath(path))
+        return Place(remote.desk, remote.desk, remote=remote)
+    folder = homes.local(path)
     left, at, name = str(folder).rpartition("@")
     if folder.exists() or not at or "/" in name or not is_map(Path(left)):
         return Place(folder, folder)
@@ -168,6 +176,12 @@ class Branches:
             StoreError: the map's folder cannot be written.
         """
         home = self._place.home
+        if self._place.remote is not None:
+            kind = "tag" if tag else "branch"
+            raise ConfigError(
+                f"{self._place.location} lies in a bucket, where a map has no branches or tags: gsmap clone makes "
+                f"a map of its own in a folder, which can have a {kind}"
+            )
         folder = home / FOLDER / checked_name(name)
         if folder.exists() or Path(f"{home}@{name}").exists():
             taken = "a branch or tag" if folder.exists() else f"the path {home}@{name}"

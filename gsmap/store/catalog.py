@@ -19,8 +19,8 @@ from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from gsmap.durable import lock_within
 from gsmap.errors import BusyError, ConfigError, CorruptError, MissingDependencyError, StoreError
-from gsmap.store import digests, sqlite, trust
-from gsmap.store.explained import NOT_KEPT, explained, is_full, summary
+from gsmap.store import advisory, digests, sqlite, trust
+from gsmap.store.explained import NOT_KEPT, called, explained, is_full, summary
 from gsmap.store.wal import log_of, read_log
 
 LOCK_FILE = "lock"
@@ -43,7 +43,7 @@ class Catalog:
         self, folder: Path, engine: Engine, *, writable: bool, patience_s: float = 120.0, refusal: str = ""
     ) -> None:
         self.folder = folder
-        self._refusal = refusal or f"{folder} was opened for reading: open it with mode 'w' to change it"
+        self._refusal = refusal or f"{called(folder)} was opened for reading: open it with mode 'w' to change it"
         self.engine = engine
         self.writable = writable
         self.patience_s = patience_s
@@ -52,6 +52,23 @@ class Catalog:
     @property
     def is_sqlite(self) -> bool:
         return self.engine.dialect.name == "sqlite"
+
+    @property
+    def _depth(self) -> int:
+        """Whether this thread holds the writer lock."""
+        return int(getattr(self._held, "depth", 0))
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        self._held.depth = 1
+        try:
+            yield
+        finally:
+            self._held.depth = 0
+
+    @property
+    def _busy(self) -> str:
+        return f"{called(self.folder)}: others have been writing"
 
     @property
     def _writing(self) -> Connection | None:
@@ -101,13 +118,18 @@ class Catalog:
         if self._writing is not None:
             yield self._writing
             return
-        with self.lock():
+        if not self.writable:
+            raise StoreError(self._refusal)
+        with self.lock() if self.is_sqlite else contextlib.nullcontext():
             with explained(self.folder, NOT_KEPT), self.engine.connect() as connection:
                 try:
                     with (
                         contextlib.ExitStack() as until_end,
                         connection.execution_options(gsmap_write=True).begin() as transaction,
                     ):
+                        if not self._depth:  # on a server, where the lock is the transaction's own
+                            advisory.take(connection, advisory.WRITER, self.patience_s, self._busy)
+                            until_end.enter_context(self._locked())
                         self._held.connection, self._held.until_end = connection, until_end
                         yield connection
                         with explained(self.folder, NOT_KEPT, committing=True):
@@ -130,8 +152,13 @@ class Catalog:
         """
         if not self.writable:
             raise StoreError(self._refusal)
-        if getattr(self._held, "depth", 0):
+        if self._depth:
             yield
+            return
+        patience_s = self.patience_s if patience_s is None else patience_s
+        if not self.is_sqlite:
+            with self._advised(advisory.WRITER, patience_s), self._locked():
+                yield
             return
         try:
             handle = os.open(self.folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
@@ -139,13 +166,24 @@ class Catalog:
             with explained(self.folder, NOT_KEPT):
                 raise error
         try:
-            patience_s = self.patience_s if patience_s is None else patience_s
-            lock_within(handle, fcntl.LOCK_EX, patience_s, f"{self.folder}: others have been writing")
-            self._held.depth = 1
-            yield
+            lock_within(handle, fcntl.LOCK_EX, patience_s, self._busy)
+            with self._locked():
+                yield
         finally:
-            self._held.depth = 0
             os.close(handle)
+
+    @contextlib.contextmanager
+    def arrays_lock(self, patience_s: float = 120.0) -> Iterator[None]:
+        """As `gsmap.store.arrays.Arrays.lock`, of arrays that lie in no folder; the catalog is on a server."""
+        with self._advised(advisory.ARRAYS, patience_s):
+            yield
+
+    @contextlib.contextmanager
+    def _advised(self, lock: int, patience_s: float, *, shared: bool = False) -> Iterator[None]:
+        """Hold a lock of the server's by a transaction of its own, which ends with this process."""
+        with explained(self.folder, NOT_KEPT), self.engine.connect() as connection, connection.begin():
+            advisory.take(connection, lock, patience_s, self._busy, shared=shared)
+            yield
 
     @contextlib.contextmanager
     def still(self) -> Iterator[None]:
@@ -153,8 +191,14 @@ class Catalog:
 
         Not to be begun by who holds the lock of the arrays: a writer waits for that one while we wait for this one.
         """
-        with contextlib.nullcontext() if getattr(self._held, "depth", 0) else still(self.folder, self.patience_s):
+        if self._depth:
             yield
+        elif self.is_sqlite:
+            with still(self.folder, self.patience_s):
+                yield
+        else:
+            with self._advised(advisory.WRITER, self.patience_s, shared=True):
+                yield
 
     def verify(self) -> None:
         """Compare the catalog's pages with what was written, unless there are very many; `check` does it always.

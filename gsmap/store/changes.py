@@ -83,7 +83,7 @@ class Changes:
             "gains": from_array(np.asarray(report.gains)),
             "group_id": group_id,
         }
-        staging = self._arrays.stage(arrays) if report.changes else contextlib.nullcontext()
+        staging = self._arrays.stage(arrays, KIND, group_id) if group_id is not None else contextlib.nullcontext()
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             for scene in (older, newer):
                 resolve(connection, scene)

@@ -50,6 +50,19 @@ _GONE: _Said = (StoreError, "the catalog's server went away", "try again once it
 _PASSWORD: _Said = (StoreError, "the catalog's server wants another password", "give it in PGPASSWORD or ~/.pgpass")
 
 
+_CALLED: dict[Path, str] = {}
+
+
+def call(folder: Path, name: str) -> None:
+    """Let a folder that stands for something else be called by that in messages."""
+    _CALLED[folder] = name
+
+
+def called(folder: Path) -> str:
+    """What a folder is called in messages."""
+    return _CALLED.get(folder, str(folder))
+
+
 @contextlib.contextmanager
 def explained(folder: Path, state: str = "", *, committing: bool = False) -> Iterator[None]:
     """Turn what a database or the operating system says into one line of ours.
@@ -107,7 +120,7 @@ def sqlite_code(error: BaseException) -> int | None:
 
 def _error(where: Path, said: _Said, text: str, state: str) -> StoreError:
     kind, what, advice = said
-    return kind("; ".join(part for part in (f"{where}: {what} ({text})", state, advice) if part))
+    return kind("; ".join(part for part in (f"{called(where)}: {what} ({text})", state, advice) if part))
 
 
 def _text(error: BaseException) -> str:

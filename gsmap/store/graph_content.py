@@ -58,7 +58,7 @@ def to_arrays(graph: SceneGraph) -> tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
 def shapes_of(about: Mapping[str, Any]) -> dict[str, Shape] | None:
-    """What a graph's row says of its arrays; None in rows of gsmap before 0.3, which does not say.
+    """What a graph's row says of its arrays; None in rows of schema 0006 and older, which do not.
 
     Raises:
         CorruptError: what no graph says.
@@ -107,7 +107,7 @@ def _layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[s
 
 
 def _older_layers(about: Mapping[str, Any], whole: Mapping[str, np.ndarray]) -> dict[str, NodeLayer]:
-    """Of graphs of gsmap before 0.3: arrays of their own for every layer, called by its number."""
+    """Of graphs of schema 0006 and older: arrays of their own for every layer, called by its number."""
     out = {}
     for i, (name, layer) in enumerate(about["layers"].items()):
         own: dict[str, Any] = {key.split(".", 1)[1]: array for key, array in whole.items() if key.startswith(f"{i}.")}

@@ -71,7 +71,7 @@ class Graphs:
         group_id = digest(*arrays.values(), text=f"{key.digest}{about}")
         row = {"key": key.digest, "scene": graph.scene_id, "num_nodes": graph.num_nodes, "about": about}
         mine = graphs.c.key == key.digest
-        staging = self._arrays.stage(arrays)
+        staging = self._arrays.stage(arrays, KIND, group_id)
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             old = connection.execute(select(graphs).where(mine)).first()
             known = manifest(connection, group_id)

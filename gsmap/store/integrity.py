@@ -109,7 +109,7 @@ def check(
         spare = {group for _, group in _waste(connection, None).doomed}
         if catalog.is_sqlite:
             problems += sqlite.integrity_problems(connection)
-    problems += [f"{arrays.root / name} does not belong there: remove it" for name in arrays.strangers()]
+    problems += [f"{arrays.url}/{name} does not belong there: remove it" for name in arrays.strangers()]
     problems += _odd_models(home)
     if catalog.is_sqlite:
         problems += catalog.page_problems()
@@ -117,7 +117,7 @@ def check(
     for i, (group, kind) in enumerate(unread.items()):
         if progress:
             progress(i / len(unread), f"{kind}/{group[:12]}")
-        if group in spare and not (arrays.root / kind / group).exists():
+        if group in spare and not arrays.exists(kind, group):
             continue  # a prune on a full disk was interrupted: nothing claims it
         found = arrays.problems(kind, group, manifests[group])
         if not found:

@@ -6,7 +6,7 @@ codecs, chunks that are missing or would not unpack to their size, shapes that t
 larger than anything real packs to. What is left to do then is to unpack zstd frames, which zarr is not needed for (it
 would take a millisecond an array).
 
-A group is one archive (`gsmap.store.packed`); in maps of gsmap before 0.3 it is a folder of a file for every key.
+A group is one archive (`gsmap.store.packed`); in maps of schema 0006 and older it is a folder of a file for every key.
 """
 
 from __future__ import annotations

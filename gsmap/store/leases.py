@@ -22,6 +22,7 @@ from sqlalchemy.dialects import sqlite as sqlite_dialect
 
 from gsmap.errors import BusyError, GsmapError, StoreError
 from gsmap.store.catalog import Catalog
+from gsmap.store.explained import called
 from gsmap.store.schema import leases
 from gsmap.types.holder import Holder, this_process
 
@@ -128,7 +129,7 @@ class Leases:
         if not self.try_hold(what, task):
             holder = next((lease for lease in self.list() if lease.what == what), None)
             who = "another process" if holder is None else holder.who
-            raise BusyError(f"{self._catalog.folder}: {who} is at work on {what}; try again when it has ended")
+            raise BusyError(f"{called(self._catalog.folder)}: {who} is at work on {what}; try again when it has ended")
         try:
             yield
         finally:

@@ -20,6 +20,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import is_relative
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import checked_text
+from gsmap.store.homes import Home
 from gsmap.store.schema import models
 from gsmap.types.plain import plain
 
@@ -54,9 +55,11 @@ class Models:
 
     Args:
         arrays: of the same map; the copies lie beside them, for all its branches.
+        remote: the map's home where that is a bucket: copies lie there, and are brought here to be used.
     """
 
-    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
+    def __init__(self, catalog: Catalog, arrays: Arrays, remote: Home | None = None) -> None:
+        self._remote = remote
         self._catalog = catalog
         self._arrays = arrays
         self._home = arrays.root.parent
@@ -91,6 +94,8 @@ class Models:
             if copy:
                 self._catalog.hold(self._arrays.lock())
                 _copy(source, self._home / relative)
+                if self._remote is not None:
+                    self._remote.send(relative, self._home / relative)
             standing = (models.c.name == name) & models.c.removed_at.is_(None)
             connection.execute(update(models).where(standing).values(removed_at=now()))
             connection.execute(insert(models), row | {"created_at": now()})
@@ -122,6 +127,8 @@ class Models:
 
     def _model(self, row: Row[Any]) -> Model:
         path = model_path(self._home, row)
+        if row.copied and self._remote is not None:
+            self._remote.bring(row.path)
         return Model(
             row.name, row.kind, path, bool(row.copied), row.sha256, row.size_bytes, row.created_at, row.options
         )

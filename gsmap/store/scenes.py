@@ -112,7 +112,7 @@ class Scenes:
                 if progress:
                     progress(0.4, f"writing {name}")
                 content = GaussianBlocks(ordered, CHUNK_ROWS)
-                staging = self._arrays.stage(content.arrays | camera_arrays(cameras))
+                staging = self._arrays.stage(content.arrays | camera_arrays(cameras), KIND, new_id)
                 staged = until_end.enter_context(staging)
             connection = until_end.enter_context(self._catalog.write())
             row = by_id(connection, new_id)
@@ -286,7 +286,7 @@ class Scenes:
         content = compact.pack(own) | camera_arrays(self.cameras(before.id))
         boxes = chunk_boxes(own, CHUNK_ROWS, sigmas=_SIGMAS)
         group_id = digest(*content.values(), text=f"compact {before.id}")
-        staging = self._arrays.stage(content)
+        staging = self._arrays.stage(content, KIND, group_id)
         with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
             row = alive(connection, before.id)
             if row.thinned is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import tempfile
 import uuid
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,7 +15,7 @@ from sqlalchemy import insert, select
 
 from gsmap.durable import sync_folder
 from gsmap.errors import ConfigError, CorruptError, NotFoundError, StoreError
-from gsmap.store import branches, integrity, migrate, schema, staging, trust
+from gsmap.store import branches, homes, integrity, migrate, schema, staging, trust
 from gsmap.store import catalog as _catalog
 from gsmap.store.arrays import Arrays, StoredFile
 from gsmap.store.backups import Backups
@@ -25,10 +26,12 @@ from gsmap.store.copying import empty_catalog
 from gsmap.store.explained import explained
 from gsmap.store.exports import Exports
 from gsmap.store.graphs import Graphs
+from gsmap.store.homes import Home
 from gsmap.store.indexes import Indexes
 from gsmap.store.integrity import Check, Pruned
 from gsmap.store.leases import Leases
 from gsmap.store.models import Models
+from gsmap.store.object_arrays import ObjectArrays
 from gsmap.store.priors import Priors
 from gsmap.store.recipes import Recipes
 from gsmap.store.registrations import Registrations
@@ -66,7 +69,10 @@ class Store:
         self.branch = place.branch
         self.location = place.location
         self.is_tag = place.is_tag
+        self._remote = place.remote
         self.arrays = Arrays(place.home / "arrays")
+        if place.remote is not None:
+            self.arrays = ObjectArrays(place.home / "arrays", place.remote.place, catalog.arrays_lock)
         self.catalog = catalog
         self.scenes = Scenes(catalog, self.arrays)
         self.recipes = Recipes(catalog)
@@ -76,7 +82,7 @@ class Store:
         self.changes = Changes(catalog, self.arrays)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
-        self.models = Models(catalog, self.arrays)
+        self.models = Models(catalog, self.arrays, place.remote)
         self.exports = Exports(catalog)
         self.branches = Branches(place, catalog, self.arrays)
         self.backups = Backups(catalog)
@@ -97,7 +103,10 @@ class Store:
             StoreError: the folder is not empty, or cannot be written.
             NotFoundError: the folder it should lie in does not exist.
         """
-        folder = branches.find(Path(path).absolute()).folder
+        if (home := branches.find(path).remote) is not None:
+            _claim(home, catalog_url)
+            return cls.open(path, "w", catalog_url=catalog_url)
+        folder = branches.find(homes.local(path).absolute()).folder
         if folder.is_dir() and any(folder.iterdir()):
             is_map = "is a map already" if branches.holds_catalog(folder) else "is not empty"
             raise StoreError(f"{path} {is_map}: open it, or choose another name")
@@ -147,12 +156,15 @@ class Store:
         Raises:
             NotFoundError: the path names a branch that its map lacks.
         """
-        return branches.find(path).folder.exists()
+        place = branches.find(path)
+        return place.folder.exists() if place.remote is None else place.remote.exists()
 
     @staticmethod
     def can_write(path: str | os.PathLike[str]) -> bool:
         """Whether `open` with mode ``w`` makes sense there: not of a read-only folder, and not of a tag."""
         place = branches.find(path)
+        if place.remote is not None:
+            return True
         return not place.is_tag and (not place.folder.is_dir() or os.access(place.folder, os.W_OK))
 
     @classmethod
@@ -213,6 +225,8 @@ class Store:
             raise ConfigError(f"a store opens with mode 'r' or 'w', got {mode!r}")
         place = branches.find(path)
         folder = place.folder
+        if place.remote is not None:
+            place.remote.lay_out()
         if not folder.exists():
             raise NotFoundError(f"no map at {path}: make one with gsmap init {path}")
         if not branches.is_map(place.home):
@@ -244,6 +258,11 @@ class Store:
         """Everything inside is committed together at the end, or not at all. Keep it short: other writers wait."""
         with self.catalog.write():
             yield
+
+    def send_settings(self) -> None:
+        """Let the home have ``settings.toml`` as it is now; in a folder it is there already."""
+        if self._remote is not None:
+            self._remote.send_settings()
 
     @property
     def id(self) -> str:
@@ -328,6 +347,24 @@ def _refuse_strange_entries(folder: Path) -> None:
                 raise CorruptError(
                     f"{folder / name} is {what}: gsmap makes none in a map; put what belongs there in its place"
                 )
+
+
+def _claim(home: Home, catalog_url: str | None) -> None:
+    """Make an empty map in a bucket."""
+    if catalog_url is None:
+        raise ConfigError(
+            f"{home.url} is a bucket, which can hold no catalog: name an empty PostgreSQL database (gsmap init "
+            f"{home.url} --catalog postgresql+psycopg://...)"
+        )
+    if home.exists():
+        raise StoreError(f"{home.url} is a map already: open it, or choose another name")
+    if (found := home.place.anything()) is not None:
+        raise StoreError(f"{home.url} is not empty (it has {found}): choose another name")
+    with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
+        _make_catalog(Path(folder), catalog_url)
+        if not home.claim(Path(folder)):
+            raise StoreError(f"another process made a map at {home.url} meanwhile: open it, or choose another name")
+        trust.remember(Path(folder))
 
 
 def _make_catalog(folder: Path, url: str | None) -> None:

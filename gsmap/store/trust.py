@@ -22,6 +22,7 @@ from sqlalchemy.exc import ArgumentError
 from gsmap.durable import open_file, write_whole
 from gsmap.errors import CorruptError, StoreError
 from gsmap.store.columns import is_digest
+from gsmap.store.explained import called
 from gsmap.texts import control_characters
 
 _log = logging.getLogger("gsmap.store")
@@ -80,8 +81,9 @@ def remembered(folder: Path) -> Remembered:
         fits = False
     if not fits:
         raise CorruptError(
-            f"{path} does not name a PostgreSQL database (postgresql+psycopg://...), and gsmap writes nothing else "
-            f"there: name the catalog in {ENVIRONMENT}, and do not trust a map that was sent to you so"
+            f"{called(folder)}/{URL_FILE} does not name a PostgreSQL database (postgresql+psycopg://...), and gsmap "
+            f"writes nothing else there: name the catalog in {ENVIRONMENT}, and do not trust a map that was sent to "
+            "you so"
         )
     return Remembered(lines[0], lines[1] if len(lines) > 1 else None)
 
@@ -105,8 +107,9 @@ def named_url(folder: Path) -> str:
     if is_trusted(found):
         return found.url
     raise StoreError(
-        f"{folder} would connect to {found.server} (database {found.database!r}, user {found.user!r}), which you have "
-        f"not trusted yet: run gsmap trust {folder} if that is right, or name the catalog's URL in {ENVIRONMENT}"
+        f"{called(folder)} would connect to {found.server} (database {found.database!r}, user {found.user!r}), which "
+        f"you have not trusted yet: run gsmap trust {called(folder)} if that is right, or name the catalog's URL in "
+        f"{ENVIRONMENT}"
     )
 
 

@@ -23,8 +23,8 @@ class PlacedScene:
         captured_at: ISO 8601 time with zone, or None.
         centroid: reads the whole capture and returns (3,) the mean of its means, map frame (None where it is empty);
             given where `gaussians` is only a piece of it. See `whole_centroid`.
-        sights: what its views show (`gsmap.merge.sights.PlacedSights`), given the longest side of a picture and how
-            much around a camera is shown, in metres; None where it is to be rendered from `gaussians`.
+        sights: what its views show (`gsmap.merge.sights.PlacedSights`), given the longest side of a picture; None where
+            it is to be rendered from `gaussians`.
     """
 
     gaussians: Gaussians
@@ -32,7 +32,7 @@ class PlacedScene:
     scene_id: str = ""
     captured_at: str | None = None
     centroid: Callable[[], np.ndarray | None] | None = None
-    sights: Callable[[int, float], Any] | None = None
+    sights: Callable[[int], Any] | None = None
 
     def whole_centroid(self) -> np.ndarray | None:
         """(3,) float64 unweighted mean of the means of the whole capture, map frame; None where it holds nothing.

@@ -174,7 +174,8 @@ def _few_steps(method: Any) -> Any:
 def test_merger(name: str, world: World) -> None:
     method = family("merger").get(name)
     params = _few_steps(method)
-    assert method.reading_m(params) >= method.reach_m(params) >= 0
+    assert method.reading_m(params, True) >= method.reading_m(params, False) >= method.reach_m(params) >= 0
+    assert method.looking_m(params) >= 0
     assert isinstance(method.min_cameras(params), int)
     assert isinstance(method.uses_dates(params), bool)
     assert isinstance(method.RENDERS, bool)
@@ -300,6 +301,10 @@ def test_embedder(name: str, world: World) -> None:
 @pytest.mark.parametrize("name", of("executor"))
 def test_executor(name: str) -> None:
     method = family("executor").get(name)
+    if name == "dask":
+        with pytest.raises(ConfigError, match="--scheduler"):
+            method.start(method.Params())  # with a cluster: tests/engine/test_engine_dask.py
+        return
     workers = method.start(method.Params())
     try:
         assert dict(workers.run(divmod, [(7, 2), (9, 4)])) == {0: (3, 1), 1: (2, 1)}

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import time
+
+from gsmap.errors import InputError
 
 
 def square(x: int) -> int:
@@ -11,10 +14,17 @@ def square(x: int) -> int:
 
 
 def refuse(x: int) -> int:
-    raise ValueError(f"no {x}")
+    raise InputError(f"no {x}")
 
 
-def die_of_three(x: int) -> int:
+def die_of_three(x: int, tries: str) -> int:
     if x == 3:
+        with open(tries, "a") as file:
+            file.write("x")
         os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+def nap(x: int, seconds: float) -> int:
+    time.sleep(seconds)
     return x

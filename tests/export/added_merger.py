@@ -27,7 +27,12 @@ def reach_m(params):
     return params.cell_m * 2**params.rounds
 
 
-reading_m = reach_m
+def reading_m(params, dated):
+    return reach_m(params)
+
+
+def looking_m(params):
+    return 0.0
 
 
 def min_cameras(params):

@@ -284,7 +284,7 @@ def test_the_family_keeps_the_contract():
     for name in family("merger").names():
         merger = family("merger").get(name)
         params = merger.Params()
-        assert 0 <= merger.reach_m(params) <= merger.reading_m(params)
+        assert 0 <= merger.reach_m(params) <= merger.reading_m(params, False) <= merger.reading_m(params, True)
         assert merger.STEPS is None or hasattr(params, merger.STEPS)
         assert isinstance(merger.RENDERS, bool)
         assert isinstance(merger.uses_dates(params), bool)

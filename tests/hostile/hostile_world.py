@@ -159,7 +159,7 @@ class World:
         return self.map / "arrays" / kind / str(found[0])
 
     def older_form(self, kind: str = "scenes") -> list[Path]:
-        """Make all groups of a kind folders of a file for every key, as gsmap before 0.3 kept them; their folders."""
+        """Make all groups of a kind folders of a file for every key, as schema 0006 and older do; their folders."""
         groups = sorted((self.map / "arrays" / kind).iterdir())
         for group in groups:
             with zipfile.ZipFile(group / packed.FILE) as archive:

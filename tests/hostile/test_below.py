@@ -106,7 +106,7 @@ def test_a_group_is_laid_out_as_it_is_checked(tmp_path, monkeypatch):
         made = {"x": rng.normal(size=(n, 3)).astype(np.float32), "zeros": np.zeros((n, 2, 3)), "none": np.zeros((n, 0))}
         made["flags"] = np.zeros(n, bool)
         name = f"{n:032x}"
-        with arrays.stage(made) as staged:
+        with arrays.stage(made, "scenes", name) as staged:
             arrays.publish(staged, "scenes", name)
         assert arrays.problems("scenes", name, staged.files) == []
         read = arrays.read("scenes", name, staged.files, shapes={"x": (n, 3), "none": (None, 0)})

@@ -91,4 +91,6 @@ def test_gravity_free_landmarks_vote_only_where_a_scene_does_not_know_up():
     knows = SceneGraph("a", {"landmarks": levelled, "landmarks_gravity_free": plain}, up)
     other = SceneGraph("b", {"landmarks": plain})
     assert candidate_pairs([knows, other]) == [("a", "b")]
-    assert candidate_pairs([knows, SceneGraph("b", {"landmarks": plain}, up)]) == []
+    other_levelled = layer(rng, 40, descriptor="levelled of another kind")
+    knows_too = SceneGraph("b", {"landmarks": other_levelled, "landmarks_gravity_free": plain}, up)
+    assert candidate_pairs([knows, knows_too]) == []

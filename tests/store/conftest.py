@@ -1,9 +1,13 @@
 import multiprocessing
+import shutil
+import tempfile
+from pathlib import Path
 
 import check_flips
 import pytest
 from store_postgres import NoServer, make_database, running_server
 from store_samples import make_cameras, make_gaussians
+from store_swift import Swift, why_not
 
 from gsmap.store import Store
 
@@ -52,6 +56,22 @@ def start(context):
         if process.is_alive():
             process.kill()
         process.join()
+
+
+@pytest.fixture(scope="session")
+def server():
+    """A server that speaks S3, with an empty bucket."""
+    pytest.importorskip("obstore")
+    folder = Path(tempfile.mkdtemp(prefix="gsmap-s3-"))
+    reason = why_not(folder)
+    try:
+        if reason:
+            pytest.skip(reason)
+        with Swift(folder) as swift:
+            swift.make_bucket()
+            yield swift
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")

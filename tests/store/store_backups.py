@@ -11,9 +11,9 @@ from test_store_nouns import graph_of, layer, registration, tile
 
 from gsmap.store import Store
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import SNAPSHOTS, Backup, Snapshot, listed, object_name
 from gsmap.store.copying import one_state, tables
+from gsmap.store.places import Place
 from gsmap.types import Prior, SceneGraph, Sim3
 
 PASSING = {"leases", "backups"}  # who is at work, and where it went: no part of what a map holds

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from datetime import timedelta
@@ -138,6 +141,62 @@ class Swift:
             time.sleep(0.05)
         logs = "".join((self.root / f).read_text() for f in os.listdir(self.root) if f.endswith(".log"))
         raise AssertionError(f"Swift did not start: {logs[-3000:]}")
+
+
+class Wire:
+    """A wire to the server that counts, and on which the answer to every so many-th request is lost after the server
+    has done it.
+
+    Args:
+        every: 0 to lose none.
+    """
+
+    def __init__(self, url: str, every: int = 0) -> None:
+        self.host, port = url.removeprefix("http://").split(":")
+        self.port = int(port)
+        self.every = every
+        self.lost = self.answers = self.num_bytes = 0
+        self._count = itertools.count(1)
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listening.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        self._listening.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                client, _ = self._listening.accept()
+            except OSError:
+                return
+            server = socket.create_connection((self.host, self.port))
+            threading.Thread(target=self._forward, args=(client, server), daemon=True).start()
+            threading.Thread(target=self._answer, args=(server, client), daemon=True).start()
+
+    def _forward(self, client: socket.socket, server: socket.socket) -> None:
+        try:
+            while data := client.recv(1 << 16):
+                server.sendall(data)
+        except OSError:
+            pass
+
+    def _answer(self, server: socket.socket, client: socket.socket) -> None:
+        try:
+            while data := server.recv(1 << 16):
+                self.num_bytes += len(data)
+                if data.startswith(b"HTTP/1.1 "):
+                    self.answers += 1
+                    if self.every and next(self._count) % self.every == 0:
+                        self.lost += 1
+                        break  # the server has done it, and nobody hears of it
+                client.sendall(data)
+        except OSError:
+            pass
+        for one in (client, server):
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
 
 
 def _free_ports(count: int) -> list[int]:

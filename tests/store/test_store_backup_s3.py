@@ -1,39 +1,17 @@
 """Backups in an object store: a real server that speaks S3."""
 
-import contextlib
 import itertools
-import shutil
-import socket
-import tempfile
-import threading
-from pathlib import Path
 
 import pytest
 from store_backups import fill, holdings
 from store_samples import make_cameras, make_gaussians
-from store_swift import BUCKET, ENVIRONMENT, Swift, why_not
+from store_swift import BUCKET, ENVIRONMENT, Wire
 
 from gsmap.errors import CorruptError, MissingDependencyError, NotFoundError, StoreError
+from gsmap.store import places as places_module
 from gsmap.store.backup import Backup, restore, save
-from gsmap.store.backup import places as places_module
-from gsmap.store.backup.places import place_of
 from gsmap.store.backup.repository import object_name
-
-
-@pytest.fixture(scope="module")
-def server():
-    pytest.importorskip("obstore")
-    folder = Path(tempfile.mkdtemp(prefix="gsmap-s3-"))
-    reason = why_not(folder)
-    try:
-        if reason:
-            pytest.skip(reason)
-        with Swift(folder) as swift:
-            swift.make_bucket()
-            yield swift
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
+from gsmap.store.places import place_of
 
 _numbers = itertools.count()
 
@@ -100,56 +78,8 @@ def test_large_objects_go_in_parts_and_appear_whole(filled, place, tmp_path, mon
     assert holdings(tmp_path / "r") == holdings(filled.catalog.folder)
 
 
-class Lossy:
-    """A wire to the server on which the answer to every so many-th request is lost after the server has done it."""
-
-    def __init__(self, url, every):
-        self.host, port = url.removeprefix("http://").split(":")
-        self.port = int(port)
-        self.every = every
-        self.lost = 0
-        self._count = itertools.count(1)
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.url = f"http://127.0.0.1:{self._listening.getsockname()[1]}"
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def close(self):
-        self._listening.close()
-
-    def _accept(self):
-        while True:
-            try:
-                client, _ = self._listening.accept()
-            except OSError:
-                return
-            server = socket.create_connection((self.host, self.port))
-            threading.Thread(target=self._forward, args=(client, server), daemon=True).start()
-            threading.Thread(target=self._answer, args=(server, client), daemon=True).start()
-
-    def _forward(self, client, server):
-        try:
-            while data := client.recv(1 << 16):
-                server.sendall(data)
-        except OSError:
-            pass
-
-    def _answer(self, server, client):
-        try:
-            while data := server.recv(1 << 16):
-                if data.startswith(b"HTTP/1.1 ") and next(self._count) % self.every == 0:
-                    self.lost += 1
-                    break  # the server has done it, and nobody hears of it
-                client.sendall(data)
-        except OSError:
-            pass
-        for one in (client, server):
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
-
-
 def test_answers_that_are_lost_are_no_errors(server, filled, place, tmp_path, monkeypatch):
-    wire = Lossy(server.url, every=4)
+    wire = Wire(server.url, every=4)
     monkeypatch.setenv("AWS_ENDPOINT_URL", wire.url)
     save(filled, place_of(place.url))
     filled.scenes.add(make_gaussians(seed=5), make_cameras(), name="c")

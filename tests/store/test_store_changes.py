@@ -9,8 +9,8 @@ from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store
 from gsmap.store.backup import clone, restore, save
-from gsmap.store.backup.places import FolderPlace
 from gsmap.store.merging import merge, split
+from gsmap.store.places import FolderPlace
 from gsmap.store.superseding import inherit
 from gsmap.types import ChangeReport, PoseGraph, ScenePose, Sim3
 

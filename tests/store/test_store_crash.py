@@ -96,11 +96,11 @@ def die_at_steps(tmp_path, start, stride: int) -> None:
         places.append(said)
         step += stride
     assert any("os.rename" in place for place in places) or stride > 1
-    assert len(places) > 30 / stride
+    assert len(places) > 8 / stride
 
 
 def test_killed_at_chosen_steps(tmp_path, start):
-    die_at_steps(tmp_path, start, 7)
+    die_at_steps(tmp_path, start, 3)
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_killed_at_every_step(tmp_path, start):
 
 
 @pytest.mark.parametrize("code", store_children.CODES)
-@pytest.mark.parametrize("stride", [10, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stride", [4, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_failing_disk_is_one_typed_error_and_changes_nothing(tmp_path, start, code, stride):
     path = tmp_path / "site.gsmap"
     Store.create(path).close()
@@ -126,7 +126,7 @@ def test_a_failing_disk_is_one_typed_error_and_changes_nothing(tmp_path, start, 
             assert "damaged" not in text
             assert os.strerror(code) in text
     assert said[-1][1] == "through"
-    assert sum(kind != "through" for _, kind, *_ in said) > 60 / stride
+    assert sum(kind != "through" for _, kind, *_ in said) > 10 / stride
 
 
 def test_a_full_disk(tmp_path):
@@ -185,8 +185,8 @@ def test_check_finds_a_flipped_bit_in_every_file(tmp_path):
         store.models.add("net", __file__, kind="clip")
         assert store.check().ok
         files = [p for folder in ("arrays", "models") for p in (store.folder / folder).rglob("*") if p.is_file()]
-        assert len(files) > 30
-        for file in files:
+        assert len(files) == 3
+        for file in files * 10:
             whole = file.read_bytes()
             broken = bytearray(whole)
             broken[rng.randrange(len(broken))] ^= 1 << rng.randrange(8)

@@ -158,11 +158,11 @@ def test_the_log_is_folded_in_under_the_lock(store, monkeypatch):
 
 def test_what_is_being_staged_is_not_swept_away(store):
     others = Arrays(store.arrays.root)
-    with store.arrays.stage({"a": np.zeros(3)}) as staged:
+    with store.arrays.stage({"a": np.zeros(3)}, "scenes", "0" * 32) as staged:
         assert is_locked(store.arrays.staging)
         assert others.drop_leftovers() == 0
         assert staged.folder.is_dir()
-        with others.stage({"a": np.zeros(3)}):  # two may stage at a time
+        with others.stage({"a": np.zeros(3)}, "scenes", "1" * 32):  # two may stage at a time
             pass
         assert staged.folder.is_dir()
     assert not staged.folder.exists()  # nobody published it

@@ -14,8 +14,8 @@ from gsmap.errors import CorruptError, DiskError, NotFoundError, SchemaVersionEr
 from gsmap.store import Store
 from gsmap.store.backup import Backup, clone, restore, save
 from gsmap.store.backup import restoring as restoring_module
-from gsmap.store.backup.places import FolderPlace
 from gsmap.store.backup.repository import object_name
+from gsmap.store.places import FolderPlace
 
 
 @pytest.fixture

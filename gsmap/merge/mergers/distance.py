@@ -25,7 +25,11 @@ def reach_m(params: Params) -> float:
     return 0.0
 
 
-def reading_m(params: Params) -> float:
+def reading_m(params: Params, dated: bool) -> float:
+    return 0.0
+
+
+def looking_m(params: Params) -> float:
     return 0.0
 
 

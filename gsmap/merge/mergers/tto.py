@@ -28,7 +28,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 2
+VERSION = 3
 STEPS: str | None = "steps"
 RENDERS = True
 
@@ -150,7 +150,12 @@ def reach_m(params: Params) -> float:
     return params.halo_m
 
 
-def reading_m(params: Params) -> float:
+def reading_m(params: Params, dated: bool) -> float:
+    compares = params.balance_exposure or (dated and uses_dates(params))
+    return params.halo_m + (params.reach_m if compares else 0.0)
+
+
+def looking_m(params: Params) -> float:
     return params.halo_m + params.reach_m
 
 

@@ -32,7 +32,11 @@ def reach_m(params: Params) -> float:
     return 0.0
 
 
-def reading_m(params: Params) -> float:
+def reading_m(params: Params, dated: bool) -> float:
+    return LOOKING_M if dated and uses_dates(params) else 0.0
+
+
+def looking_m(params: Params) -> float:
     return LOOKING_M if uses_dates(params) else 0.0
 
 

@@ -36,8 +36,12 @@ def reach_m(params: Params) -> float:
     return params.voxel_m
 
 
-def reading_m(params: Params) -> float:
-    return params.voxel_m + (LOOKING_M if uses_dates(params) else 0.0)
+def reading_m(params: Params, dated: bool) -> float:
+    return params.voxel_m + (LOOKING_M if dated and uses_dates(params) else 0.0)
+
+
+def looking_m(params: Params) -> float:
+    return LOOKING_M if uses_dates(params) else 0.0
 
 
 def min_cameras(params: Params) -> int:

@@ -20,8 +20,8 @@ from typing import Any
 
 from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.places import Place, place_of
 from gsmap.store.backup.states import check_path, checked
+from gsmap.store.places import Place, place_of
 from gsmap.version import __version__
 
 FORMAT = 1

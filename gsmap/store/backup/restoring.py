@@ -20,7 +20,6 @@ from gsmap.errors import CorruptError, DiskError, DiskFullError, GsmapError, Not
 from gsmap.store import catalog as _catalog
 from gsmap.store import migrate, schema, sqlite, staging, trust
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.places import Place
 from gsmap.store.backup.repository import Backup, Snapshot
 from gsmap.store.backup.saving import TRANSFERS
 from gsmap.store.backup.states import ARRAYS, State, Vanished, capture, read_file, read_state
@@ -28,6 +27,7 @@ from gsmap.store.branches import FOLDER as BRANCHES
 from gsmap.store.catalog import Catalog
 from gsmap.store.copying import copy_catalog, empty_catalog, make_own, own_catalog
 from gsmap.store.explained import explained
+from gsmap.store.places import Place
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__

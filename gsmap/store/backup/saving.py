@@ -13,10 +13,10 @@ from pathlib import Path
 
 from gsmap.errors import ConfigError, CorruptError, GsmapError, StoreError
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.places import FolderPlace, Place
 from gsmap.store.backup.repository import OBJECTS, SNAPSHOTS, Backup, Snapshot, digest_of, listed, object_name
 from gsmap.store.backup.sharing import SAVE, SWEEP, Lease
 from gsmap.store.backup.states import State, Vanished, capture, home_of, read_file, still
+from gsmap.store.places import FolderPlace, Place
 from gsmap.store.store import Store
 from gsmap.types.progress import Progress, silent
 from gsmap.version import __version__

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from types import TracebackType
 
 from gsmap.errors import MALFORMED, BusyError, GsmapError, NotFoundError, StoreError
-from gsmap.store.backup.places import Place
+from gsmap.store.places import Place
 from gsmap.types.holder import Holder, this_process
 
 LEASES = "leases/"

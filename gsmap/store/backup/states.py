@@ -8,17 +8,16 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from gsmap.durable import open_file
-from gsmap.errors import CorruptError, StoreError
+from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import catalog as _catalog
 from gsmap.store import sqlite
 from gsmap.store.arrays import StoredFile
-from gsmap.store.backup.places import CHUNK_BYTES
 from gsmap.store.branches import FOLDER as BRANCHES
 from gsmap.store.branches import MARKER as BRANCH_FILE
 from gsmap.store.branches import places
@@ -27,6 +26,7 @@ from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.explained import explained
 from gsmap.store.layout import mend
 from gsmap.store.models import FOLDER as MODELS
+from gsmap.store.places import CHUNK_BYTES
 
 if TYPE_CHECKING:
     from gsmap.store.store import Store
@@ -184,8 +184,8 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
     immutable = file.path.split("/")[0] in (ARRAYS, MODELS)
     path = (home_of(store) if immutable else folder) / file.path
     try:
-        yield from checked(_chunks(path), file, str(path))
-    except (CorruptError, FileNotFoundError, NotADirectoryError) as error:
+        yield from checked(_bytes_of(store, file, path), file, str(path))
+    except (CorruptError, FileNotFoundError, NotADirectoryError, NotFoundError) as error:
         if immutable and not _still_named(store, file):
             raise Vanished(file.path) from error
         if isinstance(error, CorruptError):
@@ -193,6 +193,14 @@ def read_file(store: Store, file: StoredFile, folder: Path) -> Generator[bytes, 
         raise CorruptError(f"{path} is missing: {_mend(file)}, or gsmap prune if one was interrupted") from error
     except OSError as error:
         raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _bytes_of(store: Store, file: StoredFile, path: Path) -> Iterator[bytes]:
+    top, *rest = file.path.split("/")
+    if top != ARRAYS:
+        return _chunks(path)
+    kind, group, *within = rest
+    return store.arrays.chunks(kind, group, replace(file, path="/".join(within)))
 
 
 def _mend(file: StoredFile) -> str:

@@ -59,7 +59,8 @@ class Opaque:
         min_opacity: float = 0.5
 
     VERSION, STEPS, RENDERS = 1, None, False
-    reach_m = reading_m = staticmethod(lambda params: 0.0)
+    reach_m = looking_m = staticmethod(lambda params: 0.0)
+    reading_m = staticmethod(lambda params, dated: 0.0)
     min_cameras = staticmethod(lambda params: 0)
     uses_dates = staticmethod(lambda params: False)
 

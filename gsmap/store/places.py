@@ -11,7 +11,7 @@ import stat
 import tempfile
 import urllib.parse
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -282,6 +282,27 @@ class ObjectPlace:
             if name.startswith("objects/") and self.size_bytes(name) == size_bytes:
                 return
             raise
+
+    def put_new(self, name: str, content: bytes) -> bool:
+        """Write an object unless there is one of that name; whether it was written."""
+        from obstore.exceptions import AlreadyExistsError
+
+        with self._explained("write"):
+            try:
+                self._api.put(self._store, name, content, use_multipart=False, mode="create")
+            except AlreadyExistsError:
+                return False
+        return True
+
+    def ranges(self, name: str, ranges: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        """The bytes of ranges ``[start, stop)`` of an object, one request each; NotFoundError where there is none."""
+        starts, ends = [start for start, _ in ranges], [stop for _, stop in ranges]
+        with self._explained("read"):
+            try:
+                found = self._api.get_ranges(self._store, name, starts=starts, ends=ends, coalesce=0)
+            except FileNotFoundError:
+                raise NotFoundError(f"{self.url} has no {name}") from None
+        return [bytes(one) for one in found]
 
     def get(self, name: str) -> Iterator[bytes]:
         with self._explained("read"):

@@ -1,0 +1,293 @@
+"""Groups of arrays in an object store: the objects ``arrays/KIND/ID/DIGEST-FILE`` of a map's home.
+
+An object store has no rename, and needs none: a group counts only once a committed row of the catalog names it, so its
+files go to their final names before. A name holds the digest of the bytes, so an object that is there already is the
+one that was to be written: a request whose answer was lost, or another writer of the same content, is no conflict.
+Whoever names a group looks under the lock whether it is still there, and whoever deletes what no row names holds the
+same lock.
+
+Parts are read by few requests: ranges that lie near each other are one. What is read whole, or nearly, is kept on this
+machine (`gsmap.store.cache`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import CorruptError, NotFoundError, StoreError
+from gsmap.store import cache, layout, packed
+from gsmap.store.arrays import Arrays, Staged, StoredFile, stored_file
+from gsmap.store.columns import KINDS, is_digest
+from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.places import CHUNK_BYTES, SINGLE_PUT_BYTES, ObjectPlace
+
+_ROOT = "arrays"
+_MAX_REQUESTS = 5  # for the parts of a group that are read, beside the one for its table of contents
+_WHOLE = 0.5  # of a file: who reads so much of it gets all of it
+
+
+class ObjectArrays(Arrays):
+    """The groups of a map whose home is an object store.
+
+    Args:
+        root: a folder on this machine that stands for the home; nothing is kept in it.
+        place: the home.
+        lock: see `Arrays.lock`.
+    """
+
+    def __init__(
+        self, root: Path, place: ObjectPlace, lock: Callable[[float], contextlib.AbstractContextManager[None]]
+    ) -> None:
+        super().__init__(root)
+        self.url = f"{place.url}/{_ROOT}"
+        self._home = place
+        self._lock = lock
+        self._sent: set[str] = set()  # by us, and not yet named
+
+    @contextlib.contextmanager
+    def scratch(self) -> Iterator[Path]:
+        with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
+            yield Path(folder) / "scratch"
+
+    @contextlib.contextmanager
+    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column], kind: str, name: str) -> Iterator[Staged]:
+        with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
+            packed.write(Path(folder) / packed.FILE, arrays, chunk_rows=CHUNK_ROWS)
+            staged = Staged(Path(folder), (stored_file(Path(folder), packed.FILE),))
+            self._send(staged, kind, name)
+            yield staged
+
+    @contextlib.contextmanager
+    def stage_copies(
+        self, source: Arrays, groups: Mapping[tuple[str, str], Sequence[StoredFile]]
+    ) -> Iterator[dict[tuple[str, str], Staged]]:
+        with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
+            staged = {
+                group: Staged(source.copied(*group, files, Path(folder) / "-".join(group)), tuple(files))
+                for group, files in groups.items()
+            }
+            for group, one in staged.items():
+                self._send(one, *group)
+            yield staged
+
+    @contextlib.contextmanager
+    def lock(self, patience_s: float = 120.0) -> Iterator[None]:
+        if getattr(self._held, "depth", 0):
+            yield
+            return
+        with self._lock(patience_s):
+            self._held.depth = 1
+            try:
+                yield
+            finally:
+                self._held.depth = 0
+
+    def _send(self, staged: Staged, kind: str, name: str) -> None:
+        for file in staged.files:
+            key, path = self._key(kind, name, file), staged.folder / file.path
+            if file.size_bytes <= SINGLE_PUT_BYTES:
+                try:
+                    if self._home.put_new(key, path.read_bytes()):
+                        self._sent.add(key)
+                except StoreError:
+                    if self._home.size_bytes(key) != file.size_bytes:  # else only the answer was lost
+                        raise
+            elif self._home.size_bytes(key) != file.size_bytes:  # S3 has no condition for objects of several parts
+                self._home.put(key, _chunks(path), file.size_bytes)
+                self._sent.add(key)
+
+    def publish(self, staged: Staged, kind: str, name: str) -> None:
+        for file in staged.files:
+            key = self._key(kind, name, file)
+            whole = self._home.size_bytes(key) == file.size_bytes  # else a prune took it for an orphan
+            if key not in self._sent:  # another one sent it, some time
+                whole = whole and self._sha256(key) == file.sha256
+            if not whole:
+                self._home.put(key, _chunks(staged.folder / file.path), file.size_bytes)
+            self._sent.discard(key)
+
+    def read(
+        self,
+        kind: str,
+        name: str,
+        files: Sequence[StoredFile],
+        *,
+        only: Sequence[str] | None = None,
+        rows: Sequence[tuple[int, int]] | None = None,
+        shapes: Mapping[str, layout.Shape] | None = None,
+    ) -> dict[str, np.ndarray]:
+        reader = _Objects(self, kind, name, files)
+        try:
+            return self._read(reader, kind, name, files, only, rows, shapes)
+        except CorruptError:
+            if not reader.dropped():
+                raise
+        return self._read(_Objects(self, kind, name, files), kind, name, files, only, rows, shapes)
+
+    def _read(
+        self,
+        reader: _Objects,
+        kind: str,
+        name: str,
+        files: Sequence[StoredFile],
+        only: Sequence[str] | None,
+        rows: Sequence[tuple[int, int]] | None,
+        shapes: Mapping[str, layout.Shape] | None,
+    ) -> dict[str, np.ndarray]:
+        try:
+            body = self._body(reader, kind, name, files)
+            names = body.array_names() if only is None else only
+            return body.read(body.laid_out(names, shapes), rows)
+        except NotFoundError as error:
+            raise CorruptError(f"{error}, or not all of it: {layout.mend(kind)}") from error
+
+    def problems(self, kind: str, name: str, files: Sequence[StoredFile]) -> list[str]:
+        out = []
+        expected = {self._key(kind, name, file): file for file in files}
+        for key, file in expected.items():
+            found = self._sha256(key)
+            if found is None:
+                out.append(f"{self._home.url}/{key} is missing")
+            elif found != file.sha256:
+                out.append(f"{self._home.url}/{key} differs from what was written")
+        if not out and files:
+            try:
+                body = self._body(_Objects(self, kind, name, files), kind, name, files)
+                body.laid_out(body.array_names())
+            except (CorruptError, NotFoundError) as error:
+                out.append(str(error))
+        return out
+
+    def copied(self, kind: str, name: str, files: Sequence[StoredFile], target: Path) -> Path:
+        target.mkdir(parents=True)
+        for file in files:
+            with open(target / file.path, "xb") as copy:
+                for chunk in self.chunks(kind, name, file):
+                    copy.write(chunk)
+            if stored_file(target, file.path) != file:
+                raise CorruptError(f"{self._home.url}/{self._key(kind, name, file)} differs from what was written")
+        return target
+
+    def chunks(self, kind: str, name: str, file: StoredFile) -> Iterator[bytes]:
+        return self._home.get(self._key(kind, name, file))
+
+    def _sha256(self, key: str) -> str | None:
+        """Of an object's bytes; None where there is none."""
+        digest = hashlib.sha256()
+        try:
+            for chunk in self._home.get(key):
+                digest.update(chunk)
+        except NotFoundError:
+            return None
+        return digest.hexdigest()
+
+    def size_bytes(self, kind: str, name: str) -> int:
+        return sum(found.size_bytes for found in self._home.list(self._prefix(kind, name)).values())
+
+    def drop(self, kind: str, name: str) -> None:
+        for key in self._home.list(self._prefix(kind, name)):
+            self._home.delete(key)
+
+    def groups(self) -> list[tuple[str, str]]:
+        found = {tuple(key.split("/")[1:3]) for key in self._home.list(f"{_ROOT}/")}
+        return sorted((kind, name) for kind, name in found if kind in KINDS and is_digest(name))
+
+    def exists(self, kind: str, name: str) -> bool:
+        return bool(self._home.list(self._prefix(kind, name)))
+
+    def strangers(self) -> list[str]:
+        ours = {f"{_ROOT}/{kind}/{name}" for kind, name in self.groups()}
+        return sorted(
+            key[len(_ROOT) + 1 :] for key in self._home.list(f"{_ROOT}/") if key.rpartition("/")[0] not in ours
+        )
+
+    def drop_leftovers(self, *, dry_run: bool = False) -> int:
+        return 0  # what was sent and not named is an orphan
+
+    def _body(self, reader: _Objects, kind: str, name: str, files: Sequence[StoredFile]) -> layout.Body:
+        at = f"{self._home.url}/{self._prefix(kind, name)}".rstrip("/")
+        return layout.Body(at, kind, {file.path: file.size_bytes for file in files}, reader)
+
+    def _key(self, kind: str, name: str, file: StoredFile) -> str:
+        if "/" in file.path:
+            raise CorruptError(f"{kind}/{name} has a file {file.path!r}, which no archive is called: nothing is done")
+        return f"{self._prefix(kind, name)}{file.sha256[:32]}-{file.path}"
+
+    def _prefix(self, kind: str, name: str) -> str:
+        if kind not in KINDS or not is_digest(name):
+            raise CorruptError(f"{kind}/{name} is not the name of a group of arrays: nothing is done with it")
+        return f"{_ROOT}/{kind}/{name}/"
+
+
+class _Objects:
+    """The files of a group in an object store."""
+
+    def __init__(self, arrays: ObjectArrays, kind: str, name: str, files: Sequence[StoredFile]) -> None:
+        self._home = arrays._home
+        self._files = {file.path: file for file in files}
+        self._keys = {file.path: arrays._key(kind, name, file) for file in files}
+        self._whole = {path: cache.find(file.sha256) for path, file in self._files.items()}
+        self._held: dict[str, list[tuple[int, bytes]]] = {path: [] for path in self._files}
+
+    def read(self, file: str, start: int, stop: int) -> bytes:
+        if (whole := self._whole[file]) is not None:
+            with contextlib.suppress(FileNotFoundError), open(whole, "rb") as opened:
+                opened.seek(start)
+                return opened.read(stop - start)
+            self._whole[file] = None  # the cache let it go
+        for at, held in self._held[file]:
+            if at <= start and stop <= at + len(held):
+                return held[start - at : stop - at]
+        (found,) = self._home.ranges(self._keys[file], [(start, stop)])
+        return found
+
+    def expect(self, file: str, ranges: Sequence[layout.Range]) -> None:
+        size = self._files[file].size_bytes
+        missing = [r for r in ranges if not any(at <= r[0] and r[1] <= at + len(b) for at, b in self._held[file])]
+        if self._whole[file] is not None or not missing:
+            return
+        few = joined(missing, _MAX_REQUESTS)
+        if sum(stop - start for start, stop in few) > _WHOLE * size:
+            one = self._files[file]
+            self._whole[file] = cache.keep(one.sha256, self._home.get(self._keys[file]), self._keys[file])
+            return
+        found = self._home.ranges(self._keys[file], few)
+        self._held[file] += [(start, content) for (start, _), content in zip(few, found, strict=True)]
+
+    def dropped(self) -> bool:
+        """Forget what this machine had kept of the group; whether there was anything."""
+        kept = [self._files[path].sha256 for path, whole in self._whole.items() if whole is not None]
+        for sha256 in kept:
+            cache.drop(sha256)
+        return bool(kept)
+
+
+def joined(ranges: Sequence[layout.Range], at_most: int) -> list[layout.Range]:
+    """Ranges that cover those that are given, at most so many: those with the least between them become one."""
+    out: list[layout.Range] = []
+    for start, stop in sorted(ranges):
+        if out and start <= out[-1][1]:
+            out[-1] = (out[-1][0], max(stop, out[-1][1]))
+        else:
+            out.append((start, stop))
+    gaps = sorted(range(1, len(out)), key=lambda i: out[i][0] - out[i - 1][1])
+    closed = set(gaps[: max(0, len(out) - at_most)])
+    few: list[layout.Range] = []
+    for i, (start, stop) in enumerate(out):
+        if i in closed:
+            few[-1] = (few[-1][0], stop)
+        else:
+            few.append((start, stop))
+    return few
+
+
+def _chunks(path: Path) -> Iterator[bytes]:
+    with open(path, "rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            yield chunk
