@@ -11,15 +11,18 @@ import os
 import sys
 import uuid
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import family
-from gsmap.types import Cameras, FileInfo, Gaussians
+from gsmap.types import Cameras, FileInfo, Gaussians, GaussianSource
+
+_Part = TypeVar("_Part")
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
@@ -43,6 +46,54 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         return found
 
 
+def stream(path: str | os.PathLike[str]) -> GaussianSource:
+    """The Gaussians of a file of any known format, read a chunk at a time where the format can; else all at once.
+
+    Raises:
+        NotFoundError, InputError: as `read`; the chunks may raise them too.
+    """
+    path = Path(path)
+    module = _load(_layout(path, _suffix(path, "read")))
+    if not hasattr(module, "stream"):
+        return read(path)
+    with _explained(path, "read"), np.errstate(all="ignore"):
+        return _FileSource(path, module.stream(path))
+
+
+@dataclass(frozen=True, eq=False)
+class _FileSource:
+    """What a format opened; what the system says while it is read is explained."""
+
+    path: Path
+    source: GaussianSource
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.source.num_gaussians
+
+    @property
+    def sh_degree(self) -> int:
+        return self.source.sh_degree
+
+    def chunks(self) -> Iterator[Gaussians]:
+        yield from self._quietly(self.source.chunks())
+
+    def columns(self, name: str) -> Iterator[np.ndarray]:
+        yield from self._quietly(self.source.columns(name))
+
+    def load(self) -> Gaussians:
+        with _explained(self.path, "read"), np.errstate(all="ignore"):
+            return self.source.load()
+
+    def _quietly(self, parts: Iterator[_Part]) -> Iterator[_Part]:
+        while True:
+            with _explained(self.path, "read"), np.errstate(all="ignore"):
+                part = next(parts, None)
+            if part is None:
+                return
+            yield part
+
+
 def info(path: str | os.PathLike[str]) -> FileInfo:
     """What the file says about itself beside its Gaussians; an empty `FileInfo` where the format says nothing."""
     path = Path(path)
@@ -51,8 +102,10 @@ def info(path: str | os.PathLike[str]) -> FileInfo:
         return module.info(path) if hasattr(module, "info") else FileInfo()
 
 
-def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object) -> None:
+def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: object) -> None:
     """Write Gaussians in the format of the path's suffix; the file appears whole or not at all.
+
+    What is still to be read is written a chunk at a time by formats that can (``.ply``), and is loaded for others.
 
     Args:
         options: of the format; see the ``write`` of its module.
@@ -66,7 +119,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, **options: object)
     staged = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # a name that nobody can have put a link at
     try:
         with _explained(path, "write"):
-            module.write(staged, gaussians, **options)
+            module.write(staged, gaussians if hasattr(module, "stream") else gaussians.load(), **options)
             os.replace(staged, path)
     finally:
         with contextlib.suppress(OSError):

@@ -6,9 +6,10 @@ abort the process on a malformed header, or allocate whatever it claims.
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,9 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.sh import sh0_of_rgb
-from gsmap.types import FileInfo, Gaussians
+from gsmap.stream import loaded
+from gsmap.types import FileInfo, Gaussians, GaussianSource
+from gsmap.types.gaussians import CHUNK_ROWS, FIELDS
 
 VERSION = 1
 
@@ -41,7 +44,6 @@ _TYPES = {
     "float64": "f8",
 }
 _ENCODINGS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,16 @@ class Header:
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a 3DGS ``.ply``.
+    """Read a 3DGS ``.ply``; see `stream`.
+
+    Raises:
+        InputError: not a PLY, truncated, or not a splat.
+    """
+    return stream(path).load()
+
+
+def stream(path: str | os.PathLike[str]) -> PlySource:
+    """A 3DGS ``.ply``, to be read a chunk at a time.
 
     A file without ``f_dc`` but with ``red green blue`` takes its colours from those, one without ``scale_2`` (2DGS)
     gets flat Gaussians, and the 3D filter of Mip-Splatting (``filter_3D``) is folded into scales and opacities.
@@ -80,40 +91,88 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     header = read_header(path)
     if is_compressed(header):
         raise InputError(f"{path} holds the layout of a .compressed.ply: read it with gsmap.formats.read, which looks")
-    rows = read_element(path, header, "vertex")
+    rows = _rows(path, header, "vertex")
     names = set(header.elements["vertex"].names)
     rest = _rest_names(path, names)
-    has_dc, flat = "f_dc_0" in names, "scale_2" not in names
-    position, quat, opacity = ["x", "y", "z"], ["rot_0", "rot_1", "rot_2", "rot_3"], ["opacity"]
-    scale = ["scale_0", "scale_1"] if flat else ["scale_0", "scale_1", "scale_2"]
-    colour = ["f_dc_0", "f_dc_1", "f_dc_2"] if has_dc or "red" not in names else ["red", "green", "blue"]
-    missing = [n for n in (*position, *colour, *opacity, *scale, *quat) if n not in names]
+    columns = {
+        "means": ["x", "y", "z"],
+        "quats": ["rot_0", "rot_1", "rot_2", "rot_3"],
+        "log_scales": ["scale_0", "scale_1", *(["scale_2"] if "scale_2" in names else [])],
+        "logit_opacities": ["opacity"],
+        "sh": ["f_dc_0", "f_dc_1", "f_dc_2"] if "f_dc_0" in names or "red" not in names else ["red", "green", "blue"],
+    }
+    missing = [n for field in ("means", "sh", "logit_opacities", "log_scales", "quats") for n in columns[field]]
+    missing = [n for n in missing if n not in names]
     if missing:
         raise InputError(f"{path} is not a 3DGS .ply: its vertices lack {', '.join(missing)} (a point cloud or mesh?)")
+    return PlySource(rows, columns, tuple(rest), "filter_3D" in names)
 
-    n, k = len(rows), 1 + len(rest) // 3
-    means, quats, log_scales = np.empty((n, 3), "f4"), np.empty((n, 4), "f4"), np.empty((n, 3), "f4")
-    logits, sh = np.empty((n, 1), "f4"), np.empty((n, k, 3), "f4")
-    for start in range(0, n, _BLOCK):  # blocks keep the strided reads inside the cache
-        block = slice(start, start + _BLOCK)
-        part = rows[block]
-        _take(part, position, means[block])
-        _take(part, quat, quats[block])
-        _take(part, scale, log_scales[block, : len(scale)])
-        _take(part, opacity, logits[block])
-        _take(part, colour, sh[block, 0])
-        if rest:
-            channel_major = np.empty((len(part), len(rest)), "f4")
-            _take(part, rest, channel_major)
-            sh[block, 1:] = channel_major.reshape(len(part), 3, k - 1).transpose(0, 2, 1)
-    if not has_dc:
-        top = np.iinfo(rows.dtype["red"]).max if rows.dtype["red"].kind in "iu" else 1.0
-        sh[:, 0] = sh0_of_rgb(sh[:, 0] / top)
-    if flat:
-        log_scales[:, 2] = log_scales[:, :2].min(1) + np.log(1e-3)
-    if "filter_3D" in names:
-        logits, log_scales = _fold_filter(logits, log_scales, np.asarray(rows["filter_3D"], "f8"))
-    return Gaussians(means, quats, log_scales, logits[:, 0], sh)
+
+@dataclass(frozen=True, eq=False)
+class PlySource:
+    """The Gaussians of a ``.ply``, read as they are asked for.
+
+    Args:
+        rows: of the file.
+        names: the properties that make each field of `Gaussians`.
+        rest: those of the spherical harmonics above degree 0, channel by channel.
+        filtered: there is a 3D filter to be folded in.
+    """
+
+    rows: Rows
+    names: Mapping[str, list[str]]
+    rest: tuple[str, ...]
+    filtered: bool
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.rows.count
+
+    @property
+    def sh_degree(self) -> int:
+        return math.isqrt(1 + len(self.rest) // 3) - 1
+
+    def chunks(self) -> Iterator[Gaussians]:
+        for part in self.rows.parts():
+            yield Gaussians(**{name: self._field(name, part) for name in FIELDS})
+
+    def columns(self, name: str) -> Iterator[np.ndarray]:
+        for part in self.rows.parts():
+            yield self._field(name, part)
+
+    def load(self) -> Gaussians:
+        return loaded(self)
+
+    def _field(self, name: str, part: np.ndarray) -> np.ndarray:
+        """One field of `Gaussians`, of some rows."""
+        if name == "sh":
+            return self._sh(part)
+        if not self.filtered or name not in ("log_scales", "logit_opacities"):
+            return self._raw(name, part)
+        logits, log_scales = self._raw("logit_opacities", part)[:, None], self._raw("log_scales", part)
+        logits, log_scales = _fold_filter(logits, log_scales, np.asarray(part["filter_3D"], "f8"))
+        return log_scales if name == "log_scales" else logits[:, 0]
+
+    def _raw(self, name: str, part: np.ndarray) -> np.ndarray:
+        names = self.names[name]
+        out = np.empty((len(part), 3 if name == "log_scales" else len(names)), "f4")
+        _take(part, names, out[:, : len(names)])
+        if name == "log_scales" and len(names) == 2:
+            out[:, 2] = out[:, :2].min(1) + np.log(1e-3)  # 2DGS
+        return out[:, 0] if name == "logit_opacities" else out
+
+    def _sh(self, part: np.ndarray) -> np.ndarray:
+        k = 1 + len(self.rest) // 3
+        out = np.empty((len(part), k, 3), "f4")
+        _take(part, self.names["sh"], out[:, 0])
+        if self.names["sh"][0] == "red":
+            kind = part.dtype["red"]
+            out[:, 0] = sh0_of_rgb(out[:, 0] / (np.iinfo(kind).max if kind.kind in "iu" else 1.0))
+        if self.rest:
+            channel_major = np.empty((len(part), len(self.rest)), "f4")
+            _take(part, list(self.rest), channel_major)
+            out[:, 1:] = channel_major.reshape(len(part), 3, k - 1).transpose(0, 2, 1)
+        return out
 
 
 def info(path: str | os.PathLike[str]) -> FileInfo:
@@ -134,7 +193,7 @@ def info(path: str | os.PathLike[str]) -> FileInfo:
 
 def write(
     path: str | os.PathLike[str],
-    gaussians: Gaussians,
+    gaussians: GaussianSource,
     *,
     antialiased: bool = False,
     extra: Mapping[str, np.ndarray] | None = None,
@@ -146,7 +205,7 @@ def write(
         extra: further float properties by name, (N,) each, such as the index of the capture each came from.
     """
     extra = dict(extra or {})
-    k = gaussians.sh.shape[1]
+    k = (gaussians.sh_degree + 1) ** 2
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -154,11 +213,11 @@ def write(
     names += list(extra)
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += ["comment SplatRenderMode: mip"] if antialiased else []
-    lines += [f"element vertex {len(gaussians)}", *(f"property float {n}" for n in names), "end_header", ""]
+    lines += [f"element vertex {gaussians.num_gaussians}", *(f"property float {n}" for n in names), "end_header", ""]
     with open(path, "wb") as file:
         file.write("\n".join(lines).encode())
-        for start in range(0, len(gaussians), _BLOCK):
-            g = gaussians[start : start + _BLOCK]
+        start = 0
+        for g in gaussians.chunks():
             rows = np.zeros((len(g), len(names)), "<f4")
             rows[:, 0:3] = g.means
             rows[:, 6:9] = g.sh[:, 0]
@@ -169,6 +228,7 @@ def write(
             for column, values in enumerate(extra.values(), start=inria):
                 rows[:, column] = values[start : start + len(g)]
             file.write(rows.data)
+            start += len(g)
 
 
 def read_header(path: str | os.PathLike[str]) -> Header:
@@ -228,6 +288,60 @@ def read_element(path: str | os.PathLike[str], header: Header, name: str) -> np.
     Raises:
         InputError: no such element, a list property in the way, or fewer bytes than the header promises.
     """
+    element, offset, skip = _located(path, header, name)
+    if header.encoding == "ascii":
+        return _read_ascii(path, header, element, skip)
+    return np.memmap(path, dtype=element.dtype, mode="r", offset=offset, shape=(element.count,))
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The rows of one element, read in parts; those of an ASCII file are in memory.
+
+    Args:
+        count: of the rows.
+        dtype: of a row.
+        offset: where they begin in the file.
+        version: of the file, to see that it stays the same.
+        held: all of them, where they are in memory.
+    """
+
+    path: Path
+    count: int
+    dtype: np.dtype
+    offset: int
+    version: tuple[int, ...]
+    held: np.ndarray | None = None
+
+    def parts(self) -> Iterator[np.ndarray]:
+        """Structured arrays of at most `CHUNK_ROWS` rows."""
+        if self.held is not None:
+            for start in range(0, self.count, CHUNK_ROWS):
+                yield self.held[start : start + CHUNK_ROWS]
+            return
+        with open(self.path, "rb") as file:  # not mapped: what was read of a map counts as memory in use
+            file.seek(self.offset)
+            for start in range(0, self.count, CHUNK_ROWS):
+                wanted = min(CHUNK_ROWS, self.count - start)
+                part = np.fromfile(file, self.dtype, wanted)
+                if _version(os.fstat(file.fileno())) != self.version or len(part) < wanted:
+                    raise InputError(f"{self.path} was written to while it was read: let its writer finish first")
+                yield part
+
+
+def _rows(path: str | os.PathLike[str], header: Header, name: str) -> Rows:
+    """As `read_element`, in parts."""
+    element, offset, skip = _located(path, header, name)
+    held = _read_ascii(path, header, element, skip) if header.encoding == "ascii" else None
+    return Rows(Path(path), element.count, element.dtype, offset, _version(os.stat(path)), held)
+
+
+def _version(found: os.stat_result) -> tuple[int, ...]:
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def _located(path: str | os.PathLike[str], header: Header, name: str) -> tuple[Element, int, int]:
+    """An element, where its rows begin in a binary file, and how many rows are before them."""
     if name not in header.elements or not header.elements[name].count:
         raise InputError(f"{path} has no {name} rows: there is nothing to read")
     offset, skip = header.data_offset, 0
@@ -248,9 +362,7 @@ def read_element(path: str | os.PathLike[str], header: Header, name: str) -> np.
             f"{path} is truncated: its header promises {element.count} {name} rows of at least {stride} bytes, "
             f"but {max(0, present)} bytes follow"
         )
-    if header.encoding == "ascii":
-        return _read_ascii(path, header, element, skip)
-    return np.memmap(path, dtype=element.dtype, mode="r", offset=offset, shape=(element.count,))
+    return element, offset, skip
 
 
 def is_compressed(header: Header) -> bool:

@@ -11,13 +11,19 @@ def morton_order(points: np.ndarray) -> np.ndarray:
     """(N,) permutation that sorts finite points (N, 3) along a Z-order curve of cubic cells; ties keep their order."""
     if not len(points):
         return np.zeros(0, np.int64)
-    low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
+    return np.argsort(morton_codes(points, np.stack([points.min(0), points.max(0)])), kind="stable")
+
+
+def morton_codes(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """(N,) uint64 place of points (N, 3) along the Z-order curve of the smallest cube at the low corner of a box (2, 3)
+    that holds them all."""
+    low, high = box.astype(np.float64)
     step = max((high - low).max(), np.finfo(np.float32).tiny) / ((1 << _BITS) - 1)
     code = np.zeros(len(points), np.uint64)
     for axis in range(3):
         cell = ((points[:, axis] - low[axis]) / step).astype(np.uint64)
         code |= _spread(cell) << np.uint64(2 - axis)
-    return np.argsort(code, kind="stable")
+    return code
 
 
 def _spread(cell: np.ndarray) -> np.ndarray:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap.types import Cameras, Gaussians
+from gsmap.types import Cameras, GaussianSource
+from gsmap.types.source import gathered
 
 _POINTS = 20_000
 _PLACES = 256
@@ -17,7 +18,7 @@ _WORTH = 0.002  # share of the points that a further place must add
 _SIDE_PX = 512
 
 
-def synthesise_cameras(gaussians: Gaussians, *, num_positions: int = 16, seed: int = 0) -> Cameras:
+def synthesise_cameras(gaussians: GaussianSource, *, num_positions: int = 16, seed: int = 0) -> Cameras:
     """Cameras in the free space of a scene that together see its surfaces.
 
     Up to ``num_positions`` places, each the one that sees most of what those before did not, looking along the axes
@@ -46,15 +47,16 @@ def synthesise_cameras(gaussians: Gaussians, *, num_positions: int = 16, seed: i
     return Cameras(poses, intrinsics, np.full((n, 2), _SIDE_PX), names, synthesised=True)
 
 
-def _solid_points(gaussians: Gaussians, rng: np.random.Generator) -> np.ndarray:
+def _solid_points(gaussians: GaussianSource, rng: np.random.Generator) -> np.ndarray:
     """(N, 3) centres of a sample of the opaque Gaussians that are not huge; of all where none is."""
-    widest = gaussians.log_scales.max(1)
-    solid = np.flatnonzero((gaussians.logit_opacities > -0.85) & (widest <= np.percentile(widest, 98)))
+    widest = np.concatenate([log_scales.max(1) for log_scales in gaussians.columns("log_scales")])
+    opaque = np.concatenate([logits > -0.85 for logits in gaussians.columns("logit_opacities")])
+    solid = np.flatnonzero(opaque & (widest <= np.percentile(widest, 98)))
     if not len(solid):
-        solid = np.arange(len(gaussians))
+        solid = np.arange(len(widest))
     if len(solid) > _POINTS:
         solid = np.sort(rng.choice(solid, _POINTS, replace=False))
-    return gaussians.means[solid].astype(np.float64)
+    return gathered(gaussians, "means", solid).astype(np.float64)
 
 
 def _free_places(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 
 from gsmap import formats
@@ -13,18 +14,19 @@ from gsmap.errors import ConfigError
 from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.ingest.dates import find_date, given_date
 from gsmap.ingest.find import Found, find_captures
-from gsmap.ingest.validate import validate
-from gsmap.types import Cameras, Gaussians
+from gsmap.ingest.validate import validate_cameras, validate_gaussians
+from gsmap.types import Cameras, Gaussians, GaussianSource
 from gsmap.types.progress import Progress
 from gsmap.types.scene import SCALE_POLICIES
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One capture, read and checked, ready for the store.
+    """One capture, checked, ready for the store.
 
     Args:
-        gaussians, cameras: in the capture's own frame; ``cameras.synthesised`` where the source had none.
+        content: its Gaussians, in the capture's own frame; perhaps still in their file.
+        cameras: in the same frame; ``cameras.synthesised`` where the source had none.
         name: from the file or folder, or as given.
         source: the file it was read from.
         captured_at: ISO 8601 with zone, or None.
@@ -34,7 +36,7 @@ class Capture:
         notes: what a person should know.
     """
 
-    gaussians: Gaussians
+    content: GaussianSource
     cameras: Cameras
     name: str
     source: str = ""
@@ -43,6 +45,11 @@ class Capture:
     antialiased: bool = False
     notes: tuple[str, ...] = ()
     dated_by: str = ""
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Its Gaussians, in memory from now on."""
+        return self.content.load()
 
 
 def read_captures(
@@ -86,7 +93,7 @@ def read_capture(
 ) -> Capture:
     """Read and check one capture that `find_captures` found; see `read_captures`."""
     given_date(captured_at)  # refuses what is none before a large file is read
-    gaussians = formats.read(found.path)
+    gaussians = formats.stream(found.path)
     about = formats.info(found.path)
     source = Path(cameras) if cameras is not None else found.cameras
     capture = take_capture(
@@ -108,7 +115,7 @@ def read_capture(
 
 
 def take_capture(
-    gaussians: Gaussians,
+    gaussians: GaussianSource,
     cameras: Cameras | None = None,
     *,
     name: str,
@@ -117,7 +124,7 @@ def take_capture(
     source: str = "",
     cameras_source: str = "",
 ) -> Capture:
-    """Check one capture that is in memory; cameras are synthesised where there are none.
+    """Check one capture; cameras are synthesised where there are none.
 
     Raises:
         InputError: what makes no capture; see `gsmap.ingest.validate`.
@@ -127,11 +134,12 @@ def take_capture(
         raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {scale_policy!r}")
     date = given_date(captured_at)
     where = source or f"capture {name!r}"
-    notes = list(validate(gaussians, where=where))
+    notes: list[str] = []
+    validate_gaussians(gaussians, where)
     if cameras is None:
         cameras = synthesise_cameras(gaussians)
         notes.append(f"no cameras were found beside it: {len(cameras)} were synthesised in its free space")
     else:
-        notes += validate(gaussians, cameras, where=f"{where} with {cameras_source}" if cameras_source else where)
+        notes += validate_cameras(cameras, gaussians, f"{where} with {cameras_source}" if cameras_source else where)
     notes += [date.note] if date.note else []
     return Capture(gaussians, cameras, name, source, date.when, scale_policy, notes=tuple(notes))

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.geometry.projection import in_image, project
-from gsmap.types import Cameras, Gaussians
+from gsmap.types import Cameras, GaussianSource
+from gsmap.types.gaussians import FIELDS
+from gsmap.types.source import gathered
 
 # A Gaussian this many times wider than the scene is not a background; it is a broken file.
 MAX_SCALE_OVER_EXTENT = 1e4
@@ -15,7 +19,9 @@ MAX_SIDE_PX = 65_535
 _SAMPLE = 20_000
 
 
-def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str = "the capture") -> tuple[str, ...]:
+def validate(
+    gaussians: GaussianSource, cameras: Cameras | None = None, *, where: str = "the capture"
+) -> tuple[str, ...]:
     """Refuse what cannot be a capture; return notes on what merely looks odd.
 
     Args:
@@ -25,22 +31,42 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
         InputError: no Gaussians; NaN, infinity, an absurd scale or a zero quaternion, with its row; cameras of which
             none sees a Gaussian, or with pictures larger than any.
     """
-    if not len(gaussians):
+    validate_gaussians(gaussians, where)
+    return () if cameras is None else validate_cameras(cameras, gaussians, where)
+
+
+def validate_gaussians(gaussians: GaussianSource, where: str) -> None:
+    """As `validate`, of the Gaussians alone; they are read once."""
+    n = gaussians.num_gaussians
+    if not n:
         raise InputError(f"{where} has no Gaussians")
-    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
-        rows = getattr(gaussians, name).reshape(len(gaussians), -1)
-        # One sum finds any NaN or infinity in a pass; only a bad file pays for the second.
-        with np.errstate(over="ignore", invalid="ignore"):
-            suspicious = not np.isfinite(rows.sum(dtype=np.float64))
-        if suspicious:
-            _refuse(where, ~np.isfinite(rows).all(1), f"NaN or infinity in {name}")
-    _refuse(where, (gaussians.quats == 0).all(1), "a rotation quaternion of zero")
-    low, high = np.percentile(_sampled(gaussians).means, [5, 95], axis=0).astype(np.float64)
-    widest = gaussians.log_scales.max(1).astype(np.float64)
-    extent = max(float(np.linalg.norm(high - low)), float(np.exp(min(np.median(widest), 80.0))))
-    _refuse(where, widest > np.log(MAX_SCALE_OVER_EXTENT * extent), f"a scale over {MAX_SCALE_OVER_EXTENT:g} extents")
-    if cameras is None:
-        return ()
+    bad = {f"NaN or infinity in {name}": _Rows() for name in FIELDS} | {"a rotation quaternion of zero": _Rows()}
+    widest = np.empty(n, np.float32)
+    sampled = []
+    start, step = 0, _step(n)
+    for chunk in gaussians.chunks():
+        for name in FIELDS:
+            rows = getattr(chunk, name).reshape(len(chunk), -1)
+            # One sum finds any NaN or infinity in a pass; only a bad file pays for the second.
+            with np.errstate(over="ignore", invalid="ignore"):
+                suspicious = not np.isfinite(rows.sum(dtype=np.float64))
+            if suspicious:
+                bad[f"NaN or infinity in {name}"].note(start, ~np.isfinite(rows).all(1))
+        bad["a rotation quaternion of zero"].note(start, (chunk.quats == 0).all(1))
+        widest[start : start + len(chunk)] = chunk.log_scales.max(1)
+        sampled.append(chunk.means[-start % step :: step])
+        start += len(chunk)
+    for what, found in bad.items():
+        found.refuse(where, what)
+    low, high = np.percentile(np.concatenate(sampled), [5, 95], axis=0).astype(np.float64)
+    extent = max(float(np.linalg.norm(high - low)), float(np.exp(min(float(np.median(widest)), 80.0))))
+    absurd = _Rows()
+    absurd.note(0, widest.astype(np.float64) > np.log(MAX_SCALE_OVER_EXTENT * extent))
+    absurd.refuse(where, f"a scale over {MAX_SCALE_OVER_EXTENT:g} extents")
+
+
+def validate_cameras(cameras: Cameras, gaussians: GaussianSource, where: str) -> tuple[str, ...]:
+    """As `validate`, of the cameras of Gaussians that are sound."""
     if not len(cameras):
         raise InputError(f"{where} has an empty list of cameras: leave them out, and gsmap makes some")
     large = cameras.sizes_px.max(1) > MAX_SIDE_PX
@@ -51,8 +77,9 @@ def validate(gaussians: Gaussians, cameras: Cameras | None = None, *, where: str
             f"{where}: camera {cameras.names[i]!r} has {width} x {height} pixels, more than {MAX_SIDE_PX} on a side: "
             "correct its size"
         )
-    seen = sees(cameras, _sampled(gaussians).means)
-    if not seen.any() and not sees(cameras, gaussians.means).any():
+    n = gaussians.num_gaussians
+    seen = sees(cameras, gathered(gaussians, "means", np.arange(0, n, _step(n))))
+    if not seen.any() and not any(sees(cameras, means).any() for means in gaussians.columns("means")):
         raise InputError(f"{where}: none of its {len(cameras)} cameras sees a Gaussian: they belong to another scene")
     blind = int((~seen).sum())
     return (f"{blind} of {len(cameras)} cameras see no Gaussian",) if blind else ()
@@ -68,13 +95,25 @@ def sees(cameras: Cameras, points: np.ndarray) -> np.ndarray:
     return out
 
 
-def _sampled(gaussians: Gaussians) -> Gaussians:
-    step = max(1, len(gaussians) // _SAMPLE)
-    return gaussians[::step]
+def _step(n: int) -> int:
+    """Every so many Gaussians are looked at where all would be too many."""
+    return max(1, n // _SAMPLE)
 
 
-def _refuse(where: str, bad: np.ndarray, what: str) -> None:
-    if bad.any():
-        count = int(bad.sum())
-        more = f" ({count} such rows)" if count > 1 else ""
-        raise InputError(f"{where} holds {what} in row {int(np.argmax(bad))}{more}: clean or export it again")
+@dataclass
+class _Rows:
+    """Rows of which there should be none."""
+
+    first: int = 0
+    count: int = 0
+
+    def note(self, start: int, bad: np.ndarray) -> None:
+        """Of the rows from ``start`` on."""
+        if bad.any():
+            self.first = self.first if self.count else start + int(np.argmax(bad))
+            self.count += int(bad.sum())
+
+    def refuse(self, where: str, what: str) -> None:
+        if self.count:
+            more = f" ({self.count} such rows)" if self.count > 1 else ""
+            raise InputError(f"{where} holds {what} in row {self.first}{more}: clean or export it again")

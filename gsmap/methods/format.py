@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any, Protocol
 
-from gsmap.types import FileInfo, Gaussians
+from gsmap.types import FileInfo, Gaussians, GaussianSource
 
 
 class Format(Protocol):
@@ -18,7 +18,8 @@ class Format(Protocol):
         ".xyz" = "my_package.xyz"
 
     A format has `VERSION` and ``read``, ``write`` or both (`ReadableFormat`, `WritableFormat`); one that is read may
-    also say more of a file (`DescribedFormat`). It has no ``Params``: options are keyword arguments of ``write``.
+    also say more of a file (`DescribedFormat`), and read it in chunks (`StreamedFormat`). It has no ``Params``: options
+    are keyword arguments of ``write``.
 
     Frames: right-down-front, the axes of a trained ``.ply``, in the file's own unit; a format of other axes turns its
     Gaussians, spherical harmonics included (`gsmap.formats.axes`).
@@ -48,6 +49,18 @@ class DescribedFormat(ReadableFormat, Protocol):
 
     def info(self, path: str | os.PathLike[str], /) -> FileInfo:
         """What that is, from the header alone.
+
+        Raises:
+            InputError, OSError: as ``read``.
+        """
+        ...
+
+
+class StreamedFormat(ReadableFormat, Protocol):
+    """A format of files that need not fit in memory; where it has ``write``, that takes a `GaussianSource` too."""
+
+    def stream(self, path: str | os.PathLike[str], /) -> GaussianSource:
+        """As ``read``, a chunk at a time; what is wrong with the file as a whole is said when it is opened.
 
         Raises:
             InputError, OSError: as ``read``.

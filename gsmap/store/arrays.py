@@ -20,7 +20,7 @@ import shutil
 import stat
 import threading
 import uuid
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,7 +79,7 @@ class Arrays:
         self._held = threading.local()
 
     @contextlib.contextmanager
-    def stage(self, arrays: Mapping[str, np.ndarray], kind: str, name: str) -> Iterator[Staged]:
+    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column], kind: str, name: str) -> Iterator[Staged]:
         """Write arrays beside their place and synchronise them; dropped at the end unless `publish` took them.
 
         Args:
@@ -93,6 +93,17 @@ class Arrays:
                 yield Staged(folder, _synchronise(folder))
             finally:
                 with contextlib.suppress(OSError):  # there is nothing where it was published
+                    self._remove_staged(folder.name)
+
+    @contextlib.contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """A folder for files that are needed for a moment, on the disk of the arrays; it is not made yet."""
+        with self._lock_staging(fcntl.LOCK_SH):
+            folder = self.staging / uuid.uuid4().hex
+            try:
+                yield folder
+            finally:
+                with contextlib.suppress(OSError):
                     self._remove_staged(folder.name)
 
     @contextlib.contextmanager
@@ -332,13 +343,27 @@ class Arrays:
             os.close(handle)
 
 
-def digest(*arrays: np.ndarray, text: str = "") -> str:
+@dataclass(frozen=True)
+class Parts:
+    """An array that is read part after part.
+
+    Args:
+        shape, dtype: of the whole.
+        parts: reads it from its first row on.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    parts: Callable[[], Iterator[np.ndarray]]
+
+
+def digest(*arrays: np.ndarray | Parts, text: str = "") -> str:
     """32 hex digits over the bytes, shapes and types of arrays, and a text."""
     out = hashlib.sha256(text.encode())
     for array in arrays:
-        array = np.ascontiguousarray(array)
         out.update(f"|{array.dtype.str}{array.shape}|".encode())
-        out.update(array.reshape(-1).view(np.uint8).data)
+        for part in array.parts() if isinstance(array, Parts) else (array,):
+            out.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
     return out.hexdigest()[:32]
 
 

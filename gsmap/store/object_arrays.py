@@ -50,7 +50,12 @@ class ObjectArrays(Arrays):
         self._sent: set[str] = set()  # by us, and not yet named
 
     @contextlib.contextmanager
-    def stage(self, arrays: Mapping[str, np.ndarray], kind: str, name: str) -> Iterator[Staged]:
+    def scratch(self) -> Iterator[Path]:
+        with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
+            yield Path(folder) / "scratch"
+
+    @contextlib.contextmanager
+    def stage(self, arrays: Mapping[str, np.ndarray | packed.Column], kind: str, name: str) -> Iterator[Staged]:
         with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
             packed.write(Path(folder) / packed.FILE, arrays, chunk_rows=CHUNK_ROWS)
             staged = Staged(Path(folder), (stored_file(Path(folder), packed.FILE),))

@@ -10,6 +10,7 @@ they are, within the file.
 
 from __future__ import annotations
 
+import math
 import struct
 import zipfile
 from collections.abc import Callable, Mapping
@@ -42,8 +43,33 @@ class Member:
     crc32: int
 
 
-def write(path: Path, arrays: Mapping[str, np.ndarray], *, chunk_rows: int) -> None:
-    """Write arrays in chunks of ``chunk_rows`` rows; memory beyond theirs is that of a chunk."""
+@dataclass(frozen=True)
+class Column:
+    """An array that is written block after block, and is never in memory as a whole.
+
+    Args:
+        shape, dtype: of the whole.
+        block: gives the block that begins at a row; blocks are as long as a chunk, and asked for in order.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    block: Callable[[int], np.ndarray]
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return self.block(rows.start)
+
+
+def write(path: Path, arrays: Mapping[str, np.ndarray | Column], *, chunk_rows: int) -> None:
+    """Write arrays in chunks of ``chunk_rows`` rows, whose blocks are asked for in the order of their rows, those of
+    all arrays before the next; memory beyond theirs is that of a row block."""
     import zarr
     from numcodecs import zstd
     from zarr.codecs import ZstdCodec

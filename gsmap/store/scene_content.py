@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,16 +10,19 @@ from sqlalchemy import Row
 
 from gsmap.errors import InputError
 from gsmap.store import compact
-from gsmap.store.arrays import digest
+from gsmap.store.arrays import Parts, digest
+from gsmap.store.boxes import chunk_boxes
 from gsmap.store.layout import Shape
-from gsmap.types import Cameras, Gaussians, Scene, Thinning
+from gsmap.store.packed import Column
+from gsmap.stream import blocks
+from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
+from gsmap.types.gaussians import FIELDS
 
-GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
-
-def scene_id(gaussians: Gaussians, cameras: Cameras) -> str:
+def scene_id(gaussians: GaussianSource, cameras: Cameras) -> str:
     """32 hex digits of content: the same Gaussians and cameras have the same id in every map."""
-    arrays = [getattr(gaussians, name) for name in GAUSSIANS]
+    shapes = gaussian_shapes(gaussians.num_gaussians, gaussians.sh_degree)
+    arrays = [Parts(shapes[name], np.dtype(np.float32), partial(gaussians.columns, name)) for name in FIELDS]
     views = [cameras.T_frame_camera, cameras.intrinsics_px, cameras.sizes_px]
     return digest(*arrays, *views, text="\n".join(cameras.names))
 
@@ -53,13 +57,7 @@ def _thinning(row: Row[Any]) -> Thinning | None:
 def shapes_of(row: Row[Any]) -> dict[str, Shape]:
     """What a scene's row says of its arrays."""
     n, c = row.num_gaussians, row.num_cameras
-    shapes: dict[str, Shape] = {
-        "means": (n, 3),
-        "quats": (n, 4),
-        "log_scales": (n, 3),
-        "logit_opacities": (n,),
-        "sh": (n, (row.sh_degree + 1) ** 2, 3),
-    }
+    shapes: dict[str, Shape] = {**gaussian_shapes(n, row.sh_degree)}
     if row.thinned is not None:
         shapes = compact.shapes(n, row.sh_degree)
     shapes |= {
@@ -71,13 +69,46 @@ def shapes_of(row: Row[Any]) -> dict[str, Shape]:
     return shapes
 
 
-def to_arrays(gaussians: Gaussians, cameras: Cameras) -> dict[str, np.ndarray]:
-    """What is written of a scene, by the names of its arrays."""
-    return {name: getattr(gaussians, name) for name in GAUSSIANS} | camera_arrays(cameras)
+def gaussian_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """The shape of each field of so many Gaussians."""
+    n, k = count, (sh_degree + 1) ** 2
+    return {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, k, 3)}
+
+
+class GaussianBlocks:
+    """The Gaussians of a source as arrays that are written block after block, each block read once.
+
+    Args:
+        source: in the order to be written.
+        rows: of a block.
+    """
+
+    def __init__(self, source: GaussianSource, rows: int) -> None:
+        self._blocks = blocks(source, rows)
+        self._rows = rows
+        self._count = 0
+        self._block = Gaussians.empty()
+        self._boxes: list[np.ndarray] = []
+        shapes = gaussian_shapes(source.num_gaussians, source.sh_degree)
+        self.arrays = {name: Column(shapes[name], np.dtype(np.float32), partial(self._of, name)) for name in FIELDS}
+
+    def boxes(self) -> np.ndarray:
+        """(C, 2, 3) of the blocks, once all have been written."""
+        return np.array(self._boxes, dtype=np.float64).reshape(-1, 2, 3)
+
+    def _of(self, name: str, start: int) -> np.ndarray:
+        if start == self._rows * self._count:
+            self._block = next(self._blocks)
+            self._boxes.append(chunk_boxes(self._block, self._rows)[0])
+            self._count += 1
+        if start != self._rows * (self._count - 1):
+            raise ValueError(f"rows from {start} on were asked for out of order")
+        column: np.ndarray = getattr(self._block, name)
+        return column
 
 
 def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
-    """As `to_arrays`, of its cameras alone."""
+    """What is written of a scene's cameras, by the names of its arrays."""
     for name in cameras.names:
         if "\n" in name:
             raise InputError(f"camera name {name!r} has a line break")

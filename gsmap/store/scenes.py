@@ -10,7 +10,6 @@ import numpy as np
 from sqlalchemy import Connection, Row, insert, select, update
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
-from gsmap.geometry.morton import morton_order
 from gsmap.store import compact, facts
 from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes, put_boxes, row_ranges, touching
@@ -19,10 +18,13 @@ from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
 from gsmap.store.groups import drop_graphs, has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.layout import CHUNK_ROWS
-from gsmap.store.scene_content import GAUSSIANS, camera_arrays, scene_id, scene_of, shapes_of, to_arrays
+from gsmap.store.scene_content import GaussianBlocks, camera_arrays, scene_id, scene_of, shapes_of
 from gsmap.store.scene_refs import alive, by_id, find, find_removed, free_name, name_taken
 from gsmap.store.schema import scenes
-from gsmap.types import Cameras, Gaussians, Scene
+from gsmap.stream import bounds as bounds_of
+from gsmap.stream import in_morton_order
+from gsmap.types import Cameras, Gaussians, GaussianSource, Scene
+from gsmap.types.gaussians import FIELDS
 from gsmap.types.progress import Progress
 
 KIND = "scenes"
@@ -42,7 +44,7 @@ class Scenes:
 
     def add(
         self,
-        gaussians: Gaussians,
+        gaussians: GaussianSource,
         cameras: Cameras,
         *,
         name: str,
@@ -58,7 +60,8 @@ class Scenes:
         """Add a scene; durable when it returns.
 
         Args:
-            gaussians, cameras: in the scene's own frame; validated before (`gsmap.ingest.validate`).
+            gaussians, cameras: in the scene's own frame; validated before (`gsmap.ingest.validate`). Gaussians that
+                are not in memory need no more of it than `gsmap.stream.order.BUCKET_BYTES` and a few bytes each.
             captured_at: ISO 8601; UTC where it has no zone.
             dated_by: what the date was read from; empty where a person said it.
             rename: where another scene has the name, take ``name-2`` and so on; else refuse.
@@ -74,7 +77,7 @@ class Scenes:
         """
         facts.checked_text("the name of a scene", name)
         captured_at = None if captured_at is None else facts.checked_date(captured_at)
-        if not len(gaussians):
+        if not gaussians.num_gaussians:
             raise InputError(f"scene {name!r} has no Gaussians")
         new_id = scene_id(gaussians, cameras)
         with self._catalog.read() as connection:
@@ -83,12 +86,13 @@ class Scenes:
         stored = bool(files) and not self._arrays.problems(KIND, new_id, files)
         if row is not None and row.removed_at is None and stored:
             return self._dated(row.id, captured_at, dated_by), False
+        box = bounds_of(gaussians)
         fields: dict[str, Any] = {
             "name": name,
-            "num_gaussians": len(gaussians),
+            "num_gaussians": gaussians.num_gaussians,
             "sh_degree": gaussians.sh_degree,
             "num_cameras": len(cameras),
-            "bounds": np.stack([gaussians.means.min(0), gaussians.means.max(0)]).astype(np.float64).tolist(),
+            "bounds": box.astype(np.float64).tolist(),
             "scale_policy": scale_policy,
             "captured_at": captured_at,
             "source": source,
@@ -102,12 +106,15 @@ class Scenes:
                     return self._enter(connection, new_id, fields, rename, dated_by), True
         if progress:
             progress(0.1, f"sorting {name}")
-        ordered = gaussians[morton_order(gaussians.means)]
-        boxes = chunk_boxes(ordered, CHUNK_ROWS, sigmas=_SIGMAS)
-        if progress:
-            progress(0.4, f"writing {name}")
-        staging = self._arrays.stage(to_arrays(ordered, cameras), KIND, new_id)
-        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+        with contextlib.ExitStack() as until_end:
+            until_end.enter_context(explained(self._catalog.folder, NOT_KEPT))
+            with self._arrays.scratch() as scratch, in_morton_order(gaussians, box, scratch) as ordered:
+                if progress:
+                    progress(0.4, f"writing {name}")
+                content = GaussianBlocks(ordered, CHUNK_ROWS)
+                staging = self._arrays.stage(content.arrays | camera_arrays(cameras), KIND, new_id)
+                staged = until_end.enter_context(staging)
+            connection = until_end.enter_context(self._catalog.write())
             row = by_id(connection, new_id)
             if row is not None and row.removed_at is None:
                 scene = self._dated(new_id, captured_at, dated_by)
@@ -120,8 +127,8 @@ class Scenes:
             if row is not None and row.thinned is not None:
                 drop_graphs(connection, new_id)  # made since of the compact Gaussians, which have other rows
             number = connection.execute(select(scenes.c.number).where(scenes.c.id == new_id)).scalar_one()
-            put_boxes(connection, number, boxes)
-            whole = {"group_id": new_id, "num_gaussians": len(gaussians), "thinned": None}
+            put_boxes(connection, number, content.boxes())
+            whole = {"group_id": new_id, "num_gaussians": gaussians.num_gaussians, "thinned": None}
             connection.execute(update(scenes).where(scenes.c.id == new_id).values(**whole))
             scene = _with_tags(connection, find(connection, new_id))
         return scene, True
@@ -252,7 +259,7 @@ class Scenes:
         """The Gaussians in ranges of rows, all where None."""
         shapes = shapes_of(row)
         if row.thinned is None:
-            read = self._arrays.read(KIND, row.group_id, files, only=GAUSSIANS, rows=ranges, shapes=shapes)
+            read = self._arrays.read(KIND, row.group_id, files, only=FIELDS, rows=ranges, shapes=shapes)
             return Gaussians(**read)
         by_row = [name for name in compact.shapes(0, 0) if name not in compact.WHOLE]
         read = self._arrays.read(KIND, row.group_id, files, only=by_row, rows=ranges, shapes=shapes)

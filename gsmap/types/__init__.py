@@ -11,6 +11,7 @@ from gsmap.types.registration import Proposal, Registration
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph, Things
 from gsmap.types.sim3 import Sim3
+from gsmap.types.source import GaussianSource
 from gsmap.types.thinning import Thinning
 from gsmap.types.tile import Tile
 
@@ -24,6 +25,7 @@ __all__ = [
     "Edge",
     "EdgeOutcome",
     "FileInfo",
+    "GaussianSource",
     "Gaussians",
     "MapObject",
     "MergeResult",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.errors import InputError
 
+FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+CHUNK_ROWS = 1 << 16
 _SH_DEGREE = {1: 0, 4: 1, 9: 2, 16: 3}
 
 
@@ -34,7 +36,7 @@ class Gaussians:
     sh: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        for name in FIELDS:
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
             object.__setattr__(self, name, array)
         n = self.means.shape[0] if self.means.ndim else 0
@@ -49,8 +51,27 @@ class Gaussians:
         return len(self.means)
 
     @property
+    def num_gaussians(self) -> int:
+        return len(self.means)
+
+    @property
     def sh_degree(self) -> int:
         return _SH_DEGREE[self.sh.shape[1]]
+
+    def chunks(self) -> Iterator[Gaussians]:
+        """As a `gsmap.types.GaussianSource`; what is yielded are views."""
+        for start in range(0, len(self), CHUNK_ROWS):
+            yield self[start : start + CHUNK_ROWS]
+
+    def columns(self, name: str) -> Iterator[np.ndarray]:
+        """As a `gsmap.types.GaussianSource`; what is yielded are views."""
+        column = getattr(self, name)
+        for start in range(0, len(column), CHUNK_ROWS):
+            yield column[start : start + CHUNK_ROWS]
+
+    def load(self) -> Gaussians:
+        """Themselves."""
+        return self
 
     @property
     def opacities(self) -> np.ndarray:

@@ -23,7 +23,7 @@ LAYERS = [
     {"types"},
     {"geometry"},
     {"methods"},
-    {"settings"},
+    {"settings", "stream"},
     {"formats", "render", "networks"},
     {"compare"},
     {

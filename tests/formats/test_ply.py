@@ -1,8 +1,10 @@
+import os
+
 import numpy as np
 import pytest
 
 from gsmap.errors import InputError
-from gsmap.formats import info, ply, read, write
+from gsmap.formats import info, ply, read, stream, write
 from gsmap.geometry.sh import SH_C0
 from gsmap.types import Gaussians
 
@@ -280,3 +282,25 @@ def test_lines_without_data_among_ascii_rows_are_left_out_in_silence(tmp_path):
     text = BASE.format(2).replace("binary_little_endian", "ascii") + "end_header\n"
     (tmp_path / "a.ply").write_text(text + "1 " * 14 + "\n\n \n" + "2 " * 14 + "\n")
     np.testing.assert_array_equal(read(tmp_path / "a.ply").means[:, 0], [1, 2])
+
+
+def test_a_file_that_is_written_to_while_it_is_read_is_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    write(path, some(100))
+    source = stream(path)
+    assert source.num_gaussians == 100
+    assert len(list(source.chunks())) == 1
+    before = path.stat()
+    write(path, some(100))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+    with pytest.raises(InputError, match="was written to while it was read"):
+        list(source.chunks())
+    with pytest.raises(InputError, match="was written to"):
+        list(source.columns("means"))
+
+
+def test_a_ply_is_copied_chunk_by_chunk(tmp_path, monkeypatch):
+    write(tmp_path / "a.ply", some(degree=1))
+    monkeypatch.setattr(ply.PlySource, "load", None)
+    write(tmp_path / "b.ply", stream(tmp_path / "a.ply"))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

@@ -89,7 +89,7 @@ def readers(
 def _add(store: Store, capture: Capture, dates: dict[str, str | None]) -> Ingested:
     """Store a capture; ``dates`` of the scenes in the map are brought up to date."""
     scene, new = store.scenes.add(
-        capture.gaussians,
+        capture.content,
         capture.cameras,
         name=capture.name,
         scale_policy=capture.scale_policy,

@@ -1,0 +1,133 @@
+"""Sorting more Gaussians than memory holds along a space-filling curve: a sample sort with buckets on disk.
+
+A sample of the codes says where to cut the curve so that every bucket fits in memory; one pass writes each Gaussian
+into the file of its bucket, and each bucket is sorted when it is read. Every step keeps the order of equal codes, so
+that the result is exactly what sorting all of them at once gives.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.geometry.morton import morton_codes
+from gsmap.types import Gaussians, GaussianSource
+from gsmap.types.gaussians import CHUNK_ROWS
+
+BUCKET_BYTES = 128 << 20
+"""What is sorted in memory at once; the sort needs about three times as much."""
+
+_SAMPLES = 1 << 20
+_MAX_BUCKETS = 256  # files that are open at once
+
+
+@contextlib.contextmanager
+def in_morton_order(
+    source: GaussianSource, box: np.ndarray, scratch: Path, *, bucket_bytes: int = BUCKET_BYTES
+) -> Iterator[GaussianSource]:
+    """The Gaussians of a source along the Morton curve of its box, as `gsmap.geometry.morton.morton_order` has them.
+
+    Args:
+        source: with finite means.
+        box: (2, 3) of its means (`gsmap.stream.bounds`).
+        scratch: a folder that does not exist, for as many bytes as the Gaussians have; gone when the block ends.
+        bucket_bytes: a source of so many bytes is sorted in memory, and no folder is made.
+    """
+    row_bytes = 4 * _width(source.sh_degree)
+    if source.num_gaussians * row_bytes <= bucket_bytes:
+        whole = source.load()
+        yield whole[np.argsort(morton_codes(whole.means, box), kind="stable")]
+        return
+    scratch.mkdir(parents=True)
+    try:
+        rows = max(bucket_bytes // row_bytes, source.num_gaussians // _MAX_BUCKETS)
+        cuts = _cuts(source, box, rows)
+        counts = _distribute(source, box, cuts, scratch)
+        yield _Buckets(scratch, counts, source.sh_degree, box)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Buckets:
+    """Gaussians in the files of their buckets, sorted as each is read."""
+
+    folder: Path
+    counts: np.ndarray
+    sh_degree: int
+    box: np.ndarray
+
+    @property
+    def num_gaussians(self) -> int:
+        return int(self.counts.sum())
+
+    def chunks(self) -> Iterator[Gaussians]:
+        for bucket in np.flatnonzero(self.counts).tolist():
+            table = np.fromfile(_file(self.folder, bucket), np.float32).reshape(-1, _width(self.sh_degree))
+            order = np.argsort(morton_codes(table[:, :3], self.box), kind="stable")
+            for start in range(0, len(order), CHUNK_ROWS):
+                yield _gaussians(table[order[start : start + CHUNK_ROWS]])
+
+    def columns(self, name: str) -> Iterator[np.ndarray]:
+        for chunk in self.chunks():
+            yield getattr(chunk, name)
+
+    def load(self) -> Gaussians:
+        from gsmap.stream.rows import loaded
+
+        return loaded(self)
+
+
+def _cuts(source: GaussianSource, box: np.ndarray, rows: int) -> np.ndarray:
+    """Codes at which to cut the curve so that about ``rows`` Gaussians lie between two of them."""
+    step = -(-source.num_gaussians // _SAMPLES)
+    sampled, at = [], 0
+    for means in source.columns("means"):
+        sampled.append(morton_codes(means[-at % step :: step], box))
+        at += len(means)
+    codes = np.sort(np.concatenate(sampled))
+    cuts: np.ndarray = np.unique(codes[:: max(1, rows // step)][1:])
+    return cuts
+
+
+def _distribute(source: GaussianSource, box: np.ndarray, cuts: np.ndarray, folder: Path) -> np.ndarray:
+    """Write every Gaussian into the file of its bucket; how many each got."""
+    counts = np.zeros(len(cuts) + 1, np.int64)
+    with contextlib.ExitStack() as opened:
+        files = [opened.enter_context(open(_file(folder, i), "xb")) for i in range(len(counts))]
+        for chunk in source.chunks():
+            bucket = np.searchsorted(cuts, morton_codes(chunk.means, box), side="right")
+            table = _table(chunk)[np.argsort(bucket, kind="stable")]
+            here = np.bincount(bucket, minlength=len(counts))
+            ends = np.cumsum(here)
+            for i in np.flatnonzero(here):
+                files[i].write(table[ends[i] - here[i] : ends[i]].data)
+            counts += here
+    return counts
+
+
+def _file(folder: Path, bucket: int) -> Path:
+    return folder / f"{bucket}.f32"
+
+
+def _width(sh_degree: int) -> int:
+    """Numbers of a Gaussian."""
+    return 3 + 4 + 3 + 1 + 3 * (sh_degree + 1) ** 2
+
+
+def _table(gaussians: Gaussians) -> np.ndarray:
+    """(n, width) float32."""
+    g = gaussians
+    return np.concatenate(
+        [g.means, g.quats, g.log_scales, g.logit_opacities[:, None], g.sh.reshape(len(g), -1)], axis=1
+    )
+
+
+def _gaussians(table: np.ndarray) -> Gaussians:
+    sh = table[:, 11:].reshape(len(table), -1, 3)
+    return Gaussians(table[:, :3], table[:, 3:7], table[:, 7:10], table[:, 10], sh)
