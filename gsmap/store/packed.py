@@ -99,7 +99,7 @@ def write(path: Path, arrays: Mapping[str, np.ndarray | Column], *, chunk_rows: 
             archive.writestr(zipfile.ZipInfo(key, _NEVER), described.to_bytes())
 
 
-def _chunk(array: np.ndarray, i: int, rows: int) -> np.ndarray:
+def _chunk(array: np.ndarray | Column, i: int, rows: int) -> np.ndarray:
     """The bytes of a chunk of so many rows; the last one is filled with zeros, as zarr does."""
     part = np.ascontiguousarray(array[i * rows : (i + 1) * rows], array.dtype.newbyteorder("<"))
     if len(part) < rows:
