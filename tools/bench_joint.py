@@ -94,6 +94,9 @@ def main() -> None:
         began = time.process_time()
         place = read_place(folder, options)
         registered = time.process_time() - began
+        if not place.pairs:
+            print(f"{place.name}: no pair is accepted", flush=True)
+            continue
         began = time.process_time()
         graph, covariances = solved(place, [p.found for p in place.pairs])
         print(f"{place.name}: {len(place.captures)} captures, {len(place.pairs)} pairs in use, "
