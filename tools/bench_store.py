@@ -3,8 +3,8 @@
     python tools/bench_store.py [FILE.ply] [--gaussians 1000000] [--degree 3] [--repeat 3] [--json out.json]
 
 Without a file the Gaussians are random (worse to compress than real ones). CPU is process time of all threads, best of
-the repeats; MB/s counts the bytes of the arrays in memory. "damage found" flips some 16 bits, evenly over the files that
-hold arrays, one after the other, and reads the scene: how many of them raised an error.
+the repeats; MB/s counts the bytes of the arrays in memory. "damage found" flips some 16 bits, evenly over the files
+that hold arrays, one after the other, and reads the scene: how many of them raised an error.
 """
 
 from __future__ import annotations
