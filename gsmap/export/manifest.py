@@ -25,6 +25,7 @@ FILE_NAME = "tiles.json"
 _VERSION = 2
 _NAMELESS = 1  # its tiles had a free text instead of a recipe, so that nobody knows what made them
 _SAVE_EVERY_S = 2.0
+_SAVE_SHARE = 50  # times what the last one took, at least
 _MAX_BYTES = 1 << 30  # a tile's entry has some kilobytes
 _PATH = re.compile(r"component_\d+/[^/\\]+")
 
@@ -49,6 +50,7 @@ class Manifest:
     doomed: set[str] = field(default_factory=set)
     metres: dict[int, Metre] = field(default_factory=dict)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
+    _save_took_s: float = field(default=0.0, repr=False)
 
     @classmethod
     def load(cls, folder: Path, map_id: str) -> Manifest:
@@ -113,7 +115,7 @@ class Manifest:
 
     def save_sometimes(self, folder: Path) -> None:
         """Save, unless that was done a moment ago: an interrupted export loses seconds, a large one does not crawl."""
-        if time.monotonic() - self._saved_at > _SAVE_EVERY_S:
+        if time.monotonic() - self._saved_at > max(_SAVE_EVERY_S, _SAVE_SHARE * self._save_took_s):
             self.save(folder)
 
     def save(self, folder: Path) -> None:
@@ -127,8 +129,9 @@ class Manifest:
             content["components"] = [_component(c, self.metres[c]) for c in sorted(self.metres)]
         if self.doomed:
             content["doomed"] = sorted(self.doomed)
+        began = time.process_time()
         write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
-        self._saved_at = time.monotonic()
+        self._saved_at, self._save_took_s = time.monotonic(), time.process_time() - began
 
 
 def _component(component: int, metre: Metre) -> dict[str, object]:

@@ -188,12 +188,14 @@ class PlacedSights:
         S_map_scene: where it lies.
         rows: (C,) which of its cameras each of the placed ones is.
         keys: (N,) uint64, names of the placed Gaussians.
+        order: (N,) that sorts them.
     """
 
     sights: Sights
     S_map_scene: Sim3
     rows: np.ndarray
     keys: np.ndarray
+    order: np.ndarray
 
     def of(self, camera: int) -> Sight:
         """What one of the placed cameras sees, in the frame of the capture."""
@@ -219,11 +221,14 @@ class PlacedSights:
 
     def count(self, sight: Sight, pixels: np.ndarray, largest: np.ndarray) -> None:
         """Add to (N,) what the placed Gaussians show in it."""
-        at = np.searchsorted(sight.keys, self.keys)
-        at[at == len(sight.keys)] = 0
-        rows = np.flatnonzero(sight.keys[at] == self.keys) if len(sight.keys) else np.zeros(0, np.int64)
-        pixels[rows] += sight.pixels[at[rows]]
-        largest[rows] = np.maximum(largest[rows], sight.largest[at[rows]])
+        if not len(sight.keys):
+            return
+        # Sorted into sorted: searching at random takes several times as long.
+        at = np.minimum(np.searchsorted(sight.keys, self.keys[self.order]), len(sight.keys) - 1)
+        known = sight.keys[at] == self.keys[self.order]
+        rows, at = self.order[known], at[known]
+        pixels[rows] += sight.pixels[at]
+        largest[rows] = np.maximum(largest[rows], sight.largest[at])
 
 
 def keys_of(means: np.ndarray) -> np.ndarray:

@@ -127,7 +127,7 @@ def _sights(
     assert scene.cameras is not None
     around = around_m / scene.S_map_scene.scale
     sights = Sights(scene.scene_id, scene.load, scene.cameras, around, longest_side_px, scene.store)
-    return PlacedSights(sights, scene.S_map_scene, rows, keys)
+    return PlacedSights(sights, scene.S_map_scene, rows, keys, np.argsort(keys, kind="stable"))
 
 
 def _with_cameras(box: np.ndarray, centers: np.ndarray, count: int) -> np.ndarray:

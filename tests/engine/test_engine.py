@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 from gsmap import engine
-from gsmap.engine import SetAside
+from gsmap.engine import SetAside, pool
 from gsmap.engine.executors.local import Params, start
 from gsmap.errors import ConfigError, GsmapError
 
@@ -53,11 +54,6 @@ def die_once(x: int, folder: str) -> int:
     with open(Path(folder, "ended"), "a") as file:
         file.write(f"{x} {time.monotonic()}\n")
     return x
-
-
-def where(place: str, scene: str, i: int) -> tuple[str, int]:
-    time.sleep(0.02)
-    return scene, os.getpid()
 
 
 def take_a_little(x: int) -> int:
@@ -149,13 +145,28 @@ def test_workers_are_kept_while_a_map_is_open() -> None:
     assert not processes() & first
 
 
+class Sat(pool.Worker):
+    """A worker that waits, and has read some scenes."""
+
+    def __init__(self, *scenes: str) -> None:
+        self.read = deque([frozenset([scene]) for scene in scenes])
+
+    def is_alive(self) -> bool:
+        return True
+
+
 def test_jobs_run_where_what_they_read_was_read() -> None:
-    """Two scenes, each in half of the jobs, and two workers: each reads one of them."""
-    jobs = [("map", scene, i) for i in range(8) for scene in ("hall", "attic")]
-    found = dict(run_jobs(where, jobs, Params(workers=2)))
-    processes = {scene: {process for told, process in found.values() if told == scene} for scene in ("hall", "attic")}
-    assert len(processes["hall"] | processes["attic"]) == 2
-    assert sum(len(each) for each in processes.values()) <= 3  # who has nothing left to do takes of the other's
+    """Idle workers and jobs ahead are matched by scenes; who has read none of them takes the first job."""
+    hall, attic = Sat("cellar", "hall"), Sat("attic")
+    workers = pool.Pool(3)
+    workers._idle = [attic, hall]
+    jobs = [("map", ("stairs", "key")), ("map", "hall", "stairs"), ("map", "attic"), ("map", "loft")]
+    ahead = deque(pool._Task(i, job, pool._reads(job)) for i, job in enumerate(jobs))
+    matched = [workers._matched(ahead) for _ in range(2)]
+    assert {task.index: worker for worker, task in matched} == {1: hall, 2: attic}
+    workers._idle = [attic]
+    worker, task = workers._matched(ahead)
+    assert (worker, task.index) == (attic, 0)
 
 
 @pytest.mark.parametrize(("jobs", "here"), [(4, True), (400, False)])
