@@ -15,7 +15,7 @@ them that is right, as they are tried where nothing else holds (a capture has tw
 `retrieve.enough`); recall where all N ask at once; then the same of votes of all nodes for all, as gsmap 0.3 did it.
 
 --cost prints, for an index as it lies in a map: segments, bytes, CPU s of one newcomer's lookup (reading included), of
-putting it into the index, and how much memory both took. Beyond the captures that are there it is filled with copies
+putting it into the index, and how much memory asking takes. Beyond the captures that are there it is filled with copies
 whose codes and positions have noise: that tells what asking costs, and nothing of what is found.
 """
 
@@ -30,10 +30,10 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import argparse
 import pickle
-import resource
 import sys
 import tempfile
 import time
+import tracemalloc
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -198,7 +198,10 @@ def cost(voters: Sequence[Voters], count: int, params: Params) -> None:
             ]
             put(store, key, batch)
         look_up([asking], store.indexes.segments(key), params)  # imports, and pages of the disk
-        memory = peak()
+        tracemalloc.start()
+        look_up([asking], store.indexes.segments(key), params)
+        memory = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
         begin = time.process_time()
         look_up([asking], store.indexes.segments(key), params)
         asked = time.process_time() - begin
@@ -209,7 +212,7 @@ def cost(voters: Sequence[Voters], count: int, params: Params) -> None:
         kept = time.process_time() - begin
         print(
             f"{count:5d} scenes: {len(segments)} segments, {size / 1e6:.1f} MB; a newcomer asks {asked:.3f} CPU s, is "
-            f"put in {kept:.3f} CPU s; {peak() - memory:.0f} MB of memory more",
+            f"put in {kept:.3f} CPU s; asking takes {memory:.0f} MB of memory",
             flush=True,
         )
 
@@ -231,10 +234,6 @@ def _copy(voters: Voters, scene: str, rng: np.random.Generator | None) -> Voters
     codes = np.clip(kept.codes + rng.integers(-12, 13, kept.codes.shape), -127, 127).astype(np.int8)
     positions = (kept.positions + rng.normal(size=kept.positions.shape) * 0.3).astype(np.float16)
     return replace(voters, member=member, kept=replace(kept, codes=codes, positions=positions))
-
-
-def peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ def test_distances_of_codes_are_those_of_the_vectors():
         codes = coding.encode(vectors).astype(float)
         told = np.linalg.norm(codes[:, None] - codes[None], axis=2) / coding.SCALE
         true = np.linalg.norm(vectors[:, None] - vectors[None], axis=2)
-        assert np.quantile(np.abs(told - true), 0.9) < 0.02  # a component beyond 127 / 200 is cut off
+        assert np.quantile(np.abs(told - true), 0.9) < 0.05  # a component beyond 127 / 200 is cut off
 
 
 def test_vectors_of_any_dimension_have_codes_that_tell_them_apart():
