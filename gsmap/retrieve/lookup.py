@@ -15,7 +15,7 @@ from gsmap.types.retrieval import Candidate, Member
 
 VERSION = 3
 
-_BLOCK_ROWS = 200_000  # of an index that are in memory at a time: 12 MB
+_BLOCK_ROWS = 100_000  # of an index that are in memory at a time: 6 MB
 _SAME_NODE_M = 0.05  # two nodes nearer than this may be one
 
 
