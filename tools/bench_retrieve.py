@@ -12,10 +12,11 @@ not trained, in a frame of its own), and is described under the default settings
 For each N it prints, of up to 60 of the captures, each asking an index of all N as a newcomer does: the share of its
 true neighbours among the first 5, 10, top_k and 15 of its list, and by votes alone; pairs a scene and the share of
 them that is right, as they are tried where nothing else holds (a capture has two neighbours here, fewer than
-`retrieve.enough`); recall where all N ask at once; then the same of votes of all nodes for all, as gsmap 0.3 did it.
+`retrieve.enough`); recall where all N ask at once; with --older the same of votes of all nodes for all, as it was before
+there was an index.
 
 --cost prints, for an index as it lies in a map: segments, bytes, CPU s of one newcomer's lookup (reading included), of
-putting it into the index, and how much memory both took. Beyond the captures that are there it is filled with copies
+putting it into the index, and how much memory asking takes. Beyond the captures that are there it is filled with copies
 whose codes and positions have noise: that tells what asking costs, and nothing of what is found.
 """
 
@@ -30,10 +31,10 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import argparse
 import pickle
-import resource
 import sys
 import tempfile
 import time
+import tracemalloc
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -141,7 +142,7 @@ def report(graphs: Sequence[SceneGraph], voters: Sequence[Voters], params: Param
     if older:
         begin = time.process_time()
         pairs = votes_of_all(graphs)
-        say("gsmap 0.3", names, pairs, (time.process_time() - begin) / len(names))
+        say("all for all", names, pairs, (time.process_time() - begin) / len(names))
 
 
 def say(what: str, names: Sequence[str], pairs: set[frozenset[str]], seconds: float) -> None:
@@ -154,7 +155,7 @@ def say(what: str, names: Sequence[str], pairs: set[frozenset[str]], seconds: fl
 
 
 def votes_of_all(graphs: Sequence[SceneGraph], top_k: int = 10, most: int = 20) -> set[frozenset[str]]:
-    """Pairs as gsmap 0.3 found them: every node votes for the most similar ones of its type, of all scenes at once."""
+    """Pairs as they were found before: every node votes for the most similar ones of its type, of all scenes at once."""
     votes = np.zeros((len(graphs), len(graphs)))
     budget = max(16, min(400, 60_000 // len(graphs)))
     layers = defaultdict(list)
@@ -198,7 +199,10 @@ def cost(voters: Sequence[Voters], count: int, params: Params) -> None:
             ]
             put(store, key, batch)
         look_up([asking], store.indexes.segments(key), params)  # imports, and pages of the disk
-        memory = peak()
+        tracemalloc.start()
+        look_up([asking], store.indexes.segments(key), params)
+        memory = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
         begin = time.process_time()
         look_up([asking], store.indexes.segments(key), params)
         asked = time.process_time() - begin
@@ -209,7 +213,7 @@ def cost(voters: Sequence[Voters], count: int, params: Params) -> None:
         kept = time.process_time() - begin
         print(
             f"{count:5d} scenes: {len(segments)} segments, {size / 1e6:.1f} MB; a newcomer asks {asked:.3f} CPU s, is "
-            f"put in {kept:.3f} CPU s; {peak() - memory:.0f} MB of memory more",
+            f"put in {kept:.3f} CPU s; asking takes {memory:.0f} MB of memory",
             flush=True,
         )
 
@@ -231,10 +235,6 @@ def _copy(voters: Voters, scene: str, rng: np.random.Generator | None) -> Voters
     codes = np.clip(kept.codes + rng.integers(-12, 13, kept.codes.shape), -127, 127).astype(np.int8)
     positions = (kept.positions + rng.normal(size=kept.positions.shape) * 0.3).astype(np.float16)
     return replace(voters, member=member, kept=replace(kept, codes=codes, positions=positions))
-
-
-def peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 if __name__ == "__main__":

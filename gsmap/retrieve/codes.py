@@ -16,7 +16,7 @@ AXES = Path(__file__).with_name("axes.npz")
 
 NUM_DIMS = 48  # of a code
 SCALE = 200  # of a unit vector's components; what is beyond 127 / 200 is cut off, which next to none is
-NUM_SIGNS = 5  # axes whose signs name a list: 32 lists for every type of node
+NUM_SIGNS = 6  # axes whose signs name a list: 64 lists for every type of node
 
 
 def encode(vectors: np.ndarray) -> np.ndarray:

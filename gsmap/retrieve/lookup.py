@@ -15,7 +15,7 @@ from gsmap.types.retrieval import Candidate, Member
 
 VERSION = 3
 
-_BLOCK_ROWS = 200_000  # of an index that are in memory at a time: 12 MB
+_BLOCK_ROWS = 100_000  # of an index that are in memory at a time: 6 MB
 _SAME_NODE_M = 0.05  # two nodes nearer than this may be one
 
 
@@ -60,17 +60,24 @@ class _Members:
 
 
 @dataclass(frozen=True, eq=False)
-class _Block:
-    """Some lists of an index, of all segments.
+class _Part:
+    """What a segment has of some lists.
 
     Args:
-        keys: (W,) rising; starts: (W + 1,) in the nodes.
-        nodes: of scenes that count, by key.
+        at: (W, 2) where each of them begins and ends among the nodes.
+        nodes: their places are those of `_Members`, -1 where a scene does not count.
     """
 
-    keys: np.ndarray
-    starts: np.ndarray
+    at: np.ndarray
     nodes: Unpacked
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Some lists of an index, of all segments; ``keys`` (W,) rises."""
+
+    keys: np.ndarray
+    parts: list[_Part]
 
 
 def _blocks(
@@ -101,26 +108,18 @@ def _read(
     lists: Sequence[tuple[np.ndarray, np.ndarray]],
     members: _Members,
 ) -> _Block:
-    keys_of, parts, places_of = [], [], []
+    parts = []
     for segment, (keys, starts), place_of in zip(segments, lists, members.places, strict=True):
         low, high = np.searchsorted(keys, wanted[0]), np.searchsorted(keys, wanted[-1], side="right")
         if low == high:
             continue
-        rows = segment.rows(int(starts[low]), int(starts[high]))
-        repeated = np.repeat(keys[low:high], np.diff(starts[low : high + 1]))
-        found = unpacked(rows)
+        found = unpacked(segment.rows(int(starts[low]), int(starts[high])))
         places = place_of[checked_places(found.places, len(segment.members))]
-        at = np.searchsorted(wanted, repeated)
-        counts = (places >= 0) & (wanted[np.minimum(at, len(wanted) - 1)] == repeated)
-        keys_of.append(repeated[counts])
-        parts.append(rows[counts])
-        places_of.append(places[counts])
-    key, place = np.concatenate(keys_of), np.concatenate(places_of)
-    order = np.argsort(key, kind="stable")
-    names, count = np.unique(key, return_counts=True)
-    nodes = unpacked(np.concatenate(parts)[order])
-    starts = np.concatenate([[0], np.cumsum(count)])
-    return _Block(names, starts, Unpacked(nodes.codes, nodes.positions, place[order]))
+        first = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        at = np.stack([starts[first], starts[first + (keys[first] == wanted)]], 1) - starts[low]
+        at[keys[first] != wanted] = 0
+        parts.append(_Part(at, Unpacked(found.codes, found.positions, places)))
+    return _Block(wanted, parts)
 
 
 class _Matches:
@@ -148,23 +147,31 @@ def _search(asker: Voters, block: _Block, members: _Members, found: _Matches, pa
     norms = (vectors**2).sum(1)
     most = np.float32(2 * codes.SCALE**2 * (1 - params.min_similarity))
     for first, last in zip(firsts, np.r_[firsts[1:], len(which)], strict=True):
-        rows = slice(block.starts[which[first]], block.starts[which[first] + 1])
-        mine, theirs = node[first:last], block.nodes.codes[rows].astype(np.float32)
+        nodes = _listed(block, int(which[first]))
+        mine, theirs = node[first:last], nodes.codes.astype(np.float32)
         squared = norms[mine, None] + (theirs**2).sum(1) - 2 * (vectors[mine] @ theirs.T)
-        if own >= 0:
-            squared[:, block.nodes.places[rows] == own] = np.inf
+        squared[:, (nodes.places == own) | (nodes.places < 0)] = np.inf
         bar = np.full(len(mine), most)
         if squared.shape[1] > params.votes_per_node:  # all that are as near as the last one: no order decides
-            bar = np.minimum(
-                bar, np.partition(squared, params.votes_per_node - 1, axis=1)[:, params.votes_per_node - 1]
-            )
+            kth = params.votes_per_node - 1
+            bar = np.minimum(bar, np.partition(squared, kth, axis=1)[:, kth])
         if is_small:
-            found.seen.update(block.nodes.places[rows].tolist())
+            found.seen.update(nodes.places[nodes.places >= 0].tolist())
         q, e = np.nonzero(squared <= bar[:, None])
         found.nodes.append(mine[q])
-        found.places.append(block.nodes.places[rows][e])
+        found.places.append(nodes.places[e])
         found.squared.append(squared[q, e])
-        found.positions.append(block.nodes.positions[rows][e])
+        found.positions.append(nodes.positions[e])
+
+
+def _listed(block: _Block, number: int) -> Unpacked:
+    """What one list holds, of all segments."""
+    slices = [(part.nodes, slice(*part.at[number])) for part in block.parts]
+    return Unpacked(
+        np.concatenate([nodes.codes[rows] for nodes, rows in slices]),
+        np.concatenate([nodes.positions[rows] for nodes, rows in slices]),
+        np.concatenate([nodes.places[rows] for nodes, rows in slices]),
+    )
 
 
 def _ranked(asker: Voters, found: _Matches, members: _Members, params: Params) -> list[Candidate]:

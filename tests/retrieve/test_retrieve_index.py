@@ -29,7 +29,7 @@ def test_distances_of_codes_are_those_of_the_vectors():
         codes = coding.encode(vectors).astype(float)
         told = np.linalg.norm(codes[:, None] - codes[None], axis=2) / coding.SCALE
         true = np.linalg.norm(vectors[:, None] - vectors[None], axis=2)
-        assert np.quantile(np.abs(told - true), 0.9) < 0.02  # a component beyond 127 / 200 is cut off
+        assert np.quantile(np.abs(told - true), 0.9) < 0.05  # a component beyond 127 / 200 is cut off
 
 
 def test_vectors_of_any_dimension_have_codes_that_tell_them_apart():
@@ -95,7 +95,7 @@ def test_any_order_and_any_segments_say_the_same():
     graphs = walk(40)
     graphs += [replace(graph, scene_id=f"x{graph.scene_id}") for graph in graphs[:6]]  # as alike as can be: ties
     voters = _voters(graphs)
-    params = Params(top_k=5)
+    params = Params(top_k=5, checked_scenes=3)  # where ties are cut, too
     first = look_up(voters, [new_segment(voters)], params)
     for count in (1, 2, 7):
         order = rng.permutation(len(voters))
