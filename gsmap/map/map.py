@@ -834,7 +834,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.check_report(self.store.check(lambda f, text: self._progress("check", f, text)))
 
     def prune(self, keep_revisions: int | None = None, *, dry_run: bool = False) -> PruneReport:
-        """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names or holds."""
+        """Delete leftovers of interrupted work and what none of the newest ``keep_revisions`` (None: all) names."""
         return reports.prune_report(self.store.prune(keep_revisions=keep_revisions, dry_run=dry_run), dry_run)
 
     def thin(

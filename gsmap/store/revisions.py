@@ -266,8 +266,14 @@ def stored_lines(connection: Connection, row: Row[Any]) -> Lines | None:
 
 
 def is_dropped(connection: Connection, row: Row[Any]) -> bool:
-    """Whether only the line of a revision is left. The newest one's poses are those of the map, and stay."""
-    return row.dropped_at is not None and row.number != _newest(connection)
+    """Whether `prune` took poses or edges of a revision. The newest one's are those of the map, and stay."""
+    if row.dropped_at is None or row.number == _newest(connection):
+        return False
+    left = [
+        connection.execute(select(func.count()).select_from(table).where(_holds(table, row.number))).scalar_one()
+        for table in (poses, edges)
+    ]
+    return left != [row.num_scenes, row.num_used + row.num_tentative + row.num_unused]
 
 
 def named_by_kept(after: int = 0) -> Select[Any]:
