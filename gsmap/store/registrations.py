@@ -385,7 +385,7 @@ def _choose(
     ends = select(func.min(registrations.c.number).label("first"), func.max(registrations.c.number).label("newest"))
     silent = ends.where(wanted, registrations.c.pair.not_in(spoken)).group_by(registrations.c.pair).subquery()
     query = select(*columns, silent.c.first).join(silent, silent.c.newest == registrations.c.number)
-    rows = connection.execute(query if silent_if is None else query.where(silent_if)).all()
+    rows: Sequence[Row[Any]] = connection.execute(query if silent_if is None else query.where(silent_if)).all()
     found = [(row.first, _Chosen(row, None)) for row in rows]
 
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)

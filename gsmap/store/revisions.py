@@ -40,6 +40,8 @@ from gsmap.store.schema import REVISION_COUNTS, edges, poses, revisions
 from gsmap.types import EdgeOutcome, PoseGraph, Provenance, ScenePose
 from gsmap.types.plain import plain
 
+PairsByRevision = dict[int, list[tuple[str, str]]]
+
 
 @dataclass(frozen=True)
 class Revision:
@@ -171,13 +173,13 @@ class Revisions:
         with self._catalog.read() as connection:
             return _outcomes(connection, newest & mine if scenes else newest)
 
-    def undecided(self, number: int | None = None) -> dict[int, list[tuple[str, str]]]:
+    def undecided(self, number: int | None = None) -> PairsByRevision:
         """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)
         query = query.order_by(edges.c.target, edges.c.source)
         if number is not None:
             query = query.where(_holds(edges, number))
-        found: dict[int, list[tuple[str, str]]] = {}
+        found: PairsByRevision = {}
         with self._catalog.read() as connection:
             end = (_newest(connection) or 0) + 1
             for row in connection.execute(query):
@@ -376,10 +378,11 @@ def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, Scen
         S_map_scene = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
     with not_ours("poses.covariance"):
         covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
+    none: Any = None
     return {
         row.scene: ScenePose(
             row.scene,
-            None if row.S_map_scene is None else next(S_map_scene),
+            none if row.S_map_scene is None else next(S_map_scene),
             row.component,
             row.status,
             None if row.covariance is None else next(covariances),
