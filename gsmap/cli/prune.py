@@ -12,7 +12,10 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 def command(
     map: MapPath,
     keep_revisions: Annotated[
-        int | None, typer.Option("--keep-revisions", help="Keep only the newest N revisions exportable; all else.")
+        int | None,
+        typer.Option(
+            "--keep-revisions", help="Keep only the newest N revisions; of older ones their line in the list."
+        ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Delete nothing: only say what would go.")] = False,
     json: AsJson = False,

@@ -193,22 +193,28 @@ class Registrations:
                 found += _current(connection, registrations.c.pair.in_(some))
         return found
 
-    def standing(self) -> list[Standing]:
-        """What counts of each pair of living scenes, by (target, source); no matrix of any is read."""
+    def standing(self, *, usable: bool = False) -> list[Standing]:
+        """What counts of each pair of living scenes, by (target, source); no matrix of any is read.
+
+        Args:
+            usable: only those that are (`Standing.usable`); their ``keys`` are those of their current row.
+        """
+        accepted = registrations.c.status == "accepted" if usable else None
         repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
         with self._catalog.read() as connection:
             alive = living_ids(connection)
-            chosen = _choose(connection, _LEAN, true())
+            chosen = _choose(connection, _LEAN, silent_if=accepted)
             keys: dict[str, set[str]] = {}
-            again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
-            for row in connection.execute(again):
-                keys.setdefault(row.pair, set()).add(row.key)
+            if not usable:
+                again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
+                for row in connection.execute(again):
+                    keys.setdefault(row.pair, set()).add(row.key)
         made = [
             _standing(choice, keys.get(choice.row.pair, {choice.row.key}))
             for choice in chosen
             if choice.row.target in alive and choice.row.source in alive
         ]
-        return sorted(made, key=lambda one: (one.target, one.source))
+        return sorted((one for one in made if one.usable or not usable), key=lambda one: (one.target, one.source))
 
     def usable(self) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source)."""

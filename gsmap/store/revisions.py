@@ -8,7 +8,7 @@ around its number, so that reading one costs no chain of others, and forgetting 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -39,6 +39,8 @@ from gsmap.store.matrices import covariance_bytes, covariances_of_bytes, pose_by
 from gsmap.store.schema import REVISION_COUNTS, edges, poses, revisions
 from gsmap.types import EdgeOutcome, PoseGraph, Provenance, ScenePose
 from gsmap.types.plain import plain
+
+PairsByRevision = dict[int, list[tuple[str, str]]]
 
 
 @dataclass(frozen=True)
@@ -171,13 +173,13 @@ class Revisions:
         with self._catalog.read() as connection:
             return _outcomes(connection, newest & mine if scenes else newest)
 
-    def undecided(self, number: int | None = None) -> Mapping[int, Sequence[tuple[str, str]]]:
+    def undecided(self, number: int | None = None) -> PairsByRevision:
         """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)
         query = query.order_by(edges.c.target, edges.c.source)
         if number is not None:
             query = query.where(_holds(edges, number))
-        found: dict[int, Any] = {}
+        found: PairsByRevision = {}
         with self._catalog.read() as connection:
             end = (_newest(connection) or 0) + 1
             for row in connection.execute(query):
@@ -266,8 +268,14 @@ def stored_lines(connection: Connection, row: Row[Any]) -> Lines | None:
 
 
 def is_dropped(connection: Connection, row: Row[Any]) -> bool:
-    """Whether only the line of a revision is left. The newest one's poses are those of the map, and stay."""
-    return row.dropped_at is not None and row.number != _newest(connection)
+    """Whether `prune` took poses or edges of a revision. The newest one's are those of the map, and stay."""
+    if row.dropped_at is None or row.number == _newest(connection):
+        return False
+    left = [
+        connection.execute(select(func.count()).select_from(table).where(_holds(table, row.number))).scalar_one()
+        for table in (poses, edges)
+    ]
+    return left != [row.num_scenes, row.num_used + row.num_tentative + row.num_unused]
 
 
 def named_by_kept(after: int = 0) -> Select[Any]:
@@ -367,15 +375,14 @@ def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, Scen
     query = select(*map(_as_it_lies, poses.columns)).where(where).order_by(poses.c.scene)
     rows = connection.execute(query).all()
     with not_ours("poses.S_map_scene"):
-        placed = [bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]
-        S_map_scene: Iterator[Any] = iter(poses_of_bytes(placed))
+        S_map_scene = iter(poses_of_bytes([bytes(row.S_map_scene) for row in rows if row.S_map_scene is not None]))
     with not_ours("poses.covariance"):
-        known = [bytes(row.covariance) for row in rows if row.covariance is not None]
-        covariances = iter(covariances_of_bytes(known))
+        covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
+    none: Any = None
     return {
         row.scene: ScenePose(
             row.scene,
-            None if row.S_map_scene is None else next(S_map_scene),
+            none if row.S_map_scene is None else next(S_map_scene),
             row.component,
             row.status,
             None if row.covariance is None else next(covariances),

@@ -101,7 +101,10 @@ def test_everything_in_it_is_listed_and_shown(opened: Map) -> None:
     assert edges
     for edge in edges:
         assert opened.show_pair(f"{edge.target_name}:{edge.source_name}").history
-    for before, after in pairwise(revisions):
+    # From schema 0007 on, what is dropped is gone; older ones marked it only.
+    whole = [row for row in revisions if row.dropped_at is None or before_dropping(opened)]
+    assert len(whole) > 1
+    for before, after in pairwise(whole):
         opened.diff(before.number, after.number)
     assert opened.status().scenes == len(scenes)
     for one in opened.store.changes.current():
@@ -109,6 +112,11 @@ def test_everything_in_it_is_listed_and_shown(opened: Map) -> None:
         for change in one.changes:
             shown = opened.show_change(f"c{change.number}")
             assert (shown.status == "confirmed") == bool(shown.history)
+
+
+def before_dropping(m: Map) -> bool:
+    """Whether the map was written when `prune` kept the poses of revisions that it dropped."""
+    return any((m.store.folder / f"{sqlite.FILE}.{number:04}.bak").exists() for number in range(1, 7))
 
 
 def test_its_branches_and_tags_open(site: Path) -> None:

@@ -187,6 +187,7 @@ def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
             stored.manual,
         )
         assert one.usable == stored.is_usable
+    assert store.registrations.standing(usable=True) == [one for one in standing if one.usable]
     usable = store.registrations.usable()
     assert [one.number for one in usable] == [one.number for one in standing if one.usable]
     of_one = {one.number for one in store.registrations.current_of(ids[1])}

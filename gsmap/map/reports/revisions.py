@@ -101,10 +101,10 @@ def pose_change_rows(store: Store, before: int, after: int, settings: Settings) 
 @of_one_state
 def update_report(store: Store, ingested: Sequence[IngestRow], metres: Mapping[int, Metre]) -> UpdateReport:
     """What an update took in, and the map as it is now."""
-    revisions = store.revisions.list()
+    newest = store.revisions.current()
     return UpdateReport(
         ingested=tuple(ingested),
         scenes=tuple(scene_rows(store, metres=metres)),
         edges=tuple(edge_rows(store)),
-        revision=revision_row(store, revisions[-1].number) if revisions else None,
+        revision=None if newest is None else revision_row(store, newest),
     )

@@ -49,12 +49,11 @@ def pose_basis(store: Store, settings: Settings) -> PoseBasis:
     hours = settings.optimize.aliasing.same_visit_h
     named, same_visits = [], set()
     # By id, not in the order in which workers happened to finish: the same key whenever they were made.
-    for one in store.registrations.standing():
-        if one.usable:
-            same = _is_same_visit(captured[one.target], captured[one.source], hours)
-            named.append(f"{one.key or one.number} {one.review}" + " same visit" * same)
-            if same:
-                same_visits.add((one.target, one.source))
+    for one in store.registrations.standing(usable=True):
+        same = _is_same_visit(captured[one.target], captured[one.source], hours)
+        named.append(f"{one.key or one.number} {one.review}" + " same visit" * same)
+        if same:
+            same_visits.add((one.target, one.source))
     ups = _ups(store, living, {key.digest for key in graph_keys(store, living, settings).values()})
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
     recipe = solver.recipe_key(settings.optimize)
