@@ -1,6 +1,7 @@
 """Executors: how well workers are used, what starting them costs, and what is lost when they are killed.
 
-    python tools/bench_engines.py [--workers 2] [--jobs 100] [--soak 600] [--kill-every 30] [--dask]
+    python tools/bench_engines.py [--workers 2] [--jobs 100] [--soak 600] [--kill-every 30] [--wait] [--dask]
+    python tools/bench_engines.py --update [--workers 2]
 
 Efficiency is the CPU seconds that the jobs themselves take, over the wall seconds times the workers; on a machine that
 does other work besides, CPU seconds of the whole over those of the jobs say more. The soak kills one of four workers
@@ -13,6 +14,7 @@ import argparse
 import os
 import random
 import resource
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -53,7 +55,11 @@ def main() -> None:
         "--wait", action="store_true", help="jobs wait and compute nothing: for a machine that others use, too"
     )
     parser.add_argument("--dask", action="store_true", help="on a LocalCluster instead of the local pool")
+    parser.add_argument("--update", action="store_true", help="instead: a map of 3 small scenes is given a fourth")
     arguments = parser.parse_args()
+    if arguments.update:
+        update(arguments.workers)
+        return
     with started(arguments.dask, arguments.workers) as workers:
         list(workers.run(burn, [(i, 0.01) for i in range(4 * arguments.workers)]))  # they are there now
         wall, cpu, idle = time.monotonic(), cpu_s(), idle_s()
@@ -113,6 +119,35 @@ def soak(arguments: argparse.Namespace) -> None:
             f"{aside} set aside, {tries - submitted} ({(tries - submitted) / submitted:.1%}) computed twice, "
             f"{count - distinct} committed twice"
         )
+
+
+def update(most: int) -> None:
+    """CPU seconds of ``gsmap update`` with one new scene, its workers included."""
+    from gsmap_synthetic import make_captures, write_captures
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = make_captures(0, 4, shut_doors=False, steps=0, num_frames=24, num_gaussians=25_000, size_px=(160, 120))
+        paths = write_captures(Path(folder, "captures"), made)
+        site = Path(folder, "site.gsmap")
+        gsmap(1, "update", site, *paths[:3])
+        for workers in sorted({1, most}):
+            again = shutil.copytree(site, Path(folder, f"{workers}.gsmap"))
+            spent = gsmap(workers, "update", again, paths[3])
+            print(f"3 + 1 scenes, {workers} worker{'s' * (workers > 1)}: {spent:.1f} CPU s", flush=True)
+
+
+def gsmap(workers: int, *arguments: object) -> float:
+    """CPU seconds that a verb takes, all processes that it starts included."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    env = os.environ | {"GSMAP_WORKERS": str(workers)}
+    subprocess.run(
+        [sys.executable, "-P", "-m", "gsmap", "-q", *map(str, arguments)],
+        check=True,
+        env=env,
+        stdout=subprocess.DEVNULL,
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 @contextmanager
