@@ -18,7 +18,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import reports
 from gsmap.map import values as as_values
 from gsmap.map.logs import logged
-from gsmap.map.metres import map_metres
+from gsmap.map.metres import metres_at
 from gsmap.map.sharing import at_work
 from gsmap.store import Store
 from gsmap.types import Cameras, Change, Gaussians, PoseGraph, Prior, Scene, SceneGraph, Sim3
@@ -534,7 +534,7 @@ class Map(AbstractContextManager["Map"]):
 
     def metres(self, revision: int | None = None) -> dict[int, Metre]:
         """How long a metre is in the frame of each component of a revision, by default the newest."""
-        return map_metres(self.store, self._settings_to_look_by(), self.pose_graph(revision))
+        return metres_at(self.store, self._settings_to_look_by(), revision)
 
     def pose_graph(self, revision: int | None = None) -> PoseGraph | None:
         """The poses of a revision, of the newest one by default; None before the first optimize."""

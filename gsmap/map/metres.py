@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from gsmap.map.settings import Settings
 
 
+def metres_at(store: Store, settings: Settings, revision: int | None = None) -> dict[int, Metre]:
+    """The metre of every component of a revision, by default the newest; of that no edge is read."""
+    graph = PoseGraph(store.revisions.poses()) if revision is None else store.revisions.get(revision)
+    return map_metres(store, settings, graph)
+
+
 def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dict[int, Metre]:
     """The metre of every component of some poses, the largest first; no array is read.
 

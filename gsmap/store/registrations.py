@@ -8,7 +8,20 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, LargeBinary, Row, case, func, insert, or_, select, true, type_coerce
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    LargeBinary,
+    Row,
+    Select,
+    case,
+    func,
+    insert,
+    or_,
+    select,
+    true,
+    type_coerce,
+)
 
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
@@ -404,8 +417,8 @@ def _choose(
     wanted = true() if of is None else of
     ends = select(func.min(registrations.c.number).label("first"), func.max(registrations.c.number).label("newest"))
     silent = ends.where(wanted, registrations.c.pair.not_in(spoken)).group_by(registrations.c.pair).subquery()
-    query = select(*columns, silent.c.first).join(silent, silent.c.newest == registrations.c.number)
-    rows: Sequence[Row[Any]] = connection.execute(query if silent_if is None else query.where(silent_if)).all()
+    query: Select[Any] = select(*columns, silent.c.first).join(silent, silent.c.newest == registrations.c.number)
+    rows = connection.execute(query if silent_if is None else query.where(silent_if)).all()
     found = [(row.first, _Chosen(row, None)) for row in rows]
 
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
