@@ -16,6 +16,7 @@ from gsmap.types.retrieval import Candidate, Member
 VERSION = 3
 
 _BLOCK_ROWS = 100_000  # of an index that are in memory at a time: 6 MB
+_FAR = 1e12  # squared: farther than any code
 _SAME_NODE_M = 0.05  # two nodes nearer than this may be one
 
 
@@ -143,14 +144,18 @@ def _search(asker: Voters, block: _Block, members: _Members, found: _Matches, pa
     order = np.argsort(which, kind="stable")
     node, which = node[order], which[order]
     firsts = np.flatnonzero(np.r_[True, which[1:] != which[:-1]]) if len(which) else np.zeros(0, np.int64)
-    vectors = asker.asking.codes.astype(np.float32)
-    norms = (vectors**2).sum(1)
+    vectors = np.ones((len(asker.asking), codes.NUM_DIMS + 2), np.float32)
+    vectors[:, :-2] = asker.asking.codes
+    vectors[:, -2] = (vectors[:, :-2] ** 2).sum(1)
+    vectors[:, :-2] *= -2
     most = np.float32(2 * codes.SCALE**2 * (1 - params.min_similarity))
     for first, last in zip(firsts, np.r_[firsts[1:], len(which)], strict=True):
         nodes = _listed(block, int(which[first]))
-        mine, theirs = node[first:last], nodes.codes.astype(np.float32)
-        squared = norms[mine, None] + (theirs**2).sum(1) - 2 * (vectors[mine] @ theirs.T)
-        squared[:, (nodes.places == own) | (nodes.places < 0)] = np.inf
+        mine, theirs = node[first:last], np.ones((len(nodes.codes), codes.NUM_DIMS + 2), np.float32)
+        theirs[:, :-2] = nodes.codes
+        theirs[:, -1] = (theirs[:, :-2] ** 2).sum(1)
+        theirs[(nodes.places == own) | (nodes.places < 0), -1] = _FAR
+        squared = vectors[mine] @ theirs.T  # |a|^2 + |b|^2 - 2 a b: whole numbers below 2 ** 22, so exact in any order
         bar = np.full(len(mine), most)
         if squared.shape[1] > params.votes_per_node:  # all that are as near as the last one: no order decides
             kth = params.votes_per_node - 1
