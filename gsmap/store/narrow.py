@@ -51,8 +51,9 @@ def widen(stored: np.ndarray, how: Mapping[str, Any]) -> np.ndarray:
     values = values.reshape(how["shape"])
     if kept == dtype:
         return values
-    wide = values.astype(dtype)
-    return wide if how["step"] == 1.0 else wide * dtype.type(how["step"])
+    step = how["step"]
+    out: np.ndarray = values.astype(dtype) if step == 1.0 else np.multiply(values, dtype.type(step), dtype=dtype)
+    return out
 
 
 def shape_of(how: Mapping[str, Any]) -> Shape:

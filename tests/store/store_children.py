@@ -66,7 +66,7 @@ def die_at(path: str, seed: int, step: int, pipe) -> None:
     pipe.send("through")
 
 
-def fail_at_steps(path: str, code: int, stride: int, pipe) -> None:
+def fail_at_steps(path: str, code: int, pipe) -> None:
     """Add one scene after another, each failing at a later change of the disk, until one comes through."""
     armed = [0]
 
@@ -77,7 +77,7 @@ def fail_at_steps(path: str, code: int, stride: int, pipe) -> None:
                 raise OSError(code, os.strerror(code))
 
     sys.addaudithook(hook)
-    for step in itertools.count(1, stride):
+    for step in itertools.count(1):
         with Store.open(path) as store:
             before = len(store.scenes.list())
             armed[0] = step
