@@ -47,6 +47,14 @@ def test_the_decoration_comes_again_exactly_and_the_furniture_stands_elsewhere()
     assert len(moved) >= len(both) - 1
 
 
+def test_another_floor_has_the_decorations_and_its_furniture_elsewhere():
+    first = _street("decoration")
+    above = make_street(3, rooms=4, decorations=2, floor=1, texel_m=0.1)
+    for room in (0, 1):
+        assert _same(_things(first, room, "decoration"), _things(above, room, "decoration"))
+        assert not _same(_things(first, room, "furniture"), _things(above, room, "furniture"))
+
+
 def test_pictures_show_the_same_paint():
     place = _street("decoration")
 
