@@ -21,7 +21,7 @@ def command(
     ] = None,
     json: AsJson = False,
 ) -> None:
-    """Make an empty map.
+    """Make an empty map: in a folder, or in a bucket (s3://BUCKET/PREFIX, with --catalog).
 
     Example: `gsmap init site.gsmap`
     """

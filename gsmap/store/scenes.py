@@ -112,7 +112,8 @@ class Scenes:
                 if progress:
                     progress(0.4, f"writing {name}")
                 content = GaussianBlocks(ordered, CHUNK_ROWS)
-                staging = self._arrays.stage(content.arrays | camera_arrays(cameras), KIND, new_id)
+                arrays = {**content.arrays, **camera_arrays(cameras)}
+                staging = self._arrays.stage(arrays, KIND, new_id)
                 staged = until_end.enter_context(staging)
             connection = until_end.enter_context(self._catalog.write())
             row = by_id(connection, new_id)

@@ -94,13 +94,14 @@ class Store:
         """Make an empty map and open it for writing; it appears whole or not at all.
 
         Args:
-            path: a folder that does not exist or is empty.
+            path: a folder that does not exist or is empty, or ``s3://BUCKET/PREFIX`` where nothing is.
             catalog_url: an SQLAlchemy URL (an empty PostgreSQL database, for many writers) to use instead of
                 ``map.sqlite``. It is remembered in ``catalog.url`` without its password, which the driver then takes
                 from its usual places (``PGPASSWORD``, ``~/.pgpass``), and this user trusts it from now on.
 
         Raises:
-            StoreError: the folder is not empty, or cannot be written.
+            ConfigError: a bucket without a ``catalog_url``.
+            StoreError: the folder or bucket is not empty, or cannot be written.
             NotFoundError: the folder it should lie in does not exist.
         """
         if (home := branches.find(path).remote) is not None:
