@@ -18,6 +18,7 @@ from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.facts import SceneFact
 from gsmap.store.groups import drop_graphs, has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.layout import CHUNK_ROWS
+from gsmap.store.packed import Column
 from gsmap.store.scene_content import GaussianBlocks, camera_arrays, scene_id, scene_of, shapes_of
 from gsmap.store.scene_refs import alive, by_id, find, find_removed, free_name, name_taken
 from gsmap.store.schema import scenes
@@ -112,7 +113,7 @@ class Scenes:
                 if progress:
                     progress(0.4, f"writing {name}")
                 content = GaussianBlocks(ordered, CHUNK_ROWS)
-                arrays = {**content.arrays, **camera_arrays(cameras)}
+                arrays: dict[str, np.ndarray | Column] = {**content.arrays, **camera_arrays(cameras)}
                 staging = self._arrays.stage(arrays, KIND, new_id)
                 staged = until_end.enter_context(staging)
             connection = until_end.enter_context(self._catalog.write())
