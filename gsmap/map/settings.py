@@ -152,11 +152,6 @@ def write_settings(
     Raises:
         ConfigError: no such preset or setting, or a value that does not fit.
     """
-    if of_run := [name for name in values if _is_of_the_run(name)]:
-        raise ConfigError(
-            f"{of_run[0]} is not kept with a map: say it with each run (--executor, --scheduler), or by GSMAP_EXECUTOR "
-            "and GSMAP_SCHEDULER"
-        )
     old_preset, old = read_settings(folder)
     kept = {name: value for name, value in old.items() if name not in drop}
     if preset is not None:
@@ -165,4 +160,9 @@ def write_settings(
     if unknown:
         raise ConfigError(f"{unknown[0]} is not changed in {folder / FILE_NAME}: there is nothing to take back")
     _combined(folder, preset or old_preset, kept, values)
+    if of_run := [name for name in values if _is_of_the_run(name)]:
+        raise ConfigError(
+            f"{of_run[0]} is not kept with a map: say it with each run (--executor, --scheduler), or by GSMAP_EXECUTOR "
+            "and GSMAP_SCHEDULER"
+        )
     save(folder / FILE_NAME, {**({PRESET: preset} if preset else {}), **values}, drop)

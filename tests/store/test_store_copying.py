@@ -33,6 +33,7 @@ def fill(store):
         blank = {"name": "m", "kind": "clip", "path": "/m.onnx", "copied": 0, "sha256": "0" * 64, "size_bytes": 2**40}
         connection.execute(insert(schema.models), blank | {"options": {"x": 0.1}, "created_at": now()})
         connection.execute(insert(schema.leases), {column.name: "x" for column in schema.leases.columns})
+        connection.execute(insert(schema.set_aside), {column.name: "x" for column in schema.set_aside.columns})
         connection.execute(
             insert(schema.backups), {"target": "t", "snapshot": "s", "created_at": now(), "num_bytes": 1}
         )
