@@ -301,7 +301,17 @@ def test_migrating_a_map_migrates_its_branches(store, tmp_path):
     for place in (store.folder, *(store.home / "branches").iterdir()):
         connection = sqlite3.connect(place / "map.sqlite")
         with connection:
-            for table in ("change_reviews", "changes", "comparisons", "leases", "backups", "purges"):
+            newer = (
+                "change_reviews",
+                "changes",
+                "comparisons",
+                "leases",
+                "backups",
+                "purges",
+                "lookups",
+                "index_segments",
+            )
+            for table in newer:
                 connection.execute(f"DROP TABLE {table}")
             connection.execute("ALTER TABLE revisions DROP COLUMN origin")
             connection.execute("ALTER TABLE scenes DROP COLUMN thinned")
