@@ -8,7 +8,8 @@ import pytest
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import ConfigError, NotFoundError, StoreError
-from gsmap.store import Store, digests, schema
+from gsmap.store import Store, migrate, schema
+from gsmap.store.catalog import Catalog, open_engine
 from gsmap.types import PoseGraph, SceneGraph, ScenePose, Sim3
 
 
@@ -294,20 +295,12 @@ def test_a_branch_appears_whole_or_not_at_all(store, monkeypatch):
 
 
 def test_migrating_a_map_migrates_its_branches(store, tmp_path):
-    import sqlite3
-
     store.branches.make("b")
     store.branches.make("v1", tag=True)
     for place in (store.folder, *(store.home / "branches").iterdir()):
-        connection = sqlite3.connect(place / "map.sqlite")
-        with connection:
-            for table in ("change_reviews", "changes", "comparisons", "leases", "backups", "purges", "set_aside"):
-                connection.execute(f"DROP TABLE {table}")
-            connection.execute("ALTER TABLE revisions DROP COLUMN origin")
-            connection.execute("ALTER TABLE scenes DROP COLUMN thinned")
-            connection.execute("UPDATE alembic_version SET version_num = '0002'")
-        connection.close()
-        digests.note(place / "map.sqlite")
+        catalog = Catalog(place, open_engine(place, writable=True), writable=True)
+        migrate.upgrade(catalog, "0002")
+        catalog.close()
     assert Store.migrate(store.home) == ("0002", schema.HEAD)
     for location in (store.location, at(store, "b"), at(store, "v1")):
         Store.open(location, "r").close()

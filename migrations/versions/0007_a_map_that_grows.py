@@ -1,4 +1,8 @@
-"""Poses and what became of edges are kept once for all revisions that share them; their numbers are bytes."""
+"""A map that grows: groups are archives, retrieval keeps an index, poses and what became of edges are kept once for all
+revisions that share them and their numbers are bytes, and jobs that end their process are set aside.
+
+Groups that are folders of a file for every key stay as they are. Older gsmap cannot read archives.
+"""
 
 import json
 import struct
@@ -9,8 +13,8 @@ import sqlalchemy as sa
 from alembic import op
 from sqlalchemy import bindparam, text
 
-revision = "0010"
-down_revision = "0009"
+revision = "0007"
+down_revision = "0006"
 branch_labels = None
 depends_on = None
 
@@ -24,6 +28,8 @@ _BATCH = 1000
 
 
 def upgrade() -> None:
+    _tables_of_retrieval()
+    _table_of_what_is_set_aside()
     connection = op.get_bind()
     for name in _COUNTS:
         op.execute(f"ALTER TABLE revisions ADD COLUMN {name} INTEGER NOT NULL DEFAULT 0")
@@ -66,9 +72,52 @@ def downgrade() -> None:
                 connection.execute(query, [dict(zip(columns, row, strict=True)) for row in rows])
     for name in _COUNTS:
         op.execute(f"ALTER TABLE revisions DROP COLUMN {name}")
+    op.drop_table("set_aside")
+    op.drop_table("lookups")
+    op.execute("DELETE FROM files WHERE group_id IN (SELECT group_id FROM index_segments)")
+    op.drop_table("index_segments")
+    op.execute("DELETE FROM groups WHERE kind = 'indexes'")
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
+
+
+def _tables_of_retrieval() -> None:
+    op.create_table(
+        "index_segments",
+        sa.Column("number", sa.Integer, nullable=False),
+        sa.Column("key", sa.Text, nullable=False),
+        sa.Column("members", sa.Text, nullable=False),
+        sa.Column("num_nodes", sa.Integer, nullable=False),
+        sa.Column("group_id", sa.Text, nullable=False),
+        sa.Column("created_at", sa.Text, nullable=False),
+        sa.ForeignKeyConstraint(["group_id"], ["groups.id"], name=op.f("fk_index_segments_group_id_groups")),
+        sa.PrimaryKeyConstraint("number", name=op.f("pk_index_segments")),
+        sqlite_strict=True,
+    )
+    op.create_table(
+        "lookups",
+        sa.Column("scene", sa.Text, nullable=False),
+        sa.Column("key", sa.Text, nullable=False),
+        sa.Column("candidates", sa.Text, nullable=False),
+        sa.Column("num_left", sa.Integer),
+        sa.Column("created_at", sa.Text, nullable=False),
+        sa.ForeignKeyConstraint(["scene"], ["scenes.id"], name=op.f("fk_lookups_scene_scenes")),
+        sa.PrimaryKeyConstraint("scene", name=op.f("pk_lookups")),
+        sqlite_strict=True,
+    )
+
+
+def _table_of_what_is_set_aside() -> None:
+    op.create_table(
+        "set_aside",
+        sa.Column("what", sa.Text, nullable=False),
+        sa.Column("about", sa.Text, nullable=False),
+        sa.Column("reason", sa.Text, nullable=False),
+        sa.Column("created_at", sa.Text, nullable=False),
+        sa.PrimaryKeyConstraint("what", name=op.f("pk_set_aside")),
+        sqlite_strict=True,
+    )
 
 
 def _tables_of_differences() -> None:
