@@ -33,7 +33,7 @@ def to_arrays(graph: SceneGraph) -> tuple[dict[str, np.ndarray], dict[str, Any]]
         layer = layers[name] = {
             "count": len(nodes),
             "widths": [nodes.embeddings.shape[1], nodes.features.shape[1]],
-            "features_embed": nodes.embeddings.tobytes() == nodes.features.tobytes(),
+            "features_embed": _is_same(nodes.embeddings, nodes.features),
             "rest": {part: plain(value) for part, value in own.items() if part not in _NODES},
         }
         if around:
@@ -123,6 +123,10 @@ def _keys(layer: Mapping[str, Any]) -> dict[str, str]:
     if layer["features_embed"]:
         del own["embeddings"]
     return own
+
+
+def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
 def _around(nodes: NodeLayer) -> np.ndarray:

@@ -210,7 +210,7 @@ class Registrations:
         """What counts of each pair of living scenes, by (target, source); no matrix of any is read.
 
         Args:
-            usable: only those that are (`Standing.usable`); their ``keys`` are those of their current row.
+            usable: only those that are (`Standing.usable`).
         """
         accepted = registrations.c.status == "accepted" if usable else None
         repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
@@ -218,10 +218,9 @@ class Registrations:
             alive = living_ids(connection)
             chosen = _choose(connection, _LEAN, silent_if=accepted)
             keys: dict[str, set[str]] = {}
-            if not usable:
-                again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
-                for row in connection.execute(again):
-                    keys.setdefault(row.pair, set()).add(row.key)
+            again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
+            for row in connection.execute(again):
+                keys.setdefault(row.pair, set()).add(row.key)
         made = [
             _standing(choice, keys.get(choice.row.pair, {choice.row.key}))
             for choice in chosen

@@ -14,6 +14,7 @@ from gsmap.types import Sim3
 
 LANDMARKS = Params(objects=False, things=False)
 UP = np.array([0.0, 0.0, 1.0])
+ROUNDED_M = 4.1 / 1024  # positions are kept to about a millimetre of the room, which is four of the hall
 
 
 def large(factor):
@@ -29,8 +30,8 @@ def test_a_hall_four_times_as_large_has_the_landmarks_of_the_room_in_metres_too(
     assert [name for name in small.layers if "free" not in name] == ["landmarks"]
     one, two = small.layers["landmarks"], hall.layers["landmarks@2"]
     assert two.unit_m == 0.25
-    np.testing.assert_allclose(two.positions, 4 * one.positions, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(two.embeddings, one.embeddings, atol=1e-5)
+    np.testing.assert_allclose(two.positions, 4 * one.positions, rtol=1e-5, atol=ROUNDED_M)
+    np.testing.assert_allclose(two.embeddings, one.embeddings, atol=1.1 / 256)
     assert {"landmarks", "landmarks_gravity_free@2"} <= set(hall.layers)
 
 

@@ -105,7 +105,7 @@ def test_a_newcomer_alone_asks(made: Described, site: Path, read: Counter[str]) 
 def test_a_lost_or_damaged_index_is_made_anew_and_says_the_same(made: Described, site: Path) -> None:
     with gsmap.map.open(site) as m:
         (segment,) = m.store.indexes.segments(_recipe(m))
-        for path in (m.store.arrays.root / "indexes" / segment.id).rglob("c/*"):
+        for path in (m.store.arrays.root / "indexes" / segment.id).iterdir():
             if path.is_file():
                 path.write_bytes(b"damaged".ljust(path.stat().st_size, b"."))
         assert not m.store.check().ok

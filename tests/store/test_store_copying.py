@@ -13,7 +13,9 @@ from gsmap.store import Store, schema
 from gsmap.store.arrays import CHUNK_ROWS
 from gsmap.store.catalog import now
 from gsmap.store.copying import copy_catalog, copy_rows, empty_catalog, one_state, tables
+from gsmap.store.indexes import Lookup
 from gsmap.types import Prior, SceneGraph, Sim3
+from gsmap.types.retrieval import Candidate, IndexArrays, Member
 
 
 def fill(store):
@@ -29,6 +31,9 @@ def fill(store):
     store.revisions.save(graph_of([a, b]))
     store.priors.set(Prior("a", Sim3.identity(), np.full(7, np.inf)))
     store.exports.add_tile(store.exports.begin("/tmp/out", revision=1), tile("a.ply", [a, b]))
+    nodes = IndexArrays(np.zeros(1, np.int64), np.arange(2, dtype=np.int64), np.zeros((1, 58), np.uint8))
+    store.indexes.put("0" * 32, [Member(a.id, "1" * 32, True, False, 1.5)], nodes, ())
+    store.indexes.note([Lookup(a.id, "0" * 32, (Candidate(b.id, 1.0, 2.0),))])
     with store.transaction(), store.catalog.read() as connection:
         blank = {"name": "m", "kind": "clip", "path": "/m.onnx", "copied": 0, "sha256": "0" * 64, "size_bytes": 2**40}
         connection.execute(insert(schema.models), blank | {"options": {"x": 0.1}, "created_at": now()})

@@ -1,7 +1,5 @@
 """Segments of the retrieval index and lookups: kept whole, replaced in one step, forgotten with their scenes."""
 
-import shutil
-
 import numpy as np
 import pytest
 from sqlalchemy import text
@@ -128,7 +126,8 @@ def test_a_purged_scene_is_in_no_segment_and_no_lookup(store):
 def test_a_damaged_segment_is_named_by_check(store):
     store.indexes.put(A, members(A), arrays(), ())
     (group,) = bodies(store)
-    shutil.rmtree(store.arrays.root / "indexes" / group / "nodes")
+    (archive,) = (store.arrays.root / "indexes" / group).iterdir()
+    archive.write_bytes(b"damaged".ljust(archive.stat().st_size, b"."))
     problems = store.check().problems
     assert any("made anew when the next new scene asks" in problem for problem in problems)
     with pytest.raises(CorruptError, match="the index is made anew"):
