@@ -25,7 +25,7 @@ import numpy as np
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.formats import glb
 from gsmap.formats.quantise import require_writable
-from gsmap.geometry.voxels import covariances, merge_groups, voxel_labels
+from gsmap.geometry.voxels import axis_deviations, merge_groups, voxel_labels
 from gsmap.types import Gaussians
 
 VERSION = 1
@@ -163,7 +163,7 @@ def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
 
 def box_of(gaussians: Gaussians) -> np.ndarray:
     """(2, 3) float64 box of the Gaussians, each widened by three standard deviations along the axes."""
-    reach = _SIGMAS * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
+    reach = _SIGMAS * axis_deviations(gaussians)
     return np.stack([(gaussians.means - reach).min(0), (gaussians.means + reach).max(0)])
 
 

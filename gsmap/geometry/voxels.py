@@ -42,6 +42,23 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
     return out
 
 
+def axis_deviations(gaussians: Gaussians) -> np.ndarray:
+    """(N, 3) float64 standard deviations along the axes of the frame: `covariances` has their squares on its diagonals."""
+    w, x, y, z = np.ascontiguousarray(gaussians.quats.T, dtype=np.float64)
+    squared = w * w + x * x + y * y + z * z
+    with np.errstate(divide="ignore"):
+        twice = np.where(squared > 0, 2.0 / squared, 0.0)  # a quaternion of zero is the identity, as everywhere
+    a, b, c = np.exp(2 * np.ascontiguousarray(gaussians.log_scales.T, dtype=np.float64))
+    xx, yy, zz, xy, xz, yz = x * x * twice, y * y * twice, z * z * twice, x * y * twice, x * z * twice, y * z * twice
+    wx, wy, wz = w * x * twice, w * y * twice, w * z * twice
+    variances = (
+        (1 - yy - zz) ** 2 * a + (xy - wz) ** 2 * b + (xz + wy) ** 2 * c,
+        (xy + wz) ** 2 * a + (1 - xx - zz) ** 2 * b + (yz - wx) ** 2 * c,
+        (xz - wy) ** 2 * a + (yz + wx) ** 2 * b + (1 - xx - yy) ** 2 * c,
+    )
+    return np.sqrt(np.stack(variances, axis=1))
+
+
 def projected_areas(scales: np.ndarray) -> np.ndarray:
     """(N,) mean area of the shadows of ellipsoids with semi-axes (N, 3): surface / 4 (Cauchy), surface by Thomsen."""
     a, b, c = np.asarray(scales, dtype=np.float64).T

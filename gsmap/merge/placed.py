@@ -14,7 +14,9 @@ def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -
     """(N,) which points (N, 3) lie in bounds (2, 3) grown by a margin (``low <= x < high``); all if None."""
     if bounds is None:
         return np.ones(len(points), dtype=bool)
-    result: np.ndarray = ((points >= bounds[0] - margin) & (points < bounds[1] + margin)).all(1)
+    low, high = bounds[0] - margin, bounds[1] + margin
+    x, y, z = ((points[:, k] >= low[k]) & (points[:, k] < high[k]) for k in range(3))  # `all` along rows is far slower
+    result: np.ndarray = x & y & z
     return result
 
 

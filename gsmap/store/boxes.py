@@ -6,7 +6,7 @@ import numpy as np
 from sqlalchemy import Connection, text
 
 from gsmap.errors import InputError, StoreError
-from gsmap.geometry.rotations import quats_to_matrices
+from gsmap.geometry.voxels import axis_deviations
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.schema import CHUNK_BOXES
 from gsmap.types import Gaussians
@@ -17,9 +17,7 @@ def chunk_boxes(gaussians: Gaussians, rows: int, *, sigmas: float = 3.0) -> np.n
     out = []
     for start in range(0, len(gaussians), rows):
         part = gaussians[start : start + rows]
-        # sigma along a frame axis: sqrt of the diagonal of R diag(s^2) R^T
-        variance = np.einsum("nij,nj->ni", quats_to_matrices(part.quats) ** 2, part.scales.astype(np.float64) ** 2)
-        reach = sigmas * np.sqrt(variance)
+        reach = sigmas * axis_deviations(part)
         out.append(np.stack([(part.means - reach).min(0), (part.means + reach).max(0)]))
     return np.array(out).reshape(-1, 2, 3)
 

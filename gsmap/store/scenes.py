@@ -252,8 +252,10 @@ class Scenes:
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)
-        reach = _SIGMAS * np.exp(out.log_scales.max(1, initial=-np.inf, keepdims=True))
-        return out[((out.means >= low - reach) & (out.means <= high + reach)).all(1)]
+        a, b, c = out.log_scales.T
+        reach = _SIGMAS * np.exp(np.maximum(np.maximum(a, b), c))
+        x, y, z = ((p >= low[k] - reach) & (p <= high[k] + reach) for k, p in enumerate(out.means.T))
+        return out[x & y & z]
 
     def _read(
         self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None

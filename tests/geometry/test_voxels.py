@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 
 from gsmap.errors import ConfigError, InputError
-from gsmap.geometry.voxels import covariances, merge_groups, optical_depths, projected_areas, voxel_labels
+from gsmap.geometry.voxels import (
+    axis_deviations,
+    covariances,
+    merge_groups,
+    optical_depths,
+    projected_areas,
+    voxel_labels,
+)
 from gsmap.types import Gaussians
 
 
@@ -83,3 +90,13 @@ def test_bad_input_is_refused():
     with pytest.raises(InputError, match="labels"):
         merge_groups(Gaussians.empty(), np.zeros(2, dtype=int))
     assert len(merge_groups(Gaussians.empty(), np.zeros(0, dtype=int))[0]) == 0
+
+
+def test_deviations_along_the_axes_are_those_of_the_covariances():
+    rng = np.random.default_rng(3)
+    n = 500
+    quats = rng.normal(size=(n, 4)) * rng.uniform(0.1, 5, (n, 1))
+    quats[7] = 0
+    g = Gaussians(np.zeros((n, 3)), quats, rng.normal(-3, 1, (n, 3)), np.zeros(n), np.zeros((n, 1, 3)))
+    expected = np.sqrt(np.diagonal(covariances(g), axis1=1, axis2=2))
+    np.testing.assert_allclose(axis_deviations(g), expected, rtol=1e-12)
