@@ -43,7 +43,7 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 
 def axis_deviations(gaussians: Gaussians) -> np.ndarray:
-    """(N, 3) float64 standard deviations along the axes of the frame: `covariances` has their squares on its diagonals."""
+    """(N, 3) float64 standard deviations along the axes: `covariances` has their squares on its diagonals."""
     w, x, y, z = np.ascontiguousarray(gaussians.quats.T, dtype=np.float64)
     squared = w * w + x * x + y * y + z * z
     with np.errstate(divide="ignore"):
