@@ -56,7 +56,8 @@ def axis_deviations(gaussians: Gaussians) -> np.ndarray:
         (xy + wz) ** 2 * a + (1 - xx - zz) ** 2 * b + (yz - wx) ** 2 * c,
         (xz - wy) ** 2 * a + (yz + wx) ** 2 * b + (1 - xx - yy) ** 2 * c,
     )
-    return np.sqrt(np.stack(variances, axis=1))
+    out: np.ndarray = np.sqrt(np.stack(variances, axis=1))
+    return out
 
 
 def projected_areas(scales: np.ndarray) -> np.ndarray:
