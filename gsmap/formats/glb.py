@@ -119,7 +119,7 @@ def write_packed(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.
     three, four = (np.broadcast_to(np.float32(0), (len(g), width)) for width in (3, 4))
     colour = np.broadcast_to(np.uint8(0), (len(g), 4))  # CesiumJS makes bytes of it, and believes what stands here
     # What the attributes are once unpacked; degree 0 is in COLOR_0.
-    shown = dict.fromkeys([*names, *_sh_names(g.sh.shape[1])[1:]], three)
+    shown: dict[str, np.ndarray] = dict.fromkeys([*names, *_sh_names(g.sh.shape[1])[1:]], three)
     shown |= {"POSITION": g.means, "COLOR_0": colour, f"{EXTENSION}:ROTATION": four}
     gltf = _gltf(
         {name: _accessor_of(name, values) for name, values in shown.items()},
