@@ -33,6 +33,7 @@ VERBS = (
     "graph",
     "history",
     "edit",
+    "localize",
     "export",
     "list",
     "show",

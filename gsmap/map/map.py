@@ -38,6 +38,7 @@ from gsmap.types.rows import (
     GraphRow,
     HistoryReport,
     IngestRow,
+    LocalizeReport,
     MapStatus,
     MergeReport,
     ModelRow,
@@ -461,6 +462,42 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import history_report, known_objects
 
         return history_report(known_objects(self.store, self.settings, self._progress), place, box)
+
+    # --- localize ----------------------------------------------------------------------------------------------------
+
+    def localize(
+        self,
+        *files: str | os.PathLike[str],
+        intrinsics: str | Sequence[float] | None = None,
+        focal: str | float | None = None,
+        near: str | None = None,
+    ) -> LocalizeReport:
+        """``gsmap localize MAP FILE...``: where photographs were taken, or why that is not said.
+
+        What views are found by is made for every scene that lacks it, and kept unless the map is read-only.
+
+        Args:
+            intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright picture.
+            focal: focal length in pixels, or ``auto`` to solve for it; by default what the file says (EXIF).
+            near: only what this scene shows, or ``X,Y,Z,R`` around a point of the map.
+
+        Raises:
+            NotFoundError: no such file or scene, or nothing in the map has a place.
+            InputError: a file is no picture.
+            ConfigError: what is said of the lens or the place makes no sense.
+        """
+        from gsmap.map.localizing import localize_files
+
+        with at_work(self.store, "localize"):
+            return localize_files(
+                self.store,
+                self.settings,
+                files,
+                intrinsics=intrinsics,
+                focal=focal,
+                near=near,
+                progress=self._progress,
+            )
 
     # --- export ------------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, merge, objects, optimize, register, retrieve, thin
+from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.map import visits
@@ -63,6 +63,7 @@ class Settings:
         visits: which captures are compared for changes.
         change: how changes between two captures are found.
         objects: when things of several captures are one, and how they are looked for.
+        localize: how photographs are found.
         evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
@@ -77,6 +78,7 @@ class Settings:
     visits: visits.Params = field(default_factory=visits.Params)
     change: change.Params = field(default_factory=change.Params)
     objects: objects.Params = field(default_factory=objects.Params)
+    localize: localize.Params = field(default_factory=localize.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 

@@ -14,6 +14,7 @@ from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, Com
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
+from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -81,6 +82,8 @@ __all__ = [
     "IngestRow",
     "InitReport",
     "LayerRow",
+    "LocalizeReport",
+    "LocalizeRow",
     "MapStatus",
     "MetreRow",
     "MergeReport",
