@@ -39,6 +39,8 @@ VERBS = (
     "why",
     "diff",
     "poses",
+    "georeference",
+    "measure",
     "settings",
     "convert",
     "models",

@@ -37,6 +37,7 @@ LAYERS = [
         "change",
         "objects",
         "thin",
+        "world",
         "export",
         "evaluate",
         "view",
@@ -66,6 +67,7 @@ HOMES = {
     "pycolmap": {"formats"},
     "torch": {"render"},
     "tomlkit": {"settings"},
+    "pyproj": {"world"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

@@ -55,6 +55,7 @@ NAMES_NOTHING = (
     "export.",
     "evaluate.",
     "engine.",
+    "world.",  # is in what was observed once it was read
     "merge.method",
     "describe.object.model_",
 )

@@ -55,8 +55,10 @@ from gsmap.types.rows.truth import (
     PoseErrorRow,
 )
 from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
+from gsmap.types.rows.world import MeasureReport, PlaceRow, ResidualRow, TieRow, WorldReport
 
 __all__ = [
+    "SCHEMA",
     "AtWorkRow",
     "BackupReport",
     "BandRow",
@@ -82,8 +84,9 @@ __all__ = [
     "InitReport",
     "LayerRow",
     "MapStatus",
-    "MetreRow",
+    "MeasureReport",
     "MergeReport",
+    "MetreRow",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -93,6 +96,7 @@ __all__ = [
     "PairEventRow",
     "PairRef",
     "PairReport",
+    "PlaceRow",
     "PoseChangeRow",
     "PoseErrorRow",
     "PoseRow",
@@ -100,10 +104,10 @@ __all__ = [
     "PruneReport",
     "PurgeReport",
     "RelationRow",
+    "ResidualRow",
     "RestoreReport",
     "RevisionRow",
     "Row",
-    "SCHEMA",
     "SceneEdgeRow",
     "SceneRef",
     "SceneReport",
@@ -114,6 +118,7 @@ __all__ = [
     "SplitReport",
     "ThinReport",
     "ThinRow",
+    "TieRow",
     "TileRow",
     "TodoRow",
     "TrustReport",
@@ -121,4 +126,5 @@ __all__ = [
     "ViewReport",
     "WhyReport",
     "WhyStep",
+    "WorldReport",
 ]

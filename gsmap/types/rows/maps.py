@@ -46,9 +46,10 @@ class MetreRow(Row):
         component: its index.
         metres_per_unit: metres in a unit of its frame: of its poses and of its tiles.
         metre_sigma: standard deviation of its logarithm (0.01 is one percent); null where it is unknown.
-        metre_known_by: ``measured`` (by captures that are said to be in metres), ``told`` (a person gave metres per
-            unit of a capture), ``assumed`` (nobody said so, but the captures' own unit may well be the metre),
-            ``guessed`` (from how far cameras stand from what they see), ``unknown`` (1 is taken).
+        metre_known_by: ``surveyed`` (by control points, positions or scale bars), ``measured`` (by captures
+            that are said to be in metres), ``told`` (a person gave metres per unit of a capture), ``assumed``
+            (nobody said so, but the captures' own unit may well be the metre), ``guessed`` (from how far
+            cameras stand from what they see), ``unknown`` (1 is taken).
         metre_note: what a person should know of it; empty where nothing.
     """
 
