@@ -46,6 +46,10 @@ def write_poses(store: Store, out: Path, format: str, crs: str | None = None) ->
     placed = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in scenes]
     if graph is None or not placed:
         raise NotFoundError("no scene has a place in the map yet: run gsmap update first")
+    if crs is not None and format != "json":
+        raise ConfigError(
+            f"{format} holds poses in the map's frame; world coordinates go into json: leave out --format"
+        )
     if format == "json":
         rows = [row.to_json() for row in reports.pose_rows(store, crs)]
         text = json.dumps({"schema": SCHEMA, "poses": rows}, indent=1)

@@ -273,6 +273,10 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
         said = f"the pose of {_GONE} is no longer part of this revision"
         connection.execute(update(revisions).where(mine).values(notes=[*notes, said]))
     counts["revisions"] = len(affected)
+    for line in connection.execute(select(revisions.c.number, revisions.c.world)).all():
+        left = [tie | {"residuals": [row for row in tie["residuals"] if row["scene"] != scene]} for tie in line.world]
+        if left != line.world:
+            connection.execute(update(revisions).where(revisions.c.number == line.number).values(world=left))
     return counts, bodies
 
 

@@ -245,3 +245,46 @@ def test_surveyed_positions_of_scenes(site: Site, tmp_path: Path) -> None:
         assert [row.kind for row in tie.residuals] == ["fix"] * 4
         m.remove_prior(site.names[0])
         assert len(m.store.world.survey().fixes) == 3
+
+
+def test_what_is_exported_says_where_it_lies(tied: Path, site: Site, tmp_path: Path) -> None:
+    """3D Tiles lie on the globe; other formats, whose numbers are too short for it, have it beside them."""
+    from gsmap.formats import tiles3d
+    from gsmap.world.crs import ECEF
+    from gsmap.world.frame import of_frame
+
+    with gsmap.map.open(tied) as m:
+        m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
+        report = m.export(tmp_path / "plain", tile_size_m=0, format="ply", merge="union")
+        tie = m.store.revisions.world()[0]
+    assert any("tiles.json has S_world_map" in note for note in report.notes)
+    (tileset,) = (tmp_path / "globe").glob("component_0/tileset.json")
+    root = json.loads(tileset.read_text())["root"]
+    transform = np.reshape(root["transform"], (4, 4)).T
+    points = tiles3d.read(tileset).means[::97].astype(np.float64)
+    there = points @ transform[:3, :3].T + transform[:3, 3]
+    want = of_frame(tie.frame, tie.S_world_map.apply(points), ECEF)
+    assert np.abs(there - want).max() < 1e-3
+    sidecar = json.loads((tmp_path / "plain" / "tiles.json").read_text())["components"][0]["world"]
+    assert sidecar["crs"] == "EPSG:25832"
+    assert np.abs(np.array(sidecar["S_world_map"]) - tie.S_world_map.matrix()).max() == 0
+    assert np.abs(np.array(sidecar["S_ecef_map"]) - transform).max() == 0
+
+
+def test_tiles_move_on_the_globe_when_the_tie_does(tied: Path, tmp_path: Path) -> None:
+    with gsmap.map.open(tied) as m:
+        m.clone(tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+
+        def root() -> list[float]:
+            m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
+            found: list[float] = json.loads((tmp_path / "globe/component_0/tileset.json").read_text())["root"][
+                "transform"
+            ]
+            return found
+
+        before = root()
+        m.georeference(Request(check=["G3"]))
+        assert root() != before
+        m.georeference(remove=[])
+        assert abs(root()[12]) < 100, "in the map's own frame again"

@@ -16,6 +16,7 @@ from gsmap.store.copying import copy_catalog, copy_rows, empty_catalog, one_stat
 from gsmap.store.indexes import Lookup
 from gsmap.types import Prior, SceneGraph, Sim3
 from gsmap.types.retrieval import Candidate, IndexArrays, Member
+from gsmap.types.world import ControlPoint
 
 
 def fill(store):
