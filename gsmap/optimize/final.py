@@ -104,5 +104,7 @@ def solve_components(
     notes = tuple(
         f"no covariances in component {component[scene]} ({size} scenes): {why}" for scene, size, why in missing
     )
-    world = tuple(replace(tie, component=int(component[scene])) for scene, tie in ties)
-    return Solved(poses, component, covariances, notes, world)
+    placed: dict[int, WorldTie] = {}
+    for scene, tie in ties:  # of components that priors put into one frame, the largest says where that is
+        placed.setdefault(int(component[scene]), replace(tie, component=int(component[scene])))
+    return Solved(poses, component, covariances, notes, tuple(placed.values()))

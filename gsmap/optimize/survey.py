@@ -270,9 +270,8 @@ class _Problem:
         """
         H, _ = self._normal(self._all(x, x, self.as_weights(weights)))
         if world_held:
-            world = np.arange(self.size)
-            world = (world >= self.terms.columns.world) & (world < self.terms.columns.points)
-            H = H + sp.diags(world.astype(float))
+            columns, at = self.terms.columns, np.arange(self.size)
+            H = H + sp.diags(((at >= columns.world) & (at < columns.points)).astype(float))
         return self._factored(H)
 
     def fit(self, x: Unknowns, weights: Active, max_steps: int = 30, *, hold: bool = False) -> Unknowns:

@@ -65,10 +65,10 @@ def joined(ours: PoseGraph, theirs: PoseGraph, living: Collection[str], bounds: 
     known_in_world = {tie.component for tie in world}
     apart = {pose.scene: pose.component for pose in theirs.poses.values() if pose.scene not in ours.poses}
     # A component of theirs that came into a frame of ours left its own, and its tie with it.
-    moved = {theirs.poses[p.scene].component for p in theirs.poses.values() if p.scene in ours.poses}
+    left = {pose.component for pose in theirs.poses.values() if pose.scene in ours.poses}
     world += tuple(
         tie
-        for tie in _ties(theirs, placed, {s: c for s, c in apart.items() if c not in moved})
+        for tie in _ties(theirs, placed, {s: c for s, c in apart.items() if c not in left})
         if tie.component not in known_in_world
     )
     return PoseGraph(placed, outcomes, settings=ours.settings, notes=tuple(notes), world=world)

@@ -52,7 +52,12 @@ def _tie(value: dict[str, Any]) -> WorldTie:
         raise ValueError("no metre")
     rows = []
     for row in value["residuals"]:
-        rows.append(Residual(**{k: tuple(map(float, v)) if k in _PAIRS else v for k, v in row.items()}))
+        values: dict[str, Any] = {k: tuple(map(float, v)) if k in _PAIRS else v for k, v in row.items()}
+        if not all(isinstance(values[k], str) for k in ("kind", "name", "scene", "use", "reason")):
+            raise ValueError("names that are no texts")
+        if not isinstance(values["dof"], int) or not isinstance(values["statistic"], float | int | None):
+            raise ValueError("no statistic")
+        rows.append(Residual(**values))
     return WorldTie(
         int(value["component"]),
         to_pose(value["S_world_map"]),

@@ -29,6 +29,7 @@ _TYPES: Mapping[str, type[Observation]] = {
     "bar": ScaleBar,
 }
 _ARRAYS = {"position", "pixel", "T_scene_camera", "intrinsics_px", "camera_covariance", "point", "points"}
+_TEXTS = {"name", "crs", "image", "scene"}
 _TUPLES = {"sigma_m", "common_sigma_m", "scenes", "point_sigmas"}
 
 
@@ -152,7 +153,7 @@ def _row(item: Observation) -> dict[str, Any]:
 
 def _item(row: Row[Any]) -> Any:
     try:
-        values = {
+        values: dict[str, Any] = {
             name: _tuple(value)
             if name in _TUPLES and isinstance(value, list)
             else np.array(value)
@@ -160,6 +161,9 @@ def _item(row: Row[Any]) -> Any:
             else value
             for name, value in row.value.items()
         }
+        texts = [value for name, value in values.items() if name in _TEXTS]
+        if not all(isinstance(text, str) for text in [*texts, *values.get("scenes", ())]):
+            raise ValueError("names that are no texts")
         made = _TYPES[row.kind](**values)
         if _row(made)["scene"] != row.scene or _row(made)["other"] != row.other or _row(made)["name"] != row.name:
             raise ValueError("of another name or scene than its row")

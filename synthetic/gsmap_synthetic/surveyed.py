@@ -148,8 +148,8 @@ def _truth(k: int, p: SiteParams, rng: np.random.Generator) -> Sim3:
         column = p.columns - 1 - column
     east, north = (column - p.columns / 2) * p.spacing_m, (row - p.rows / 2) * p.spacing_m
     up = 0.6 * np.sin(east / 15) + 0.8 * np.cos(north / 12)
-    turn = exp_so3([0, 0, rng.uniform(-np.pi, np.pi)])
-    return Sim3(turn, [east, north, up], p.unit_m)
+    turn = exp_so3(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
+    return Sim3(turn, np.array([east, north, up]), p.unit_m)
 
 
 def _neighbours(p: SiteParams) -> list[tuple[int, int]]:

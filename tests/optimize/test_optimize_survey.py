@@ -239,3 +239,32 @@ def test_derivatives() -> None:
                 ahead, behind = x.moved(step, dim), x.moved(-step, dim)
                 numeric = (residuals(terms, ahead, x)[k] - residuals(terms, behind, x)[k]) / 2e-6
                 assert np.abs(numeric - J[:, :, c]).max(initial=0) < 1e-3 * max(1.0, np.abs(J).max(initial=0)), (k, c)
+
+
+def test_a_component_that_is_turned_upright_lies_where_it_lay() -> None:
+    from gsmap.optimize import gravity_align
+
+    site = surveyed_site(9, SMALL)
+    answer, tie = solved(site, survey_of(site))
+    assert tie.S_world_map is not None
+    up = {name: np.array([0.0, 0.5, 1.0]) for name in site.names}
+    turned = gravity_align(answer, up)
+    assert turned.world[0].S_world_map is not None
+    for name in site.names[:3]:
+        before = tie.S_world_map @ answer.poses[name].S_map_scene
+        after = turned.world[0].S_world_map @ turned.poses[name].S_map_scene
+        assert np.abs(before.matrix() - after.matrix()).max() < 1e-9
+    assert np.abs(turned.poses[site.names[0]].S_map_scene.matrix() - np.eye(4)).max() > 0.1
+
+
+def test_the_covariance_of_the_tie_is_honest() -> None:
+    """``S_world_map`` with the anchor's scene taken as exact, over made sites."""
+    nees = []
+    for seed in range(15):
+        site = surveyed_site(300 + seed, replace(SMALL, num_check=0))
+        _, tie = solved(site, survey_of(site))
+        assert tie.S_world_map is not None
+        # The anchor's own frame is the map's.
+        step = Similarities.stack([tie.S_world_map.inverse() @ site.truth[0]]).log()[0]
+        nees.append(step @ np.linalg.solve(tie.covariance, step))
+    assert 0.5 < np.mean(nees) / 7 < 1.7

@@ -365,7 +365,7 @@ def test_levels_of_an_export_that_was_killed_go(place, tmp_path):
         m.remove(secret)
         m.optimize()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("gsmap.map.stages.export.write_tilesets", lambda *a: None)
+            patch.setattr("gsmap.map.stages.export.write_tilesets", lambda *a, **options: None)
             m.export(out, tile_size_m=2, merge="union", format="3dtiles")
         tiles = set(folder.glob("*.glb"))
         assert {p.name for p in (folder / "levels").iterdir()} == before

@@ -56,6 +56,7 @@ class Request:
     steps: int | None = None
     budget_s: float | None = None
     provenance: bool = False
+    uncompressed: bool = False
     prefer: str | None = None
     as_of: str | None = None
 
@@ -81,6 +82,7 @@ _OPTIONS = {
     "steps": "--steps",
     "budget_s": "--budget",
     "provenance": "--provenance",
+    "uncompressed": "--uncompressed",
     "prefer": "--prefer",
     "as_of": "--as-of",
 }
@@ -120,7 +122,9 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         params = with_steps(method, params, request.steps)
     if request.prefer is not None:
         params = with_prefer(method, params, request.prefer)
-    recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
+    recipe = TileRecipe(
+        recipe_key(method, params), request.format, request.provenance, request.budget_s, request.uncompressed
+    )
     _check(request, recipe)
     revision = store.revisions.current() if request.revision is None else request.revision
     graph, placed = _placed(store, revision, request.component)
@@ -223,7 +227,10 @@ def _export(
     if planned.recipe.is_tileset and is_stale(out, result.tiles):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
         S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}
-        write_tilesets(out, result.tiles, request.tile_size_m, in_metres_of, S_ecef_map)
+        compressed = not request.uncompressed
+        write_tilesets(
+            out, result.tiles, request.tile_size_m, in_metres_of, S_ecef_map=S_ecef_map, compressed=compressed
+        )
     if store.catalog.writable:
         refused = ""
         try:  # what an interrupted export, or one that could not be noted, left untold is told now

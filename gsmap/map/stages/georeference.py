@@ -154,16 +154,14 @@ def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | Fi
     known = before.frame
     if known is not None and (crs_text is None or crs(crs_text).text == known.crs):
         return None
-    names = {(type(one), one.name, getattr(one, "scene", "")) for one in new}
-    old = [p for p in (*before.points, *before.fixes) if (type(p), p.name, getattr(p, "scene", "")) not in names]
-    points = tuple(p for p in (*old, *new) if isinstance(p, ControlPoint))
-    fixes = tuple(p for p in (*old, *new) if isinstance(p, Fix))
+    points = {one.name: one for one in (*before.points, *new) if isinstance(one, ControlPoint)}
+    fixes = {(one.name, one.scene): one for one in (*before.fixes, *new) if isinstance(one, Fix)}
     if not points and not fixes:
         if crs_text is None:
             return None
         raise InputError(f"nothing of this map lies in {crs_text} yet: give --gcp FILE or --exif DIR with it")
-    wanted = crs_text or (points or fixes)[0].crs
-    return frame_for(wanted, Survey(None, points, (), fixes))
+    first: ControlPoint | Fix = next(iter(points.values())) if points else next(iter(fixes.values()))
+    return frame_for(crs_text or first.crs, Survey(None, tuple(points.values()), (), tuple(fixes.values())))
 
 
 # --- control points ---------------------------------------------------------------------------------------------------

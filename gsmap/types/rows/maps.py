@@ -20,11 +20,12 @@ class TodoRow(Row):
 
     Args:
         what: ``undescribed`` scenes; ``stale_graphs``, made by other settings or another version; ``unregistered``
-            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews or priors are
-            newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes; ``undecided``
-            edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``; ``duplicates``, pairs that
-            are one capture twice; ``isolated`` scenes; ``set_aside``, work that twice ended the process it ran in and
-            is left out until it is asked for by name.
+            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews, priors or
+            observations are newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes;
+            ``undecided`` edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``;
+            ``world_outliers``, observations of the world that contradict the others; ``untied`` components, whose place
+            in the world is not determined; ``duplicates``, pairs that are one capture twice; ``isolated`` scenes;
+            ``set_aside``, work that twice ended the process it ran in and is left out until it is asked for by name.
         count: how many; 1 for ``unsolved``, ``stale_poses`` and ``set_aside``.
         verb: the command that helps.
         meaning: the same in words.
