@@ -9,6 +9,8 @@ import typer
 from gsmap.cli.console import AsJson, MapPath, Sets, opened, print_facts, print_rows, print_table, say
 
 if TYPE_CHECKING:
+    from gsmap.map import Map
+    from gsmap.map.stages.georeference import Localise
     from gsmap.types.rows import WorldReport
 
 
@@ -21,6 +23,12 @@ def command(
     gcp: Annotated[
         str | None,
         typer.Option("--gcp", metavar="FILE", help="Control points in photos, as OpenDroneMap has them: gcp_list.txt."),
+    ] = None,
+    photos: Annotated[
+        str | None,
+        typer.Option(
+            "--photos", metavar="DIR", help="Where photos of --gcp lie that are of no capture; localised first."
+        ),
     ] = None,
     exif: Annotated[
         str | None,
@@ -83,14 +91,28 @@ def command(
         bar_sigma_m=sigma if scale_bar is not None else None,
         photo_size_px=photo_size,
     )
+    if photos is not None and gcp is None:
+        raise ConfigError("--photos goes with --gcp")
     with opened(map, bars=True, sets=sets) as m:
-        report = m.georeference(request if said else None, remove=tuple(name or ()) if remove else None)
+        localise = None if photos is None else _localiser(m, photos)
+        taken_back = tuple(name or ()) if remove else None
+        report = m.georeference(request if said else None, remove=taken_back, localise=localise)
     for note in report.notes:
         say(note)
     if json:
         print_rows("georeference", report, json)
     else:
         _print(map, report)
+
+
+def _localiser(m: Map, folder: str) -> Localise:
+    from gsmap.errors import ConfigError
+    from gsmap.map.placed_photos import localiser
+
+    localize = getattr(m, "localize", None)
+    if localize is None:
+        raise ConfigError("this gsmap cannot localise photos: leave out --photos, and use photos of captures")
+    return localiser(m.store, localize, folder)
 
 
 def _print(map: str, report: WorldReport) -> None:

@@ -742,14 +742,18 @@ class Map(AbstractContextManager["Map"]):
     # --- the world ---------------------------------------------------------------------------------------------------
 
     def georeference(
-        self, request: Request | None = None, *, remove: Sequence[str] | None = None, localise: Localise | None = None
+        self,
+        request: Request | None = None,
+        *,
+        remove: Sequence[str] | None = None,
+        localise: Localise | None = None,
     ) -> WorldReport:
         """``gsmap georeference MAP``: note observations of the world, solve the poses with them, and say how they fit.
 
         Args:
             request: what to note (`gsmap.map.stages.georeference.Request`); None to look only.
             remove: names of observations to take back; an empty sequence takes back all, with the CRS.
-            localise: places photos that are no scene's camera.
+            localise: places photos that are no scene's camera (`gsmap.map.placed_photos.localiser`).
 
         Raises:
             ConfigError, InputError, NotFoundError: see `gsmap.map.stages.georeference`; nothing is noted then.

@@ -288,3 +288,45 @@ def test_tiles_move_on_the_globe_when_the_tie_does(tied: Path, tmp_path: Path) -
         assert root() != before
         m.georeference(remove=[])
         assert abs(root()[12]) < 100, "in the map's own frame again"
+
+
+def test_a_localised_photo_is_put_into_its_scene_s_frame(site: Site, tied: Path, tmp_path: Path) -> None:
+    """By rows as ``gsmap localize`` gives them: map frame and unit in, scene frame and unit out."""
+    from types import SimpleNamespace
+
+    from PIL import Image
+
+    from gsmap.geometry.rotations import exp_so3
+    from gsmap.map.placed_photos import localiser, placed_photo
+    from gsmap.types import ScenePose, Sim3
+
+    S = Sim3(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2, 3]), 4.0)
+    T = np.eye(4)
+    T[:3, 3] = S.apply(np.array([0.5, 0.6, 0.7]))
+    sigma = np.diag([1.0] * 3 + [16.0] * 3)
+    row = SimpleNamespace(
+        file="a.jpg", T_map_camera=T, covariance=sigma, component=1, scenes=("gone", "far", "near"),
+        intrinsics_px=np.array([100.0, 100, 32, 24]),
+    )  # fmt: skip
+    poses = {"1": ScenePose("1", S, 0, "placed"), "2": ScenePose("2", S, 1, "placed")}
+    found = placed_photo(row, (64, 48), poses, {"far": "1", "near": "2"})
+    assert found is not None
+    assert found.scene == "2", "of its own component"
+    assert found.T_scene_camera[:3, 3] == pytest.approx([0.5, 0.6, 0.7])
+    assert np.diag(found.covariance) == pytest.approx([1.0] * 6)
+    row.T_map_camera = None
+    assert placed_photo(row, (64, 48), poses, {"near": "2"}) is None
+
+    Image.new("RGB", (64, 48)).save(tmp_path / "in.jpg")
+    (tmp_path / "below").mkdir()
+    asked = []
+
+    def localize(*files: Path) -> SimpleNamespace:
+        asked.extend(files)
+        return SimpleNamespace(results=[row for _ in files])
+
+    with gsmap.map.open(tied) as m:
+        localise = localiser(m.store, localize, tmp_path / "below")
+        assert localise(["../in.jpg", "none.jpg"]) == {}, "a list of points leads to no file elsewhere"
+        assert localiser(m.store, localize, tmp_path)(["in.jpg"]) == {}
+    assert asked == [tmp_path / "in.jpg"]

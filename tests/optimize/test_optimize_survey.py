@@ -268,3 +268,15 @@ def test_the_covariance_of_the_tie_is_honest() -> None:
         step = Similarities.stack([tie.S_world_map.inverse() @ site.truth[0]]).log()[0]
         nees.append(step @ np.linalg.solve(tie.covariance, step))
     assert 0.5 < np.mean(nees) / 7 < 1.7
+
+
+def test_a_check_point_changes_nothing() -> None:
+    site = surveyed_site(10, SMALL)
+    _, tie = solved(site, survey_of(site))
+    off, other = solved(site, survey_of(site.with_blunder("C0", (5.0, 0.0, 0.0))))
+    assert tie.S_world_map is not None
+    assert other.S_world_map is not None
+    assert np.abs(tie.S_world_map.matrix() - other.S_world_map.matrix()).max() < 1e-9
+    row = next(row for row in other.residuals if row.name == "C0")
+    assert row.use == "check"
+    assert np.linalg.norm(row.error_m) == pytest.approx(5, abs=0.1)
