@@ -40,6 +40,8 @@ VERBS = (
     "why",
     "diff",
     "poses",
+    "georeference",
+    "measure",
     "settings",
     "convert",
     "models",

@@ -63,6 +63,8 @@ OBJECTS: dict[str, Object] = {
     "why A:B": One(rows.WhyReport),
     "diff": Many("scenes", rows.PoseChangeRow),
     "poses": Many("poses", rows.PoseRow),
+    "georeference": One(rows.WorldReport),
+    "measure": One(rows.MeasureReport),
     "settings": Many("settings", rows.SettingRow),
     "convert": One(rows.ConvertReport),
     "models add": One(rows.ModelRow),

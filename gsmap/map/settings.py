@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin
+from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin, world
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.map import visits
@@ -57,6 +57,7 @@ class Settings:
         retrieve: which pairs are tried.
         register: how a pair is registered and judged.
         optimize: how poses are solved.
+        world: how observations of the world are read.
         thin: when a capture is kept compact.
         merge: how captures become one.
         export: how tiles are planned and kept.
@@ -72,6 +73,7 @@ class Settings:
     retrieve: retrieve.Params = field(default_factory=retrieve.Params)
     register: register.Params = field(default_factory=register.Params)
     optimize: optimize.Params = field(default_factory=optimize.Params)
+    world: world.Params = field(default_factory=world.Params)
     thin: thin.Params = field(default_factory=thin.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)

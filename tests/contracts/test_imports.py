@@ -38,6 +38,7 @@ LAYERS = [
         "change",
         "objects",
         "thin",
+        "world",
         "export",
         "evaluate",
         "view",
@@ -67,6 +68,7 @@ HOMES = {
     "pycolmap": {"formats", "localize"},
     "torch": {"render"},
     "tomlkit": {"settings"},
+    "pyproj": {"world"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

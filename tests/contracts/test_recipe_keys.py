@@ -62,6 +62,7 @@ NAMES_NOTHING = (
     "export.",
     "evaluate.",
     "engine.",
+    "world.",  # is in what was observed once it was read
     "merge.method",
     "describe.object.model_",
     *(f"localize.{part}" for part in JUDGING),

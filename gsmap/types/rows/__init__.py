@@ -56,8 +56,10 @@ from gsmap.types.rows.truth import (
     PoseErrorRow,
 )
 from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
+from gsmap.types.rows.world import MeasureReport, PlaceRow, ResidualRow, TieRow, WorldReport
 
 __all__ = [
+    "SCHEMA",
     "AtWorkRow",
     "BackupReport",
     "BandRow",
@@ -85,8 +87,9 @@ __all__ = [
     "LocalizeReport",
     "LocalizeRow",
     "MapStatus",
-    "MetreRow",
+    "MeasureReport",
     "MergeReport",
+    "MetreRow",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -96,6 +99,7 @@ __all__ = [
     "PairEventRow",
     "PairRef",
     "PairReport",
+    "PlaceRow",
     "PoseChangeRow",
     "PoseErrorRow",
     "PoseRow",
@@ -103,10 +107,10 @@ __all__ = [
     "PruneReport",
     "PurgeReport",
     "RelationRow",
+    "ResidualRow",
     "RestoreReport",
     "RevisionRow",
     "Row",
-    "SCHEMA",
     "SceneEdgeRow",
     "SceneRef",
     "SceneReport",
@@ -117,6 +121,7 @@ __all__ = [
     "SplitReport",
     "ThinReport",
     "ThinRow",
+    "TieRow",
     "TileRow",
     "TodoRow",
     "TrustReport",
@@ -124,4 +129,5 @@ __all__ = [
     "ViewReport",
     "WhyReport",
     "WhyStep",
+    "WorldReport",
 ]
