@@ -50,6 +50,7 @@ from gsmap.types.rows import (
     PurgeReport,
     RestoreReport,
     RevisionRow,
+    ScanRow,
     SceneReport,
     SceneRow,
     SettingRow,
@@ -461,6 +462,36 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import history_report, known_objects
 
         return history_report(known_objects(self.store, self.settings, self._progress), place, box)
+
+    # --- scans -------------------------------------------------------------------------------------------------------
+
+    def localize_scan(
+        self,
+        file: str | os.PathLike[str],
+        *,
+        intrinsics: Sequence[float] | None = None,
+        colour: str | os.PathLike[str] | None = None,
+        depth_scale: float = 1000.0,
+        scale: str | None = None,
+    ) -> ScanRow:
+        """Where a point cloud, mesh, splat or depth picture lies in the map; nothing of it is kept.
+
+        Args:
+            file: ``.ply .pcd .xyz .las .laz .obj .stl .glb``, any splat, or (with ``intrinsics``) a depth picture.
+            intrinsics: ``fx, fy, cx, cy`` of a depth picture, pixels.
+            colour: a picture aligned with the depth picture.
+            depth_scale: values of the depth picture that make a metre.
+            scale: ``known`` (the file is in metres), ``unknown`` or ``auto``; by default ``known``, but for splats,
+                ``.obj`` and ``.stl``, whose unit nobody knows: ``auto``.
+
+        Raises:
+            NotFoundError: no such file, or the map has no poses yet.
+            InputError, ConfigError, MissingDependencyError: see `gsmap.formats.scans`.
+        """
+        from gsmap.map.stages.localize_scan import Request, localize_scan
+
+        request = Request(Path(file), intrinsics, colour, depth_scale, scale)
+        return localize_scan(self.store, request, self.settings, self._progress)
 
     # --- export ------------------------------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from typing import Any
 from gsmap import change, describe, engine, export, merge, objects, optimize, register, retrieve, thin
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
+from gsmap.localize import scan
 from gsmap.map import visits
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
@@ -63,6 +64,7 @@ class Settings:
         visits: which captures are compared for changes.
         change: how changes between two captures are found.
         objects: when things of several captures are one, and how they are looked for.
+        scan: how a scan is looked for.
         evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
@@ -77,6 +79,7 @@ class Settings:
     visits: visits.Params = field(default_factory=visits.Params)
     change: change.Params = field(default_factory=change.Params)
     objects: objects.Params = field(default_factory=objects.Params)
+    scan: scan.Params = field(default_factory=scan.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 

@@ -14,6 +14,7 @@ from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, Com
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
+from gsmap.types.rows.localize_scan import ScanRow, ScanSupport
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -104,6 +105,8 @@ __all__ = [
     "RevisionRow",
     "Row",
     "SCHEMA",
+    "ScanRow",
+    "ScanSupport",
     "SceneEdgeRow",
     "SceneRef",
     "SceneReport",

@@ -1,0 +1,1 @@
+"""Where a photograph or a scan was taken: poses in the frame of the map."""
