@@ -35,6 +35,7 @@ from gsmap.types.rows import (
     EdgeRow,
     EvaluationReport,
     ExportReport,
+    FindReport,
     GraphRow,
     HistoryReport,
     IngestRow,
@@ -462,6 +463,38 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import history_report, known_objects
 
         return history_report(known_objects(self.store, self.settings, self._progress), place, box)
+
+    def find(
+        self,
+        text: str | None = None,
+        *,
+        picture: str | os.PathLike[str] | None = None,
+        like: str | None = None,
+        at: Sequence[float] | None = None,
+        top: int = 10,
+        pictures: str | os.PathLike[str] | None = None,
+    ) -> FindReport:
+        """``gsmap find MAP``: places that are like what is asked for, best first; nothing is kept.
+
+        Args:
+            text: words; the map's image encoder needs a text tower.
+            picture: a file that shows such a thing.
+            like: an object's id, or ``SCENE:NODE``, a row of a scene's layer of objects.
+            at: (3,) a point of the frame of component 0.
+            top: how many hits at most.
+            pictures: a folder to draw each hit in; an empty or new one, or one of this map.
+
+        Raises:
+            NotFoundError: no poses yet, or no such scene, node, object, or thing at the point.
+            ConfigError: not one thing to look for, or words or a picture that the embedder cannot read.
+        """
+        from gsmap.map.finding import Request, find_places, with_pictures
+
+        request = Request(text, picture, like, at, top)
+        report, boxes = find_places(self.store, request, self.settings, self._progress)
+        if pictures is None:
+            return report
+        return with_pictures(self.store, report, boxes, Path(pictures), self.settings, self._progress)
 
     # --- scans -------------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Flat, Scanned, save_depth, scanned
+from scanned_flat import Flat, Scanned, save_depth, scanned
 
 import gsmap
 from gsmap import formats
