@@ -17,12 +17,11 @@ from pathlib import Path
 import find_places
 import numpy as np
 from find_scores import Item, average_precisions, by_model, items_of
-from scipy.optimize import minimize
+from monotone import fit_curves
 
 import gsmap.find
 from gsmap.find.likeness import DIFFERENCES, Model, differences
 
-_KNOTS = 7
 _RIDGE = 3e-4
 _RIGHT = 0.1  # share of the weight that pairs of one look have
 
@@ -65,36 +64,10 @@ def pairs_of(items: Sequence[Item]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Model:
-    """Curves that only fall, by logistic regression with a ridge on their slopes."""
+    """Curves that only fall; see `monotone`."""
     x, same = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
-    knots = []
-    for column in x.T:
-        inner = np.quantile(column[same], np.linspace(0.2, 0.98, _KNOTS - 2))
-        knots.append(np.unique(np.concatenate([[0.0], inner, [np.quantile(column[~same], 0.8)]]).round(4)))
-    basis = np.concatenate([_steps(column, k) for column, k in zip(x.T, knots, strict=True)], axis=1)
-    weight = np.where(same, _RIGHT / same.sum(), (1 - _RIGHT) / (~same).sum())
-    sign = np.where(same, 1.0, -1.0)
-
-    def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
-        odds = p[0] - basis @ p[1:]
-        wrong = 1 / (1 + np.exp(np.clip(sign * odds, -50, 50)))
-        slope = -weight * sign * wrong
-        value = float(weight @ np.logaddexp(0, -sign * odds) + _RIDGE * (p[1:] ** 2).sum())
-        return value, np.append(slope.sum(), -(basis.T @ slope) + 2 * _RIDGE * p[1:])
-
-    start = np.zeros(1 + basis.shape[1])
-    bounds = [(None, None)] + [(0.0, None)] * basis.shape[1]
-    p = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 500}).x
-    worth, at = [], 1
-    for k in knots:
-        worth.append(tuple(np.concatenate([[0.0], -np.cumsum(p[at : at + len(k) - 1])]).tolist()))
-        at += len(k) - 1
-    return Model(tuple(tuple(k.tolist()) for k in knots), tuple(worth), float(p[0]))
-
-
-def _steps(values: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """(N, K - 1) how far each value has come through each interval of the knots, from 0 to 1."""
-    return np.clip((values[:, None] - knots[:-1]) / np.diff(knots), 0.0, 1.0)
+    knots, worth, base = fit_curves(x, same, ridge=_RIDGE, share=_RIGHT)
+    return Model(tuple(tuple(k.tolist()) for k in knots), tuple(tuple(w.tolist()) for w in worth), base)
 
 
 if __name__ == "__main__":

@@ -506,6 +506,7 @@ class Map(AbstractContextManager["Map"]):
         colour: str | os.PathLike[str] | None = None,
         depth_scale: float = 1000.0,
         scale: str | None = None,
+        near: str | None = None,
     ) -> ScanRow:
         """Where a point cloud, mesh, splat or depth picture lies in the map; nothing of it is kept.
 
@@ -516,6 +517,7 @@ class Map(AbstractContextManager["Map"]):
             depth_scale: values of the depth picture that make a metre.
             scale: ``known`` (the file is in metres), ``unknown`` or ``auto``; by default ``known``, but for splats,
                 ``.obj`` and ``.stl``, whose unit nobody knows: ``auto``.
+            near: only scenes near one (its name), or near ``X,Y,Z,R``, a ball in the frame of component 0.
 
         Raises:
             NotFoundError: no such file, or the map has no poses yet.
@@ -523,7 +525,7 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.stages.localize_scan import Request, localize_scan
 
-        request = Request(Path(file), intrinsics, colour, depth_scale, scale)
+        request = Request(Path(file), intrinsics, colour, depth_scale, scale, near)
         return localize_scan(self.store, request, self.settings, self._progress)
 
     # --- export ------------------------------------------------------------------------------------------------------

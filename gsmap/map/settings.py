@@ -13,6 +13,7 @@ from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.localize import scan
 from gsmap.map import visits
+from gsmap.register import by_shape
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
 
@@ -65,6 +66,7 @@ class Settings:
         change: how changes between two captures are found.
         objects: when things of several captures are one, and how they are looked for.
         scan: how a scan is looked for.
+        by_shape: how a scan without colours is compared with a scene.
         evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
@@ -80,6 +82,7 @@ class Settings:
     change: change.Params = field(default_factory=change.Params)
     objects: objects.Params = field(default_factory=objects.Params)
     scan: scan.Params = field(default_factory=scan.Params)
+    by_shape: by_shape.Params = field(default_factory=by_shape.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 

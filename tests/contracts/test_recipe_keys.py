@@ -50,6 +50,7 @@ ALTERNATIVES: dict[str, Any] = {
 NAMES_NOTHING = (
     "objects.",  # made whenever they are asked for, and not kept
     "retrieve.",
+    "by_shape.",  # nothing of it is kept
     "scan.",  # nothing of it is kept
     "visits.",
     "thin.",

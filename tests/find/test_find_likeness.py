@@ -25,7 +25,10 @@ CHAIR, GREEN = (0.45, 0.45, 0.9), (50.0, -30.0, 25.0)
 
 
 def test_turned_and_moved_it_is_the_same() -> None:
-    near = differences(box(CHAIR, GREEN, 1), [box(CHAIR, GREEN, 2)])[0]
+    bench = (1.6, 0.4, 0.9)
+    near = differences(box(bench, GREEN, 1), [box(bench, GREEN, 2)])[0]
+    assert near[DIFFERENCES.index("length")] < 0.08
+    assert near[DIFFERENCES.index("width")] < 0.08
     for name, off in zip(DIFFERENCES, near, strict=True):
         assert off < 1.5, name
 
@@ -54,6 +57,8 @@ def test_where_it_hangs_counts() -> None:
     points, lab = rng.uniform(0, 0.4, (200, 3)), np.full((200, 3), 50.0)
     low, high = look_of(points, lab, 0.0), look_of(points + np.array([0, 0, 1.5]), lab, 0.0)
     assert high.stands == pytest.approx(1.5, abs=0.02)
+    np.testing.assert_allclose(low.sizes, high.sizes, atol=1e-9)
+    np.testing.assert_allclose(low.profile, high.profile, atol=1e-9)
     assert Model.load().log_odds(differences(low, [low, high])).tolist() == sorted(
         Model.load().log_odds(differences(low, [low, high])), reverse=True
     )

@@ -244,8 +244,14 @@ def test_splats_are_told_from_scans(tmp_path: Path) -> None:
     assert not scans.holds_splat(write_ply(tmp_path / "b.ply", points, None))
     with pytest.raises(NotFoundError, match="no such file"):
         scans.holds_splat(tmp_path / "c.ply")
-    with pytest.raises(InputError, match="suffix"):
-        scans.read(write_ply(tmp_path / "a.dat", points, None))
+    other = write_ply(tmp_path / "a.dat", points, None)
+    for read in (scans.read, scans.holds_splat):
+        with pytest.raises(InputError, match="suffix"):
+            read(other)
+    assert [scans.is_scan(name) for name in ("a.LAS", "a.compressed.ply", "a.sog", "a.jpg", "a")] == [True] * 3 + [
+        False,
+        False,
+    ]
 
 
 def depth_picture(path: Path, depth_m: np.ndarray) -> Path:

@@ -19,7 +19,14 @@ from gsmap.types.scan import Scan
 SUFFIXES = (".ply", ".pcd", ".xyz", ".las", ".laz", ".obj", ".stl", ".glb")
 """Of point clouds and meshes. A ``.ply`` or ``.glb`` may hold a splat instead (`holds_splat`)."""
 
-__all__ = ["SUFFIXES", "Params", "holds_splat", "read", "read_depth"]
+__all__ = ["SUFFIXES", "Params", "holds_splat", "is_scan", "read", "read_depth"]
+
+
+def is_scan(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is called as clouds, meshes or splats are; it need not be there."""
+    from gsmap.formats import suffix_of
+
+    return _suffix(Path(path)) in SUFFIXES or suffix_of(path) is not None
 
 
 def holds_splat(path: str | os.PathLike[str]) -> bool:
@@ -27,7 +34,7 @@ def holds_splat(path: str | os.PathLike[str]) -> bool:
 
     Raises:
         NotFoundError: no such file.
-        InputError: a header that cannot be read.
+        InputError: a header that cannot be read, or neither by its suffix.
     """
     path = Path(path)
     suffix = _suffix(path)
@@ -42,6 +49,10 @@ def holds_splat(path: str | os.PathLike[str]) -> bool:
         from gsmap.formats import glb
 
         return glb.holds_splats(path)
+    if not is_scan(path):
+        raise InputError(
+            f"{path} has the suffix {suffix or '(none)'}: a scan is one of {', '.join(SUFFIXES)}, or a splat"
+        )
     return suffix not in SUFFIXES
 
 

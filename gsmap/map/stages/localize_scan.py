@@ -23,6 +23,7 @@ from gsmap.map.looking_up import ask_once
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
+from gsmap.map.stages.register import placed_scenes
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView
 from gsmap.store import Store
@@ -46,6 +47,7 @@ class Request:
         colour: picture of the same view as a depth picture.
         units_per_m: values of a depth picture that make a metre.
         scale: ``known`` (the scan is in metres), ``unknown`` or ``auto``; None for what its kind of file is in.
+        near: only scenes near one (its name), or near ``X,Y,Z,R``, a ball in the frame and unit of component 0.
     """
 
     file: Path
@@ -53,6 +55,7 @@ class Request:
     colour: str | os.PathLike[str] | None = None
     units_per_m: float = 1000.0
     scale: str | None = None
+    near: str | None = None
 
     def __post_init__(self) -> None:
         if self.scale is not None and self.scale not in SCALE_POLICIES:
@@ -94,6 +97,8 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     poses = store.revisions.get()
     scenes = {scene.id: scene for scene in store.scenes.list()}
     known = _asked(store, scenes, poses, settings)
+    if request.near is not None:
+        known = {scene: key for scene, key in known.items() if scene in _near(store, request.near)}
     told(0.1, "describing the scan")
     params = replace(settings.describe, objects=False, things=False)
     graph = describe.describe(
@@ -101,17 +106,30 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     )
     source = SceneView(_ID, sought.gaussians, sought.cameras, graph, sought.policy)
     told(0.3, "asking the index")
-    candidates = ask_once(store, known, graph, settings.retrieve)[: settings.retrieve.top_k]
+    candidates = [one.scene for one in ask_once(store, known, graph, settings.retrieve)[: settings.retrieve.top_k]]
+    notes: list[str] = []
+    if not sought.coloured:
+        # The index knows scenes by their colours, and shapes repeat: all are asked, and all have a say.
+        rest = sorted(set(known) - set(candidates))
+        candidates = [*candidates, *rest][: settings.scan.most_by_shape]
+        if len(candidates) < len(known):
+            notes.append(
+                f"{len(candidates)} of {len(known)} scenes were compared: without colours nothing tells which are the "
+                "likeliest; say where it may lie with near"
+            )
     assert poses is not None
     found: list[Registration] = []
     supports: list[Support] = []
-    for number, candidate in enumerate(candidates):
-        told(0.3 + 0.7 * number / len(candidates), f"comparing with {scenes[candidate.scene].name}")
-        target = _view(store, scenes[candidate.scene], known[candidate.scene].digest)
-        found.append(register.register_pair(target, source, settings.register))
+    for number, scene in enumerate(candidates):
+        told(0.3 + 0.7 * number / len(candidates), f"comparing with {scenes[scene].name}")
+        target = _view(store, scenes[scene], known[scene].digest)
+        if sought.coloured:
+            found.append(register.register_pair(target, source, settings.register))
+        else:
+            found.append(register.register_by_shape(target, source, settings.by_shape, settings.register))
         if found[-1].status == "accepted":
-            supports.append(Support.of(poses.poses[candidate.scene], found[-1]))
-        if len(supports) >= settings.scan.enough:
+            supports.append(Support.of(poses.poses[scene], found[-1]))
+        if sought.coloured and len(supports) >= settings.scan.enough:
             break
     told(1.0, "done")
     joined = None
@@ -122,7 +140,8 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
         one = OnePlace(same.rotation_deg, same.distance_m / metres, same.log_scale, settings.scan.agree_sigmas)
         joined = join(supports, source.centre, one, names)
     seconds = time.process_time() - began
-    return _row(request, sought, graph.notes, found, supports, joined, poses, scenes, source.centre, seconds)
+    remarks = (*graph.notes, *notes) if sought.coloured else tuple(notes)
+    return _row(request, sought, remarks, found, supports, joined, poses, scenes, source.centre, seconds)
 
 
 def _read(request: Request, settings: Settings) -> _Sought:
@@ -170,6 +189,36 @@ def _asked(store: Store, scenes: dict[str, Scene], poses: PoseGraph | None, sett
             f"no scene of {store.home} is described and has a place: run gsmap update {store.home} first"
         )
     return known
+
+
+def _near(store: Store, near: str) -> set[str]:
+    """Ids of the scenes near a scene, or near a ball ``X,Y,Z,R`` in the frame of component 0.
+
+    Raises:
+        NotFoundError: no such scene, or none is there.
+        ConfigError: four numbers that make no ball.
+    """
+    placed = placed_scenes(store)
+    parts = near.split(",")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        scene = store.scenes.get(near).id
+        if scene not in placed:
+            raise NotFoundError(f"scene {near} has no place in the map yet: run gsmap update first") from None
+        at, radius, component = placed[scene].centre, placed[scene].radius, placed[scene].component
+    else:
+        if len(numbers) != 4 or not np.isfinite(numbers).all() or not numbers[3] > 0:
+            raise ConfigError(f"near is a scene, or X,Y,Z,R with a positive radius, got {near!r}")
+        at, radius, component = np.array(numbers[:3]), numbers[3], 0
+    found = {
+        scene
+        for scene, one in placed.items()
+        if one.component == component and np.linalg.norm(one.centre - at) < radius + one.radius
+    }
+    if not found:
+        raise NotFoundError(f"no scene of the map lies near {near}")
+    return found
 
 
 def _view(store: Store, scene: Scene, graph_key: str) -> SceneView:
