@@ -40,7 +40,7 @@ class Flat:
     S_map_world: np.ndarray
 
 
-def scanned(seed: int, route: tuple[int, ...] = (0,), count: int = 10) -> Scanned:
+def scanned(seed: int, route: tuple[int, ...] = (0,), count: int = 6) -> Scanned:
     """A room of a made place, scanned on a walk of its own, which no capture made."""
     place = make_place(seed, rooms=3)
     frames = film(place, walk(place, route, count, seed=99), size_px=SIZE_PX)
