@@ -10,8 +10,8 @@ made     rooms of made flats, scanned on walks that no capture made, with the no
          a twin wing.
 
 Right is within 1 degree and 5 cm at the scan's middle; loose is within 2 degrees and 8 cm, which the kitchen's truth is
-no better than (its own captures lie 0.9 and 1.1 degrees from each other's); wrong is everything else that was placed. CPU seconds are those
-of a whole call.
+no better than (its own captures lie 0.9 and 1.1 degrees from each other's); wrong is everything else that was placed.
+CPU seconds are those of a whole call.
 """
 
 from __future__ import annotations

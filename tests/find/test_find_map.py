@@ -14,6 +14,7 @@ from tiny_text import text_tower, tokenizer
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.map import Map
+from gsmap.map.pictures import Pictures
 from gsmap.types.rows import FindHit, FindReport
 
 
@@ -84,7 +85,12 @@ def test_hits_are_drawn(site: Map, tmp_path: Path) -> None:
     red = np.asarray(Image.open(files[0] or ""))
     assert red.ndim == 3
     assert (red[..., 0] > 150).mean() > 0.02
-    assert len(list((tmp_path / "found").glob("find-*.png"))) == 2
+    drawn = {path.name for path in (tmp_path / "found").glob("find-*.png")}
+    assert len(drawn) == 2
+    scenes = {scene.id for scene in site.scenes()}
+    kept = Pictures.load(tmp_path / "found", site.store.id).scenes
+    assert set(kept) == drawn  # so that a purge finds them
+    assert {scene for ids in kept.values() for scene in ids} <= scenes
 
 
 def test_what_cannot_be_found_is_said(site: Map, tmp_path: Path) -> None:
