@@ -281,7 +281,7 @@ def _placed(
 
 def _write(path: Path, content: MergeResult, recipe: TileRecipe) -> None:
     if recipe.is_tileset:
-        tiles3d.write_content(path, content.gaussians)
+        tiles3d.write_content(path, content.gaussians, compressed=not recipe.uncompressed)
     elif recipe.provenance:
         formats.write(path, content.gaussians, extra={"scene": content.origin.astype(np.float32)})
     else:

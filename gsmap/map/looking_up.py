@@ -13,7 +13,7 @@ from gsmap.store import Store
 from gsmap.store.indexes import Lookup, StoredSegment
 from gsmap.types import SceneGraph
 from gsmap.types.progress import StageProgress
-from gsmap.types.retrieval import Candidate
+from gsmap.types.retrieval import Candidate, Member
 
 _AT_ONCE = 64  # scenes whose nodes lie in memory: about 8 MB
 _PATIENCE = 8  # times that others may change the index while it is read, or that a damaged one is made anew
@@ -113,16 +113,16 @@ def _bring_up_to_date(
 
 def _segments(store: Store, graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> list[StoredSegment]:
     """The index; of its scenes those count whose present graph it holds, each once."""
-    seen: set[str] = set()
+    present, seen = {scene: key.digest for scene, key in graphs.items()}, set[str]()
     found = []
     for segment in store.indexes.segments(retrieve.index_recipe(params)):
-        members = []
+        members: list[Member | None] = []
         for member in segment.members:
-            counts = member is not None and member.scene in graphs and member.scene not in seen
-            counts = counts and member is not None and graphs[member.scene].digest == member.graph
-            members.append(member if counts else None)
-            if counts and member is not None:
+            counts = None
+            if member is not None and member.scene not in seen and present.get(member.scene) == member.graph:
+                counts = member
                 seen.add(member.scene)
+            members.append(counts)
         found.append(replace(segment, members=members))
     return found
 

@@ -543,6 +543,7 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        uncompressed: bool = False,
         prefer: str | None = None,
         as_of: str | None = None,
         wait: bool = False,
@@ -560,6 +561,7 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            uncompressed: the content of ``3dtiles`` as float32, for viewers that do not read SPZ in glTF.
             prefer: whom to believe where captures disagree: ``newest``, ``best`` (whoever saw it best) or ``both``; by
                 default what the merger's settings say.
             as_of: only captures dated at or before this (ISO 8601; of a day, its end) take part, those without a date
@@ -582,6 +584,7 @@ class Map(AbstractContextManager["Map"]):
             steps=steps,
             budget_s=budget_s,
             provenance=provenance,
+            uncompressed=uncompressed,
             prefer=prefer,
             as_of=as_of,
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from sqlalchemy import (
@@ -130,12 +130,6 @@ class Revisions:
                     f"revision {number} was dropped by gsmap prune: of it only its line in the list is left"
                 )
             return _pose_graph(connection, row)
-
-    def find(self, key: RecipeKey | str) -> int | None:
-        """Number of the newest revision that was solved from exactly this; None where there is none."""
-        same = revisions.c.key == recipes.digest_of(key)
-        with self._catalog.read() as connection:
-            return connection.execute(select(func.max(revisions.c.number)).where(same)).scalar()
 
     def list(self) -> list[Revision]:
         """All revisions, oldest first."""
@@ -364,10 +358,12 @@ def _revision(row: Row[Any]) -> Revision:
 
 
 def _pose_graph(connection: Connection, row: Row[Any]) -> PoseGraph:
-    return replace(
-        PoseGraph({}, {}, row.settings, _provenance(row.provenance), tuple(row.notes)),
+    return PoseGraph(
         poses=_poses(connection, _where(connection, poses, row.number)),
         outcomes=_outcomes(connection, _where(connection, edges, row.number)),
+        settings=row.settings,
+        provenance=_provenance(row.provenance),
+        notes=tuple(row.notes),
     )
 
 

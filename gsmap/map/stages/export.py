@@ -55,6 +55,7 @@ class Request:
     steps: int | None = None
     budget_s: float | None = None
     provenance: bool = False
+    uncompressed: bool = False
     prefer: str | None = None
     as_of: str | None = None
 
@@ -80,6 +81,7 @@ _OPTIONS = {
     "steps": "--steps",
     "budget_s": "--budget",
     "provenance": "--provenance",
+    "uncompressed": "--uncompressed",
     "prefer": "--prefer",
     "as_of": "--as-of",
 }
@@ -117,7 +119,9 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         params = with_steps(method, params, request.steps)
     if request.prefer is not None:
         params = with_prefer(method, params, request.prefer)
-    recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
+    recipe = TileRecipe(
+        recipe_key(method, params), request.format, request.provenance, request.budget_s, request.uncompressed
+    )
     _check(request, recipe)
     revision = store.revisions.current() if request.revision is None else request.revision
     graph, placed = _placed(store, revision, request.component)
@@ -216,7 +220,8 @@ def _export(
     _put_aside(store, out, planned, result)
     if planned.recipe.is_tileset and is_stale(out, result.tiles):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
-        write_tilesets(out, result.tiles, request.tile_size_m, in_metres_of)
+        compressed = not request.uncompressed
+        write_tilesets(out, result.tiles, request.tile_size_m, in_metres_of, compressed=compressed)
     if store.catalog.writable:
         refused = ""
         try:  # what an interrupted export, or one that could not be noted, left untold is told now

@@ -107,7 +107,10 @@ def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dic
 
 def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
     """Solve for all poses and keep the answer as a new revision; returns its number."""
-    given = pose_inputs(store, settings)
+    return _optimize(store, pose_inputs(store, settings), settings, progress)
+
+
+def _optimize(store: Store, given: PoseInputs, settings: Settings, progress: StageProgress) -> int:
     progress("optimize", 0.0, "poses")
     previous: PoseGraph | None = store.revisions.get()
     fixed = {prior.scene for prior in given.priors}
@@ -124,11 +127,12 @@ def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
     One process does it at a time: others wait, and then need not.
     """
     told = False
-    while not is_solved(store, settings):
+    while not _is_of(store, pose_basis(store, settings)):
         if store.leases.try_hold("poses", "optimize"):
             try:
-                if not is_solved(store, settings):
-                    optimize(store, settings, progress)
+                given = pose_inputs(store, settings)
+                if not _is_of(store, given):
+                    _optimize(store, given, settings, progress)
             finally:
                 store.leases.release(["poses"])
             return True
@@ -140,7 +144,7 @@ def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
     return told
 
 
-def is_solved(store: Store, settings: Settings) -> bool:
-    """Whether the newest revision is what this recipe makes of what the map knows now."""
+def _is_of(store: Store, basis: PoseBasis) -> bool:
+    """Whether the newest revision is what was solved from this."""
     newest = store.revisions.newest()
-    return newest is not None and newest.key == pose_basis(store, settings).key.digest
+    return newest is not None and newest.key == basis.key.digest
