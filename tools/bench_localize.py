@@ -227,7 +227,11 @@ def measure(held: World, shots: list[Shot], change: Callable[[Photo], Photo], ve
             row["nees"] = float(xi @ np.linalg.solve(found.covariance, xi))
         rows.append(row)
         if verbose:
-            told = f"{row['deg']:.2f} deg {100 * row['m']:.1f} cm NEES {row['nees']:.1f}" if found.is_placed else found.reason
+            told = (
+                f"{row['deg']:.2f} deg {100 * row['m']:.1f} cm NEES {row['nees']:.1f}"
+                if found.is_placed
+                else found.reason
+            )
             print(f"  {row['name']} covered {shot.coverage:.0%}: {told} ({seconds:.2f} CPU s)", flush=True)
     return rows
 

@@ -32,6 +32,7 @@ VERBS = (
     "changes",
     "graph",
     "history",
+    "find",
     "edit",
     "localize",
     "export",

@@ -51,6 +51,7 @@ OBJECTS: dict[str, Object] = {
     "graph": One(rows.ObjectsReport),
     "history": One(rows.HistoryReport),
     "localize": One(rows.LocalizeReport),
+    "find": One(rows.FindReport),
     "edit": One(rows.SceneRow),
     "export": One(rows.ExportReport),
     "list scenes": Many("scenes", rows.SceneRow),

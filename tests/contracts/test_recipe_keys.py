@@ -57,6 +57,8 @@ JUDGING = tuple(
 NAMES_NOTHING = (
     "objects.",  # made whenever they are asked for, and not kept
     "retrieve.",
+    "by_shape.",  # nothing of it is kept
+    "scan.",  # nothing of it is kept
     "visits.",
     "thin.",
     "export.",
