@@ -4,7 +4,7 @@
 
 A level of a quarter of the Gaussians has half the detail of a surface: it is seen from twice as far, which is a picture
 of half the size; one of a sixteenth (6 %) from four times as far. PSNR against the capture's own render at that size,
-from its own cameras (CAPTURE.cameras.json). splat-transform (npm: @playcanvas/splat-transform, node 22) needs a GPU or,
+from its own cameras (CAPTURE.cameras.json), none of which the level was fitted to. splat-transform (npm: @playcanvas/splat-transform, node 22) needs a GPU or,
 as here, ``-g cpu``.
 """
 
@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap import formats
+from gsmap.export.levels import make_level
 from gsmap.geometry.decimate import decimate
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.render import render
@@ -40,12 +41,15 @@ def main() -> None:
     for path in options.captures:
         g = formats.read(path)
         cameras = formats.read_cameras(path.with_suffix(".cameras.json"))
-        cameras = cameras[np.linspace(0, len(cameras) - 1, options.views).astype(int)]
+        shown = np.linspace(0, len(cameras) - 1, options.views).astype(int)
+        others = cameras[np.setdiff1d(np.arange(len(cameras)), shown)]
+        cameras = cameras[shown]
         print(f"{path.name}: {len(g):,} Gaussians")
         for share, smaller in LEVELS:
             seen = cameras.resized(int(cameras.sizes_px[0].max()) // smaller)
             whole, count = pictures(g, seen), int(share * len(g))
-            report(f"{share:.0%} decimate", lambda: decimate(g, count)[0], seen, whole)  # noqa: B023
+            report(f"{share:.0%} gsmap", lambda: make_level(g, count, others).gaussians, seen, whole)  # noqa: B023
+            report(f"{share:.0%} gsmap, merged only", lambda: decimate(g, count)[0], seen, whole)  # noqa: B023
             report(f"{share:.0%} voxels", lambda: voxels(g, count), seen, whole)  # noqa: B023
             if options.splat_transform:
                 for way in ("decimate", "decimate-adaptive"):

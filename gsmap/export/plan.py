@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gsmap.errors import ConfigError, InputError
+from gsmap.export import levels
 from gsmap.export.cells import Boxes, CellSet, Grid
 from gsmap.types import Sim3
 
@@ -21,11 +22,13 @@ class Params:
         moved_m: a tile is made again when a scene moved farther than this within it.
         max_tiles: an export of more tiles than this is refused; tiles that no scene reaches into do not count.
         shared_bytes: what renders of the captures, which tiles share while they are made, may take in the folder.
+        levels: how the coarser levels of 3D Tiles are made.
     """
 
     moved_m: float = 0.005
     max_tiles: int = 1_000_000
     shared_bytes: int = 4 << 30
+    levels: levels.Params = field(default_factory=levels.Params)
 
     def __post_init__(self) -> None:
         if not self.moved_m >= 0:

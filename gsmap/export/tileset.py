@@ -5,20 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from gsmap.durable import is_file, make_folder, open_file, refuse_links, remove_file, write_whole
 from gsmap.errors import MALFORMED, CorruptError
+from gsmap.export.levels import VERSION, Params, make_level
 from gsmap.export.manifest import FILE_NAME as MANIFEST
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
-from gsmap.types import Gaussians, Sim3, Tile
+from gsmap.types import Cameras, Gaussians, Sim3, Tile
 
 FILE_NAME = "tileset.json"
 LEVELS_FOLDER = "levels"
@@ -48,7 +49,7 @@ def is_stale(out: Path, tiles: Sequence[Tile]) -> bool:
                 return True
         except OSError:
             return True
-        known = _known_boxes(folder)
+        known = _known_levels(folder)
         if any(f"{LEVELS_FOLDER}/{path.name}" not in known for path in (folder / LEVELS_FOLDER).glob("*")):
             return True
     return False
@@ -62,12 +63,14 @@ def write_tilesets(
     *,
     S_ecef_map: Mapping[int, Sim3] | None = None,
     compressed: bool = True,
+    cameras: Callable[[int], Cameras | None] = lambda component: None,
+    levels: Params | None = None,
 ) -> list[Path]:
-    """Write ``tileset.json`` into each component's folder, with coarser levels made by merging, never by dropping.
+    """Write ``tileset.json`` into each component's folder, with coarser levels above the tiles (`gsmap.export.levels`).
 
-    Levels are named by what they were made from, so those whose tiles did not change are not made again. Memory is
-    bounded by eight tiles. 3D Tiles are in metres: the root's transform makes the map's unit one, its geometric errors
-    with it.
+    Levels are named by what they were made from and how, so those whose tiles did not change are not made again. Memory
+    is bounded by eight tiles. 3D Tiles are in metres: the root's transform makes the map's unit one, its geometric
+    errors with it.
 
     Args:
         out: the export's folder; the tiles' ``.glb`` lie in it.
@@ -76,6 +79,8 @@ def write_tilesets(
         S_ecef_map: of components that are tied to the world: takes their frames to Earth-centred metres (EPSG:4978),
             where globes draw them.
         compressed: whether the tiles are packed as SPZ, and levels are to be.
+        cameras: of the captures, in the frame of a component.
+        levels: how they are made.
     """
     by_component: dict[int, list[Tile]] = defaultdict(list)
     for tile in tiles:
@@ -86,10 +91,11 @@ def write_tilesets(
         metres = 1.0 if metres_per_unit is None else metres_per_unit[component]
         folder = (out / members[0].path).parent
         refuse_links(out, folder.name, LEVELS_FOLDER)
-        known = _known_boxes(folder)
+        known = _known_levels(folder)
+        maker = _Maker(folder, known, compressed, cache(partial(cameras, component)), levels or Params())
         cells = {_cell(tile, tile_size_m / metres): _leaf(folder, tile) for tile in members}
         while len(cells) > 1:
-            cells = _one_level_up(folder, cells, known, compressed)
+            cells = _one_level_up(cells, maker)
         (root,) = cells.values()
         # The map's z is up where gsmap could tell.
         transform = np.diag([metres, metres, metres, 1.0])
@@ -112,45 +118,58 @@ def _leaf(folder: Path, tile: Tile) -> _Drawn:
     return _Drawn(TileNode(tiles3d.box_of(tiles3d.read_content(path)), 0.0, path.name), path, tile.sha256)
 
 
-def _one_level_up(
-    folder: Path, cells: dict[_Cell, _Drawn], known: dict[str, tuple[np.ndarray, float]], compressed: bool
-) -> dict[_Cell, _Drawn]:
+@dataclass(frozen=True, eq=False)
+class _Maker:
+    """How the levels of one component are made.
+
+    Args:
+        folder: of the component.
+        known: levels that the folder's present tileset names, by uri.
+        compressed, cameras, levels: see `write_tilesets`.
+    """
+
+    folder: Path
+    known: Mapping[str, TileNode]
+    compressed: bool
+    cameras: Callable[[], Cameras | None]
+    levels: Params
+
+    def parent(self, children: list[_Drawn]) -> _Drawn:
+        """The tile that is drawn in place of its children; the one of earlier where it was made of the same."""
+        made_of = [f"levels {VERSION} {self.levels} {self.compressed}", *(child.digest for child in children)]
+        digest = hashlib.sha256("\n".join(made_of).encode()).hexdigest()
+        uri = f"{LEVELS_FOLDER}/{digest[:24]}.glb"
+        path = self.folder / uri
+        below = tuple(child.node for child in children)
+        if uri in self.known and is_file(path):
+            return _Drawn(replace(self.known[uri], children=below), path, digest)
+        finer = Gaussians.concatenate([child.gaussians() for child in children])
+        level = make_level(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)), self.cameras(), self.levels)
+        make_folder(path.parent)
+        written: list[np.ndarray] = []
+        content = partial(tiles3d.write_content, gaussians=level.gaussians, compressed=self.compressed)
+        write_whole(path, lambda staged: written.append(content(staged)))
+        boxes = np.stack([*written, *(node.box for node in below)])
+        box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+        # A level must never be finer than what replaces it, or viewers would stop at it too early.
+        error_m = max(level.error_m, 1.5 * max(node.error_m for node in below), 1e-3)
+        said = {} if level.psnr_db is None else dict(zip(("psnr_worst_db", "psnr_db"), level.psnr_db, strict=True))
+        return _Drawn(TileNode(box, error_m, uri, below, {n: round(v, 2) for n, v in said.items()}), path, digest)
+
+
+def _one_level_up(cells: dict[_Cell, _Drawn], maker: _Maker) -> dict[_Cell, _Drawn]:
     """Join every two by two by two cells, counted from the lowest one, so that each component ends in one root."""
     low = np.min(list(cells), axis=0)
     groups: dict[_Cell, list[_Drawn]] = defaultdict(list)
     for cell in sorted(cells):
         x, y, z = ((np.array(cell) - low) // 2).tolist()
         groups[x, y, z].append(cells[cell])
-    return {
-        cell: children[0] if len(children) == 1 else _parent(folder, children, known, compressed)
-        for cell, children in groups.items()
-    }
+    return {cell: children[0] if len(children) == 1 else maker.parent(children) for cell, children in groups.items()}
 
 
-def _parent(
-    folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndarray, float]], compressed: bool
-) -> _Drawn:
-    digest = hashlib.sha256("\n".join(child.digest for child in children).encode()).hexdigest()
-    uri = f"{LEVELS_FOLDER}/{digest[:24]}.glb"
-    path = folder / uri
-    if uri in known and is_file(path):
-        box, error_m = known[uri]
-    else:
-        finer = Gaussians.concatenate([c.gaussians() for c in children])
-        level, voxel_m = tiles3d.coarser(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)))
-        make_folder(path.parent)
-        written: list[np.ndarray] = []
-        write_whole(path, lambda staged: written.append(tiles3d.write_content(staged, level, compressed=compressed)))
-        boxes = np.stack([*written, *(c.node.box for c in children)])
-        box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
-        # A level must never be finer than what replaces it, or viewers would stop at it too early.
-        error_m = max(voxel_m, 1.5 * max(c.node.error_m for c in children), 1e-3)
-    return _Drawn(TileNode(box, error_m, uri, tuple(c.node for c in children)), path, digest)
-
-
-def _known_boxes(folder: Path) -> dict[str, tuple[np.ndarray, float]]:
-    """Box and error of every level that the folder's present tileset names."""
-    known: dict[str, tuple[np.ndarray, float]] = {}
+def _known_levels(folder: Path) -> dict[str, TileNode]:
+    """Every tile that the folder's present tileset names, by uri, without its children."""
+    known: dict[str, TileNode] = {}
 
     def walk(tile: dict) -> None:
         center, axes = (
@@ -158,7 +177,8 @@ def _known_boxes(folder: Path) -> dict[str, tuple[np.ndarray, float]]:
             np.reshape(tile["boundingVolume"]["box"][3:], (3, 3)),
         )
         half = np.diag(axes)
-        known[tile["content"]["uri"]] = np.stack([center - half, center + half]), tile["geometricError"]
+        box, uri = np.stack([center - half, center + half]), tile["content"]["uri"]
+        known[uri] = TileNode(box, tile["geometricError"], uri, extras=dict(tile.get("extras", {})))
         for child in tile.get("children", ()):
             walk(child)
 

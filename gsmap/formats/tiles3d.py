@@ -14,8 +14,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
@@ -49,12 +49,14 @@ class TileNode:
         error_m: how far, in the frame's unit, what it draws may be from the originals; 0 for the originals.
         uri: its GLB, relative to ``tileset.json``, with ``/``; None where only its children draw.
         children: finer tiles that replace it.
+        extras: numbers about it, by name, that viewers leave alone.
     """
 
     box: np.ndarray
     error_m: float
     uri: str | None = None
     children: tuple[TileNode, ...] = ()
+    extras: Mapping[str, float] = field(default_factory=dict)
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
@@ -212,6 +214,8 @@ def _tile_json(node: TileNode) -> dict[str, Any]:
     tile: dict[str, Any] = {"boundingVolume": {"box": [float(v) for v in box]}, "geometricError": float(node.error_m)}
     if node.uri is not None:
         tile["content"] = {"uri": node.uri}
+    if node.extras:
+        tile["extras"] = dict(node.extras)
     if node.children:
         tile["children"] = [_tile_json(child) for child in node.children]
     return tile

@@ -50,7 +50,8 @@ class Store:
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``indexes``, ``view_features``, ``registrations``,
     ``changes``, ``revisions``, ``priors``, ``world``, ``models``, ``exports``, ``branches``, ``backups``, ``leases``
     and ``set_aside``. Every method that changes something is one transaction, durable when it returns; `transaction`
-    makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes open their own.
+    makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes open their
+    own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 

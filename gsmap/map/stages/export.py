@@ -18,6 +18,7 @@ from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, Not
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
 from gsmap.export.tileset import is_stale, write_tilesets
+from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.dates import is_until, last_of, undated_note
 from gsmap.map.jobs import TileMaker
 from gsmap.map.metres import map_metres, metre_notes
@@ -28,7 +29,7 @@ from gsmap.merge import reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.sights import SightStore
 from gsmap.store import Store
 from gsmap.texts import escaped
-from gsmap.types import PoseGraph, Scene, ScenePose, Tile
+from gsmap.types import Cameras, PoseGraph, Scene, ScenePose, Tile
 from gsmap.types.metre import Metre
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress
@@ -229,7 +230,14 @@ def _export(
         S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}
         compressed = not request.uncompressed
         write_tilesets(
-            out, result.tiles, request.tile_size_m, in_metres_of, S_ecef_map=S_ecef_map, compressed=compressed
+            out,
+            result.tiles,
+            request.tile_size_m,
+            in_metres_of,
+            S_ecef_map=S_ecef_map,
+            compressed=compressed,
+            cameras=partial(_cameras, store, planned),
+            levels=settings.export.levels,
         )
     if store.catalog.writable:
         refused = ""
@@ -260,6 +268,20 @@ def _maker(
         budget_s=request.budget_s,
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
         store=SightStore(folder, settings.export.shared_bytes),
+    )
+
+
+def _cameras(store: Store, planned: Planned, component: int) -> Cameras | None:
+    """Of all captures of a component, in its frame; None where there are none."""
+    poses = {scene: S for tile in planned.tiles if tile.component == component for scene, S in tile.poses.items()}
+    found = [transform_cameras(store.scenes.cameras(scene), S) for scene, S in sorted(poses.items())]
+    found = [cameras for cameras in found if len(cameras)]
+    if not found:
+        return None
+    return Cameras(
+        np.concatenate([cameras.T_frame_camera for cameras in found]),
+        np.concatenate([cameras.intrinsics_px for cameras in found]),
+        np.concatenate([cameras.sizes_px for cameras in found]),
     )
 
 

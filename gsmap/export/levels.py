@@ -1,0 +1,171 @@
+"""Coarser levels of a tileset: merged, made to look like what they stand for, and measured.
+
+A level is merged pair by pair (`gsmap.geometry.decimate`), fitted to renders of what it replaces from where the
+captures' cameras stood, in pictures so small that its Gaussians are what they can show, and compared with such renders
+of views that it was not fitted to; where these do not gain by the fit, it is left out. How small a picture must be to
+be like enough decides from how far the level is shown: that is its geometric error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import ConfigError
+from gsmap.formats import tiles3d
+from gsmap.geometry.projection import in_image, project
+from gsmap.render import render
+from gsmap.render.fit import Fitter, LearningRates
+from gsmap.types import Cameras, Gaussians
+
+VERSION = 1
+"""Raised whenever levels of the same tiles and cameras come out otherwise: they are then made again."""
+
+_SCREEN_PX = 16.0  # viewers of 3D Tiles refine what is off by more pixels than this, if not told otherwise
+_TRIED = 240  # cameras near a level of which the ones that see it best are taken
+_SAMPLE = 1000  # Gaussians that tell how well a camera sees a level
+_SEEN = 0.15  # share of them that makes a view of it
+_FIRST = LearningRates(means=0.035, quats=2e-3, log_scales=1e-2, logit_opacities=5e-2, sh_base=5e-3, sh_rest=5e-3)
+_LAST = 0.1  # of the first step, reached exponentially; the steps of merging, whose start is nearly right as well
+
+
+@dataclass(frozen=True)
+class Params:
+    """How levels are refined and measured.
+
+    Args:
+        views: cameras of the captures that a level is seen from; every fourth is kept to measure it. 0: levels are
+            merged only, and their errors are distances.
+        steps: of fitting one level.
+        deviation_px: size of a level's Gaussians (largest deviation, median) in the pictures that it is fitted to.
+        least_db: PSNR from which a level is like enough to be shown.
+    """
+
+    views: int = 48
+    steps: int = 200
+    deviation_px: float = 3.0
+    least_db: float = 30.0
+
+    def __post_init__(self) -> None:
+        for name in ("views", "steps"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("deviation_px", "least_db"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """What a tile draws in place of finer ones.
+
+    Args:
+        gaussians: what is drawn.
+        error_m: geometric error, in the frame's unit: it is shown where this is less than 16 pixels.
+        psnr_db: of the worst and of the median view that it was not fitted to, at the distance where it is first shown;
+            None where no camera sees it.
+    """
+
+    gaussians: Gaussians
+    error_m: float
+    psnr_db: tuple[float, float] | None = None
+
+
+def make_level(finer: Gaussians, max_count: int, cameras: Cameras | None, params: Params = Params()) -> Level:
+    """At most so many Gaussians in place of finer ones.
+
+    Args:
+        cameras: of the captures, in the frame of the Gaussians; None where there are none.
+    """
+    start, apart = tiles3d.coarser(finer, max_count)
+    views = None if cameras is None or not params.views else _views(finer, cameras, params.views)
+    if views is None or len(start) == len(finer):
+        return Level(start, apart)
+    kept = np.arange(len(views)) % 4 == 3
+    depths = _depths(finer, views)
+    footprint = float(np.exp(np.median(start.log_scales.max(1)))) / params.deviation_px
+    fitted = _fitted(start, finer, views[~kept], depths[~kept], footprint, params)
+    judged = _seen_at(views[kept], depths[kept], footprint)
+    level = max(fitted, start, key=lambda one: np.median(_decibels(one, finer, judged)))
+    shown, decibels = _measured(level, finer, views[kept], depths[kept], footprint, params.least_db)
+    return Level(level, _SCREEN_PX * shown, (float(decibels.min()), float(np.median(decibels))))
+
+
+def _views(gaussians: Gaussians, cameras: Cameras, count: int) -> Cameras | None:
+    """The cameras that see most of the Gaussians; None where fewer than four see enough."""
+    low, high = np.quantile(gaussians.means, (0.02, 0.98), axis=0)
+    eyes = cameras.T_frame_camera[:, :3, 3]
+    away = np.linalg.norm(np.maximum(0, np.maximum(low - eyes, eyes - high)), axis=1)
+    near = np.flatnonzero(away <= np.linalg.norm(high - low))
+    near = near[:: -(-len(near) // _TRIED) or 1]
+    points = gaussians.means[:: -(-len(gaussians) // _SAMPLE)].astype(np.float64)
+    share = np.zeros(len(near))
+    for k, c in enumerate(near.tolist()):
+        pixels, depth = project(points, cameras.T_camera_frame[c], cameras.intrinsics_px[c])
+        share[k] = in_image(pixels, depth, cameras.sizes_px[c]).mean()
+    best = near[np.sort(np.argsort(-share, kind="stable")[:count])]
+    best = best[share[np.searchsorted(near, best)] >= _SEEN]
+    return cameras[best] if len(best) >= 4 else None
+
+
+def _depths(gaussians: Gaussians, views: Cameras) -> np.ndarray:
+    """(V,) median depth of what each view shows, in small pictures."""
+    out = np.full(len(views), np.nan)
+    for v in range(len(views)):
+        seen = render(gaussians, views[v].resized(64), dominant_id=False)
+        there = seen.alpha[0] > 0.5
+        if there.any():
+            out[v] = np.median(seen.depth[0][there])
+    return np.where(np.isfinite(out), out, np.nanmedian(out) if np.isfinite(out).any() else 1.0)
+
+
+def _seen_at(views: Cameras, depths: np.ndarray, footprint: float) -> list[Cameras]:
+    """Each view in a picture whose pixels are ``footprint`` wide at its depth; never larger than the capture's own."""
+    focal = views.intrinsics_px[:, 0]
+    longest = views.sizes_px.max(1) * depths / (footprint * focal)
+    return [views[v].resized(int(np.clip(longest[v], 24, views.sizes_px[v].max()))) for v in range(len(views))]
+
+
+def _picture(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
+    picture: np.ndarray = np.clip(render(gaussians, camera, depth=False, dominant_id=False).colour[0], 0, 1)
+    return picture
+
+
+def _decibels(level: Gaussians, finer: Gaussians, cameras: list[Cameras]) -> np.ndarray:
+    """(V,) PSNR of a level in each picture."""
+    errors = [np.mean((_picture(level, camera) - _picture(finer, camera)) ** 2) for camera in cameras]
+    return -10 * np.log10(np.maximum(errors, 1e-10))
+
+
+def _fitted(
+    start: Gaussians, finer: Gaussians, views: Cameras, depths: np.ndarray, footprint: float, params: Params
+) -> Gaussians:
+    """The start, made to look like the finer Gaussians."""
+    seen = _seen_at(views, depths, footprint)
+    wanted = [_picture(finer, camera) for camera in seen]
+    size = float(np.exp(np.median(start.log_scales.max(1))))
+    fitter = Fitter(start, ssim_weight=0.2)
+    rng = np.random.default_rng(0)
+    turns = -(-params.steps // len(seen))
+    order = np.concatenate([rng.permutation(len(seen)) for _ in range(turns)] or [np.zeros(0, int)])[: params.steps]
+    for step, v in enumerate(order.tolist()):
+        share = _LAST ** (step / params.steps)
+        rates = {name: rate * share for name, rate in vars(_FIRST).items()}
+        fitter.learning_rates = LearningRates(**rates | {"means": rates["means"] * size})
+        fitter.step(seen[v], wanted[v][None])
+    return fitter.gaussians()
+
+
+def _measured(
+    level: Gaussians, finer: Gaussians, views: Cameras, depths: np.ndarray, footprint: float, least_db: float
+) -> tuple[float, np.ndarray]:
+    """The smallest footprint of a pixel at which every second view is like enough, and PSNR (V,) there.
+
+    Looked for from half the given one to four times; where none is, the last.
+    """
+    for size in footprint * 2.0 ** np.arange(-1, 3):
+        decibels = _decibels(level, finer, _seen_at(views, depths, size))
+        if np.median(decibels) >= least_db:
+            break
+    return float(size), decibels
