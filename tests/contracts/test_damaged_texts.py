@@ -49,7 +49,7 @@ def test_a_tile_whose_path_is_no_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [DEEP, f'{{"root": {{"boundingVolume": {{"box": [{HUGE}, 0]}}}}}}', '{"root": 7}'])
 def test_levels_of_a_tileset_that_is_not_ours_are_made_again(tmp_path: Path, text: str) -> None:
     (tmp_path / "tileset.json").write_text(text)
-    assert tileset._known_boxes(tmp_path) == {}
+    assert tileset._known_levels(tmp_path) == {}
 
 
 @pytest.mark.parametrize(
