@@ -37,6 +37,14 @@ def test_as_many_are_left_as_are_asked_for_and_moments_stay(count):
     np.testing.assert_allclose(moments(fewer)[2], spread, atol=0.01)
 
 
+def test_no_gaussian_is_in_two_pairs_of_a_round():
+    from gsmap.geometry.decimate import _cheapest
+
+    pairs = np.concatenate(_cheapest(wall(1000), 1000))
+    assert len(pairs) > 800
+    assert len(set(pairs.tolist())) == len(pairs)
+
+
 def test_few_enough_are_left_as_they_are():
     g = wall(50)
     same, into = decimate(g, 50)
