@@ -313,13 +313,13 @@ def _read_exif(store: Store, folder: Path, settings: Settings, noted: _Noted) ->
             strangers += 1
             continue
         scene, camera = found
-        sigma, common = photo.sigmas(settings.world)
+        sigma, common, sea_level = photo.sigmas(settings.world)
         height = photo.height_m
         if height is None:
             without_height += 1
             continue
         position = np.array([photo.longitude_deg, photo.latitude_deg, height])
-        noted.items.append(Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common))
+        noted.items.append(Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level))
     if not any(isinstance(one, Fix) for one in noted.items):
         raise NotFoundError(
             f"no photo in {folder} that has a position with a height is a camera of this map: photos go by the names "
