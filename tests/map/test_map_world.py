@@ -286,6 +286,8 @@ def test_tiles_move_on_the_globe_when_the_tie_does(tied: Path, tmp_path: Path) -
         before = root()
         m.georeference(Request(check=["G3"]))
         assert root() != before
+        with pytest.raises(InputError, match="the map lies at 48"):
+            m.georeference(Request(crs="EPSG:2583"))  # a digit short of EPSG:25832
         m.georeference(Request(crs="EPSG:4326"))
         root()  # no tile changes, and what is said of them does
         told = json.loads((tmp_path / "globe" / "tiles.json").read_text())["components"][0]["world"]

@@ -109,9 +109,7 @@ def georeference(
     check_area(places, settings.world.area_margin_deg)
     frame = _frame(before, request.crs, places)
     if frame is not None:
-        crs(frame.crs).of_geodetic(
-            crs(frame.crs).to_geodetic(_origin(frame))
-        )  # refuse here what the solve could not do
+        crs(frame.crs).check_area(_origin(frame), ["the map"], settings.world.area_margin_deg)
         noted.items.append(frame)
     if not noted.items:
         raise ConfigError("say what ties the map to the world: --gcp FILE, --exif DIR, --scale-bar A B METRES")
