@@ -170,6 +170,7 @@ def test_bad_input_changes_nothing(site: Site, tmp_path: Path) -> None:
             (file("EPSG:25832", outside), InputError, r"line 2: pixel 4000 20 lies outside .*--photo-size"),
             (file("EPSG:25832", unknown), NotFoundError, "none of the 1 photos"),
             (file("EPSG:999999", lines[1]), ConfigError, "no coordinate reference system"),
+            (file("EPSG:25832+7837", lines[1]), ConfigError, "needs the grid"),
             (Request(crs="EPSG:25832"), InputError, "nothing of this map lies in"),
             (Request(), ConfigError, "say what ties"),
             (Request(check=["P9"]), NotFoundError, "no control point is called 'P9'"),
