@@ -50,6 +50,8 @@ OBJECTS: dict[str, Object] = {
     "changes": One(rows.ChangesReport),
     "graph": One(rows.ObjectsReport),
     "history": One(rows.HistoryReport),
+    "localize": One(rows.LocalizeReport),
+    "find": One(rows.FindReport),
     "edit": One(rows.SceneRow),
     "export": One(rows.ExportReport),
     "list scenes": Many("scenes", rows.SceneRow),

@@ -35,9 +35,11 @@ from gsmap.types.rows import (
     EdgeRow,
     EvaluationReport,
     ExportReport,
+    FindReport,
     GraphRow,
     HistoryReport,
     IngestRow,
+    LocalizeReport,
     MapStatus,
     MeasureReport,
     MergeReport,
@@ -51,6 +53,7 @@ from gsmap.types.rows import (
     PurgeReport,
     RestoreReport,
     RevisionRow,
+    ScanRow,
     SceneReport,
     SceneRow,
     SettingRow,
@@ -467,6 +470,106 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import history_report, known_objects
 
         return history_report(known_objects(self.store, self.settings, self._progress), place, box)
+
+    # --- localize ----------------------------------------------------------------------------------------------------
+
+    def localize(
+        self,
+        *files: str | os.PathLike[str],
+        intrinsics: str | Sequence[float] | None = None,
+        focal: str | float | None = None,
+        near: str | None = None,
+    ) -> LocalizeReport:
+        """``gsmap localize MAP FILE...``: where photographs were taken, or why that is not said.
+
+        What views are found by is made for every scene that lacks it, and kept unless the map is read-only.
+
+        Args:
+            intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright picture.
+            focal: focal length in pixels, or ``auto`` to solve for it; by default what the file says (EXIF).
+            near: only what this scene shows, or ``X,Y,Z,R`` around a point of the map.
+
+        Raises:
+            NotFoundError: no such file or scene, or nothing in the map has a place.
+            InputError: a file is no picture.
+            ConfigError: what is said of the lens or the place makes no sense.
+        """
+        from gsmap.map.localizing import localize_files
+
+        with at_work(self.store, "localize"):
+            return localize_files(
+                self.store,
+                self.settings,
+                files,
+                intrinsics=intrinsics,
+                focal=focal,
+                near=near,
+                progress=self._progress,
+            )
+
+    def find(
+        self,
+        text: str | None = None,
+        *,
+        picture: str | os.PathLike[str] | None = None,
+        like: str | None = None,
+        at: Sequence[float] | None = None,
+        top: int = 10,
+        pictures: str | os.PathLike[str] | None = None,
+    ) -> FindReport:
+        """``gsmap find MAP``: places that are like what is asked for, best first; nothing is kept.
+
+        Args:
+            text: words; the map's image encoder needs a text tower.
+            picture: a file that shows such a thing.
+            like: an object's id, or ``SCENE:NODE``, a row of a scene's layer of objects.
+            at: (3,) a point of the frame of component 0.
+            top: how many hits at most.
+            pictures: a folder to draw each hit in; an empty or new one, or one of this map.
+
+        Raises:
+            NotFoundError: no poses yet, or no such scene, node, object, or thing at the point.
+            ConfigError: not one thing to look for, or words or a picture that the embedder cannot read.
+        """
+        from gsmap.map.finding import Request, find_places, with_pictures
+
+        request = Request(text, picture, like, at, top)
+        report, boxes = find_places(self.store, request, self.settings, self._progress)
+        if pictures is None:
+            return report
+        return with_pictures(self.store, report, boxes, Path(pictures), self.settings, self._progress)
+
+    # --- scans -------------------------------------------------------------------------------------------------------
+
+    def localize_scan(
+        self,
+        file: str | os.PathLike[str],
+        *,
+        intrinsics: Sequence[float] | None = None,
+        colour: str | os.PathLike[str] | None = None,
+        depth_scale: float = 1000.0,
+        scale: str | None = None,
+        near: str | None = None,
+    ) -> ScanRow:
+        """Where a point cloud, mesh, splat or depth picture lies in the map; nothing of it is kept.
+
+        Args:
+            file: ``.ply .pcd .xyz .las .laz .obj .stl .glb``, any splat, or (with ``intrinsics``) a depth picture.
+            intrinsics: ``fx, fy, cx, cy`` of a depth picture, pixels.
+            colour: a picture aligned with the depth picture.
+            depth_scale: values of the depth picture that make a metre.
+            scale: ``known`` (the file is in metres), ``unknown`` or ``auto``; by default ``known``, but for splats,
+                ``.obj`` and ``.stl``, whose unit nobody knows: ``auto``.
+            near: only scenes near one (its name), or near ``X,Y,Z,R``, a ball in the frame of component 0.
+
+        Raises:
+            NotFoundError: no such file, or the map has no poses yet.
+            InputError, ConfigError, MissingDependencyError: see `gsmap.formats.scans`.
+        """
+        from gsmap.map.stages.localize_scan import Request, localize_scan
+
+        request = Request(Path(file), intrinsics, colour, depth_scale, scale, near)
+        return localize_scan(self.store, request, self.settings, self._progress)
 
     # --- export ------------------------------------------------------------------------------------------------------
 

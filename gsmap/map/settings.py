@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, merge, objects, optimize, register, retrieve, thin, world
+from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin, world
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
+from gsmap.localize import scan
 from gsmap.map import visits
+from gsmap.register import by_shape
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
 
@@ -64,6 +66,9 @@ class Settings:
         visits: which captures are compared for changes.
         change: how changes between two captures are found.
         objects: when things of several captures are one, and how they are looked for.
+        localize: how photographs are found.
+        scan: how a scan is looked for.
+        by_shape: how a scan without colours is compared with a scene.
         evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
@@ -79,6 +84,9 @@ class Settings:
     visits: visits.Params = field(default_factory=visits.Params)
     change: change.Params = field(default_factory=change.Params)
     objects: objects.Params = field(default_factory=objects.Params)
+    localize: localize.Params = field(default_factory=localize.Params)
+    scan: scan.Params = field(default_factory=scan.Params)
+    by_shape: by_shape.Params = field(default_factory=by_shape.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 

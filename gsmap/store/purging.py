@@ -48,6 +48,7 @@ from gsmap.store.schema import (
     scenes,
     set_aside,
     tiles,
+    view_features,
 )
 from gsmap.store.store import Store
 
@@ -256,12 +257,14 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     drop("tiles", tiles, tiles.c.number.in_(made_with_it))
     _forget_lookups(connection, scene)
     drop("graphs", graphs, graphs.c.scene == scene)
+    drop("view_features", view_features, view_features.c.scene == scene)
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
     claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
     claimed |= set(connection.execute(select(graphs.c.group_id)).scalars())
     claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(view_features.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
     sizes = select(files.c.group_id, func.sum(files.c.size_bytes)).where(files.c.group_id.in_(unclaimed))
     bodies = {group: int(size) for group, size in connection.execute(sizes.group_by(files.c.group_id))}

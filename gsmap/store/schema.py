@@ -13,6 +13,7 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
+    LargeBinary,
     MetaData,
     Table,
     Text,
@@ -112,7 +113,7 @@ about = _table(
 groups = _table(
     "groups",
     Column("id", Digest, primary_key=True),  # digest of the content
-    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes
+    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes, views
     Column("created_at", Text, nullable=False),
 )
 files = _table(
@@ -242,6 +243,19 @@ lookups = _table(
     Column("key", Key, nullable=False),  # RecipeKey.digest of how it asked, and of its graph
     Column("candidates", Json(candidates), nullable=False),  # best first; each: scene, score, votes
     Column("num_left", Integer),  # of these, not tried when there was enough; null until the list was gone down
+    Column("created_at", Text, nullable=False),
+)
+
+# What the views of a scene show, which photographs are found by; made anew where it is lost.
+view_features = _table(
+    "view_features",
+    Column("key", Key, primary_key=True),  # RecipeKey.digest
+    _recipe(),
+    _scene("scene", index=True),
+    Column("num_views", Integer, nullable=False),
+    Column("num_features", Integer, nullable=False),
+    Column("summaries", LargeBinary, nullable=False),  # int8, as many to each view
+    Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )
 

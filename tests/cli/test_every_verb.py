@@ -56,6 +56,7 @@ RUNS = {
     "changes": "changes MAP",
     "graph": "graph MAP",
     "history": "history MAP 0.5,0.5,0.5",
+    "find": "find MAP --like left:0",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",
     "list scenes": "list MAP scenes",

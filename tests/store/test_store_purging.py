@@ -105,7 +105,16 @@ def test_nothing_of_it_is_left(place):
     assert report.scene_id == secret
     assert report.num_rows == {
         **{"scenes": 1, "graphs": 1, "registrations": 2, "reviews": 1, "poses": 1, "edges": 1, "priors": 1},
-        **{"facts": 6, "leases": 0, "tiles": 0, "revisions": 2, "comparisons": 0, "changes": 0, "change_reviews": 0},
+        **{
+            "facts": 6,
+            "leases": 0,
+            "tiles": 0,
+            "revisions": 2,
+            "comparisons": 0,
+            "changes": 0,
+            "change_reviews": 0,
+            "view_features": 0,
+        },
         "set_aside": 0,
         "observations": 1,
     }

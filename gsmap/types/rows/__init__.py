@@ -12,8 +12,11 @@ from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, S
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
 from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.find import FindHit, FindReport
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
+from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
+from gsmap.types.rows.localize_scan import ScanRow, ScanSupport
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -77,12 +80,16 @@ __all__ = [
     "EvaluationReport",
     "ExportReport",
     "FactRow",
+    "FindHit",
+    "FindReport",
     "GraphRow",
     "HistoryReport",
     "ImageErrorRow",
     "IngestRow",
     "InitReport",
     "LayerRow",
+    "LocalizeReport",
+    "LocalizeRow",
     "MapStatus",
     "MeasureReport",
     "MergeReport",
@@ -108,6 +115,8 @@ __all__ = [
     "RestoreReport",
     "RevisionRow",
     "Row",
+    "ScanRow",
+    "ScanSupport",
     "SceneEdgeRow",
     "SceneRef",
     "SceneReport",
