@@ -370,3 +370,25 @@ def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
         found = {row.scene_name: row.world for row in m.pose_rows()}
         want = of_frame(site.frame, site.truth[4].translation[None])[0]
         assert np.linalg.norm(found[site.names[4]][:2] - want[:2]) < 4
+
+
+def test_a_photo_that_cannot_be_placed_is_left_out(tied: Path, site: Site, tmp_path: Path) -> None:
+    """Through `Map.localize` itself: noise is refused, and its points with it."""
+    from PIL import Image
+
+    from gsmap.map.placed_photos import localiser
+
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "noise.jpg")
+    known = site.gcp_lines()[0]
+    lines = [known, replace(known, image="noise.jpg", pixel=(10.0, 20.0))]
+    from gsmap.formats import gcp_list
+
+    gcp_list.write(tmp_path / "g.txt", site.frame.crs, lines)
+    with gsmap.map.open(tied) as m:
+        m.clone(tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        localise = localiser(m.store, m.localize, tmp_path)
+        report = m.georeference(Request(gcp=tmp_path / "g.txt"), localise=localise)
+        assert any("noise.jpg" in note for note in report.notes)
+        assert all(image.image != "noise.jpg" for image in m.store.world.survey().images)
