@@ -9,8 +9,6 @@ import typer
 from gsmap.cli.console import AsJson, MapPath, Sets, opened, print_facts, print_rows, print_table, say
 
 if TYPE_CHECKING:
-    from gsmap.map import Map
-    from gsmap.map.stages.georeference import Localise
     from gsmap.types.rows import WorldReport
 
 
@@ -68,6 +66,7 @@ def command(
     Example: `gsmap georeference site.gsmap --crs EPSG:25832 --gcp gcp_list.txt --check P4,P7`
     """
     from gsmap.errors import ConfigError
+    from gsmap.map.placed_photos import localiser
     from gsmap.map.stages.georeference import Request
 
     said = any(one is not None for one in (crs, gcp, exif, scale_bar, check))
@@ -94,7 +93,7 @@ def command(
     if photos is not None and gcp is None:
         raise ConfigError("--photos goes with --gcp")
     with opened(map, bars=True, sets=sets) as m:
-        localise = None if photos is None else _localiser(m, photos)
+        localise = None if photos is None else localiser(m.store, m.localize, photos)
         taken_back = tuple(name or ()) if remove else None
         report = m.georeference(request if said else None, remove=taken_back, localise=localise)
     for note in report.notes:
@@ -103,16 +102,6 @@ def command(
         print_rows("georeference", report, json)
     else:
         _print(map, report)
-
-
-def _localiser(m: Map, folder: str) -> Localise:
-    from gsmap.errors import ConfigError
-    from gsmap.map.placed_photos import localiser
-
-    localize = getattr(m, "localize", None)
-    if localize is None:
-        raise ConfigError("this gsmap cannot localise photos: leave out --photos, and use photos of captures")
-    return localiser(m.store, localize, folder)
 
 
 def _print(map: str, report: WorldReport) -> None:

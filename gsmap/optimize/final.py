@@ -82,15 +82,14 @@ def solve_components(
             if not len(open_gauge(poses, scenes, anchor, own, m.dim, params.gauge.loose)):
                 # Fully known to the outside: it shares the world's frame with every other such component.
                 component[scenes] = world = index if world is None else world
-        if not len(mine) and not len(own) and not survey:
-            continue
-        solution = solve(m[mine], poses, anchor, own, params.gauge, most)
-        poses = solution.poses
-        if solution.covariances is not None:
-            covariances[scenes] = solution.covariances[scenes]
-        elif params.marginals:
-            why = solution.problem or f"more than limits.marginal_scenes, {most}"
-            missing.append((int(scenes[0]), len(scenes), why))
+        if len(mine) or len(own):
+            solution = solve(m[mine], poses, anchor, own, params.gauge, most)
+            poses = solution.poses
+            if solution.covariances is not None:
+                covariances[scenes] = solution.covariances[scenes]
+            elif params.marginals:
+                why = solution.problem or f"more than limits.marginal_scenes, {most}"
+                missing.append((int(scenes[0]), len(scenes), why))
         if survey:
             held = held_directions(m[mine], poses, scenes, anchor, own, params.gauge)
             whole = Component(scenes, m[mine], own, anchor, held)
@@ -98,7 +97,7 @@ def solve_components(
             if surveyed is not None:
                 poses = surveyed.poses
                 ties.append((int(scenes[0]), surveyed.tie))
-                if surveyed.covariances is not None:
+                if surveyed.covariances is not None and (len(mine) or len(own)):
                     covariances[scenes] = surveyed.covariances
     _, component = np.unique(component, return_inverse=True)
     notes = tuple(

@@ -335,13 +335,18 @@ class _Problem:
         names = [f"control point {terms.points[k].name}" for k in chosen.tolist()]
         names += [f"{fix.name} of a scene" for fix in terms.fixes]
         world = [terms.points[k].position for k in chosen.tolist()] + [fix.position for fix in terms.fixes]
-        sigmas = [max(terms.points[k].sigma_m) for k in chosen.tolist()] + [max(fix.sigma_m) for fix in terms.fixes]
+        sigmas = [max(terms.points[k].sigma_m) for k in chosen.tolist()]
+        reach = sigmas + [
+            float(np.hypot(max(f.sigma_m) + max(f.common_sigma_m), f.sea_level_sigma_m)) for f in terms.fixes
+        ]
+        sigmas = sigmas + [max(fix.sigma_m) for fix in terms.fixes]
         places = np.concatenate([in_map[chosen], terms.fix_points(self.scenes)])
         return Places(
             tuple(names),
             places,
             np.array(world, dtype=np.float64).reshape(-1, 3),
             np.array(sigmas, dtype=np.float64),
+            np.array(reach, dtype=np.float64),
             np.r_[chosen, np.full(len(terms.fixes), -1)],
         )
 
@@ -594,6 +599,7 @@ class _Problem:
             use = "used" if active[2][k] else "outlier"
             off = at[k] - fix.position
             h, v = np.hypot(fix.sigma_m, fix.common_sigma_m)
+            v = np.hypot(v, fix.sea_level_sigma_m)
             rows.append(
                 Residual(
                     "fix", fix.name, fix.scene, use, (float(off[0]), float(off[1]), float(off[2])),
@@ -677,7 +683,8 @@ class Places:
     """P places known in the map and in the world.
 
     Args:
-        names: for people. in_map, in_world: (P, 3). sigma_m: (P,).
+        names: for people. in_map, in_world: (P, 3).
+        sigma_m: (P,) of each by itself. reach_m: (P,) with what it is off by together with others.
         rows: (P,) of the control point; -1 of a fix.
     """
 
@@ -685,11 +692,13 @@ class Places:
     in_map: np.ndarray
     in_world: np.ndarray
     sigma_m: np.ndarray
+    reach_m: np.ndarray
     rows: np.ndarray
 
     def __getitem__(self, keep: np.ndarray) -> Places:
         names = tuple(name for name, k in zip(self.names, keep.tolist(), strict=True) if k)
-        return Places(names, self.in_map[keep], self.in_world[keep], self.sigma_m[keep], self.rows[keep])
+        arrays = (self.in_map, self.in_world, self.sigma_m, self.reach_m, self.rows)
+        return Places(names, *(array[keep] for array in arrays))
 
     def missing(self, params: SurveyParams) -> str | None:
         """What they do not determine, and what would; None where they determine everything."""
@@ -733,7 +742,7 @@ class Places:
         n = len(self.names)
         middle = np.median(self.in_world, axis=0)
         extent = 2 * float(np.median(np.linalg.norm(self.in_world - middle, axis=1)))
-        bar = 5 * self.sigma_m + params.drift_share * extent
+        bar = 5 * self.reach_m + params.drift_share * extent
         triples = list(itertools.combinations(range(n), 3)) if n <= 15 else self._drawn(params.draws)
         best, least = None, np.inf
         for three in triples:

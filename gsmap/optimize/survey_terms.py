@@ -30,7 +30,7 @@ class Unknowns:
 
     Args:
         scenes: N poses. world: ``S_world_map``, as one row. points: (K, 3). cameras: M poses, scene frame.
-        offsets: (B, 3) common errors of fixes, m.
+        offsets: (B, 3) common errors of fixes, m: of scenes, and of the sea level.
     """
 
     scenes: Similarities
@@ -155,7 +155,7 @@ class SurveyTerms:
     @property
     def columns(self) -> Columns:
         return Columns(
-            len(self.scene_ids), self.dim, len(self.points), len(self._camera_rows), len(self._offset_scenes)
+            len(self.scene_ids), self.dim, len(self.points), len(self._camera_rows), len(self._offset_sigmas)
         )
 
     @cached_property
@@ -196,6 +196,7 @@ class SurveyTerms:
 
     @cached_property
     def _offset_scenes(self) -> list[str]:
+        """Whose fixes are off together; the sea level, where any fix counts from it, comes after them."""
         return sorted({fix.scene for fix in self.fixes if max(fix.common_sigma_m) > 0})
 
     def start(self, scenes: Similarities, world: Sim3) -> Unknowns:
@@ -206,7 +207,7 @@ class SurveyTerms:
             Similarities.stack([world]),
             np.array([point.position for point in self.points], dtype=np.float64).reshape(-1, 3),
             Similarities.stack(cameras),
-            np.zeros((len(self._offset_scenes), 3)),
+            np.zeros((len(self._offset_sigmas), 3)),
         )
 
     # --- terms -------------------------------------------------------------------------------------------------------
@@ -241,7 +242,7 @@ class SurveyTerms:
             ((columns.cameras + 6 * np.arange(m), roots @ back),),
             np.ones(m, dtype=bool),
         )
-        b = len(self._offset_scenes)
+        b = len(self._offset_sigmas)
         weights = 1 / self._offset_sigmas
         offsets = Terms(
             "",
@@ -259,7 +260,8 @@ class SurveyTerms:
             for fix in self.fixes:
                 if fix.scene == scene:
                     out[k] = np.maximum(out[k], _per_axis(fix.common_sigma_m))
-        return out
+        sea_level = max((fix.sea_level_sigma_m for fix in self.fixes), default=0.0)
+        return np.concatenate([out, np.array([[1e-6, 1e-6, sea_level]])]) if sea_level else out
 
     def _points(self, x: Unknowns) -> Terms:
         weights = np.array([1 / _per_axis(point.sigma_m) for point in self.points]).reshape(-1, 3)
@@ -314,9 +316,13 @@ class SurveyTerms:
 
     def cameras_at(self, x: Unknowns) -> Similarities:
         """(I) the camera of each image in its scene."""
-        exact = Similarities.stack([Sim3.from_matrix(image.T_scene_camera) for image in self.images])
         rows = np.flatnonzero(self._image_cameras >= 0)
+        exact = self._exact_cameras
         return exact.replaced(rows, x.cameras[self._image_cameras[rows]]) if len(rows) else exact
+
+    @cached_property
+    def _exact_cameras(self) -> Similarities:
+        return Similarities.stack([Sim3.from_matrix(image.T_scene_camera) for image in self.images])
 
     def image_errors_px(self, x: Unknowns) -> np.ndarray:
         """(I, 2) from where points were picked to where they fall."""
@@ -337,13 +343,17 @@ class SurveyTerms:
         in_map = pose.apply(points)
         of_scene = {scene: k for k, scene in enumerate(self._offset_scenes)}
         common = np.array([of_scene.get(f.scene, -1) if max(f.common_sigma_m) > 0 else -1 for f in self.fixes])
-        off = np.where(common[:, None] >= 0, x.offsets[common] if len(x.offsets) else 0.0, 0.0)
+        sea = np.array([len(self._offset_scenes) if fix.sea_level_sigma_m else -1 for fix in self.fixes])
+        off = np.zeros((count, 3))
+        for rows in (common, sea):
+            off[rows >= 0] += x.offsets[rows[rows >= 0]]
         residual = (world.apply(in_map) + off - measured) * weights
         turn = _linear(world)
         parts = (
             (scenes * self.dim, weights[:, :, None] * (turn @ _linear(pose) @ _moves(points)[:, :, : self.dim])),
             (np.full(count, columns.world), weights[:, :, None] * (turn @ _moves(in_map))),
             (np.where(common >= 0, columns.offsets + 3 * common, -1), weights[:, :, None] * np.eye(3)),
+            (np.where(sea >= 0, columns.offsets + 3 * sea, -1), weights[:, :, None] * np.eye(3)),
         )
         return Terms("fix", residual, parts, np.ones(count, dtype=bool))
 

@@ -120,7 +120,9 @@ class Fix:
         crs: of ``position``; ``local`` once it is in the world frame.
         position: (3,) x y z in it.
         sigma_m: (2,) standard deviations, horizontal (per axis) and vertical, each fix by itself.
-        common_sigma_m: (2,) the same of what all fixes of a scene are off by together: satellites, antenna, datum.
+        common_sigma_m: (2,) the same of what all fixes of a scene are off by together: satellites, antenna.
+        sea_level_sigma_m: how far the surface that heights are counted from may be from that of the CRS, which is the
+            same for all fixes of a map; 0 where it is none other.
     """
 
     name: str
@@ -130,14 +132,16 @@ class Fix:
     position: np.ndarray
     sigma_m: tuple[float, float]
     common_sigma_m: tuple[float, float] = (0.0, 0.0)
+    sea_level_sigma_m: float = 0.0
 
     def __post_init__(self) -> None:
         where = f"the position of {self.name} in scene {self.scene}"
         _finite(where, self.point, 3)
         _finite(where, self.position, 3)
         _positive(where, *self.sigma_m)
-        if not (np.isfinite(self.common_sigma_m).all() and min(self.common_sigma_m) >= 0):
-            raise InputError(f"{where} needs a common sigma of at least 0, got {self.common_sigma_m}")
+        common = (*self.common_sigma_m, self.sea_level_sigma_m)
+        if not (np.isfinite(common).all() and min(common) >= 0):
+            raise InputError(f"{where} needs common sigmas of at least 0, got {common}")
 
 
 @dataclass(frozen=True, eq=False)

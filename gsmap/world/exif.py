@@ -34,16 +34,16 @@ class PhotoPosition:
     above_ellipsoid: bool
     sigma_m: float | None
 
-    def sigmas(self, params: Params) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Standard deviations, horizontal and vertical, of this photo by itself and common to a capture's photos."""
+    def sigmas(self, params: Params) -> tuple[tuple[float, float], tuple[float, float], float]:
+        """Standard deviations, horizontal and vertical, of this photo by itself and common to a capture's photos; and
+        that of the sea level."""
         own = self.sigma_m or params.gnss_sigma_m
         common = max(params.gnss_common_sigma_m, self.sigma_m or 0.0)
         if self.sigma_m is not None and self.sigma_m < 0.5:  # a receiver with corrections: what it says covers both
             common = self.sigma_m
-        up = common * params.gnss_height_factor
-        if not self.above_ellipsoid:
-            up = (up**2 + params.sea_level_sigma_m**2) ** 0.5
-        return (own, own * params.gnss_height_factor), (common, up)
+        sea_level = 0.0 if self.above_ellipsoid else params.sea_level_sigma_m
+        factor = params.gnss_height_factor
+        return (own, own * factor), (common, common * factor), sea_level
 
 
 def read_folder(folder: str | os.PathLike[str]) -> list[PhotoPosition]:

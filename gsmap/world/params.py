@@ -20,7 +20,7 @@ class Params:
         gnss_sigma_m: of a position in EXIF that does not say how good it is, from photo to photo.
         gnss_common_sigma_m: what all positions of a capture are off by together.
         gnss_height_factor: heights by satellites are worse by this.
-        sea_level_sigma_m: EXIF gives heights above sea level, which lies up to this far from the ellipsoid.
+        sea_level_sigma_m: EXIF gives heights above sea level, which is about so far from the ellipsoid, all over a map.
         survey_sigma_m: of a scene's surveyed position where nobody gives one.
         bar_sigma_share: of a scale bar, as a share of it, where nobody gives its sigma.
     """

@@ -170,6 +170,7 @@ def test_bad_input_changes_nothing(site: Site, tmp_path: Path) -> None:
             (file("EPSG:25832", outside), InputError, r"line 2: pixel 4000 20 lies outside .*--photo-size"),
             (file("EPSG:25832", unknown), NotFoundError, "none of the 1 photos"),
             (file("EPSG:999999", lines[1]), ConfigError, "no coordinate reference system"),
+            (file("EPSG:25832+7837", lines[1]), ConfigError, "needs the grid"),
             (Request(crs="EPSG:25832"), InputError, "nothing of this map lies in"),
             (Request(), ConfigError, "say what ties"),
             (Request(check=["P9"]), NotFoundError, "no control point is called 'P9'"),
@@ -286,6 +287,12 @@ def test_tiles_move_on_the_globe_when_the_tie_does(tied: Path, tmp_path: Path) -
         before = root()
         m.georeference(Request(check=["G3"]))
         assert root() != before
+        with pytest.raises(InputError, match="the map lies at 48"):
+            m.georeference(Request(crs="EPSG:2583"))  # a digit short of EPSG:25832
+        m.georeference(Request(crs="EPSG:4326"))
+        root()  # no tile changes, and what is said of them does
+        told = json.loads((tmp_path / "globe" / "tiles.json").read_text())["components"][0]["world"]
+        assert told["crs"] == "EPSG:4326"
         m.georeference(remove=[])
         assert abs(root()[12]) < 100, "in the map's own frame again"
 
@@ -330,3 +337,58 @@ def test_a_localised_photo_is_put_into_its_scene_s_frame(site: Site, tied: Path,
         assert localise(["../in.jpg", "none.jpg"]) == {}, "a list of points leads to no file elsewhere"
         assert localiser(m.store, localize, tmp_path)(["in.jpg"]) == {}
     assert asked == [tmp_path / "in.jpg"]
+
+
+def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
+    """A drone's photos: heights above sea level, and what a whole flight is off by, are in the sigma."""
+    from PIL import Image
+
+    from gsmap.world.frame import of_frame
+
+    site = surveyed_site(4, replace(SITE, spacing_m=40.0, edge_translation_m=5e-3))
+    rng, folder = np.random.default_rng(0), tmp_path / "photos"
+    folder.mkdir()
+    for S, cameras in zip(site.truth, site.cameras, strict=True):
+        flight = rng.normal(size=3) * [2, 2, 4]
+        at = S.apply(cameras.centers[::3]) + flight + rng.normal(size=(3, 3)) * 0.5
+        for name, (lon, lat, height) in zip(cameras.names[::3], of_frame(site.frame, at, "EPSG:4979"), strict=True):
+            picture = Image.new("RGB", (8, 8))
+            tags = picture.getexif()
+            gps = tags.get_ifd(0x8825)
+            for letter, value, tag in (("N", lat, 1), ("E", lon, 3)):
+                minutes = (value % 1) * 60
+                gps[tag], gps[tag + 1] = letter, (int(value), int(minutes), (minutes % 1) * 60)
+            gps[6] = float(height)
+            picture.save(folder / name, exif=tags)
+    with made_map(tmp_path / "m.gsmap", site) as m:
+        report = m.georeference(Request(crs="EPSG:25832", exif=folder))
+        (tie,) = report.components
+        assert tie.problem == ""
+        assert tie.num_outliers == 0
+        sigma = np.sqrt(np.diag(tie.covariance))[3:6] * tie.metres_per_unit
+        assert sigma.max() > 5, "forty metres of geoid, of which nine flights know no better"
+        found = {row.scene_name: row.world for row in m.pose_rows()}
+        want = of_frame(site.frame, site.truth[4].translation[None])[0]
+        assert np.linalg.norm(found[site.names[4]][:2] - want[:2]) < 4
+
+
+def test_a_photo_that_cannot_be_placed_is_left_out(tied: Path, site: Site, tmp_path: Path) -> None:
+    """Through `Map.localize` itself: noise is refused, and its points with it."""
+    from PIL import Image
+
+    from gsmap.map.placed_photos import localiser
+
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "noise.jpg")
+    known = site.gcp_lines()[0]
+    lines = [known, replace(known, image="noise.jpg", pixel=(10.0, 20.0))]
+    from gsmap.formats import gcp_list
+
+    gcp_list.write(tmp_path / "g.txt", site.frame.crs, lines)
+    with gsmap.map.open(tied) as m:
+        m.clone(tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        localise = localiser(m.store, m.localize, tmp_path)
+        report = m.georeference(Request(gcp=tmp_path / "g.txt"), localise=localise)
+        assert any("noise.jpg" in note for note in report.notes)
+        assert all(image.image != "noise.jpg" for image in m.store.world.survey().images)

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from gsmap.geometry.projection import project
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize import joint_covariance, optimize
 from gsmap.optimize.survey_terms import SurveyTerms, Unknowns
 from gsmap.types import PoseGraph, Sim3
-from gsmap.types.world import Fix, ScaleBar, Survey, WorldTie
+from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldTie
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
@@ -171,9 +172,8 @@ def test_positions_of_cameras_tie_a_map_with_an_honest_sigma() -> None:
     rng = np.random.default_rng(0)
     site = surveyed_site(7, SMALL)
     fixes = []
-    off = rng.normal(size=3) * 3.0
     for name, S, cameras in zip(site.names, site.truth, site.cameras, strict=True):
-        own = off if False else rng.normal(size=3) * 3.0
+        own = rng.normal(size=3) * 3.0
         for photo, centre in zip(cameras.names, cameras.centers, strict=True):
             at = S.apply(centre) + own + rng.normal(size=3) * 0.5
             fixes.append(Fix(photo, name, centre, "local", at, (0.5, 0.5), (3.0, 3.0)))
@@ -182,6 +182,8 @@ def test_positions_of_cameras_tie_a_map_with_an_honest_sigma() -> None:
     assert tie.S_world_map is not None
     sigma = np.sqrt(np.diag(tie.covariance))
     shift = sigma[3:6] * tie.metres_per_unit
+    assert not any(row.use == "outlier" for row in tie.residuals)
+    assert tie.notes == ()
     assert (shift > 0.5).all(), "sixteen captures of 3 m each"
     assert (shift < 3).all()
     assert np.abs(errors(site, answer, tie).mean(0)).max() < 3
@@ -224,7 +226,7 @@ def test_derivatives() -> None:
         for k, i in enumerate(survey.images)
     )
     a, b = site.names[:2]
-    fixes = (Fix("f", a, rng.normal(size=3), "local", rng.normal(size=3), (1.0, 2.0), (3.0, 4.0)),)
+    fixes = (Fix("f", a, rng.normal(size=3), "local", rng.normal(size=3), (1.0, 2.0), (3.0, 4.0), 40.0),)
     bars = (ScaleBar("b", (a, b), rng.normal(size=(2, 3)), (1e-4, 1e-4), 3.0, 0.1),)
     for dim in (6, 7):
         terms = SurveyTerms.of(replace(survey, images=images, fixes=fixes, bars=bars), site.names, dim)
@@ -259,7 +261,7 @@ def test_a_component_that_is_turned_upright_lies_where_it_lay() -> None:
 
 def test_the_covariance_of_the_tie_is_honest() -> None:
     """``S_world_map`` with the anchor's scene taken as exact, over made sites."""
-    nees = []
+    nees, snooped = [], []
     for seed in range(15):
         site = surveyed_site(300 + seed, replace(SMALL, num_check=0))
         _, tie = solved(site, survey_of(site))
@@ -267,16 +269,45 @@ def test_the_covariance_of_the_tie_is_honest() -> None:
         # The anchor's own frame is the map's.
         step = Similarities.stack([tie.S_world_map.inverse() @ site.truth[0]]).log()[0]
         nees.append(step @ np.linalg.solve(tie.covariance, step))
+        snooped += [row.statistic / row.dof for row in tie.residuals if row.kind == "point"]
     assert 0.5 < np.mean(nees) / 7 < 1.7
+    assert 0.7 < np.mean(snooped) < 1.4, "each observation against all others"
 
 
 def test_a_check_point_changes_nothing() -> None:
     site = surveyed_site(10, SMALL)
     _, tie = solved(site, survey_of(site))
-    off, other = solved(site, survey_of(site.with_blunder("C0", (5.0, 0.0, 0.0))))
+    _, other = solved(site, survey_of(site.with_blunder("C0", (5.0, 0.0, 0.0))))
     assert tie.S_world_map is not None
     assert other.S_world_map is not None
     assert np.abs(tie.S_world_map.matrix() - other.S_world_map.matrix()).max() < 1e-9
     row = next(row for row in other.residuals if row.name == "C0")
     assert row.use == "check"
     assert np.linalg.norm(row.error_m) == pytest.approx(5, abs=0.1)
+
+
+def test_a_single_capture_is_tied() -> None:
+    """As most maps begin: no edge, and marks in the photos of one capture."""
+    site = surveyed_site(11, replace(SMALL, rows=1, columns=2, num_control=2, num_check=0))
+    cameras, S = site.cameras[0], site.truth[0]
+    rng, points, images = np.random.default_rng(0), [], []
+    for k, local in enumerate([(-4, -3, 0), (4, -3, 0.5), (3, 4, 0), (-4, 3, 1), (0, 0, 0.2)]):
+        at = np.array(local, dtype=float) / 2
+        points.append(ControlPoint(f"P{k}", "local", S.apply(at) + rng.normal(size=3) * 0.003, (0.003, 0.003)))
+        for c in (0, 3, 6):
+            pixel, _ = project(at[None], cameras.T_camera_frame[c], cameras.intrinsics_px[c])
+            picked = pixel[0] + rng.normal(size=2) * 0.5
+            pose, intrinsics = cameras.T_frame_camera[c], cameras.intrinsics_px[c]
+            images.append(ImagePoint(f"P{k}", cameras.names[c], site.names[0], picked, 0.5, pose, intrinsics))
+    survey = Survey(site.frame, tuple(points), tuple(images))
+    answer = optimize(site.names[:1], (), survey=survey)
+    (tie,) = answer.world
+    assert tie.S_world_map is not None
+    off = (tie.S_world_map @ answer.poses[site.names[0]].S_map_scene).apply(np.zeros((1, 3)))[0] - S.translation
+    assert np.linalg.norm(off) < 0.01
+    step = Similarities.stack([tie.S_world_map.inverse() @ S]).log()[0]
+    assert step @ np.linalg.solve(tie.covariance, step) < chi2.ppf(0.999, 7)
+    assert answer.poses[site.names[0]].covariance is None, "it is its own frame"
+    joint = joint_covariance(answer, (), (), survey, [site.names[0]], 0)
+    assert joint is not None
+    assert np.isfinite(joint).all()

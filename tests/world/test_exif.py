@@ -30,9 +30,10 @@ def test_a_position_is_read(tmp_path: Path) -> None:
     assert found.height_m == pytest.approx(520.5)
     assert found.sigma_m == pytest.approx(4.0)
     assert not found.above_ellipsoid
-    own, common = found.sigmas(Params())
+    own, common, sea_level = found.sigmas(Params())
     assert own == pytest.approx((4.0, 8.0))
-    assert common[1] > 40, "sea level is not the ellipsoid"
+    assert common == pytest.approx((4.0, 8.0))
+    assert sea_level == 40, "sea level is not the ellipsoid"
 
 
 @pytest.mark.parametrize(

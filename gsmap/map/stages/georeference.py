@@ -20,7 +20,7 @@ from gsmap.types import Cameras
 from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame
 from gsmap.world.crs import WGS84, crs
 from gsmap.world.exif import read_folder
-from gsmap.world.survey import check_area, frame_for
+from gsmap.world.survey import check_area, frame_for, in_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +109,9 @@ def georeference(
     check_area(places, settings.world.area_margin_deg)
     frame = _frame(before, request.crs, places)
     if frame is not None:
-        crs(frame.crs).of_geodetic(
-            crs(frame.crs).to_geodetic(_origin(frame))
-        )  # refuse here what the solve could not do
+        crs(frame.crs).check_area(_origin(frame), ["the map"], settings.world.area_margin_deg)
         noted.items.append(frame)
+    _refuse_unreachable(before, frame or before.frame, places)
     if not noted.items:
         raise ConfigError("say what ties the map to the world: --gcp FILE, --exif DIR, --scale-bar A B METRES")
     store.world.add(noted.items)
@@ -130,7 +129,9 @@ def survey_position(
     scene = store.scenes.get(ref)
     fix = Fix(SURVEYED, scene.id, np.zeros(3), crs(crs_text).text, np.array(position, dtype=np.float64), sigma_m)
     check_area([fix], settings.world.area_margin_deg)
-    frame = _frame(store.world.survey(), None, [fix])
+    before = store.world.survey()
+    frame = _frame(before, None, [fix])
+    _refuse_unreachable(before, frame or before.frame, [fix])
     store.world.add([fix] if frame is None else [fix, frame])
 
 
@@ -141,6 +142,13 @@ def forget_position(store: Store, ref: str) -> bool:
         return False
     store.world.remove((SURVEYED,), kinds=("fix",), scene=scene.id)
     return True
+
+
+def _refuse_unreachable(before: Survey, frame: WorldFrame | None, new: Sequence[ControlPoint | Fix]) -> None:
+    """Raise where PROJ has no way from what is or will be noted to the map's CRS: no solve would end from then on."""
+    points = tuple(one for one in (*before.points, *new) if isinstance(one, ControlPoint))
+    fixes = tuple(one for one in (*before.fixes, *new) if isinstance(one, Fix))
+    in_frame(Survey(frame, points, (), fixes))
 
 
 def _origin(frame: WorldFrame) -> np.ndarray:
@@ -313,13 +321,13 @@ def _read_exif(store: Store, folder: Path, settings: Settings, noted: _Noted) ->
             strangers += 1
             continue
         scene, camera = found
-        sigma, common = photo.sigmas(settings.world)
+        sigma, common, sea_level = photo.sigmas(settings.world)
         height = photo.height_m
         if height is None:
             without_height += 1
             continue
         position = np.array([photo.longitude_deg, photo.latitude_deg, height])
-        noted.items.append(Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common))
+        noted.items.append(Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level))
     if not any(isinstance(one, Fix) for one in noted.items):
         raise NotFoundError(
             f"no photo in {folder} that has a position with a height is a camera of this map: photos go by the names "
