@@ -37,6 +37,7 @@ VERBS = (
     "list",
     "show",
     "why",
+    "report",
     "diff",
     "poses",
     "settings",

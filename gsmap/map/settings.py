@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, merge, objects, optimize, register, retrieve, thin
+from gsmap import change, describe, engine, export, merge, objects, optimize, register, report, retrieve, thin
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.map import visits
@@ -64,6 +64,7 @@ class Settings:
         change: how changes between two captures are found.
         objects: when things of several captures are one, and how they are looked for.
         evaluate: when an edge counts as wrong.
+        report: how much a report shows.
         engine: where jobs run.
     """
 
@@ -78,6 +79,7 @@ class Settings:
     change: change.Params = field(default_factory=change.Params)
     objects: objects.Params = field(default_factory=objects.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
+    report: report.Params = field(default_factory=report.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 
 

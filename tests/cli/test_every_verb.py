@@ -66,6 +66,7 @@ RUNS = {
     "show A:B": "show MAP left:right",
     "show CHANGE": "show MAP c1",
     "why A:B": "why MAP left:right --pictures TMP/why",
+    "report": "report MAP TMP/report.html --since 2024-05-31",
     "diff": "diff MAP 1 2",
     "poses": "poses MAP",
     "settings": "settings MAP",
@@ -93,7 +94,7 @@ RUNS = {
     "demo": "demo TMP/demo",
 }
 SILENT = {
-    *("init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view"),
+    *("init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view", "report"),
     *("backup", "restore", "clone"),
 }
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""

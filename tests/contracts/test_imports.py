@@ -40,6 +40,7 @@ LAYERS = [
         "export",
         "evaluate",
         "view",
+        "report",
         "engine",
     },
     {"map"},
