@@ -6,6 +6,7 @@ import base64
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsmap.report import svg
 from gsmap.report.markup import Markup, joined, tag
@@ -64,7 +65,7 @@ def draw_plan(plan: Plan, title: str) -> tuple[Markup, int]:
             outline = plan.middles[i] + magnified * ellipse(covariance)
             parts.append(svg.path(at(outline), "ellipse", closed=True))
         x, y = middles[i]
-        parts.append(svg.dot(x, y, 5, f"node {plan.statuses[i]} {_colour(i)}", plan.names[i]))
+        parts.append(svg.dot(x, y, 3 if crowded else 5, f"node {plan.statuses[i]} {_colour(i)}", plan.names[i]))
     parts.append(_names(plan, middles, size))
     parts.append(_scale_bar(scale, size))
     parts.append(_axes(plan, size))
@@ -102,6 +103,8 @@ def _magnification(plan: Plan) -> int:
     if not known:
         return 0
     room = _ELLIPSE_SHARE * float(np.linalg.norm(plan.bounds[1] - plan.bounds[0]))
+    if len(plan.middles) > _MANY:  # so that neighbours' ellipses do not cover each other
+        room = min(room, float(np.median(cKDTree(plan.middles).query(plan.middles, k=2)[0][:, 1])))
     fits = [factor for factor in _MAGNIFIED if factor * float(np.quantile(known, 0.9)) <= room]
     return fits[-1] if fits else 1
 

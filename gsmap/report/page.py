@@ -19,6 +19,7 @@ from gsmap.report.top import picture_webp
 from gsmap.report.words import (
     CHI2_999,
     angle,
+    chi_square,
     count,
     cut,
     day,
@@ -27,6 +28,7 @@ from gsmap.report.words import (
     metre,
     moment,
     number,
+    probability,
     size,
     strained,
     verdict,
@@ -94,8 +96,9 @@ def _head(report: Report) -> Markup:
     standing, sentences = verdict(report)
     rows = [entry.row for entry in report.scenes]
     dates = sorted(row.captured_at for row in rows if row.captured_at)
-    dated = f"{day(dates[0])} to {day(dates[-1])}" if dates and day(dates[0]) != day(dates[-1]) else ""
     undated = len(rows) - len(dates)
+    dated = [f"to {day(dates[-1])}"] if dates and day(dates[0]) != day(dates[-1]) else []
+    dated += [f"{undated:,} without a date"] if undated else []
     islands = [island for island in report.islands if len(island.scenes) > 1]
     alone = len(report.islands) - len(islands)
     facts: list[tuple[str, Part, str]] = [
@@ -103,7 +106,7 @@ def _head(report: Report) -> Markup:
         ("Islands", f"{len(report.islands):,}", count(alone, "scene") + " alone" if alone else ""),
         ("Gaussians", _short(sum(row.num_gaussians for row in rows)), ""),
         ("On disk", size(sum(one.num_bytes for one in report.storage)), ""),
-        ("Captured", dated or (day(dates[0]) if dates else "–"), f"{undated:,} without a date" if undated else ""),
+        ("Captured", day(dates[0]) if dates else "–", ", ".join(dated)),
         ("Revision", str(report.revision.number) if report.revision else "none",
          moment(report.revision.created_at) if report.revision else "never solved"),
     ]  # fmt: skip
@@ -152,7 +155,7 @@ def _todo(report: Report) -> Markup | None:
     if not status.todo and not status.at_work:
         return None
     rows = [(row.count, row.meaning, tag("code", row.verb)) for row in status.todo]
-    parts: list[Part] = [_table(("count", "what", "the command that helps"), rows, numeric=(0,)) if rows else None]
+    parts: list[Part] = [_table(("count", "what", "the command that helps"), rows, (0,), (1, 2)) if rows else None]
     if status.at_work:
         working = [(row.what, row.task, row.host, moment(row.since)) for row in status.at_work[:_FEW]]
         parts += [tag("h3", "At work now"), _table(("what", "by", "on", "since"), working)]
@@ -170,7 +173,7 @@ def _plans(report: Report) -> Markup | None:
     parts: list[Part] = [_plan(island, len(report.islands) > 1) for island in drawn]
     if others:
         rows = [(f"{i.component}", f"{len(i.scenes):,}", cut(", ".join(i.scenes), 80), i.note) for i in others]
-        parts += [tag("h3", "Islands without a plan"), _folded(("island", "scenes", "which", ""), rows, numeric=(0, 1))]
+        parts += [tag("h3", "Islands without a plan"), _folded(("island", "scenes", "which", ""), rows, (0, 1), (2, 3))]
     return joined(parts)
 
 
@@ -229,7 +232,7 @@ def _doubt(report: Report) -> Markup | None:
     if strain:
         parts.append(
             tag("p", f"{count(len(strain), 'edge')} pulled beyond 99.9 % of what its error lets expect: ",
-                ", ".join(f"{e.row.pair} (chi² {number(e.chi2)})" for e in strain[:_FEW]), ".")
+                ", ".join(f"{e.row.pair} (chi² {chi_square(e.chi2)})" for e in strain[:_FEW]), ".")
         )  # fmt: skip
     entries = {edge.row.pair: edge for edge in doubtful}
     for one in report.pair_pictures:
@@ -240,6 +243,8 @@ def _doubt(report: Report) -> Markup | None:
             tag(
                 "figure",
                 tag("h3", one.row.target_name, tag("span", " : ", class_="quiet"), one.row.source_name),
+                tag("p", tag("span", one.row.target_name), tag("span", one.row.source_name),
+                    tag("span", "not the same in red"), class_="heads"),
                 tag("img", src=_data(one.picture), alt=f"{one.row.pair} from the same cameras", width=width,
                     height=height, loading="lazy"),
                 tag("figcaption", f"{reason}. {count(one.row.num_inliers, 'inlier')}, overlap "
@@ -255,7 +260,9 @@ def _doubt(report: Report) -> Markup | None:
 
 
 def _probably(edge: EdgeEntry | None) -> str:
-    return "" if edge is None or edge.probability is None else f", right with probability {number(edge.probability, 2)}"
+    return (
+        "" if edge is None or edge.probability is None else f", right with probability {probability(edge.probability)}"
+    )
 
 
 def _data(picture: np.ndarray) -> str:
@@ -272,12 +279,12 @@ def _edges(report: Report) -> Markup | None:
     solved = [edge for edge in report.edges if edge.chi2 is not None and edge.use in ("used", "tentative", "undecided")]
     checked = [edge for edge in solved if edge.use == "used"]
     plots_: list[Part] = [_figure(_matrix(report), "Who was tried with whom, and what came of it.")]
-    if solved:
+    if plots.pulled(solved):
         plots_.append(
             _figure(
                 plots.residual_bars(solved, params.bars),
-                f"{_largest(solved, params.bars)}. Dashed: 95 % and 99.9 % of correct edges lie below. An edge that no "
-                "loop checks has no residual, whether right or wrong.",
+                f"{_largest(plots.pulled(solved), params.bars)}. Dashed: 95 % and 99.9 % of correct edges lie below. "
+                "An edge that no loop checks has no residual, whether right or wrong.",
             )
         )
     if len(checked) > 1:
@@ -288,7 +295,7 @@ def _edges(report: Report) -> Markup | None:
                 "they claim (or no loop checks them); right of it, worse.",
             )
         )
-    if any(edge.translation_m for edge in solved):
+    if any(edge.translation_m is not None for edge in plots.pulled(solved)):
         plots_.append(
             _figure(plots.offset_bars(solved, params.bars), "How far the poses leave what each edge measured, at the "
                     "middle of the second scene.")
@@ -299,7 +306,7 @@ def _edges(report: Report) -> Markup | None:
 
 
 def _largest(edges: Sequence[EdgeEntry], most: int) -> str:
-    return f"The {most} largest of {len(edges):,}" if len(edges) > most else "All edges of the solution"
+    return f"The {most} largest of {len(edges):,}" if len(edges) > most else "All edges that a loop checks"
 
 
 def _redundancy(report: Report) -> Markup | None:
@@ -380,11 +387,11 @@ def _edge_table(report: Report) -> Markup:
     numeric = (2, 3, 4, 5, 6, 7)
     parts: list[Part] = []
     if tried:
-        parts += [tag("h3", "Edges, doubt first"), _folded(head, [_edge_row(e) for e in tried], numeric)]
+        parts += [tag("h3", "Edges, doubt first"), _folded(head, [_edge_row(e) for e in tried], numeric, (8,))]
     if refused:
         rows = [_edge_row(e) for e in refused]
         summary = f"{count(len(refused), 'pair')} that did not match"
-        parts.append(tag("details", tag("summary", summary), _table(head, rows, numeric)))
+        parts.append(tag("details", tag("summary", summary), _table(head, rows, numeric, (8,))))
     if len(ordered) > len(shown):
         parts.append(_more(len(ordered) - len(shown), "edges", "gsmap list MAP edges"))
     return joined(parts)
@@ -396,12 +403,12 @@ def _edge_row(edge: EdgeEntry) -> tuple[Part, ...]:
     return (
         edge.row.pair,
         tag("span", f"{kind.replace('_', ' ')}{said}", class_=f"tag {kind}"),
-        number(edge.chi2),
+        chi_square(edge.chi2),
         length(edge.translation_m),
         angle(edge.rotation_deg),
         f"{edge.row.num_inliers:,}",
         number(edge.row.overlap, 2),
-        number(edge.probability, 3),
+        probability(edge.probability),
         edge.row.reason,
     )
 
@@ -443,8 +450,11 @@ def _scenes(report: Report) -> Markup | None:
         most = report.params.bars
         first = f"The {most} largest of {len(known):,}" if len(known) > most else "The largest first"
         words = f"{first}. Of each scene's middle, along its worst axis, in the frame of its island."
-        parts.append(tag("div", _figure(plots.sigma_bars(known, most), words), class_="plots"))
-    parts.append(_folded(head, rows, (2, 4, 5, 6, 7, 8, 9)))
+        drawn = [_figure(plots.sigma_bars(known, most), words)]
+        if len(known) > most:
+            drawn.append(_figure(plots.sigma_distribution(known), "Share of the scenes up to each standard deviation."))
+        parts.append(tag("div", drawn, class_="plots"))
+    parts.append(_folded(head, rows, (2, 4, 5, 6, 7, 8, 9), (10,)))
     if len(ordered) > len(shown):
         parts.append(_more(len(ordered) - len(shown), "scenes", "gsmap list MAP scenes"))
     return joined(parts)
@@ -504,7 +514,7 @@ def _history(report: Report) -> Markup | None:
     if not report.revisions:
         return None
     parts: list[Part] = []
-    if len(report.revisions) > 1:
+    if len(report.revisions) > 2:
         caption = "Grey: scenes. Blue: edges used. Amber: edges that no loop confirms."
         parts.append(tag("div", _figure(plots.growth(report.revisions), caption), class_="plots"))
     moved = {one.after: one for one in report.moved}
@@ -535,7 +545,7 @@ def _history(report: Report) -> Markup | None:
         "poses that moved",
         "why",
     )
-    parts.append(_folded(head, rows, (3, 4, 5, 6, 7)))
+    parts.append(_folded(head, rows, (3, 4, 5, 6, 7), (9,)))
     if report.num_revisions > len(report.revisions):
         left = report.num_revisions - len(report.revisions)
         parts.append(_more(left, "earlier revisions", "gsmap list MAP revisions"))
@@ -655,21 +665,24 @@ def _foot(report: Report) -> Markup:
 # --- parts -----------------------------------------------------------------------------------------------------------
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = ()) -> Markup:
-    right = set(numeric)
-    titles = [tag("th", name, scope="col", class_="num" if k in right else None) for k, name in enumerate(head)]
-    lines = [
-        tag("tr", [tag("td", cell, class_="num" if k in right else None) for k, cell in enumerate(row)]) for row in rows
-    ]
+def _table(
+    head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = (), long: Sequence[int] = ()
+) -> Markup:
+    """A table that scrolls sideways where it is too wide; ``long`` columns hold sentences, which may break."""
+    kinds = {**dict.fromkeys(numeric, "num"), **dict.fromkeys(long, "long")}
+    titles = [tag("th", name, scope="col", class_=kinds.get(k)) for k, name in enumerate(head)]
+    lines = [tag("tr", [tag("td", cell, class_=kinds.get(k)) for k, cell in enumerate(row)]) for row in rows]
     return tag("div", tag("table", tag("thead", tag("tr", titles)), tag("tbody", lines)), class_="wide")
 
 
-def _folded(head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = ()) -> Markup:
+def _folded(
+    head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = (), long: Sequence[int] = ()
+) -> Markup:
     """A table whose later rows fold away where there are many."""
     if len(rows) <= 2 * _FEW:
-        return _table(head, rows, numeric)
-    rest = tag("details", tag("summary", f"{len(rows) - _FEW:,} more"), _table(head, rows[_FEW:], numeric))
-    return joined(_table(head, rows[:_FEW], numeric), rest)
+        return _table(head, rows, numeric, long)
+    rest = tag("details", tag("summary", f"{len(rows) - _FEW:,} more"), _table(head, rows[_FEW:], numeric, long))
+    return joined(_table(head, rows[:_FEW], numeric, long), rest)
 
 
 def _more(left: int, what: str, verb: str) -> Markup:

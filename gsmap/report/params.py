@@ -34,7 +34,7 @@ class Params:
 
     islands: int = 8
     plan_px: int = 1200
-    plan_gaussians: int = 3_000_000
+    plan_gaussians: int = 2_000_000
     plan_scenes: int = 400
     track_points: int = 120
     pair_pictures: int = 6
@@ -46,7 +46,7 @@ class Params:
     changes: int = 200
     revisions: int = 30
     moves: int = 8
-    bars: int = 40
+    bars: int = 24
     cells: int = 300
 
     def __post_init__(self) -> None:

@@ -10,16 +10,16 @@ from gsmap.report import svg
 from gsmap.report.content import CHI2_DOF, EdgeEntry, SceneEntry
 from gsmap.report.markup import Markup, joined, tag
 from gsmap.report.svg import Axis, Frame
-from gsmap.report.words import CHI2_95, CHI2_999, cut, length, number
+from gsmap.report.words import CHI2_95, CHI2_999, NOT_PULLED, cut, cut_pair, length, number
 from gsmap.types.rows import RevisionRow
 
 _ROW = 17.0
-_NAMES = 150.0
+_NAMES, _CHARACTERS = 150.0, 19  # room for names, and how many characters fit
 
 
 def residual_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
     """The chi-square of each edge, the largest first, against what its own error lets expect."""
-    chosen = sorted((e for e in edges if e.chi2 is not None), key=lambda e: -(e.chi2 or 0.0))[:most]
+    chosen = sorted(pulled(edges), key=lambda e: -(e.chi2 or 0.0))[:most]
     values = [max(e.chi2 or 0.0, 1e-2) for e in chosen]
     frame = Frame(_ROW * len(chosen) + 62, _NAMES)
     x = svg.log_axis([0.1, 100.0, *values], *frame.x_span)
@@ -29,8 +29,17 @@ def residual_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
         tip = f"{edge.row.pair}: chi2 {number(edge.chi2)}, off by {length(edge.translation_m)}"
         parts.append(svg.line(x.start, y, x.at(value), y, f"stem {_kind(edge)}"))
         parts.append(svg.dot(x.at(value), y, 4.5, f"mark {_kind(edge)}", tip))
-        parts.append(svg.label(_NAMES - 6, y + 4, cut(edge.row.pair, 21), "tick", anchor="end"))
+        parts.append(svg.label(_NAMES - 6, y + 4, _ends(edge), "tick", anchor="end"))
     return svg.plot(frame, x, None, ("chi² of the residual (7 degrees of freedom)", ""), "Residual of each edge", parts)
+
+
+def pulled(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
+    """The edges that others pull at."""
+    return [edge for edge in edges if edge.chi2 is not None and edge.chi2 > NOT_PULLED]
+
+
+def _ends(edge: EdgeEntry) -> str:
+    return cut_pair((edge.row.target_name, edge.row.source_name), _CHARACTERS)
 
 
 def _expected(frame: Frame, x: Axis) -> Markup:
@@ -69,10 +78,10 @@ def residual_distribution(edges: Sequence[EdgeEntry]) -> Markup:
 
 def offset_bars(edges: Sequence[EdgeEntry], most: int) -> Markup:
     """How far the poses leave each edge, in metres, the largest first."""
-    chosen = [e for e in edges if e.translation_m is not None and e.use != "unused"]
+    chosen = [e for e in pulled(edges) if e.translation_m is not None]
     chosen = sorted(chosen, key=lambda e: -(e.translation_m or 0.0))[:most]
     values = [max(e.translation_m or 0.0, 1e-5) for e in chosen]
-    names = [e.row.pair for e in chosen]
+    names = [_ends(e) for e in chosen]
     tips = [f"{e.row.pair}: {length(e.translation_m)}, {number(e.rotation_deg, 2)}°" for e in chosen]
     kinds = [_kind(e) for e in chosen]
     return _metre_bars(names, values, tips, kinds, "distance between edge and poses", "Residuals in metres")
@@ -88,6 +97,20 @@ def sigma_bars(scenes: Sequence[SceneEntry], most: int) -> Markup:
     return _metre_bars(names, values, tips, kinds, "standard deviation of position", "Position sigma of each scene")
 
 
+def sigma_distribution(scenes: Sequence[SceneEntry]) -> Markup:
+    """Which share of the scenes lies at least as surely as some standard deviation says."""
+    values = np.sort([s.position_sigma_m for s in scenes if s.position_sigma_m])
+    unit, factor = _unit(values.tolist())
+    frame = Frame()
+    x, y = svg.log_axis((values * factor).tolist(), *frame.x_span), Axis(0, 1, *frame.y_span)
+    found = [[x.start, y.start]]
+    for i, value in enumerate(values * factor):
+        found += [[x.at(value), y.at(i / len(values))], [x.at(value), y.at((i + 1) / len(values))]]
+    found.append([x.end, y.end])
+    words = (f"standard deviation of position, {unit}", "share of scenes")
+    return svg.plot(frame, x, y, words, "Position sigma of all scenes", svg.path(np.array(found), "found"))
+
+
 def _metre_bars(
     names: Sequence[str], values: Sequence[float], tips: Sequence[str], kinds: Sequence[str], axis: str, title: str
 ) -> Markup:
@@ -99,7 +122,7 @@ def _metre_bars(
         y = frame.y_span[1] + _ROW * (i + 0.5)
         parts.append(svg.line(x.start, y, x.at(value * factor), y, f"stem {kind}"))
         parts.append(svg.dot(x.at(value * factor), y, 4.5, f"mark {kind}", tip))
-        parts.append(svg.label(_NAMES - 6, y + 4, cut(name, 21), "tick", anchor="end"))
+        parts.append(svg.label(_NAMES - 6, y + 4, cut(name, _CHARACTERS), "tick", anchor="end"))
     return svg.plot(frame, x, None, (f"{axis}, {unit}", ""), title, parts)
 
 

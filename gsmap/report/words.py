@@ -50,7 +50,19 @@ def _two(value: float) -> str:
 
 def angle(degrees: float | None) -> str:
     """An angle in degrees."""
-    return "–" if degrees is None or not math.isfinite(degrees) else f"{degrees:.2g}°"
+    if degrees is None or not math.isfinite(degrees):
+        return "–"
+    return f"{degrees:.2g}°" if degrees == 0 or abs(degrees) >= 1e-3 else "< 0.001°"
+
+
+def chi_square(value: float | None) -> str:
+    """A chi-square; what is left by rounding where nothing pulls an edge is 0."""
+    return "0" if value is not None and abs(value) < NOT_PULLED else number(value)
+
+
+def probability(value: float | None) -> str:
+    """In three digits, and never 1: nothing is that sure."""
+    return "–" if value is None or not math.isfinite(value) else number(min(value, 0.999))
 
 
 def size(num_bytes: int) -> str:
@@ -88,6 +100,14 @@ def some(names: Sequence[str]) -> str:
 def cut(name: str, most: int = 22) -> str:
     """A name that fits a drawing."""
     return name if len(name) <= most else f"{name[: most - 1]}…"
+
+
+def cut_pair(pair: tuple[str, str], most: int = 22) -> str:
+    """Two names that fit a drawing together; what tells names apart is mostly their end."""
+    if sum(map(len, pair)) + 1 <= most:
+        return ":".join(pair)
+    half = (most - 1) // 2
+    return ":".join(name if len(name) <= half else f"…{name[1 - half :]}" for name in pair)
 
 
 def metre(one: Metre) -> str:
@@ -156,8 +176,8 @@ def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
     if tentative:
         rest = "rests" if len(tentative) == 1 else "rest"
         sentences.append(
-            f"Doubtful: {some(tentative)} {rest} on registrations that no loop confirms; look at the pictures below "
-            "and confirm or reject."
+            f"Doubtful: {some(tentative)} {rest} on registrations that no loop confirms: have a look at them, and "
+            "confirm or reject."
         )
     undecided = [edge.row.pair for edge in report.edges if edge.use == "undecided"]
     if undecided:
@@ -200,6 +220,9 @@ def strained(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
     found = [edge for edge in edges if edge.use == "used" and edge.chi2 is not None and edge.chi2 > CHI2_999]
     return sorted(found, key=lambda edge: -(edge.chi2 or 0.0))
 
+
+NOT_PULLED = 1e-6
+"""Chi-square below which an edge lies as it likes: no loop checks it."""
 
 CHI2_95, CHI2_999 = 14.067, 24.322
 """Quantiles of the chi-square distribution with 7 degrees of freedom: 95 % and 99.9 %."""

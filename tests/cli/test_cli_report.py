@@ -14,7 +14,7 @@ from cli_rooms import save_changes
 import gsmap.map
 from gsmap.map.reporting import owner_of
 from gsmap.register import recipe_key
-from gsmap.report.words import length, number
+from gsmap.report.words import chi_square, length, number
 from gsmap.types import Registration
 
 Run = Callable[..., Any]
@@ -74,7 +74,7 @@ def test_every_scene_and_edge_is_on_the_page_with_its_numbers(site: Path, cli: R
         for edge in m.edge_rows():
             cells = page.row(edge.pair)
             told = m.show_pair(edge.pair)
-            assert cells[2] == number(told.residual_chi2)
+            assert cells[2] == chi_square(told.residual_chi2)
             assert cells[5:7] == [f"{edge.num_inliers:,}", number(edge.overlap, 2)]
             assert cells[8] == edge.reason
         metre = next(iter(m.metres().values()))

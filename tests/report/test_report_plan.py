@@ -134,3 +134,11 @@ def test_what_has_no_extent_is_still_drawn():
     assert "<svg" in draw_plan(plan, "p")[0].html
     assert make_plan([], [], None) is None
     assert make_plan([shown(np.full((8, 3), np.nan), middle=np.zeros(3))], [], None) is None
+
+
+def test_ellipses_turn_with_the_plan():
+    points = room(np.random.default_rng(8))
+    turn = exp_so3([0.0, 0.0, 0.6])
+    along = turn @ np.diag([4.0, 1.0, 1.0]) @ turn.T * 1e-4  # longest along the room
+    plan = make_plan([shown(points @ turn.T, covariance_m2=along)], [], None)
+    np.testing.assert_allclose(plan.covariances[0], np.diag([4e-4, 1e-4]), atol=3e-5)
