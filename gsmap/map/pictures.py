@@ -119,7 +119,8 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
         ConfigError, InputError: see `Pictures.load`.
     """
     known, stored = Pictures.load(folder, store.id), store.registrations.get(a.id, b.id)
-    if stored is None or stored.registration.S_target_source is None:
+    picture = picture_of_pair(store, a.id, b.id)
+    if stored is None or picture is None:
         return None
     edge = stored.registration
     name = f"why-{edge.target[:8]}-{edge.source[:8]}.png"
@@ -127,7 +128,7 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
     _note(store, folder)
     known.scenes[name] = [edge.target, edge.source]
     known.save(folder)
-    write_whole(folder / name, partial(_save, picture_of_pair(store, a.id, b.id)))
+    write_whole(folder / name, partial(_save, picture))
     return str(folder / name)
 
 

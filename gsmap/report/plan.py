@@ -252,6 +252,6 @@ def rings(mask: np.ndarray) -> list[np.ndarray]:
 def _smooth(ring: np.ndarray) -> np.ndarray:
     """A line of cell sides without its steps: the mean over a few corners, every other one kept."""
     reach = min(_REACH, (len(ring) - 1) // 4)
-    mean = sum(np.roll(ring, k, axis=0) for k in range(-reach, reach + 1)) / (2 * reach + 1)
-    found: np.ndarray = mean[::2] if len(mean) > 8 else mean
+    mean: np.ndarray = np.mean([np.roll(ring, k, axis=0) for k in range(-reach, reach + 1)], axis=0)
+    found = mean[::2] if len(mean) > 8 else mean
     return found

@@ -43,8 +43,8 @@ class Axis:
         """Round values, at most about so many."""
         if self.log:
             low, high = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
-            step = max(1, -(-(high - low + 1) // most))
-            return [10.0**k for k in range(low, high + 1, step)]
+            every = max(1, -(-(high - low + 1) // most))
+            return [10.0**k for k in range(low, high + 1, every)]
         span = self.high - self.low
         if span <= 0:
             return [self.low]
@@ -88,7 +88,9 @@ class Frame:
         return self.height - _BOTTOM, _TOP
 
 
-def plot(frame: Frame, x: Axis, y: Axis | None, labels: tuple[str, str], title: str, *parts: Part) -> Markup:
+def plot(
+    frame: Frame, x: Axis, y: Axis | None, labels: tuple[str, str], title: str, *parts: Part | Iterable[Part]
+) -> Markup:
     """A framed drawing with grid, ticks and axis labels; ``title`` is read to those who cannot see it."""
     (left, right), (bottom, top) = frame.x_span, frame.y_span
     lines: list[Markup] = []
@@ -108,7 +110,7 @@ def plot(frame: Frame, x: Axis, y: Axis | None, labels: tuple[str, str], title: 
             tag("text", labels[1], x=f(14), y=f(middle), class_="name", text_anchor="middle",
                 transform=f"rotate(-90 14 {f(middle)})")
         )  # fmt: skip
-    return drawing(WIDTH, frame.height, title, lines, parts)
+    return drawing(WIDTH, frame.height, title, lines, *parts)
 
 
 def drawing(

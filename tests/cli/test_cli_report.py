@@ -12,8 +12,8 @@ import pytest
 from cli_rooms import save_changes
 
 import gsmap.map
-from gsmap.map.reporting import owner_of
 from gsmap.register import recipe_key
+from gsmap.report import owner_of
 from gsmap.report.words import chi_square, length, number
 from gsmap.types import Registration
 
