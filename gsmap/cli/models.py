@@ -8,14 +8,21 @@ import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
-app = typer.Typer(no_args_is_help=True, help="ONNX models for masks (`sam`) and image features (`clip`).")
+app = typer.Typer(
+    no_args_is_help=True, help="ONNX models for masks (`sam`), image features (`clip`) and words (`clip-text`)."
+)
 
 
 @app.command()
 def add(
     map: MapPath,
-    kind: Annotated[str, typer.Argument(help="`sam-encoder`, `sam-decoder` or `clip` (any image encoder).")],
-    path: Annotated[str, typer.Argument(metavar="FILE", help="The .onnx file.")],
+    kind: Annotated[
+        str,
+        typer.Argument(help="`sam-encoder`, `sam-decoder`, `clip` (any image encoder), `clip-text`, `clip-tokenizer`."),
+    ],
+    path: Annotated[
+        str, typer.Argument(metavar="FILE", help="The .onnx file; of `clip-tokenizer` the tokenizer.json.")
+    ],
     preset: Annotated[
         str,
         typer.Option("--preset", help="Pixel scaling: `clip`, `imagenet`, `unit`, or `mean=..,..,..;std=..,..,..`."),
@@ -32,7 +39,7 @@ def add(
     with opened(map) as m:
         m.add_model(kind, path, preset=preset, copy=not reference)
         row = next(row for row in m.model_rows() if row.kind == kind)
-    say(f"registered {kind}; run: gsmap update {map}")
+    say(f"registered {kind}" + ("" if kind in ("clip-text", "clip-tokenizer") else f"; run: gsmap update {map}"))
     if json:
         print_rows("models add", row, json)
 

@@ -61,6 +61,16 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: boo
     writer(path, change_axes(gaussians, GLTF, PLY))
 
 
+def holds_splats(path: str | os.PathLike[str]) -> bool:
+    """Whether the file says that it holds Gaussians; a mesh or a point cloud does not.
+
+    Raises:
+        InputError: not a GLB, or damaged.
+    """
+    used = _read_container(path)[0].get("extensionsUsed", [])
+    return isinstance(used, list) and EXTENSION in used
+
+
 def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -> Gaussians:
     """The splats of a GLB in glTF's own world, y up, or in the frame that ``matrix`` (4, 4) takes that world to."""
     gltf, binary = _read_container(path)

@@ -11,6 +11,7 @@ from gsmap.methods import RecipeKey
 from gsmap.retrieve import Voters
 from gsmap.store import Store
 from gsmap.store.indexes import Lookup, StoredSegment
+from gsmap.types import SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.retrieval import Candidate, Member
 
@@ -49,6 +50,33 @@ def ask(
         except NotFoundError:  # another process made segments one while they were read
             if not left:
                 raise
+
+
+def ask_once(
+    store: Store, graphs: Mapping[str, RecipeKey], graph: SceneGraph, params: retrieve.Params
+) -> list[Candidate]:
+    """What the index says of a graph that is none of the map's; nothing is kept, the index stays as it is.
+
+    Args:
+        graphs: the key of the graph of every scene that counts; those that the index lacks are read.
+        graph: made by the recipe of these.
+    """
+    for left in reversed(range(_PATIENCE)):
+        try:
+            segments: list[retrieve.Segment] = list(_segments(store, graphs, params))
+            present = {member.scene for segment in segments for member in segment.members if member is not None}
+            missing = sorted(set(graphs) - present)
+            for start in range(0, len(missing), _AT_ONCE):
+                new = [_voters(store, graphs[scene], params) for scene in missing[start : start + _AT_ONCE]]
+                segments.append(retrieve.new_segment(new))
+            asking = retrieve.voters_of(graph, "", params.nodes_per_scene)
+            return retrieve.look_up([asking], segments, params)[0]
+        except NotFoundError:  # another process made segments one while they were read
+            if not left:
+                raise
+        except CorruptError as error:
+            raise CorruptError(f"{error}: gsmap register {store.home} makes the index anew") from error
+    raise AssertionError("unreachable")
 
 
 def keys_of_lookups(graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> dict[str, str]:
