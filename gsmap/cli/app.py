@@ -39,6 +39,7 @@ VERBS = (
     "list",
     "show",
     "why",
+    "report",
     "diff",
     "poses",
     "georeference",

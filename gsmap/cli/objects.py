@@ -86,6 +86,7 @@ OBJECTS: dict[str, Object] = {
     "backup --list": Many("snapshots", rows.SnapshotRow),
     "restore": One(rows.RestoreReport),
     "clone": One(rows.CloneReport),
+    "report": One(rows.WrittenReport),
     "trust": One(rows.TrustReport),
     "view": One(rows.ViewReport),
     "demo": One(rows.DemoReport),

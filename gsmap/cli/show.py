@@ -28,7 +28,12 @@ def command(
     ],
     nodes: Annotated[bool, typer.Option("--nodes", help="Also list the nodes of the scene's graph.")] = False,
     picture: Annotated[
-        str | None, typer.Option("--picture", help="Also draw the scene's graph over a render, to this .png file.")
+        str | None,
+        typer.Option(
+            "--picture",
+            metavar="FILE.png",
+            help="Also draw a scene's graph, both captures of a pair from the same cameras, or a change, to here.",
+        ),
     ] = None,
     json: AsJson = False,
 ) -> None:
@@ -41,7 +46,8 @@ def command(
     with opened(map) as m:
         report = _report(m, thing)
         if picture:
-            m.draw_graph(thing, picture)
+            draw = {SceneReport: m.draw_graph, PairReport: m.draw_pair, ChangeDetail: m.draw_change}
+            draw[type(report)](thing, picture)
             say(f"wrote {picture}")
     if json:
         kinds = {SceneReport: "show SCENE", PairReport: "show A:B", ChangeDetail: "show CHANGE"}

@@ -64,6 +64,7 @@ from gsmap.types.rows import (
     UpdateReport,
     WhyReport,
     WorldReport,
+    WrittenReport,
 )
 
 if TYPE_CHECKING:
@@ -820,21 +821,58 @@ class Map(AbstractContextManager["Map"]):
 
         return ViewServer(view_of(self.store, self._settings_to_look_by()), port=port)
 
+    def report(self, path: str | os.PathLike[str], *, since: str | None = None, pictures: bool = True) -> WrittenReport:
+        """``gsmap report MAP OUT.html``: one page that shows the map, what is doubtful and what to do; loads nothing.
+
+        Args:
+            path: a file that ends with ``.html``; a report that is there is replaced.
+            since: tell what is new since this date, too, ISO 8601.
+            pictures: draw doubtful pairs and changes.
+
+        Raises:
+            ConfigError: another file, or no date.
+            NotFoundError: no such folder.
+        """
+        from gsmap.map.reporting import write_report
+
+        return write_report(self.store, self._settings_to_look_by(), Path(path), since, pictures, self._progress)
+
+    def draw_pair(self, pair: str, path: str | os.PathLike[str]) -> None:
+        """``gsmap show MAP A:B --picture``: both captures from the same cameras, under the pose that was found.
+
+        Raises:
+            NotFoundError: no pose was found.
+        """
+        from gsmap.map.pictures import picture_of_pair, save_picture
+
+        a, b = self._pair(pair)
+        if (picture := picture_of_pair(self.store, a.id, b.id)) is None:
+            raise NotFoundError(f"{a.name}:{b.name} has no pose to draw both captures in: gsmap why MAP A:B says why")
+        save_picture(picture, path)
+
+    def draw_change(self, name: str, path: str | os.PathLike[str]) -> None:
+        """``gsmap show MAP c12 --picture``: a change before and after.
+
+        Raises:
+            NotFoundError: no such change, or it has no place now.
+        """
+        from gsmap.map.pictures import picture_of_change, save_picture
+
+        row = self.show_change(name)
+        if (picture := picture_of_change(self.store, self._settings_to_look_by(), row)) is None:
+            raise NotFoundError(f"{name} has no place now: its newer capture has none (gsmap update)")
+        save_picture(picture, path)
+
     def draw_graph(self, ref: str, path: str | os.PathLike[str]) -> None:
         """``gsmap show MAP SCENE --picture``: the scene's graph over a render, for a person to judge."""
-        from PIL import Image
-
+        from gsmap.map.pictures import save_picture
         from gsmap.view.graph_picture import draw_graph
 
         scene = self.store.scenes.get(ref)
         graph, _ = self._graph_of(scene)
         if graph is None:
             raise NotFoundError(f"scene {scene.name} has no graph: run gsmap describe MAP {scene.name!r} first")
-        picture = Image.fromarray(draw_graph(*self.read(scene.id), graph))
-        try:
-            picture.save(path)
-        except ValueError as error:  # a suffix that Pillow does not know
-            raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
+        save_picture(draw_graph(*self.read(scene.id), graph), path)
 
     def write_poses(self, out: str | os.PathLike[str], format: str, crs: str | None = None) -> list[Path]:
         """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); the files written."""

@@ -6,10 +6,11 @@ import json
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -102,7 +103,7 @@ def draw(
     known.save(folder)  # first: what an interrupted run leaves is known to a purge
     files: dict[str, str] = {}
     for pair in dict.fromkeys((row.older, row.newer) for row in rows):
-        drawer = _Drawer(store, *pair, settings)
+        drawer = Drawer(store, *pair, settings)
         for row in rows:
             if (row.older, row.newer) == pair:
                 progress("pictures", len(files) / len(rows), row.id)
@@ -119,18 +120,54 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
         ConfigError, InputError: see `Pictures.load`.
     """
     known, stored = Pictures.load(folder, store.id), store.registrations.get(a.id, b.id)
-    if stored is None or stored.registration.S_target_source is None:
+    picture = picture_of_pair(store, a.id, b.id)
+    if stored is None or picture is None:
         return None
-    edge, S = stored.registration, stored.registration.S_target_source
+    edge = stored.registration
     name = f"why-{edge.target[:8]}-{edge.source[:8]}.png"
     make_folder(folder)
     _note(store, folder)
     known.scenes[name] = [edge.target, edge.source]
     known.save(folder)
-    target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, S)
-    drawn = _side_by_side(target, source, store.graphs.load(edge.target))
-    write_whole(folder / name, partial(_save, drawn))
+    write_whole(folder / name, partial(_save, picture))
     return str(folder / name)
+
+
+def picture_of_pair(store: Store, a: str, b: str, side_px: int = 320) -> np.ndarray | None:
+    """Both captures of a pair (ids) from the same cameras, (H, W, 3) uint8; None where its edge has no pose.
+
+    Args:
+        side_px: longer side of each view.
+
+    Raises:
+        CorruptError, NotFoundError: see `gsmap.store.scenes.Scenes.gaussians`.
+    """
+    stored = store.registrations.get(a, b)
+    if stored is None or stored.registration.S_target_source is None:
+        return None
+    edge, S = stored.registration, stored.registration.S_target_source
+    assert S is not None
+    target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, S)
+    return _side_by_side(target, source, store.graphs.load(edge.target), side_px)
+
+
+def picture_of_change(store: Store, settings: Settings, row: ChangeRow, side_px: int = 320) -> np.ndarray | None:
+    """A change before and after, (H, W, 3) uint8; None where it has no place now. Errors as `picture_of_pair`."""
+    return None if row.box_m is None else Drawer(store, row.older, row.newer, settings).picture(row, side_px)
+
+
+def save_picture(picture: np.ndarray, path: str | os.PathLike[str]) -> None:
+    """Write a picture (H, W, 3) uint8 to a file of the kind that its name says.
+
+    Raises:
+        ConfigError: a suffix that no picture has.
+    """
+    from PIL import Image
+
+    try:
+        Image.fromarray(picture).save(path)
+    except ValueError as error:  # a suffix that Pillow does not know
+        raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 
 
 def draw_places(
@@ -172,7 +209,7 @@ def draw_places(
     return [str(folder / name) for name in names]
 
 
-def _side_by_side(target: PlacedScene, source: PlacedScene, graph: SceneGraph | None) -> np.ndarray:
+def _side_by_side(target: PlacedScene, source: PlacedScene, graph: SceneGraph | None, side_px: int) -> np.ndarray:
     """The picture of two captures in one frame, from those of their cameras that see most of the other."""
     from gsmap.view.pair_picture import draw_pair
 
@@ -181,7 +218,7 @@ def _side_by_side(target: PlacedScene, source: PlacedScene, graph: SceneGraph | 
         if one.cameras is not None and len(one.cameras):
             rows = ViewCache(one.gaussians, one.cameras, _OWN).select_views(other.gaussians.means, _LOOKS)
             chosen += [one.cameras[[row]] for row in rows]
-    return draw_pair(target, source, chosen, unit_m=1.0 if graph is None else graph.unit_m)
+    return draw_pair(target, source, chosen, unit_m=1.0 if graph is None else graph.unit_m, side_px=side_px)
 
 
 def _save(drawn: np.ndarray, path: Path) -> None:
@@ -190,7 +227,7 @@ def _save(drawn: np.ndarray, path: Path) -> None:
     Image.fromarray(drawn).save(path, format="PNG")
 
 
-class _Drawer:
+class Drawer:
     """Two captures, read once for all their changes."""
 
     def __init__(self, store: Store, older: str, newer: str, settings: Settings) -> None:
@@ -202,14 +239,16 @@ class _Drawer:
         self._newer = _placed(store, newer, in_metres(graph.poses[newer].S_map_scene, metres))
 
     def draw(self, row: ChangeRow, path: Path) -> None:
-        from PIL import Image
+        """Draw a change that has a place to a file, as PNG."""
+        _save(self.picture(row), path)
 
+    def picture(self, row: ChangeRow, side_px: int = 320) -> np.ndarray:
+        """A change that has a place, before and after, (H, W, 3) uint8."""
         from gsmap.view.change_picture import draw_change
 
         change = change_arrays(self._store, named(row.id))
         box, voxels = change.box * self._metres, change.voxels * self._metres
-        drawn = draw_change(self._older, self._newer, box, voxels)
-        Image.fromarray(drawn).save(path, format="PNG")
+        return draw_change(self._older, self._newer, box, voxels, side_px)
 
 
 def _placed(store: Store, scene: str, S: Sim3) -> PlacedScene:
@@ -219,13 +258,18 @@ def _placed(store: Store, scene: str, S: Sim3) -> PlacedScene:
 
 def _note(store: Store, folder: Path) -> None:
     """Have the map know of the folder, as it does of exports."""
-    if str(folder.resolve()) in {one.target for one in store.exports.list()}:
-        return
-    refused = "" if store.catalog.writable else f"{store.location} is read-only"
-    if not refused:
-        try:
-            store.exports.begin(folder, revision=None, settings={"pictures": True})
-        except (DiskFullError, ReadOnlyError) as error:
-            refused = str(error)
-    if refused:
+    if (refused := note_target(store, folder, {"pictures": True})) is not None:
         _log.warning("%s: the map does not know of these pictures, so a purge will not find them", refused)
+
+
+def note_target(store: Store, path: Path, settings: Mapping[str, Any]) -> str | None:
+    """Have the map know of a folder or file that shows its scenes, so that a purge finds it; why it could not be."""
+    if str(path.resolve()) in {one.target for one in store.exports.list()}:
+        return None
+    if not store.catalog.writable:
+        return f"{store.location} is read-only"
+    try:
+        store.exports.begin(path, revision=None, settings=settings)
+    except (DiskFullError, ReadOnlyError) as error:
+        return str(error)
+    return None

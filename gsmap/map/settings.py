@@ -8,7 +8,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin, world
+from gsmap import (
+    change,
+    describe,
+    engine,
+    export,
+    localize,
+    merge,
+    objects,
+    optimize,
+    register,
+    report,
+    retrieve,
+    thin,
+    world,
+)
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.localize import scan
@@ -70,6 +84,7 @@ class Settings:
         scan: how a scan is looked for.
         by_shape: how a scan without colours is compared with a scene.
         evaluate: when an edge counts as wrong.
+        report: how much a report shows.
         engine: where jobs run.
     """
 
@@ -88,6 +103,7 @@ class Settings:
     scan: scan.Params = field(default_factory=scan.Params)
     by_shape: by_shape.Params = field(default_factory=by_shape.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
+    report: report.Params = field(default_factory=report.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 
 

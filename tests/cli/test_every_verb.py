@@ -67,6 +67,7 @@ RUNS = {
     "show A:B": "show MAP left:right",
     "show CHANGE": "show MAP c1",
     "why A:B": "why MAP left:right --pictures TMP/why",
+    "report": "report MAP TMP/report.html --since 2024-05-31",
     "diff": "diff MAP 1 2",
     "poses": "poses MAP",
     "georeference": "georeference MAP --scale-bar left:0,0,0 left:1,0,0 1.02",
@@ -96,7 +97,7 @@ RUNS = {
     "demo": "demo TMP/demo",
 }
 SILENT = {
-    *("init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view"),
+    *("init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view", "report"),
     *("backup", "restore", "clone"),
 }
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""

@@ -43,6 +43,7 @@ LAYERS = [
         "export",
         "evaluate",
         "view",
+        "report",
         "engine",
     },
     {"map"},

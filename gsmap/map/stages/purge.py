@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gsmap.durable import (
     files_below,
+    is_file,
     is_folder,
     refuse_links,
     remove_empty_folder,
@@ -25,6 +26,7 @@ from gsmap.export.tileset import LEVELS_FOLDER, is_stale
 from gsmap.export.write import leftovers
 from gsmap.map.pictures import FILE_NAME as PICTURES
 from gsmap.map.pictures import Pictures
+from gsmap.report import owner_of
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
 
@@ -90,11 +92,14 @@ def _finish(store: Store, begun: Purge) -> Purge:
             if os.path.lexists(out / FILE_NAME):
                 with folder_lock(out):
                     begun = _clean(store, out, begun)
+            elif is_file(out) and owner_of(out) == store.id:
+                remove_file(out.parent, out.name)  # it shows all scenes; gsmap report makes it anew
+                begun = purging.note(store, begun, str(out), 1)
             elif os.path.lexists(out / PICTURES):
                 if gone := Pictures.load(out, store.id).forget(out, begun.scene):
                     begun = purging.note(store, begun, str(out), gone)
             else:
-                unreachable.append(f"{out}: it is not there, or holds no {FILE_NAME} and no {PICTURES}")
+                unreachable.append(f"{out}: it is not there, or no report, and holds no {FILE_NAME} and no {PICTURES}")
         except (OSError, GsmapError) as error:
             if (passing := _passing(error)) is not None:
                 raise passing(f"{target} is not clean of it yet ({error}): run the same command again") from error

@@ -33,6 +33,7 @@ from gsmap.types.rows.maps import (
 )
 from gsmap.types.rows.objects import HistoryReport, ObjectRow, ObjectsReport, RelationRow, SightingRow
 from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairRef, PairReport, WhyReport, WhyStep
+from gsmap.types.rows.reports import WrittenReport
 from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
 from gsmap.types.rows.scenes import (
     FactRow,
@@ -135,5 +136,6 @@ __all__ = [
     "ViewReport",
     "WhyReport",
     "WhyStep",
+    "WrittenReport",
     "WorldReport",
 ]

@@ -1,0 +1,33 @@
+"""gsmap report: the map on one page."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+
+
+def command(
+    map: MapPath,
+    out: Annotated[str, typer.Argument(metavar="OUT.html", help="The page; a report that is there is replaced.")],
+    since: Annotated[
+        str | None, typer.Option("--since", metavar="DATE", help="Also tell what is new since then, ISO 8601.")
+    ] = None,
+    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw doubtful pairs and changes.")] = True,
+    json: AsJson = False,
+) -> None:
+    """Write one page that shows the map, what is doubtful and what to do; it holds all it shows and loads nothing.
+
+    Example: `gsmap report site.gsmap monday.html --since 2026-11-01`
+    """
+    with opened(map, bars=True) as m:
+        written = m.report(out, since=since, pictures=pictures)
+    if json:
+        print_rows("report", written, json)
+        return
+    for note in written.notes:
+        say(note)
+    say(written.verdict)
+    say(f"wrote {written.path} ({written.num_bytes / 1e6:.2g} MB)")

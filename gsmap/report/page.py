@@ -1,0 +1,707 @@
+"""The page: sections put together from a report, one HTML file that loads nothing."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.report import plots
+from gsmap.report.content import EdgeEntry, Island, Moved, Report
+from gsmap.report.draw_plan import draw_plan
+from gsmap.report.markup import Markup, Part, joined, tag
+from gsmap.report.top import picture_webp
+from gsmap.report.words import (
+    CHI2_999,
+    angle,
+    chi_square,
+    count,
+    cut,
+    day,
+    duration,
+    length,
+    metre,
+    moment,
+    number,
+    probability,
+    size,
+    strained,
+    verdict,
+)
+
+_MARK = re.compile(rb'<meta name="gsmap-map" content="([0-9a-f]{32,64})">')
+_HEAD_BYTES = 4096  # of a report, within which it says whose it is
+_FEW = 12  # rows of a table that are open; the others fold away
+_STANDING = {
+    "good": "In order",
+    "look": "Wants a look",
+    "act": "Wants work",
+    "empty": "Empty",
+}
+_ORDER = ("undecided", "tentative", "unused", "used", "rejected", "no_match", "never registered")
+
+
+def page(report: Report) -> str:
+    """A report as HTML.
+
+    The same report gives the same bytes. The page's policy forbids scripts and every request; its one style sheet is
+    named by its digest, pictures are part of it.
+    """
+    style = resources.files("gsmap.report").joinpath("style.css").read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    policy = f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:; base-uri 'none'; form-action 'none'"
+    sections = [(name, title, content) for name, (title, make) in SECTIONS.items() if (content := make(report))]
+    head = tag(
+        "head",
+        tag("meta", charset="utf-8"),
+        tag("meta", http_equiv="Content-Security-Policy", content=policy),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", name="color-scheme", content="light dark"),
+        tag("meta", name="referrer", content="no-referrer"),
+        tag("meta", name="generator", content=f"gsmap {report.version}"),
+        tag("meta", name="gsmap-map", content=report.map_id),
+        tag("title", f"{report.title}: map report"),
+        Markup(f"<style>{style}</style>"),  # our own, as the policy has its digest
+    )
+    links = [tag("a", title, href=f"#{name}") for name, title, _ in sections]
+    body = tag(
+        "body",
+        _head(report),
+        tag("nav", links, aria_label="Sections"),
+        tag("main", [tag("section", tag("h2", title), content, id=name) for name, title, content in sections]),
+        _foot(report),
+    )
+    return "<!doctype html>\n" + tag("html", head, body, lang="en").html + "\n"
+
+
+def owner_of(path: Path) -> str | None:
+    """The id of the map whose report a file is; None where it is none."""
+    try:
+        with path.open("rb") as file:
+            found = _MARK.search(file.read(_HEAD_BYTES))
+    except OSError:
+        return None
+    return None if found is None else found[1].decode()
+
+
+# --- the head --------------------------------------------------------------------------------------------------------
+
+
+def _head(report: Report) -> Markup:
+    standing, sentences = verdict(report)
+    rows = [entry.row for entry in report.scenes]
+    dates = sorted(row.captured_at for row in rows if row.captured_at)
+    undated = len(rows) - len(dates)
+    dated = [f"to {day(dates[-1])}"] if dates and day(dates[0]) != day(dates[-1]) else []
+    dated += [f"{undated:,} without a date"] if undated else []
+    islands = [island for island in report.islands if len(island.scenes) > 1]
+    alone = len(report.islands) - len(islands)
+    facts: list[tuple[str, Part, str]] = [
+        ("Scenes", f"{len(rows):,}", _statuses(report)),
+        ("Islands", f"{len(report.islands):,}", count(alone, "scene") + " alone" if alone else ""),
+        ("Gaussians", _short(sum(row.num_gaussians for row in rows)), ""),
+        ("On disk", size(sum(one.num_bytes for one in report.storage)), ""),
+        ("Captured", day(dates[0]) if dates else "–", ", ".join(dated)),
+        ("Revision", str(report.revision.number) if report.revision else "none",
+         moment(report.revision.created_at) if report.revision else "never solved"),
+    ]  # fmt: skip
+    if report.islands:
+        known = report.islands[0].metre
+        told = known.text().replace(f", {known.known_by}", "") if known.is_known else "lengths have no known unit"
+        facts.append(("Metre", known.known_by, told))
+    return tag(
+        "header",
+        tag("p", "gsmap map report", class_="kicker"),
+        tag("h1", report.title),
+        tag("p", f"Made {moment(report.made_at)} UTC by gsmap {report.version}", class_="quiet"),
+        tag(
+            "div",
+            tag("p", tag("span", _STANDING[standing], class_="badge"), class_="standing"),
+            tag("p", " ".join(sentences)),
+            class_=f"verdict {standing}",
+        ),
+        tag(
+            "dl",
+            [
+                tag("div", tag("dt", name), tag("dd", value, tag("small", more) if more else None))
+                for name, value, more in facts
+            ],
+            class_="facts",
+        ),
+    )
+
+
+def _statuses(report: Report) -> str:
+    found: dict[str, int] = {}
+    for entry in report.scenes:
+        found[entry.row.status] = found.get(entry.row.status, 0) + 1
+    return ", ".join(f"{num:,} {status}" for status, num in found.items())
+
+
+def _short(value: int) -> str:
+    for power, unit in ((9, "billion"), (6, "million")):
+        if value >= 10**power:
+            return f"{value / 10**power:.3g} {unit}"
+    return f"{value:,}"
+
+
+def _todo(report: Report) -> Markup | None:
+    status = report.status
+    if not status.todo and not status.at_work:
+        return None
+    rows = [(row.count, row.meaning, tag("code", row.verb)) for row in status.todo]
+    parts: list[Part] = [_table(("count", "what", "the command that helps"), rows, (0,), (1, 2)) if rows else None]
+    if status.at_work:
+        working = [(row.what, row.task, row.host, moment(row.since)) for row in status.at_work[:_FEW]]
+        parts += [tag("h3", "At work now"), _table(("what", "by", "on", "since"), working)]
+    return joined(parts)
+
+
+# --- plans -----------------------------------------------------------------------------------------------------------
+
+
+def _plans(report: Report) -> Markup | None:
+    if not report.islands:
+        return None
+    drawn = [island for island in report.islands if island.plan is not None]
+    others = [island for island in report.islands if island.plan is None]
+    parts: list[Part] = [_plan(island, len(report.islands) > 1) for island in drawn]
+    if others:
+        rows = [(f"{i.component}", f"{len(i.scenes):,}", cut(", ".join(i.scenes), 80), i.note) for i in others]
+        parts += [tag("h3", "Islands without a plan"), _folded(("island", "scenes", "which", ""), rows, (0, 1), (2, 3))]
+    return joined(parts)
+
+
+def _plan(island: Island, many: bool) -> Markup:
+    assert island.plan is not None
+    title = f"Floor plan of island {island.component}" if many else "Floor plan"
+    drawing, magnified = draw_plan(island.plan, title)
+    span = island.plan.bounds[1] - island.plan.bounds[0]
+    tracks = any(len(track) for track in island.plan.tracks)
+    words = [f"{count(len(island.scenes), 'scene')}, {length(span[0])} by {length(span[1])}; {metre(island.metre)}."]
+    if magnified:
+        times = "to scale" if magnified == 1 else f"drawn {magnified:,} times larger"
+        words.append(f"Ellipses hold a scene's position with 95 %, {times}.")
+    if tracks:
+        words.append("Small dots are cameras.")
+    if island.note:
+        words.append(island.note)
+    used = {edge.use for edge in island.plan.edges}
+    legend = [tag("span", tag("i", class_=f"swatch {use}"), name) for use, name in _LEGEND.items() if use in used]
+    return tag(
+        "figure",
+        tag("h3", f"Island {island.component}") if many else None,
+        tag("div", drawing, class_="wide"),
+        tag("p", legend, class_="legend") if legend else None,
+        tag("figcaption", " ".join(words)),
+    )
+
+
+_LEGEND = {
+    "used": "edge, used",
+    "strained": "used, but strained",
+    "tentative": "tentative: no loop confirms it",
+    "undecided": "undecided: contradicted by another",
+    "unused": "found, but not used",
+    "rejected": "rejected",
+    "no_match": "tried, no match",
+}
+
+
+# --- doubt -----------------------------------------------------------------------------------------------------------
+
+
+def _doubt(report: Report) -> Markup | None:
+    doubtful = [edge for edge in report.edges if edge.use in ("undecided", "tentative")]
+    strain = strained(report.edges)
+    if not doubtful and not strain:
+        return None
+    parts: list[Part] = []
+    if doubtful:
+        parts.append(
+            tag("p", "A tentative edge is one that no loop of other edges confirms: it may well be right, and nothing "
+                "but a look at it tells. An undecided one contradicts others, and the map cannot say which of them is "
+                "right. Each row shows one camera: the first scene, the second one, and in red where they differ. If "
+                "walls and furniture coincide, confirm; if not, reject.")
+        )  # fmt: skip
+    if strain:
+        parts.append(
+            tag("p", f"{count(len(strain), 'edge')} pulled beyond 99.9 % of what its error lets expect: ",
+                ", ".join(f"{e.row.pair} (chi² {chi_square(e.chi2)})" for e in strain[:_FEW]), ".")
+        )  # fmt: skip
+    entries = {edge.row.pair: edge for edge in doubtful}
+    for one in report.pair_pictures:
+        edge = entries.get(one.row.pair)
+        reason = one.row.reason or (edge.use if edge else "")
+        height, width = one.picture.shape[:2]
+        parts.append(
+            tag(
+                "figure",
+                tag("h3", one.row.target_name, tag("span", " : ", class_="quiet"), one.row.source_name),
+                tag("p", tag("span", one.row.target_name), tag("span", one.row.source_name),
+                    tag("span", "not the same in red"), class_="heads"),
+                tag("img", src=_data(one.picture), alt=f"{one.row.pair} from the same cameras", width=width,
+                    height=height, loading="lazy"),
+                tag("figcaption", f"{reason}. {count(one.row.num_inliers, 'inlier')}, overlap "
+                    f"{number(one.row.overlap, 2)}{_probably(edge)}."),
+                class_="pair",
+            )
+        )  # fmt: skip
+    rest = len(doubtful) - len(report.pair_pictures)
+    if rest > 0:
+        parts.append(tag("p", f"{count(rest, 'more such pair')} without a picture here: ",
+                         tag("code", "gsmap show MAP A:B --picture FILE"), " draws one.", class_="quiet"))  # fmt: skip
+    return joined(parts)
+
+
+def _probably(edge: EdgeEntry | None) -> str:
+    return (
+        "" if edge is None or edge.probability is None else f", right with probability {probability(edge.probability)}"
+    )
+
+
+def _data(picture: np.ndarray) -> str:
+    return "data:image/webp;base64," + base64.b64encode(picture_webp(picture)).decode()
+
+
+# --- edges -----------------------------------------------------------------------------------------------------------
+
+
+def _edges(report: Report) -> Markup | None:
+    if not report.edges:
+        return None
+    params = report.params
+    solved = [edge for edge in report.edges if edge.chi2 is not None and edge.use in ("used", "tentative", "undecided")]
+    checked = [edge for edge in solved if edge.use == "used"]
+    plots_: list[Part] = [_figure(_matrix(report), "Who was tried with whom, and what came of it.")]
+    if plots.pulled(solved):
+        plots_.append(
+            _figure(
+                plots.residual_bars(solved, params.bars),
+                f"{_largest(plots.pulled(solved), params.bars)}. Dashed: 95 % and 99.9 % of correct edges lie below. "
+                "An edge that no loop checks has no residual, whether right or wrong.",
+            )
+        )
+    if len(checked) > 1:
+        plots_.append(
+            _figure(
+                plots.residual_distribution(checked),
+                "Steps: this map. Curve: chi² with 7 degrees of freedom. Left of the curve, the edges are better than "
+                "they claim (or no loop checks them); right of it, worse.",
+            )
+        )
+    if any(edge.translation_m is not None for edge in plots.pulled(solved)):
+        plots_.append(
+            _figure(plots.offset_bars(solved, params.bars), "How far the poses leave what each edge measured, at the "
+                    "middle of the second scene.")
+        )  # fmt: skip
+    parts: list[Part] = [_redundancy(report), tag("div", plots_, class_="plots"), _statistics(checked)]
+    parts.append(_edge_table(report))
+    return joined(parts)
+
+
+def _largest(edges: Sequence[EdgeEntry], most: int) -> str:
+    return f"The {most} largest of {len(edges):,}" if len(edges) > most else "All edges that a loop checks"
+
+
+def _redundancy(report: Report) -> Markup | None:
+    """How much the edges check each other: what geodesists call the variance factor."""
+    used = [edge for edge in report.edges if edge.use == "used" and edge.chi2 is not None]
+    tied: dict[int, set[str]] = {}
+    for edge in used:
+        if edge.component is not None:
+            tied.setdefault(edge.component, set()).update((edge.row.target, edge.row.source))
+    spare = 7 * (len(used) - sum(len(scenes) - 1 for scenes in tied.values()))
+    if not used:
+        return None
+    total = sum(edge.chi2 or 0.0 for edge in used)
+    if spare <= 0:
+        return tag("p", f"{count(len(used), 'edge is', 'edges are')} used, and none more than it takes to place the "
+                   "scenes: nothing checks them.")  # fmt: skip
+    factor = total / spare
+    verdict_ = (
+        "about what the edges claim of themselves"
+        if 0.25 <= factor <= 2
+        else "better than the edges claim: sigmas are on the safe side"
+        if factor < 0.25
+        else "worse than the edges claim: sigmas are too small by about "
+        f"{number(factor**0.5, 2)} times, or an edge is wrong"
+    )
+    return tag(
+        "p",
+        f"{count(len(used), 'edge is', 'edges are')} used; {spare:,} of their measured values are spare and check the "
+        f"others. Variance factor {number(factor)} (1 is expected): {verdict_}.",
+    )
+
+
+def _statistics(edges: Sequence[EdgeEntry]) -> Markup | None:
+    rows = []
+    for name, unit, values in (
+        ("translation", "m", [e.translation_m for e in edges if e.translation_m is not None]),
+        ("rotation", "°", [e.rotation_deg for e in edges if e.rotation_deg is not None]),
+        ("chi²", "", [e.chi2 for e in edges if e.chi2 is not None]),
+    ):
+        if len(values) > 1:
+            v = np.array(values)
+            figures = (np.sqrt((v**2).mean()), v.mean(), np.median(v), v.std(), v.min(), v.max())
+            rows.append((f"{name}{', ' + unit if unit else ''}", *(number(float(one)) for one in figures)))
+    if not rows:
+        return None
+    head = ("residual of used edges", "rmse", "mean", "median", "std", "min", "max")
+    return _table(head, rows, numeric=tuple(range(1, 7)))
+
+
+def _matrix(report: Report) -> Markup:
+    known = [entry.row for entry in report.scenes]
+    order = sorted(range(len(known)), key=lambda i: (known[i].component is None, known[i].component or 0, i))
+    order = order[: report.params.cells]
+    place = {known[i].id: k for k, i in enumerate(order)}
+    cells = []
+    for edge in report.edges:
+        a, b = place.get(edge.row.target), place.get(edge.row.source)
+        if a is not None and b is not None:
+            kind = _strained_kind(edge)
+            cells.append((max(a, b), min(a, b), kind, f"{edge.row.pair}: {_LEGEND.get(kind, kind)}"))
+    return plots.matrix([known[i].name for i in order], cells, "Pairs of scenes that were tried")
+
+
+def _strained_kind(edge: EdgeEntry) -> str:
+    return "strained" if edge.use == "used" and (edge.chi2 or 0) > CHI2_999 else edge.use
+
+
+def _edge_table(report: Report) -> Markup:
+    rank = {use: k for k, use in enumerate(_ORDER)}
+    ordered = sorted(
+        report.edges,
+        key=lambda e: (rank.get(e.use, len(rank)), -(e.chi2 or 0.0), e.probability or 0.0, e.row.pair),
+    )
+    shown = ordered[: report.params.edges]
+    head = ("pair", "what came of it", "chi²", "off by", "turned by", "inliers", "overlap", "probability", "why")
+    tried = [edge for edge in shown if edge.use not in ("rejected", "no_match")]
+    refused = [edge for edge in shown if edge.use in ("rejected", "no_match")]
+    numeric = (2, 3, 4, 5, 6, 7)
+    parts: list[Part] = []
+    if tried:
+        parts += [tag("h3", "Edges, doubt first"), _folded(head, [_edge_row(e) for e in tried], numeric, (8,))]
+    if refused:
+        rows = [_edge_row(e) for e in refused]
+        summary = f"{count(len(refused), 'pair')} that did not match"
+        parts.append(tag("details", tag("summary", summary), _table(head, rows, numeric, (8,))))
+    if len(ordered) > len(shown):
+        parts.append(_more(len(ordered) - len(shown), "edges", "gsmap list MAP edges"))
+    return joined(parts)
+
+
+def _edge_row(edge: EdgeEntry) -> tuple[Part, ...]:
+    kind = _strained_kind(edge)
+    said = f", {edge.row.review}ed by a person" if edge.row.review else ""
+    return (
+        edge.row.pair,
+        tag("span", f"{kind.replace('_', ' ')}{said}", class_=f"tag {kind}"),
+        chi_square(edge.chi2),
+        length(edge.translation_m),
+        angle(edge.rotation_deg),
+        f"{edge.row.num_inliers:,}",
+        number(edge.row.overlap, 2),
+        probability(edge.probability),
+        edge.row.reason,
+    )
+
+
+# --- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def _scenes(report: Report) -> Markup | None:
+    if not report.scenes:
+        return None
+    rank = {"ingested": 0, "described": 0, "isolated": 1, "tentative": 2, "placed": 3}
+    ordered = sorted(report.scenes, key=lambda s: (rank.get(s.row.status, 0), -(s.position_sigma_m or 0.0)))
+    shown = ordered[: report.params.scenes]
+    edges: dict[str, int] = {}
+    for edge in report.edges:
+        if edge.use in ("used", "tentative", "undecided"):
+            for scene in (edge.row.target, edge.row.source):
+                edges[scene] = edges.get(scene, 0) + 1
+    rows = [
+        (
+            entry.row.name,
+            tag("span", entry.row.status, class_=f"tag {entry.row.status}"),
+            "–" if entry.row.component is None else str(entry.row.component),
+            tag("span", day(entry.row.captured_at), class_="tag"),
+            length(entry.position_sigma_m),
+            angle(entry.rotation_sigma_deg),
+            str(edges.get(entry.row.id, 0)),
+            f"{entry.row.num_gaussians:,}",
+            f"{entry.num_cameras:,}",
+            size(entry.num_bytes),
+            joined([tag("span", one, class_="chip") for one in entry.row.tags], entry.row.note),
+        )
+        for entry in shown
+    ]
+    head = ("scene", "status", "island", "captured", "sigma", "turn", "edges", "Gaussians", "cameras", "bytes", "notes")
+    parts: list[Part] = []
+    known = [entry for entry in report.scenes if entry.position_sigma_m]
+    if known:
+        most = report.params.bars
+        first = f"The {most} largest of {len(known):,}" if len(known) > most else "The largest first"
+        words = f"{first}. Of each scene's middle, along its worst axis, in the frame of its island."
+        drawn = [_figure(plots.sigma_bars(known, most), words)]
+        if len(known) > most:
+            drawn.append(_figure(plots.sigma_distribution(known), "Share of the scenes up to each standard deviation."))
+        parts.append(tag("div", drawn, class_="plots"))
+    parts.append(_folded(head, rows, (2, 4, 5, 6, 7, 8, 9), (10,)))
+    if len(ordered) > len(shown):
+        parts.append(_more(len(ordered) - len(shown), "scenes", "gsmap list MAP scenes"))
+    return joined(parts)
+
+
+# --- changes, history, cost ------------------------------------------------------------------------------------------
+
+
+def _changes(report: Report) -> Markup | None:
+    parts: list[Part] = []
+    if report.news is not None:
+        news, some_ = report.news, ""
+        if news.scenes:
+            some_ = f" ({', '.join(cut(name) for name in news.scenes[:_FEW])}{', …' * (len(news.scenes) > _FEW)})"
+        parts.append(
+            tag("p", f"Since {moment(news.since)}: {count(len(news.scenes), 'new scene')}{some_}, "
+                f"{count(news.num_tried, 'pair')} registered, {news.num_accepted:,} of them accepted.")
+        )  # fmt: skip
+    found = report.changes
+    if found is not None:
+        pictures = {one.change: one.picture for one in report.change_pictures}
+        since = "" if report.news is None else " since then"
+        if not found.pairs:
+            parts.append(tag("p", f"No captures were compared with earlier ones{since}.", class_="quiet"))
+        else:
+            parts.append(
+                tag("p", f"{count(len(found.pairs), 'pair')} of captures compared{since}: "
+                    f"{count(len(found.changes), 'change')}.")
+            )  # fmt: skip
+        cards = [
+            tag(
+                "figure",
+                tag("img", src=_data(pictures[row.id]), alt=f"{row.kind}, before and after", loading="lazy",
+                    width=pictures[row.id].shape[1], height=pictures[row.id].shape[0]),
+                tag("figcaption", tag("b", f"{row.id}: {row.kind}"), f", {row.older_name} to {row.newer_name}, "
+                    f"confidence {number(row.confidence, 2)}"),
+            )
+            for row in found.changes
+            if row.id in pictures
+        ]  # fmt: skip
+        if cards:
+            parts.append(tag("div", cards, class_="cards"))
+        rows = [
+            (row.id, row.kind, row.pair, day(row.newer_at), row.at_m, row.size_m, number(row.confidence, 2), row.status)
+            for row in found.changes[: report.params.changes]
+        ]
+        if rows:
+            head = ("id", "kind", "from:to", "seen", "at, m", "size, m", "confidence", "status")
+            parts.append(_folded(head, rows, (6,)))
+        if len(found.changes) > len(rows):
+            parts.append(_more(len(found.changes) - len(rows), "changes", "gsmap changes MAP"))
+        parts += [tag("p", note, class_="quiet") for note in found.notes]
+    return joined(parts) or None
+
+
+def _history(report: Report) -> Markup | None:
+    if not report.revisions:
+        return None
+    parts: list[Part] = []
+    if len(report.revisions) > 2:
+        caption = "Grey: scenes. Blue: edges used. Amber: edges that no loop confirms."
+        parts.append(tag("div", _figure(plots.growth(report.revisions), caption), class_="plots"))
+    moved = {one.after: one for one in report.moved}
+    rows = [
+        (
+            str(row.number),
+            moment(row.created_at),
+            row.solver,
+            f"{row.scenes:,}",
+            f"{row.components:,}",
+            f"{row.edges_used:,}",
+            f"{row.edges_tentative:,}",
+            f"{row.edges_refused:,}",
+            _moves(moved.get(row.number)),
+            row.note,
+        )
+        for row in reversed(report.revisions)
+    ]
+    head = (
+        "revision",
+        "made",
+        "solver",
+        "scenes",
+        "islands",
+        "used",
+        "tentative",
+        "refused",
+        "poses that moved",
+        "why",
+    )
+    parts.append(_folded(head, rows, (3, 4, 5, 6, 7), (9,)))
+    if report.num_revisions > len(report.revisions):
+        left = report.num_revisions - len(report.revisions)
+        parts.append(_more(left, "earlier revisions", "gsmap list MAP revisions"))
+    newest = report.moved_since or (report.moved[0] if report.moved else None)
+    if newest is not None:
+        parts.append(_moved_table(newest))
+    return joined(parts)
+
+
+def _moves(moved: Moved | None) -> str:
+    if moved is None:
+        return ""
+    went = [row.translation_m for row in moved.rows if row.change == "moved" and row.translation_m is not None]
+    new = sum(row.change == "added" for row in moved.rows)
+    gone = sum(row.change == "removed" for row in moved.rows)
+    told = [f"{len(went):,} moved by up to {length(max(went))}"] if went else ["none moved"]
+    told += [f"{new:,} new"] * (new > 0) + [f"{gone:,} gone"] * (gone > 0)
+    return f"{', '.join(told)} since {moved.before}"
+
+
+def _moved_table(moved: Moved) -> Markup:
+    changed = [row for row in moved.rows if row.change != "same"]
+    changed.sort(key=lambda row: -(row.translation_m or float("inf")))
+    title = tag("h3", f"What moved from revision {moved.before} to {moved.after}")
+    if not changed:
+        return joined(title, tag("p", "Every scene lies where it lay.", class_="quiet"))
+    rows = [
+        (row.scene_name, row.change, length(row.translation_m), angle(row.rotation_deg), row.status_after or "–")
+        for row in changed[:200]
+    ]
+    return joined(title, _folded(("scene", "what", "by", "turned", "now"), rows, (2, 3)))
+
+
+def _cost(report: Report) -> Markup | None:
+    if not report.storage:
+        return None
+    total = sum(one.num_bytes for one in report.storage)
+    kept = [(one.kind, float(one.num_bytes), f"{one.kind}: {size(one.num_bytes)}") for one in report.storage]
+    rows: list[tuple[Part, ...]] = [
+        (
+            joined(tag("i", class_=f"swatch s{i % 8}"), one.kind),
+            f"{one.count:,}",
+            size(one.num_bytes),
+            f"{100 * one.num_bytes / max(total, 1):.1f} %",
+        )
+        for i, one in enumerate(report.storage)
+    ]
+    parts: list[Part] = [
+        plots.stacked(kept, "Bytes by kind"),
+        _table(("kept", "how many", "bytes", "share"), rows, (1, 2, 3)),
+    ]
+    gaussians = sum(entry.row.num_gaussians for entry in report.scenes)
+    if gaussians:
+        own = sum(entry.num_bytes for entry in report.scenes)
+        parts.append(tag("p", f"{own / gaussians:.1f} bytes a Gaussian in the scenes' own arrays.", class_="quiet"))
+    if report.seconds:
+        spent = sum(report.seconds.values())
+        tried = sum(1 for edge in report.edges if edge.row.status != "never registered")
+        words = ", ".join(f"{name} {duration(value)}" for name, value in report.seconds.items() if value > 0)
+        parts.append(
+            tag("p", f"Registering the {count(tried, 'pair')} took {duration(spent)} of work: {words}. What describing "
+                "and solving took is not kept.")
+        )  # fmt: skip
+    return joined(parts)
+
+
+def _reading(report: Report) -> Markup:
+    return tag(
+        "dl",
+        [joined(tag("dt", word), tag("dd", meaning)) for word, meaning in _GLOSSARY],
+        class_="glossary",
+    )
+
+
+_GLOSSARY = (
+    ("scene", "One capture: the Gaussians of one visit, in a frame of its own."),
+    (
+        "island",
+        "Scenes that edges tie together; gsmap calls it a component. Two islands share no frame: how they lie to each "
+        "other is not known.",
+    ),
+    ("edge", "A registration of two scenes: how one lies in the other, with an error of its own."),
+    ("placed", "A loop of edges agrees about where the scene lies, or a prior or a person vouches for it."),
+    (
+        "tentative",
+        "The scene or edge hangs on registrations that nothing else confirms. It is drawn where it most likely is; do "
+        "not measure across it before somebody has looked.",
+    ),
+    (
+        "undecided",
+        "Two groups of edges contradict each other and nothing tells which is right: confirm one, reject the other, or "
+        "capture what lies between.",
+    ),
+    (
+        "chi²",
+        "How far the solution pulls an edge, in units of the edge's own error, squared and summed over its seven "
+        "degrees of freedom. About 7 is normal for an edge that many loops check; beyond 24 lies fewer than one in a "
+        "thousand.",
+    ),
+    (
+        "sigma",
+        "Standard deviation of a scene's position in the frame of its island, which one scene or its priors hold, as "
+        "far as the edges' errors tell. Errors that all captures share, such as a wrong metre, are not in it.",
+    ),
+)
+
+
+def _foot(report: Report) -> Markup:
+    return tag(
+        "footer",
+        [tag("p", note) for note in report.notes],
+        tag("p", f"Map {report.map_id[:12]}. This page loads nothing and runs nothing. Commands call the map "
+            f"{report.title}; places of files are left out."),
+    )  # fmt: skip
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------
+
+
+def _table(
+    head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = (), long: Sequence[int] = ()
+) -> Markup:
+    """A table that scrolls sideways where it is too wide; ``long`` columns hold sentences, which may break."""
+    kinds = {**dict.fromkeys(numeric, "num"), **dict.fromkeys(long, "long")}
+    titles = [tag("th", name, scope="col", class_=kinds.get(k)) for k, name in enumerate(head)]
+    lines = [tag("tr", [tag("td", cell, class_=kinds.get(k)) for k, cell in enumerate(row)]) for row in rows]
+    return tag("div", tag("table", tag("thead", tag("tr", titles)), tag("tbody", lines)), class_="wide")
+
+
+def _folded(
+    head: Sequence[str], rows: Sequence[Sequence[Part]], numeric: Sequence[int] = (), long: Sequence[int] = ()
+) -> Markup:
+    """A table whose later rows fold away where there are many."""
+    if len(rows) <= 2 * _FEW:
+        return _table(head, rows, numeric, long)
+    rest = tag("details", tag("summary", f"{len(rows) - _FEW:,} more"), _table(head, rows[_FEW:], numeric, long))
+    return joined(_table(head, rows[:_FEW], numeric, long), rest)
+
+
+def _more(left: int, what: str, verb: str) -> Markup:
+    return tag("p", f"{left:,} more {what} are not shown: ", tag("code", verb), class_="quiet")
+
+
+def _figure(drawing: Markup, caption: str) -> Markup:
+    return tag("figure", drawing, tag("figcaption", caption))
+
+
+SECTIONS: dict[str, tuple[str, Callable[[Report], Markup | None]]] = {
+    "todo": ("What to do", _todo),
+    "plan": ("Floor plan", _plans),
+    "doubt": ("Where doubt lies", _doubt),
+    "edges": ("Edges and residuals", _edges),
+    "scenes": ("Scenes", _scenes),
+    "changes": ("Changes", _changes),
+    "history": ("History", _history),
+    "cost": ("Storage and cost", _cost),
+    "reading": ("How to read this page", _reading),
+}
+"""The sections by their ids, in order; one without content is left out."""

@@ -1,0 +1,257 @@
+"""A floor plan: an island from straight above, in metres, walls along the page where there are walls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.geometry.rotations import skew
+from gsmap.types import ScenePose
+
+_KEPT = (0.02, 0.98)  # quantiles of what a scene shows that its footprint holds: what flies about is left out
+_YAWS_DEG = np.arange(0.0, 90.0, 1.0)
+_MARGIN = 0.05  # around everything, as a share of the longer side
+_LEAST_M = 1e-3
+_CELLS = 90  # of the longer side, that outlines follow
+_REACH = 3  # corners to either side that an outline is smoothed over
+_FEW = 50  # points below which an outline is their hull
+_LEAST_PART, _LEAST_HOLE = 0.1, 0.03  # of the largest part, of what is shown: smaller parts and holes are left out
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A scene on a plan, in the frame and unit of its component.
+
+    Args:
+        name: of the scene.
+        status: ``placed``, ``tentative`` or ``isolated``.
+        points: (K, 3) of what it shows: a sample of its Gaussians, its landmarks, or the corners of its box.
+        track: (T, 3) its cameras in the order of the capture; empty where it has none of its own.
+        middle: (3,) where its name stands and its edges end.
+        covariance_m2: (3, 3) of that point in square metres; None where it is not known.
+    """
+
+    name: str
+    status: str
+    points: np.ndarray
+    track: np.ndarray
+    middle: np.ndarray
+    covariance_m2: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class PlanEdge:
+    """An edge on a plan: places of its scenes, how it is used, and what is said of it where it is pointed at."""
+
+    a: int
+    b: int
+    use: str
+    tip: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """An island from above. Lengths in metres; x to the right, y up the page.
+
+    Args:
+        names, statuses: of its scenes.
+        footprints: of each the outlines, closed lines (K, 2), of where it shows anything; what lies in an even number
+            of them is outside.
+        tracks: of each its cameras (T, 2).
+        middles: (N, 2) where their names stand.
+        covariances: of each (2, 2), square metres; None where it is not known.
+        edges: between them.
+        bounds: (2, 2) lowest and highest corner of the drawing.
+        R_plan_map: (3, 3) takes directions of the map to the plan; its third row is up.
+        metres_per_unit: of the map's frame.
+        picture: WebP of the island from above that fills ``bounds``; None where there is none.
+        picture_kind: ``rendered`` (Gaussians) or ``landmarks`` (how densely they lie); empty where there is none.
+    """
+
+    names: tuple[str, ...]
+    statuses: tuple[str, ...]
+    footprints: tuple[tuple[np.ndarray, ...], ...]
+    tracks: tuple[np.ndarray, ...]
+    middles: np.ndarray
+    covariances: tuple[np.ndarray | None, ...]
+    edges: tuple[PlanEdge, ...]
+    bounds: np.ndarray
+    R_plan_map: np.ndarray
+    metres_per_unit: float = 1.0
+    picture: bytes | None = field(default=None, repr=False)
+    picture_kind: str = ""
+
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) points of the map in metres along the plan's axes: right, up the page, height."""
+        found: np.ndarray = np.asarray(points, np.float64).reshape(-1, 3) @ self.R_plan_map.T * self.metres_per_unit
+        return found
+
+
+def middle_covariance_m2(pose: ScenePose, middle: np.ndarray, metres_per_unit: float) -> np.ndarray | None:
+    """(3, 3) covariance in square metres, axes of the component, of a point that is fixed to a scene.
+
+    To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` of a tangent on the scene side
+    (`gsmap.types.ScenePose`), so that the point moves by ``s R [-skew(m) | I | m] xi``.
+
+    Args:
+        middle: (3,) the point, scene frame and unit.
+        metres_per_unit: of the component's frame.
+    """
+    if pose.covariance is None:
+        return None
+    S = pose.S_map_scene
+    moves = S.scale * S.rotation @ np.concatenate([-skew(middle), np.eye(3), middle[:, None]], axis=1)
+    found: np.ndarray = metres_per_unit**2 * moves @ pose.covariance @ moves.T
+    return found if np.isfinite(found).all() else None
+
+
+def make_plan(
+    shown: Sequence[Shown], edges: Sequence[PlanEdge], up: np.ndarray | None, metres_per_unit: float = 1.0
+) -> Plan | None:
+    """Lay scenes of one component out on a page; None where nothing of them has a place in space.
+
+    Args:
+        up: (3,) direction against gravity in the component's frame; its third axis where None.
+    """
+    level = _level(np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, np.float64))
+    every = [np.concatenate([one.points, one.track, one.middle[None]]) for one in shown]
+    flat = [_inner(points @ level.T) for points in every]
+    if not flat or not all(np.isfinite(points).all() for points in flat):
+        return None
+    R = _turned(level, np.concatenate([points[:, :2] for points in flat]))
+
+    def place(points: np.ndarray) -> np.ndarray:
+        found: np.ndarray = (points @ R.T)[:, :2] * metres_per_unit
+        return found
+
+    shapes = [_inner(place(one.points)) for one in shown]
+    cell = max(float(np.ptp(np.concatenate(shapes), axis=0).max()) / _CELLS, _LEAST_M)
+    footprints = tuple(_outlines(points, cell) for points in shapes)
+    tracks, middles = tuple(place(one.track) for one in shown), place(np.array([one.middle for one in shown]))
+    drawn = np.concatenate([*(ring for one in footprints for ring in one), *tracks, middles])
+    low, high = drawn.min(0), drawn.max(0)
+    margin = max(_MARGIN * float((high - low).max()), _LEAST_M)
+    covariances = [None if one.covariance_m2 is None else R @ one.covariance_m2 @ R.T for one in shown]
+    return Plan(
+        names=tuple(one.name for one in shown),
+        statuses=tuple(one.status for one in shown),
+        footprints=footprints,
+        tracks=tracks,
+        middles=middles,
+        covariances=tuple(None if one is None else one[:2, :2] for one in covariances),
+        edges=tuple(edges),
+        bounds=np.stack([low - margin, high + margin]),
+        R_plan_map=R,
+        metres_per_unit=metres_per_unit,
+    )
+
+
+def _level(up: np.ndarray) -> np.ndarray:
+    """A rotation whose third row is up."""
+    up = up / max(float(np.linalg.norm(up)), 1e-12)
+    x = np.cross([0, 1.0, 0] if abs(up[1]) < 0.9 else [1.0, 0, 0], up)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
+
+
+def _turned(level: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The rotation turned about up so that a box around the points is smallest, its longer side along x."""
+    if len(points) < 2:
+        return level
+    turns = [_turn(np.radians(angle)) for angle in _YAWS_DEG]
+    spans = np.array([np.ptp(points @ turn[:2, :2].T, axis=0) for turn in turns])
+    best = int(np.argmin(spans.prod(1)))
+    turn = turns[best]
+    if spans[best, 1] > spans[best, 0]:
+        turn = _turn(np.pi / 2) @ turn
+    found: np.ndarray = turn @ level
+    return found
+
+
+def _turn(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+
+
+def _inner(points: np.ndarray) -> np.ndarray:
+    """Points without the outermost of each axis, where there are enough."""
+    if len(points) < 50:
+        return points
+    low, high = np.quantile(points[:, :2], _KEPT, axis=0)
+    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)
+    return points[inside] if inside.sum() > 3 else points
+
+
+def _outlines(points: np.ndarray, cell: float) -> tuple[np.ndarray, ...]:
+    """Closed lines (K, 2) around where points lie, gaps of a few cells bridged, small islands and holes left out."""
+    from scipy import ndimage
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(points) < _FEW:
+        try:
+            return (points[ConvexHull(points).vertices],) if len(points) > 2 else ()
+        except QhullError:  # all on one line
+            return ()
+    low = points.min(0) - 4 * cell
+    at = ((points - low) / cell).astype(int)
+    mask = np.zeros(at.max(0) + 5, bool)
+    mask[at[:, 0], at[:, 1]] = True
+    mask = ndimage.binary_closing(mask, iterations=3)
+    mask = ndimage.binary_opening(mask, iterations=1)
+    parts, num = ndimage.label(mask)
+    areas = np.bincount(parts.ravel(), minlength=num + 1)
+    for part in range(1, num + 1):
+        if areas[part] < _LEAST_PART * areas[1:].max():
+            mask[parts == part] = False
+    mask = _without_holes(mask)
+    return tuple(_smooth(ring) * cell + low for ring in rings(mask))
+
+
+def _without_holes(mask: np.ndarray) -> np.ndarray:
+    from scipy import ndimage
+
+    holes, num = ndimage.label(~mask)
+    areas = np.bincount(holes.ravel(), minlength=num + 1)
+    small = [k for k in range(1, num + 1) if areas[k] < _LEAST_HOLE * mask.sum()]
+    found: np.ndarray = mask | np.isin(holes, small)
+    return found
+
+
+def rings(mask: np.ndarray) -> list[np.ndarray]:
+    """The boundary of the true cells of a grid, as closed lines of its corners, (K, 2), the true cells on the left."""
+    padded = np.pad(mask, 1)
+    steps: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for (dx, dy), (ax, ay), (bx, by) in (
+        ((-1, 0), (0, 1), (0, 0)),  # nothing to the left of a cell: down its left side
+        ((1, 0), (1, 0), (1, 1)),
+        ((0, -1), (0, 0), (1, 0)),
+        ((0, 1), (1, 1), (0, 1)),
+    ):
+        other = np.roll(padded, (-dx, -dy), axis=(0, 1))
+        for x, y in np.argwhere(padded & ~other) - 1:
+            steps.setdefault((int(x) + ax, int(y) + ay), []).append((int(x) + bx, int(y) + by))
+    found = []
+    while steps:
+        start = next(iter(steps))
+        ring, here = [start], start
+        while True:
+            ways = steps[here]
+            there = ways.pop()
+            if not ways:
+                del steps[here]
+            if there == start:
+                break
+            ring.append(there)
+            here = there
+        found.append(np.array(ring, np.float64))
+    return found
+
+
+def _smooth(ring: np.ndarray) -> np.ndarray:
+    """A line of cell sides without its steps: the mean over a few corners, every other one kept."""
+    reach = min(_REACH, (len(ring) - 1) // 4)
+    mean: np.ndarray = np.mean([np.roll(ring, k, axis=0) for k in range(-reach, reach + 1)], axis=0)
+    found = mean[::2] if len(mean) > 8 else mean
+    return found

@@ -1,0 +1,101 @@
+"""Pictures of an island from straight above, see-through where nothing is, to lie under a floor plan."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsmap.geometry.transforms import transform_gaussians
+from gsmap.report.plan import Plan
+from gsmap.types import Cameras, Gaussians, Sim3
+
+_FAR = 60.0  # times the plan's size that the camera stands above it: lines of sight are parallel but for a degree
+_ABOVE_EYES = 0.3  # of what lies between floor and cameras is shown above these; ceilings are not
+_FINER = 1.6  # rendered so much finer than shown
+_INK = 128
+
+
+def top_picture(parts: Sequence[Gaussians], plan: Plan, eyes: np.ndarray, longest_px: int) -> bytes:
+    """Gaussians from above without ceilings, as WebP that fills the plan's bounds.
+
+    Args:
+        parts: of every scene, in the frame and unit of the component.
+        eyes: (T, 3) cameras, same frame; what lies well above them is cut away. Nothing is cut where there are none.
+    """
+    from PIL import Image
+
+    from gsmap.render import render
+
+    S = Sim3(plan.R_plan_map, np.zeros(3), plan.metres_per_unit)
+    placed = Gaussians.concatenate([transform_gaussians(replace(part, sh=part.sh[:, :1]), S) for part in parts])
+    (low, high), means = plan.bounds, placed.means
+    with np.errstate(invalid="ignore"):
+        shown = np.isfinite(means).all(1) & (means[:, :2] > low).all(1) & (means[:, :2] < high).all(1)
+        shown &= placed.scales.max(1, initial=0) < 0.25 * float((high - low).max())  # fog
+        if len(eyes) and shown.any():
+            heights = plan.place(eyes)[:, 2]
+            floor = float(np.quantile(means[shown, 2], 0.02))
+            eye = float(np.median(heights))
+            shown &= means[:, 2] < eye + _ABOVE_EYES * max(eye - floor, 0.0)
+    if not shown.any():
+        return b""
+    placed = placed[shown]
+    image = render(placed, _camera(plan, placed.means[:, 2], longest_px), depth=False, dominant_id=False)
+    alpha = np.clip(np.nan_to_num(image.alpha[0]), 0, 1)
+    colour = np.nan_to_num(image.colour[0]) / np.maximum(alpha, 1e-3)[..., None]
+    rgba = np.concatenate([np.clip(colour, 0, 1), alpha[..., None]], axis=-1)
+    picture = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8), "RGBA")
+    return _webp(picture.resize(_size_px(plan, longest_px), Image.Resampling.LANCZOS))
+
+
+def density_picture(points: np.ndarray, plan: Plan, longest_px: int) -> bytes:
+    """Where points (K, 3) of the component lie, seen from above, darker where more do; WebP as of `top_picture`."""
+    from PIL import Image
+
+    width, height = _size_px(plan, longest_px // 3)
+    flat = plan.place(points)[:, :2]
+    edges = [np.linspace(plan.bounds[0, k], plan.bounds[1, k], size + 1) for k, size in enumerate((width, height))]
+    counts = np.histogram2d(flat[:, 0], flat[:, 1], bins=edges)[0].T[::-1]
+    if not counts.any():
+        return b""
+    shade = np.clip(np.log1p(counts) / np.log1p(np.quantile(counts[counts > 0], 0.98) + 1), 0, 1)
+    rgba = np.full((*counts.shape, 4), _INK, np.uint8)
+    rgba[..., 3] = (200 * shade + 0.5).astype(np.uint8)
+    return _webp(Image.fromarray(rgba, "RGBA"))
+
+
+def picture_webp(picture: np.ndarray) -> bytes:
+    """A picture (H, W, 3) uint8 as a page carries it."""
+    from PIL import Image
+
+    return _webp(Image.fromarray(picture))
+
+
+def _camera(plan: Plan, heights: np.ndarray, longest_px: int) -> Cameras:
+    """Far above the middle of the plan, looking down, the top of the picture up the page."""
+    size = np.array(_size_px(plan, round(_FINER * longest_px)))
+    (low, high), far = plan.bounds, _FAR * float((plan.bounds[1] - plan.bounds[0]).max())
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = [*((low + high) / 2), float(np.median(heights)) + far]
+    fx, fy = size / (high - low) * far
+    return Cameras(pose[None], np.array([[fx, fy, size[0] / 2, size[1] / 2]]), size[None])
+
+
+def _size_px(plan: Plan, longest_px: int) -> tuple[int, int]:
+    """Width and height of a picture that fills the plan."""
+    span = plan.bounds[1] - plan.bounds[0]
+    width, height = np.maximum(1, np.round(span / span.max() * longest_px)).astype(int)
+    return int(width), int(height)
+
+
+def _webp(picture: object) -> bytes:
+    from PIL import Image
+
+    assert isinstance(picture, Image.Image)
+    out = io.BytesIO()
+    picture.save(out, format="WEBP", quality=80, method=4)
+    return out.getvalue()

@@ -1,0 +1,228 @@
+"""Numbers, dates and the state of a map as people say them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from gsmap.report.content import EdgeEntry, Report
+from gsmap.types.metre import Metre
+
+_SHOWN = 3  # names in a sentence
+
+
+def count(number: int, one: str, many: str = "") -> str:
+    """``1 scene``, ``2,000 scenes``."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number in so many significant digits; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    return f"{value:.{digits}g}" if 1e-4 <= abs(value) < 10**digits else _large_or_small(value, digits)
+
+
+def _large_or_small(value: float, digits: int) -> str:
+    return f"{value:,.0f}" if 1 <= abs(value) < 1e9 else f"{value:.{digits - 1}e}"
+
+
+def length(metres: float | None) -> str:
+    """A length as surveyors write it: millimetres below a decimetre, metres, kilometres."""
+    if metres is None or not math.isfinite(metres):
+        return "–"
+    size_m = abs(metres)
+    if size_m == 0:
+        return "0"
+    if size_m < 5e-5:
+        return "< 0.1 mm"
+    if size_m < 0.1:
+        return f"{_two(metres * 1e3)} mm"
+    return f"{number(metres)} m" if size_m < 2e3 else f"{number(metres / 1e3)} km"
+
+
+def _two(value: float) -> str:
+    """Two digits, or whole numbers."""
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}".removesuffix(".0")
+
+
+def angle(degrees: float | None) -> str:
+    """An angle in degrees."""
+    if degrees is None or not math.isfinite(degrees):
+        return "–"
+    return f"{degrees:.2g}°" if degrees == 0 or abs(degrees) >= 1e-3 else "< 0.001°"
+
+
+def chi_square(value: float | None) -> str:
+    """A chi-square; what is left by rounding where nothing pulls an edge is 0."""
+    return "0" if value is not None and abs(value) < NOT_PULLED else number(value)
+
+
+def probability(value: float | None) -> str:
+    """In three digits, and never 1: nothing is that sure."""
+    return "–" if value is None or not math.isfinite(value) else number(min(value, 0.999))
+
+
+def size(num_bytes: int) -> str:
+    """``12.3 MB``; a megabyte is a million bytes."""
+    for power, unit in ((9, "GB"), (6, "MB"), (3, "kB")):
+        if num_bytes >= 10**power:
+            return f"{num_bytes / 10**power:.3g} {unit}"
+    return f"{num_bytes} bytes"
+
+
+def duration(seconds: float) -> str:
+    """``3.2 s``, ``4 min``, ``2.5 h``."""
+    if seconds < 90:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:.3g} min" if seconds < 5400 else f"{seconds / 3600:.3g} h"
+
+
+def day(when: str | None) -> str:
+    """The day of an ISO 8601 date; a dash where nobody knows."""
+    return when[:10] if when else "–"
+
+
+def moment(when: str | None) -> str:
+    """The minute of an ISO 8601 date."""
+    return when[:16].replace("T", " ") if when else "–"
+
+
+def some(names: Sequence[str]) -> str:
+    """``a, b, c and 4 more``."""
+    if len(names) > _SHOWN:
+        return f"{', '.join(names[:_SHOWN])} and {len(names) - _SHOWN} more"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
+
+
+def cut(name: str, most: int = 22) -> str:
+    """A name that fits a drawing."""
+    return name if len(name) <= most else f"{name[: most - 1]}…"
+
+
+def cut_pair(pair: tuple[str, str], most: int = 22) -> str:
+    """Two names that fit a drawing together; what tells names apart is mostly their end."""
+    if sum(map(len, pair)) + 1 <= most:
+        return ":".join(pair)
+    half = (most - 1) // 2
+    return ":".join(name if len(name) <= half else f"…{name[1 - half :]}" for name in pair)
+
+
+def metre(one: Metre) -> str:
+    """How lengths are known, in a sentence's half."""
+    how = {
+        "measured": "lengths are measured by captures that are in metres",
+        "told": "lengths follow metres that a person gave",
+        "assumed": "lengths assume that the captures' own unit is the metre, which nobody has said",
+        "guessed": "lengths are a guess, from how far cameras stand from what they see",
+        "unknown": "lengths have no known unit",
+    }[one.known_by]
+    if not one.is_known or not math.isfinite(one.sigma):
+        return how
+    return (
+        f"{how}, to {'a factor of ' + format(math.exp(one.sigma), '.2g') if one.sigma > 0.2 else _percent(one.sigma)}"
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
+
+
+def verdict(report: Report) -> tuple[str, tuple[str, ...]]:
+    """How a map stands (``good``, ``look``, ``act`` or ``empty``), and the sentences that say so.
+
+    ``act``: it is not solved as it is, or work failed. ``look``: something waits for a person's judgement.
+    """
+    scenes, status = [entry.row for entry in report.scenes], report.status
+    if not scenes:
+        return "empty", ("This map is empty: no capture has been ingested yet.",)
+    placed = [row.name for row in scenes if row.status == "placed"]
+    tentative = [row.name for row in scenes if row.status == "tentative"]
+    alone = [row.name for row in scenes if row.status == "isolated"]
+    if report.revision is None:
+        return "act", (
+            f"The map holds {count(len(scenes), 'scene')}, and none has a place yet: poses were never solved.",
+            *_next_step(report),
+        )
+    sentences = []
+    tied = len({row.component for row in scenes if row.status in ("placed", "tentative")})
+    if placed:
+        islands = " in one island" if tied == 1 else f" in {tied:,} islands, which share no frame" if tied else ""
+        all_of = "All" if len(placed) == len(scenes) and len(scenes) > 1 else f"{len(placed):,} of"
+        are = "is" if len(placed) == 1 else "are"
+        sentences.append(
+            f"{all_of} {count(len(scenes), 'scene')} {are} placed{islands}: agreeing loops of registrations, a prior "
+            "or a person confirm where they lie."
+        )
+    else:
+        sentences.append(f"The map holds {count(len(scenes), 'scene')}; none is placed beyond doubt.")
+    sigmas = sorted(
+        (entry.position_sigma_m, entry.row.name) for entry in report.scenes if entry.position_sigma_m is not None
+    )
+    sigmas = [one for one in sigmas if one[0] > 0]
+    if sigmas:
+        worst = sigmas[-1]
+        sentences.append(
+            f"Standard deviations of position have a median of {length(sigmas[len(sigmas) // 2][0])}; "
+            f"the largest is {length(worst[0])} ({worst[1]})."
+        )
+    if report.islands:
+        largest = report.islands[0]
+        name = "" if len(report.islands) == 1 else " In the largest island"
+        said = metre(largest.metre)
+        sentences.append(f"{name} {said}.".strip() if name else f"{said[0].upper()}{said[1:]}.")
+    if tentative:
+        rest = "rests" if len(tentative) == 1 else "rest"
+        sentences.append(
+            f"Doubtful: {some(tentative)} {rest} on registrations that no loop confirms: have a look at them, and "
+            "confirm or reject."
+        )
+    undecided = [edge.row.pair for edge in report.edges if edge.use == "undecided"]
+    if undecided:
+        sentences.append(f"Contradictory: nothing could decide {some(undecided)}; a person has to.")
+    if alone and len(scenes) > 1:
+        sentences.append(f"Alone: nothing ties {some(alone)} to the others.")
+    behind = [row.name for row in scenes if row.status in ("ingested", "described")]
+    if behind:
+        has = "has" if len(behind) == 1 else "have"
+        sentences.append(f"Not in the solution yet: {some(behind)} {has} no place.")
+    strain = strained(report.edges)
+    if strain:
+        sentences.append(
+            f"Strained: {count(len(strain), 'edge that is used is', 'edges that are used are')} pulled further than "
+            f"{'its' if len(strain) == 1 else 'their'} own error explains ({some([e.row.pair for e in strain])})."
+        )
+    sentences += _next_step(report)
+    whats = {row.what for row in status.todo}
+    if whats & _ACT or behind:
+        return "act", tuple(sentences)
+    return ("look" if whats & _LOOK or tentative or undecided else "good"), tuple(sentences)
+
+
+_ACT = {"undescribed", "unregistered", "unsolved", "set_aside", "contradicted_priors"}
+_LOOK = {"tentative", "undecided", "changes", "duplicates", "isolated", "stale_graphs", "stale_edges", "stale_poses"}
+_LOOK |= {"dirty_tiles"}
+
+
+def _next_step(report: Report) -> list[str]:
+    if not report.status.todo:
+        return ["Nothing waits to be done."]
+    first = report.status.todo[0]
+    rest = len(report.status.todo) - 1
+    more = f" {count(rest, 'more thing is', 'more things are')} listed below." if rest else ""
+    return [f"Next: {first.meaning} ({first.count:,}).{more}"]
+
+
+def strained(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
+    """Edges that are used and whose residual is one of the largest thousandth of what their error lets expect."""
+    found = [edge for edge in edges if edge.use == "used" and edge.chi2 is not None and edge.chi2 > CHI2_999]
+    return sorted(found, key=lambda edge: -(edge.chi2 or 0.0))
+
+
+NOT_PULLED = 1e-6
+"""Chi-square below which an edge lies as it likes: no loop checks it."""
+
+CHI2_95, CHI2_999 = 14.067, 24.322
+"""Quantiles of the chi-square distribution with 7 degrees of freedom: 95 % and 99.9 %."""
