@@ -64,6 +64,7 @@ HOMES = {
     "small_gicp": {"register"},
     "kiss_matcher": {"register"},
     "open3d": {"gsmap_synthetic"},
+    "av": {"localize"},
     "pycolmap": {"formats", "localize"},
     "torch": {"render"},
     "tomlkit": {"settings"},
