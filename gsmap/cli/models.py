@@ -8,13 +8,19 @@ import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
-app = typer.Typer(no_args_is_help=True, help="ONNX models for masks (`sam`) and image features (`clip`).")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="ONNX models for masks (`sam`), image features (`clip`), local features (`extractor`).",
+)
 
 
 @app.command()
 def add(
     map: MapPath,
-    kind: Annotated[str, typer.Argument(help="`sam-encoder`, `sam-decoder` or `clip` (any image encoder).")],
+    kind: Annotated[
+        str,
+        typer.Argument(help="`sam-encoder`, `sam-decoder`, `clip` (image encoder) or `extractor` (features)."),
+    ],
     path: Annotated[str, typer.Argument(metavar="FILE", help="The .onnx file.")],
     preset: Annotated[
         str,

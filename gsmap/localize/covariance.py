@@ -30,7 +30,7 @@ class Params:
     least_px: float = 0.15
     hidden_m: float = 0.002
     hidden_rad: float = 0.0005
-    swell: float = 1.8
+    swell: float = 1.5
 
 
 def pose_covariance(

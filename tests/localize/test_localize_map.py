@@ -31,7 +31,7 @@ def made(world, tmp_path_factory):
 
 
 def test_a_photo_in_a_file_is_placed(made, world) -> None:
-    folder, lens, report = made
+    folder, _, report = made
     (row,) = report.results
     assert row.status == "placed", row.reason
     assert row.scenes == ("room",)
