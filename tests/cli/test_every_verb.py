@@ -56,6 +56,7 @@ RUNS = {
     "changes": "changes MAP",
     "graph": "graph MAP",
     "history": "history MAP 0.5,0.5,0.5",
+    "localize": "localize MAP TMP/photo.png --focal auto",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",
     "list scenes": "list MAP scenes",
@@ -105,6 +106,9 @@ def gsmap_run(
 ) -> Callable[[str], Any]:
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (120, 160, 3)).astype(np.uint8)).save(
+        tmp_path / "photo.png"
+    )
     (tmp_path / "encoder.onnx").write_bytes(image_encoder())
     (tmp_path / "remote.gsmap" / "arrays").mkdir(parents=True)
     trust.write(tmp_path / "remote.gsmap", "postgresql+psycopg://me@example.org/site", "0" * 32)
