@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer.main
 from cli_rooms import save_changes
+from PIL import Image
 from tiny_encoder import image_encoder
 
 import gsmap
@@ -106,9 +107,8 @@ def gsmap_run(
 ) -> Callable[[str], Any]:
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (120, 160, 3)).astype(np.uint8)).save(
-        tmp_path / "photo.png"
-    )
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3)).astype(np.uint8)
+    Image.fromarray(noise).save(tmp_path / "photo.png")
     (tmp_path / "encoder.onnx").write_bytes(image_encoder())
     (tmp_path / "remote.gsmap" / "arrays").mkdir(parents=True)
     trust.write(tmp_path / "remote.gsmap", "postgresql+psycopg://me@example.org/site", "0" * 32)
