@@ -1,15 +1,14 @@
-"""How well photographs are localised: given captures crosswise, photographs of other places, and how much they may lack.
+"""How well photographs are localised: given captures crosswise, photographs of other places, and what they may lack.
 
     python tools/bench_localize.py DATA WORK                 # the house: every photograph in a map without its capture
     python tools/bench_localize.py DATA WORK --kitchen       # the same of the real kitchen, with its eight RGB-D frames
     python tools/bench_localize.py DATA WORK --only c0 c1    # photographs of these captures alone
-    python tools/bench_localize.py DATA WORK --perturb       # exposure, resolution, focal length, somebody in the picture
+    python tools/bench_localize.py DATA WORK --perturb       # exposure, resolution, focal length, people
     python tools/bench_localize.py DATA WORK --elsewhere     # photographs of other places: none may be placed
-    python tools/bench_localize.py DATA WORK --plain         # beside SIFT and PnP on photographs, and retrieval alone
 
-DATA is the folder of the given captures; maps are made in WORK once. The captures' poses in the map are gsmap's own, and
-the truth of a photograph is taken to the map through the scene that supports it most. A photograph's coverage is the
-share of its pixels whose surface another capture of the map shows where it is (5 cm and 2 % of the depth).
+DATA is the folder of the given captures; maps are made in WORK once. The captures' poses in the map are gsmap's own,
+and the truth of a photograph is taken to the map through the scene that supports it most. A photograph's coverage is
+the share of its pixels whose surface another capture of the map shows where it is (5 cm and 2 % of the depth).
 """
 
 # Thread counts must be set before numpy comes in.
@@ -120,16 +119,20 @@ def house_shots(data: Path, held: World, only: list[str]) -> Iterator[Shot]:
 
 def kitchen_shots(data: Path, held: World) -> Iterator[Shot]:
     """The eight frames of a sensor: in the whole map, which was trained on others of them."""
-    frames = data.parent / "kitchen"
+    scenes = set(held.ids.values())
+    for photo, pose, depth in kitchen_frames(data.parent / "kitchen"):
+        yield Shot(photo, pose, _coverage(held, photo, pose, depth, scenes), scenes)
+
+
+def kitchen_frames(frames: Path) -> Iterator[tuple[Photo, np.ndarray, np.ndarray]]:
+    """Each frame's photograph, camera-to-world pose and depth (a fifth of its size)."""
     fx, _, cx, _, fy, cy, *_ = np.loadtxt(frames / "camera-intrinsics.txt").ravel()
     for path in sorted(frames.glob("*.color.jpg")):
         pose = np.loadtxt(path.with_name(path.name.replace("color.jpg", "pose.txt")))
         image = np.asarray(Image.open(path).convert("RGB"))
-        photo = Photo(image, np.array([fx, fy, cx, cy]), 0.0, path.name)
         raw = np.asarray(Image.open(path.with_name(path.name.replace("color.jpg", "depth.png")))).astype(np.float32)
         depth = np.where(raw < 65535, raw / 1000, 0)[::5, ::5]
-        scenes = set(held.ids.values())
-        yield Shot(photo, pose, _coverage(held, photo, pose, depth, scenes), scenes)
+        yield Photo(image, np.array([fx, fy, cx, cy]), 0.0, path.name), pose, depth
 
 
 def _depth(held: World, scene: str, camera: Cameras) -> np.ndarray:
@@ -182,7 +185,7 @@ def nearer(photo: Photo) -> Photo:
 def hidden(photo: Photo) -> Photo:
     """Somebody upright in a tenth of the picture."""
     width, height = photo.size_px
-    rng = np.random.default_rng(abs(hash(photo.name)) % 2**32 if False else sum(photo.name.encode()))
+    rng = np.random.default_rng(sum(photo.name.encode()))
     tall, wide = 0.8 * height, 0.125 * width
     x = rng.uniform(wide / 2, width - wide / 2)
     v, u = np.mgrid[0:height, 0:width]
@@ -193,7 +196,7 @@ def hidden(photo: Photo) -> Photo:
 
 
 def unknown_focal(photo: Photo) -> Photo:
-    fx, fy, cx, cy = photo.intrinsics_px
+    cx, cy = photo.intrinsics_px[2:]
     likely = 0.8 * max(photo.size_px)
     return Photo(photo.rgb, np.array([likely, likely, cx, cy]), np.inf, photo.name)
 
@@ -283,7 +286,7 @@ def main() -> int:
             house = sorted((args.data / "house" / "frames").glob("*.jpg"))
             strangers = [Photo(np.asarray(Image.open(p)), np.array([280.0, 280, 240, 180]), 0.0, p.name) for p in house]
         else:
-            strangers = [s.photo for s in kitchen_photos(args.data)]
+            strangers = [photo for photo, *_ in kitchen_frames(args.data / "kitchen")]
         placed = [held.localize(photo, set(held.ids.values()))[0] for photo in strangers]
         print(f"photographs of another place: {sum(p.is_placed for p in placed)} of {len(placed)} placed")
         return 0

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from gsmap.describe.onnx.session import misfit, open_session, run
+from gsmap.networks.session import misfit, open_session, run
 from gsmap.types.model import ModelSpec
 from gsmap.types.views import Mask, SceneContext, View
 

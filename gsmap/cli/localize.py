@@ -22,7 +22,9 @@ from gsmap.cli.console import (
 
 def command(
     map: MapPath,
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Photographs.", show_default=False)],
+    files: Annotated[
+        list[str] | None, typer.Argument(metavar="FILE...", help="Photographs.", show_default=False)
+    ] = None,
     intrinsics: Annotated[
         str | None,
         typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="Of all photos, in pixels of the upright picture."),
@@ -39,6 +41,13 @@ def command(
         str | None,
         typer.Option("--near", metavar="SCENE|X,Y,Z,R", help="Look only at what this scene shows, or around a point."),
     ] = None,
+    together: Annotated[
+        bool,
+        typer.Option("--together", help="The photos show one place: whoever is placed helps the others."),
+    ] = False,
+    video: Annotated[
+        str | None, typer.Option("--video", metavar="FILE", help="A clip: its sharpest frames, together.")
+    ] = None,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
@@ -50,7 +59,9 @@ def command(
     Example: `gsmap localize site.gsmap phone.jpg`
     """
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
-        report = m.localize(*files, intrinsics=intrinsics, focal=focal, near=near)
+        report = m.localize(
+            *(files or ()), intrinsics=intrinsics, focal=focal, near=near, together=together, video=video
+        )
     for note in report.notes:
         say(note)
     if json:

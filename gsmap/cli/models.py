@@ -9,7 +9,8 @@ import typer
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 app = typer.Typer(
-    no_args_is_help=True, help="ONNX models for masks (`sam`), image features (`clip`) and words (`clip-text`)."
+    no_args_is_help=True,
+    help="ONNX models for masks (`sam`), image features (`clip`), words (`clip-text`), local features (`extractor`).",
 )
 
 
@@ -18,7 +19,9 @@ def add(
     map: MapPath,
     kind: Annotated[
         str,
-        typer.Argument(help="`sam-encoder`, `sam-decoder`, `clip` (any image encoder), `clip-text`, `clip-tokenizer`."),
+        typer.Argument(
+            help="`sam-encoder`, `sam-decoder`, `clip` (any image encoder), `clip-text`, `clip-tokenizer`, `extractor`."
+        ),
     ],
     path: Annotated[
         str, typer.Argument(metavar="FILE", help="The .onnx file; of `clip-tokenizer` the tokenizer.json.")

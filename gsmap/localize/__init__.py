@@ -1,5 +1,6 @@
 """Where a photograph, a clip or a scan was taken: found in the map, sharpened on it, and judged."""
 
+from gsmap.localize.clips import read_clip
 from gsmap.localize.features import scene_features
 from gsmap.localize.localizing import localize_photo
 from gsmap.localize.params import Params
@@ -7,6 +8,7 @@ from gsmap.localize.photos import Lens, read_photo
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.recipe import recipe_key
 from gsmap.localize.retrieval import ViewIndex
+from gsmap.localize.together import localize_together
 
 __all__ = [
     "Lens",
@@ -14,6 +16,8 @@ __all__ = [
     "PlacedFeatures",
     "ViewIndex",
     "localize_photo",
+    "localize_together",
+    "read_clip",
     "read_photo",
     "recipe_key",
     "scene_features",

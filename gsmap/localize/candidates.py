@@ -128,12 +128,15 @@ def _different(found: Sequence[Candidate], params: resection.Params) -> list[Can
     """The candidates without those that would settle where a better one does."""
     out: list[Candidate] = []
     for one in found:
-        if not any(one.component == other.component and _near(one, other, params) for other in out):
+        if not any(near_to(one, other, params) for other in out):
             out.append(one)
     return out
 
 
-def _near(one: Candidate, other: Candidate, params: resection.Params) -> bool:
+def near_to(one: Candidate, other: Candidate, params: resection.Params) -> bool:
+    """Whether two poses would settle at one."""
+    if one.component != other.component:
+        return False
     far = np.linalg.norm(one.T_metric_camera[:3, 3] - other.T_metric_camera[:3, 3])
     angle = angle_between(one.T_metric_camera[:3, :3], other.T_metric_camera[:3, :3])
     return bool(far < params.same_m and np.degrees(angle) < params.same_deg)

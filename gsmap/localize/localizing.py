@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from gsmap.localize import covariance, evidence, matching, probability, verdict
-from gsmap.localize.candidates import Candidate, candidates, matches_by_component
+from gsmap.localize.candidates import Candidate, candidates, matches_by_component, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.looks import GREY
 from gsmap.localize.params import Params
@@ -20,6 +20,8 @@ from gsmap.localize.settling import Picture, Settled, inliers, settle
 from gsmap.localize.summaries import summarised
 from gsmap.methods.extractor import Extractor
 from gsmap.types.localization import Keypoints, Photo, Placement
+
+_FIRST, _BOTH = (1.0,), (1.0, 0.0)  # times `matching.Params.smooth_px`
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +64,35 @@ def localize_photo(
     Returns:
         The pose in the frame and unit of its component, or the reason why there is none.
     """
-    picture, factor = prepared(photo, params)
+    picture, scale = prepared(photo, params)
     judged, why = judged_poses(picture, index, scenes, extractor, params)
     if not judged:
         return Placement(photo.name, why)
-    best = judged[0]
-    rival, sigmas = _rival(judged, params), sigmas_of(best.covariance)
-    reason = verdict.judge(best.evidence, best.probability, sigmas, rival, params.verdict)
+    return placement(photo.name, judged[0], rival_of(judged, params), picture, scale, scenes, params, metres_per_unit)
+
+
+def placement(
+    name: str,
+    best: Judged,
+    rival: float,
+    picture: Picture,
+    scale: np.ndarray,
+    scenes: Mapping[str, PlacedFeatures],
+    params: Params,
+    metres_per_unit: Mapping[int, float] | None = None,
+) -> Placement:
+    """What is said of a pose that was looked into.
+
+    Args:
+        rival: probability of the best pose at another place.
+        scale: of `prepared`.
+    """
+    reason = verdict.judge(best.evidence, best.probability, sigmas_of(best.covariance), rival, params.verdict)
     component = best.candidate.component
     metres = (metres_per_unit or {}).get(component, 1.0)
     told = {**best.evidence, "rival": rival}
     if reason:
-        return Placement(photo.name, reason, component=component, probability=best.probability, evidence=told)
+        return Placement(name, reason, component=component, probability=best.probability, evidence=told)
     support, seen = _support(best, scenes, params, picture)
     pose = best.settled.T_metric_camera.copy()
     pose[:3, 3] /= metres
@@ -81,30 +100,30 @@ def localize_photo(
     known = covariance.with_scene(best.covariance, best.settled.T_metric_camera, support)
     unit = np.r_[np.ones(3), np.full(3, 1 / metres)]
     return Placement(
-        photo.name,
+        name,
         "",
         pose,
         known * np.outer(unit, unit),
         component,
         tuple(scene.scene for scene, _ in support),
-        best.settled.intrinsics_px / factor,
+        best.settled.intrinsics_px / scale,
         best.probability,
         told,
         seen,
     )
 
 
-def prepared(photo: Photo, params: Params) -> tuple[Picture, float]:
-    """The photo as it is worked on, and how many of its pixels are one of the original's."""
+def prepared(photo: Photo, params: Params) -> tuple[Picture, np.ndarray]:
+    """The photo as it is worked on, and by what (4,) intrinsics of the original are multiplied to be of that."""
     width, height = photo.size_px
     factor = min(1.0, params.views.image_size_px / max(width, height))
-    rgb = photo.rgb
+    rgb, scale = photo.rgb, np.ones(4)
     if factor < 1:
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
         rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BOX, reducing_gap=3.0))
-        factor = size[0] / width
+        scale = np.tile([size[0] / width, size[1] / height], 2)
     real = rgb.astype(np.float32) / 255
-    return Picture(real, real @ GREY, photo.intrinsics_px * factor, photo.focal_sigma), factor
+    return Picture(real, real @ GREY, photo.intrinsics_px * scale, photo.focal_sigma), scale
 
 
 def judged_poses(
@@ -117,32 +136,56 @@ def judged_poses(
     """Poses that were looked into, the most probable first; and why there are none."""
     if not len(index):
         return [], "the map shows nothing to compare it with"
-    found = photo_features(picture, extractor, params)
-    if len(found) < params.resection.min_inliers:
-        return [], f"it shows too little: {len(found)} features"
+    out: list[Judged] = []
+    why = ""
+    smooth = params.matching.smooth_px
+    for views, factors in ((params.matching.views, _FIRST), (params.matching.more_views, _BOTH)):
+        found = photo_features(picture, extractor, [smooth * factor for factor in factors])
+        if len(found) < params.resection.min_inliers:
+            return [], f"it shows too little: {len(found)} features"
+        rough, most = _rough_poses(picture, found, index, scenes, replace(params.matching, views=views), params)
+        fewest = params.resection.min_inliers
+        why = f"nothing in the map looks like it: {most} features match, no {fewest} agree on a pose"
+        new = [one for one in rough if not any(near_to(one, other.candidate, params.resection) for other in out)]
+        for candidate in new[: params.max_candidates]:
+            sure = max((one.probability for one in out), default=0.0) >= params.sure
+            if sure and candidate.num_inliers < params.rival_inliers * out[0].candidate.num_inliers:
+                break
+            out.append(judged_pose(picture, candidate, scenes, params))
+        if max((one.probability for one in out), default=0.0) >= params.verdict.min_probability:
+            break
+    return sorted(out, key=lambda one: -one.probability), why
+
+
+def _rough_poses(
+    picture: Picture,
+    found: Keypoints,
+    index: ViewIndex,
+    scenes: Mapping[str, PlacedFeatures],
+    matched: matching.Params,
+    params: Params,
+) -> tuple[list[Candidate], int]:
+    """Poses that matches agree on, and how many matches there were."""
     described = matching.Described(quantised(found.descriptors), turns(found))
-    matches = matches_by_component(described, summarised(found.descriptors), index, scenes, params.matching)
+    matches = matches_by_component(described, summarised(found.descriptors), index, scenes, matched)
     rough = candidates(
         found.pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma, params.resection
     )
-    if not rough:
-        most = max((len(one.feature) for one in matches.values()), default=0)
-        fewest = params.resection.min_inliers
-        return [], f"nothing in the map looks like it: {most} features match, no {fewest} agree on a pose"
-    out: list[Judged] = []
-    for candidate in rough[: params.max_candidates]:
-        sure = max((one.probability for one in out), default=0.0) >= params.sure
-        if sure and candidate.num_inliers < params.rival_inliers * out[0].candidate.num_inliers:
-            break
-        out.append(judged_pose(picture, candidate, scenes, params))
-    return sorted(out, key=lambda one: -one.probability), ""
+    return rough, max((len(one.feature) for one in matches.values()), default=0)
 
 
-def photo_features(picture: Picture, extractor: Extractor, params: Params) -> Keypoints:
-    """Features of a photo, without what is finer than renders are."""
-    smooth = params.matching.smooth_px
-    rgb = gaussian_filter(picture.rgb, (smooth, smooth, 0)) if smooth > 0 else picture.rgb
-    return extractor.extract((rgb * 255 + 0.5).astype(np.uint8))
+def photo_features(picture: Picture, extractor: Extractor, smooth_px: Sequence[float]) -> Keypoints:
+    """Features of a photo, without what is finer than renders are: of each of some degrees of that."""
+    parts = []
+    for smooth in smooth_px:
+        rgb = gaussian_filter(picture.rgb, (smooth, smooth, 0)) if smooth > 0 else picture.rgb
+        parts.append(extractor.extract((rgb * 255 + 0.5).astype(np.uint8)))
+    turned = [part.angles_rad for part in parts if part.angles_rad is not None]
+    return Keypoints(
+        np.concatenate([part.pixels for part in parts]),
+        np.concatenate([part.descriptors for part in parts]),
+        np.concatenate(turned) if len(turned) == len(parts) else None,
+    )
 
 
 def judged_pose(picture: Picture, candidate: Candidate, scenes: Mapping[str, PlacedFeatures], params: Params) -> Judged:
@@ -179,7 +222,7 @@ def sigmas_of(covariance: np.ndarray | None) -> tuple[float, float]:
     return turn, shift
 
 
-def _rival(judged: Sequence[Judged], params: Params) -> float:
+def rival_of(judged: Sequence[Judged], params: Params) -> float:
     """The probability of the best pose that is another place than the best one's; 0 where there is none."""
     best = judged[0]
     for other in judged[1:]:

@@ -15,6 +15,7 @@ class Params:
         smooth_px: a photograph loses what is finer (standard deviation of a Gaussian) before its features are found:
             renders show nothing so fine, and one feature of the photo is then one of theirs more often.
         views: that a photograph is matched with, at most, best first.
+        more_views: and where that places it nowhere, together with what is finer.
         max_ratio: of the distance to the nearest neighbour and to the view's next one (Lowe 2004).
         max_distance: of unit vectors.
         max_turn: features that were turned otherwise than most others of the view by more than this, in 256ths of a
@@ -23,6 +24,7 @@ class Params:
 
     smooth_px: float = 1.2
     views: int = 24
+    more_views: int = 60
     max_ratio: float = 0.85
     max_distance: float = 0.9
     max_turn: int = 18

@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from gsmap.localize import covariance, evidence, features, matching, resection, settling, tracking, verdict, views
+from gsmap.localize import (
+    clips,
+    covariance,
+    evidence,
+    features,
+    matching,
+    resection,
+    settling,
+    tracking,
+    tying,
+    verdict,
+    views,
+)
 from gsmap.methods import MethodParams, family
 
 
@@ -25,6 +37,8 @@ class Params:
         evidence: how a photo is compared with renders.
         covariance: how well a pose is known.
         verdict: the bars that a pose must clear.
+        together: how photographs of one place help each other.
+        clips: which frames of a clip are looked at.
         max_candidates: rough poses that are looked into.
         sure: once one is this probable, others are looked into only ...
         rival_inliers: ... where so large a share of its matches agrees on them.
@@ -42,6 +56,8 @@ class Params:
     evidence: evidence.Params = field(default_factory=evidence.Params)
     covariance: covariance.Params = field(default_factory=covariance.Params)
     verdict: verdict.Params = field(default_factory=verdict.Params)
+    together: tying.Params = field(default_factory=tying.Params)
+    clips: clips.Params = field(default_factory=clips.Params)
     max_candidates: int = 5
     sure: float = 0.97
     rival_inliers: float = 0.5

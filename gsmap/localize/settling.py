@@ -65,8 +65,7 @@ class Settled:
         points: (K, 3) their places, metres.
         scene: (K,) int, whose patches they are, among ``looks``.
         tried: how many patches were looked for in the last round.
-        looks: renders from the pose.
-        moved: rad and metres from the rough pose.
+        looks: renders from the pose; none where nothing was found from the first.
     """
 
     T_metric_camera: np.ndarray
@@ -123,7 +122,7 @@ def settle(
         free = None if picture.focal_sigma <= 0.01 else (picture.intrinsics_px[0], picture.focal_sigma)
         fit = resection.refine(pixels, points, start, lens, poses, focal=free)
         pose, lens = fit.T_map_camera, fit.intrinsics_px
-    looks = look(scenes, pose, lens, picture.size_px, lifting)
+    looks = look(scenes, pose, lens, picture.size_px, lifting) if fit is not None else []
     return Settled(pose, lens, fit, pixels, points, scene, tried, looks)
 
 

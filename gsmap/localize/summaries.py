@@ -17,6 +17,7 @@ import numpy as np
 VERSION = 1
 
 _FILE = "vocabulary.npz"
+_NAMES = ("mean", "axes", "words", "centre")
 _WORDS, _SHORT, _LENGTH = 64, 32, 256
 
 
@@ -71,9 +72,8 @@ def vocabulary(width: int) -> Vocabulary:
         with path.open("rb") as file, np.load(file) as stored:
             if stored["mean"].shape == (width,):
                 whitening = stored["whitening"].astype(np.float32) * stored["steps"]
-                return Vocabulary(
-                    *(stored[name].astype(np.float32) for name in ("mean", "axes", "words", "centre")), whitening
-                )
+                mean, axes, words, centre = (stored[name].astype(np.float32) for name in _NAMES)
+                return Vocabulary(mean, axes, words, centre, whitening)
     return random_vocabulary(width)
 
 

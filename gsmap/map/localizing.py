@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gsmap.errors import ConfigError
-from gsmap.localize import Lens, read_photo
+from gsmap.localize import Lens, read_clip, read_photo
 from gsmap.map.metres import metre_notes, metres_at
-from gsmap.map.stages.localize import Localizer, localize, parse_near
+from gsmap.map.stages.localize import Localizer, localize, localize_all, parse_near
 from gsmap.store import Store
 from gsmap.types.localization import Placement
 from gsmap.types.progress import StageProgress
@@ -29,17 +29,27 @@ def localize_files(
     intrinsics: Numbers,
     focal: str | float | None,
     near: str | None,
+    together: bool,
+    video: str | os.PathLike[str] | None,
     progress: StageProgress,
 ) -> LocalizeReport:
     """Read photographs, find them, and tell of each; nothing is begun where one cannot be read."""
-    if not files:
-        raise ConfigError("name the photographs to localise")
+    if bool(files) == (video is not None):
+        raise ConfigError("name the photographs to localise, or one clip by --video")
     lens = parse_lens(intrinsics, focal)
-    photos = [read_photo(path, lens) for path in files]
+    if video is not None:
+        clip = read_clip(video, lens, settings.localize.clips)
+        named = [(f"{os.fspath(video)}#{at:.2f}", photo) for at, photo in clip]
+    else:
+        named = [(os.fspath(path), read_photo(path, lens)) for path in files]
     where = None if near is None else parse_near(store, near)
     localizer = Localizer(store, settings, progress)
-    found = localize(localizer, photos, where, progress)
-    rows = [row_of(store, os.fspath(path), *one) for path, one in zip(files, found, strict=True)]
+    photos = [photo for _, photo in named]
+    if together or video is not None:
+        found = localize_all(localizer, photos, where)
+    else:
+        found = localize(localizer, photos, where, progress)
+    rows = [row_of(store, name, *one) for (name, _), one in zip(named, found, strict=True)]
     metres = metres_at(store, settings)
     components = {row.component for row in rows if row.component is not None and row.status == "placed"}
     return LocalizeReport(

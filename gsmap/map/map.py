@@ -480,6 +480,8 @@ class Map(AbstractContextManager["Map"]):
         intrinsics: str | Sequence[float] | None = None,
         focal: str | float | None = None,
         near: str | None = None,
+        together: bool = False,
+        video: str | os.PathLike[str] | None = None,
     ) -> LocalizeReport:
         """``gsmap localize MAP FILE...``: where photographs were taken, or why that is not said.
 
@@ -489,6 +491,8 @@ class Map(AbstractContextManager["Map"]):
             intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright picture.
             focal: focal length in pixels, or ``auto`` to solve for it; by default what the file says (EXIF).
             near: only what this scene shows, or ``X,Y,Z,R`` around a point of the map.
+            together: the photos show one place and overlap: whoever is placed helps the others.
+            video: a clip, whose sharpest frames are photos of one place; needs the extra ``video``.
 
         Raises:
             NotFoundError: no such file or scene, or nothing in the map has a place.
@@ -505,6 +509,8 @@ class Map(AbstractContextManager["Map"]):
                 intrinsics=intrinsics,
                 focal=focal,
                 near=near,
+                together=together,
+                video=video,
                 progress=self._progress,
             )
 

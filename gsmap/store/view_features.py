@@ -69,7 +69,7 @@ class ViewFeatures:
         """
         if found.scene not in key.inputs:
             raise InputError(f"the key of features must name their scene {found.scene} among its inputs")
-        arrays = {
+        arrays: dict[str, np.ndarray] = {
             "starts": found.starts.astype(np.int64),
             "points": found.points.astype(np.float32),
             "descriptors": found.descriptors,

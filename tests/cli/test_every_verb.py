@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer.main
 from cli_rooms import save_changes
+from PIL import Image
 from tiny_encoder import image_encoder
 
 import gsmap
@@ -57,6 +58,7 @@ RUNS = {
     "graph": "graph MAP",
     "history": "history MAP 0.5,0.5,0.5",
     "find": "find MAP --like left:0",
+    "localize": "localize MAP TMP/photo.png --focal auto",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",
     "list scenes": "list MAP scenes",
@@ -109,6 +111,8 @@ def gsmap_run(
 ) -> Callable[[str], Any]:
     """Runs a line of `RUNS`."""
     np.savetxt(tmp_path / "pose.txt", np.eye(4))
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3)).astype(np.uint8)
+    Image.fromarray(noise).save(tmp_path / "photo.png")
     (tmp_path / "encoder.onnx").write_bytes(image_encoder())
     (tmp_path / "remote.gsmap" / "arrays").mkdir(parents=True)
     trust.write(tmp_path / "remote.gsmap", "postgresql+psycopg://me@example.org/site", "0" * 32)

@@ -67,6 +67,7 @@ HOMES = {
     "small_gicp": {"register"},
     "kiss_matcher": {"register"},
     "open3d": {"formats", "gsmap_synthetic"},
+    "av": {"localize"},
     "pycolmap": {"formats", "localize"},
     "torch": {"render"},
     "tomlkit": {"settings"},

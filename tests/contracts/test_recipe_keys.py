@@ -42,6 +42,7 @@ ALTERNATIVES: dict[str, Any] = {
     "register.polisher": "photometric",
     "register.proposers.graph.kinds": ("landmarks",),
     "register.proposers.graph.consistency.test": "ratio",
+    "localize.extractor": "onnx",
     "engine.executor": "local",
     "engine.executors.dask.scheduler": "tcp://elsewhere:8786",
 }
@@ -179,7 +180,7 @@ def test_a_setting_changes_the_keys_of_what_it_influences_and_no_others(name: st
             leaf = next(leaf for leaf in leaves(idle) if leaf.name == name)
             assert keys(with_another(idle, name, leaf.value)) == keys(idle), f"{name} counts though nothing asks for it"
         settings = changed(settings, condition)
-    elif name in ("register.scale_refiner", "localize.extractor"):
+    elif name == "register.scale_refiner":
         pytest.skip("there is only one built-in choice")
     leaf = next(leaf for leaf in leaves(settings) if leaf.name == name)
     before, after = keys(settings), keys(with_another(settings, name, leaf.value))
@@ -233,6 +234,7 @@ def test_a_version_changes_a_key(module: str, monkeypatch: pytest.MonkeyPatch) -
         chosen: list[dict[str, Any]] = [{}]
         chosen += [{"register.refiner": name} for name in families()["refiner"].names()]
         chosen += [{"register.proposer": name} for name in families()["proposer"].names()]
+        chosen += [{"localize.extractor": name} for name in families()["extractor"].names()]
         chosen += [{"describe.object.segmenter": name} for name in families()["segmenter"].names()]
         chosen += [{"describe.object.embedder": name} for name in families()["embedder"].names()]
         return [keys(changed(Settings(), values)) for values in chosen]

@@ -9,9 +9,9 @@ from gsmap.describe.embedders import clip
 from gsmap.describe.objects.layer import Params as ObjectParams
 from gsmap.describe.objects.layer import descriptor_id
 from gsmap.describe.onnx.check import check_model, kinds, parse_preset
-from gsmap.describe.onnx.session import open_session
 from gsmap.describe.segmenters import sam
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
+from gsmap.networks.session import open_session
 from gsmap.types import Cameras
 from gsmap.types.views import Mask, View
 
@@ -167,6 +167,7 @@ def test_kinds_are_those_that_methods_name():
         "sam-encoder": ["sam"],
         "sam-decoder": ["sam"],
         "clip": ["clip"],
+        "extractor": ["onnx"],
     }
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.describe.onnx import text
-from gsmap.describe.onnx.session import declared
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.methods import family
 from gsmap.networks import refuse_external_data
+from gsmap.networks.session import declared
 from gsmap.types.model import ModelLimits, ModelSpec
 
 PRESETS = {  # mean and standard deviation of rgb in [0, 1]
@@ -22,13 +22,13 @@ PRESETS = {  # mean and standard deviation of rgb in [0, 1]
 
 
 def kinds() -> dict[str, list[Any]]:
-    """Every kind of model that a segmenter or embedder names, and the methods that name it; and what reads words.
+    """Every kind of model that a segmenter, embedder or extractor names, with the methods that do; and of words.
 
     Raises:
         ConfigError: a method that names models and has no ``probe`` for them.
     """
     found: dict[str, list[Any]] = {}
-    for methods in (family("segmenter"), family("embedder")):
+    for methods in (family("segmenter"), family("embedder"), family("extractor")):
         for name in methods.names():
             method = methods.get(name)
             if method.MODELS and not hasattr(method, "probe"):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.describe.onnx.session import misfit, open_session, run
+from gsmap.networks.session import misfit, open_session, run
 from gsmap.errors import ConfigError, InputError, MissingDependencyError, NotFoundError
 from gsmap.types.model import ModelSpec, Tensor
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from gsmap.describe.onnx.session import misfit, open_session, run
+from gsmap.networks.session import misfit, open_session, run
 from gsmap.types.model import ModelSpec
 from gsmap.types.views import Mask, SceneContext, View
 

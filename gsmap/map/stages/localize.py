@@ -141,16 +141,27 @@ class Localizer:
         """Find one photograph."""
         index = self.index if near is None else localizing_near(self, near)
         found = localizing.localize_photo(photo, index, self.placed, self.extractor, self.params, self.metres)
-        if near is not None and near.point is not None and found.T_map_camera is not None:
-            far = float(np.linalg.norm(found.T_map_camera[:3, 3] - near.point))
-            if far > near.radius:
-                return replace(
-                    found,
-                    reason=f"it was taken {far:.3g} from there, farther than {near.radius:g}",
-                    T_map_camera=None,
-                    covariance=None,
-                )
+        return _within(found, near)
+
+    def localize_together(self, photos: Sequence[Photo], near: Near | None = None) -> list[Placement]:
+        """Find photographs of one place that overlap."""
+        index = self.index if near is None else localizing_near(self, near)
+        options = (index, self.placed, self.extractor, self.params, self.metres)
+        return [_within(found, near) for found in localizing.localize_together(photos, *options)]
+
+
+def _within(found: Placement, near: Near | None) -> Placement:
+    """The placement, or that it is not where it was to be.
+
+    A person who says where photographs are from rules out what is elsewhere.
+    """
+    if near is None or near.point is None or found.T_map_camera is None:
         return found
+    far = float(np.linalg.norm(found.T_map_camera[:3, 3] - near.point))
+    if far <= near.radius:
+        return found
+    reason = f"it was taken {far:.3g} from there, farther than {near.radius:g}"
+    return replace(found, reason=reason, T_map_camera=None, covariance=None)
 
 
 def localizing_near(localizer: Localizer, near: Near) -> ViewIndex:
@@ -257,3 +268,11 @@ def localize(
         found = localizer.localize(photo, near)
         progress("localize", (number + 1) / len(photos), photo.name)
         yield found, time.monotonic() - began
+
+
+def localize_all(localizer: Localizer, photos: Sequence[Photo], near: Near | None) -> Iterator[tuple[Placement, float]]:
+    """Each photo's place with the help of the others, and its share of the seconds that they took."""
+    began = time.monotonic()
+    found = localizer.localize_together(photos, near)
+    seconds = (time.monotonic() - began) / max(len(photos), 1)
+    return iter([(one, seconds) for one in found])

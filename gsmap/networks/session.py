@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.errors import InputError, NotFoundError
-from gsmap.networks import ModelProcess
+from gsmap.networks.process import ModelProcess
 from gsmap.types.model import ModelLimits, ModelSpec, Tensor
 
 _KEPT = 4  # processes: an encoder, a decoder, features, and one that takes the place of another

@@ -1,0 +1,242 @@
+"""Several photographs of one place, or a clip: whoever is placed helps the others.
+
+Photographs match each other far better than renders. Once one is placed, the map's depth from there lifts its
+features to the map, and the next photo finds its pose by them, to be sharpened and judged on renders like any other.
+What a photo shows itself and what its neighbours show are evidence together: where two photos are tied to each other by
+matches, both are right or both are wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmap.localize import covariance, matching, resection, tying
+from gsmap.localize.candidates import Candidate
+from gsmap.localize.features import quantised, turns
+from gsmap.localize.localizing import Judged, judged_pose, judged_poses, photo_features, placement, prepared, rival_of
+from gsmap.localize.looks import look
+from gsmap.localize.params import Params
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.retrieval import ViewIndex
+from gsmap.localize.settling import Picture, Settled
+from gsmap.localize.summaries import summarised
+from gsmap.methods.extractor import Extractor
+from gsmap.types.localization import Keypoints, Photo, Placement
+
+
+@dataclass(eq=False)
+class _Shot:
+    """A photo on its way."""
+
+    photo: Photo
+    picture: Picture
+    scale: np.ndarray
+    found: Keypoints
+    described: matching.Described
+    summary: np.ndarray
+    judged: list[Judged]
+    why: str
+    helped: bool = False  # whether it has helped its neighbours from the pose that it has now
+
+    @property
+    def best(self) -> Judged | None:
+        return self.judged[0] if self.judged else None
+
+    @property
+    def probability(self) -> float:
+        return self.judged[0].probability if self.judged else 0.0
+
+
+def localize_together(
+    photos: Sequence[Photo],
+    index: ViewIndex,
+    scenes: Mapping[str, PlacedFeatures],
+    extractor: Extractor,
+    params: Params,
+    metres_per_unit: Mapping[int, float] | None = None,
+) -> list[Placement]:
+    """Find photographs of one place that overlap each other; see `gsmap.localize.localize_photo`.
+
+    Returns:
+        A placement for each, in order.
+    """
+    shots = [_shot(photo, index, scenes, extractor, params) for photo in photos]
+    near = _neighbours(shots, params.together.neighbours)
+    ties: dict[tuple[int, int], bool] = {}
+    while True:
+        ready = [k for k, shot in enumerate(shots) if not shot.helped and shot.probability >= params.together.anchor]
+        if not ready:
+            break
+        k = max(ready, key=lambda one: shots[one].probability)
+        shots[k].helped = True
+        _help(k, shots, near[k], scenes, params, ties)
+    together = _probabilities(shots, ties, params.together)
+    out = []
+    for shot, probable in zip(shots, together, strict=True):
+        if shot.best is None:
+            out.append(Placement(shot.photo.name, shot.why))
+            continue
+        best, bars = replace(shot.best, probability=probable), params
+        if probable > shot.probability:  # what it lacks itself, those that it is tied to show
+            bars = replace(params, verdict=replace(params.verdict, min_inliers=0))
+        rival = rival_of([best, *shot.judged[1:]], params)
+        out.append(placement(shot.photo.name, best, rival, shot.picture, shot.scale, scenes, bars, metres_per_unit))
+    return out
+
+
+def _shot(
+    photo: Photo, index: ViewIndex, scenes: Mapping[str, PlacedFeatures], extractor: Extractor, params: Params
+) -> _Shot:
+    picture, scale = prepared(photo, params)
+    found = photo_features(picture, extractor, [0.0])  # photos hold what renders do not
+    described = matching.Described(quantised(found.descriptors), turns(found))
+    judged, why = judged_poses(picture, index, scenes, extractor, params)
+    return _Shot(photo, picture, scale, found, described, summarised(found.descriptors), judged, why)
+
+
+def _neighbours(shots: Sequence[_Shot], count: int) -> list[list[int]]:
+    """Of each photo those that look most alike, and those given just before and after it."""
+    vectors = np.stack([shot.summary.astype(np.float32) for shot in shots])
+    cosines = vectors @ vectors.T
+    cosines /= np.maximum(np.sqrt(np.outer(np.diag(cosines), np.diag(cosines))), 1e-6)
+    np.fill_diagonal(cosines, -2)
+    out = []
+    for k in range(len(shots)):
+        alike = np.argsort(-cosines[k], kind="stable")[: min(count, len(shots) - 1)].tolist()
+        beside = [one for one in (k - 1, k + 1) if 0 <= one < len(shots)]
+        out.append(list(dict.fromkeys([*beside, *alike])))
+    return out
+
+
+def _help(
+    k: int,
+    shots: Sequence[_Shot],
+    near: Sequence[int],
+    scenes: Mapping[str, PlacedFeatures],
+    params: Params,
+    ties: dict[tuple[int, int], bool],
+) -> None:
+    """Give a photo's neighbours poses by its features, and keep those that are more probable than what they had."""
+    helper = shots[k]
+    assert helper.best is not None
+    points, known = _lifted(helper, helper.best, scenes, params)
+    if not len(known):
+        return
+    mine = matching.Described(helper.described.descriptors[known], helper.described.angles[known])
+    for other in near:
+        shot = shots[other]
+        rows, columns = matching.matched(shot.described, mine, params.matching)
+        pixels, places = shot.found.pixels[rows], points[columns]
+        pose = resection.resect(
+            pixels, places, shot.picture.intrinsics_px, shot.picture.size_px, shot.picture.focal_sigma, params.resection
+        )
+        if pose is None or len(np.unique(rows[pose.inliers])) < params.together.min_tie:
+            continue
+        component = helper.best.candidate.component
+        count = len(np.unique(rows[pose.inliers]))
+        start = Candidate(component, pose.T_map_camera, pose.intrinsics_px, count, helper.best.candidate.scenes)
+        if shot.best is not None and _same(shot.best, start, params):
+            ties[k, other] = True
+            continue
+        judged = judged_pose(shot.picture, start, scenes, params)
+        if judged.settled.fit is None or not _same(judged, start, params):
+            judged = _by_matches(shot, start, pixels[pose.inliers], places[pose.inliers], helper.best, judged, params)
+        if max(judged.probability, helper.probability) >= shot.probability:
+            shot.judged, shot.helped = [judged, *shot.judged], False
+            ties[k, other] = True
+
+
+def _lifted(
+    shot: _Shot, best: Judged, scenes: Mapping[str, PlacedFeatures], params: Params
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) places of a placed photo's features by the depth of the scene that shows most there, and their rows."""
+    held = [scenes[scene] for scene in best.candidate.scenes[: params.settling.max_scenes]]
+    looks = best.settled.looks or look(
+        held, best.settled.T_metric_camera, best.settled.intrinsics_px, shot.picture.size_px, params.features
+    )
+    pixels = shot.found.pixels
+    column, row = np.clip(pixels.astype(np.int64), 0, np.array(shot.picture.size_px) - 1).T
+    points, known = np.zeros((len(pixels), 3)), np.zeros(len(pixels), bool)
+    for one in looks:
+        new = one.sound[row, column] & ~known
+        points[new] = one.points(pixels[new], best.settled.T_metric_camera, best.settled.intrinsics_px)
+        known |= new
+    rows = np.flatnonzero(known)
+    return points[rows], rows
+
+
+def _by_matches(
+    shot: _Shot,
+    start: Candidate,
+    pixels: np.ndarray,
+    points: np.ndarray,
+    helper: Judged,
+    judged: Judged,
+    params: Params,
+) -> Judged:
+    """A pose that rests on another photo's features alone: what the map shows there was not found, or led away."""
+    fit = resection.refine(pixels, points, start.T_metric_camera, start.intrinsics_px, params.resection)
+    own = covariance.pose_covariance(fit, pixels, shot.picture.size_px, params.covariance)
+    if helper.covariance is not None:
+        own = own + _carried(helper, fit.T_map_camera)
+    settled = Settled(
+        fit.T_map_camera,
+        fit.intrinsics_px,
+        fit,
+        pixels,
+        points,
+        np.zeros(len(pixels), int),
+        len(pixels),
+        judged.settled.looks,
+    )
+    return Judged(start, settled, own, judged.evidence, min(judged.probability, 0.5))
+
+
+def _carried(helper: Judged, T_metric_camera: np.ndarray) -> np.ndarray:
+    """(6, 6) of a camera that is fixed to the helper's."""
+    from gsmap.geometry.rotations import skew
+
+    relative = np.linalg.inv(T_metric_camera) @ helper.settled.T_metric_camera  # helper in camera
+    R, t = relative[:3, :3], relative[:3, 3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[3:, :3] = skew(t) @ R
+    assert helper.covariance is not None
+    return adjoint @ helper.covariance @ adjoint.T
+
+
+def _same(judged: Judged, candidate: Candidate, params: Params) -> bool:
+    """Whether a pose that was looked into is the one that another photo says."""
+    if judged.candidate.component != candidate.component:
+        return False
+    one, two = judged.settled.T_metric_camera, candidate.T_metric_camera
+    far = float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
+    chord = float(np.linalg.norm(one[:3, :3] - two[:3, :3])) / np.sqrt(8.0)
+    return far < params.resection.same_m and np.degrees(2 * np.arcsin(min(1.0, chord))) < params.resection.same_deg
+
+
+def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool], params: tying.Params) -> list[float]:
+    """Of each photo, that it is right by its own evidence or by that of the two surest that it is tied to.
+
+    Only what a photo shows itself counts for others, less what the ties between them are worth: no two make each other
+    surer in a circle.
+    """
+    own = [shot.probability for shot in shots]
+    out = []
+    for k in range(len(shots)):
+        reached, fringe = {k: 1.0}, [k]
+        while fringe:
+            at = fringe.pop()
+            for (a, b), holds in ties.items():
+                if holds and at in (a, b):
+                    other = b if at == a else a
+                    worth = reached[at] * params.tie
+                    if worth > reached.get(other, 0.0):
+                        reached[other] = worth
+                        fringe.append(other)
+        others = sorted((worth * own[one] for one, worth in reached.items() if one != k), reverse=True)[:2]
+        out.append(float(1 - (1 - own[k]) * np.prod([1 - probable for probable in others])))
+    return out

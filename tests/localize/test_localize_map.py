@@ -1,0 +1,126 @@
+"""`Map.localize` and ``gsmap localize``: features are made once and kept; whatever cannot be is told in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import gsmap.map
+from gsmap.cli.app import run
+from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
+from gsmap.store import Store
+from gsmap.types import Sim3
+
+
+@pytest.fixture(scope="module")
+def made(world, tmp_path_factory):
+    """A map of one capture, and a photograph of it in a file."""
+    folder = tmp_path_factory.mktemp("localize")
+    photo = world.photos[1]
+    Image.fromarray(photo.rgb).save(folder / "photo.png")
+    with gsmap.map.create(folder / "m.gsmap") as m:
+        m.ingest(world.capture.gaussians, cameras=world.capture.cameras, name="room")
+        m.optimize()
+        lens = ",".join(f"{value:.3f}" for value in photo.intrinsics_px)
+        report = m.localize(folder / "photo.png", intrinsics=lens)
+    return folder, lens, report
+
+
+def test_a_photo_in_a_file_is_placed(made, world) -> None:
+    folder, _, report = made
+    (row,) = report.results
+    assert row.status == "placed", row.reason
+    assert row.scenes == ("room",)
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        S_map_scene = m.pose_graph().poses[m.scenes()[0].id].S_map_scene
+    truth = S_map_scene @ world.S_world_scene.inverse() @ Sim3.from_matrix(world.poses[1])
+    assert np.linalg.norm(row.T_map_camera[:3, 3] - truth.translation) < 0.05
+    assert row.to_json()["S_map_scan"] is None
+
+
+def test_features_are_made_once(made, monkeypatch) -> None:
+    folder, lens, report = made
+
+    def never(*arguments):
+        raise AssertionError("features were made again")
+
+    monkeypatch.setattr("gsmap.map.stages.localize.features_of_scene", never)
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        again = m.localize(folder / "photo.png", intrinsics=lens)
+    assert np.array_equal(again.results[0].T_map_camera, report.results[0].T_map_camera)
+
+
+def test_near_rules_out_what_is_elsewhere(made) -> None:
+    folder, lens, report = made
+    x, y, z = report.results[0].T_map_camera[:3, 3]
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        assert m.localize(folder / "photo.png", intrinsics=lens, near="room").results[0].status == "placed"
+        assert m.localize(folder / "photo.png", intrinsics=lens, near=f"{x},{y},{z},1").results[0].status == "placed"
+        far = m.localize(folder / "photo.png", intrinsics=lens, near=f"{x + 1.5},{y},{z},1").results[0]
+        assert far.status == "refused"
+        assert far.T_map_camera is None
+        with pytest.raises(ConfigError, match="radius"):
+            m.localize(folder / "photo.png", near="1,2,3")
+        with pytest.raises(NotFoundError):
+            m.localize(folder / "photo.png", near="nowhere")
+
+
+def test_the_command_line_answers_in_json(made, capsys) -> None:
+    folder, lens, _ = made
+    with pytest.raises(SystemExit) as ended:
+        run(["-q", "localize", str(folder / "m.gsmap"), str(folder / "photo.png"), "--intrinsics", lens, "--json"])
+    assert not ended.value.code
+    told = json.loads(capsys.readouterr().out)
+    assert told["schema"] == 1
+    assert [row["status"] for row in told["results"]] == ["placed"]
+    assert np.array(told["results"][0]["covariance"]).shape == (6, 6)
+
+
+def test_nothing_is_begun_where_a_file_is_no_picture(made) -> None:
+    folder, _, _ = made
+    (folder / "text.jpg").write_text("none")
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        with pytest.raises(InputError, match="not a picture"):
+            m.localize(folder / "photo.png", folder / "text.jpg")
+        with pytest.raises(NotFoundError):
+            m.localize(folder / "none.jpg")
+        with pytest.raises(ConfigError, match="name the photographs"):
+            m.localize()
+        for lens in ({"intrinsics": "1,2,3"}, {"focal": "wide"}, {"intrinsics": "1,2,3,4", "focal": 5}):
+            with pytest.raises(ConfigError):
+                m.localize(folder / "photo.png", **lens)
+
+
+def test_an_empty_map_says_what_to_do(made, tmp_path) -> None:
+    with gsmap.map.create(tmp_path / "e.gsmap") as m, pytest.raises(NotFoundError, match="gsmap update"):
+        m.localize(made[0] / "photo.png")
+
+
+def test_features_come_and_go_with_their_scene(made, world, tmp_path) -> None:
+    """Kept by key, damaged bytes are told, and nothing is left of a scene that is purged."""
+    folder, _, _ = made
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        m.clone(tmp_path / "c.gsmap")
+    with Store.open(tmp_path / "c.gsmap") as store:
+        (stored,) = store.view_features.list()
+        held = store.view_features.load(stored.scene, stored.key)
+        assert np.array_equal(held.points, world.placed.features.points) or held.num_features > 100
+        assert held.num_views == len(stored.summaries)
+        assert store.view_features.kept([stored.key, "0" * 32]) == {stored.key}
+        assert store.view_features.load(stored.scene, "0" * 32) is None
+        (archive,) = (store.arrays.root / "views").glob("*/*")
+        os.chmod(archive, 0o644)
+        content = bytearray(archive.read_bytes())
+        content[len(content) // 3] ^= 0xFF
+        archive.write_bytes(bytes(content))
+        with pytest.raises(CorruptError):
+            store.view_features.load(stored.scene, stored.key)
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        assert not m.check().ok
+        m.purge("room")
+        assert m.store.view_features.list() == []
+        assert m.check().ok

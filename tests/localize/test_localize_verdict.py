@@ -1,0 +1,101 @@
+"""What is said of a pose: the bars, the covariance that scenes' poses add, and depth that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmap.geometry.rotations import exp_so3, retract
+from gsmap.localize import verdict
+from gsmap.localize.covariance import with_scene
+from gsmap.localize.features import sound_depth
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.probability import model
+from gsmap.render import Rendered
+from gsmap.types import Sim3
+
+GOOD = {
+    "matches": 2.0,
+    "inliers": 2.2,
+    "found_again": 0.4,
+    "spread": 0.7,
+    "explained": 0.9,
+    "contradicted": 0.02,
+    "compared": 3.2,
+    "colour": 0.97,
+    "seen": 1.0,
+    "blocked": 0.0,
+    "sigma_m": -2.3,
+}
+BAD = GOOD | {"matches": 0.9, "inliers": 0.9, "found_again": 0.03, "spread": 0.1, "explained": 0.15}
+BAD |= {"contradicted": 0.6, "colour": 0.0, "sigma_m": -1.0}
+SURE = (0.003, 0.005)
+
+
+def test_good_evidence_is_probable_and_bad_is_not() -> None:
+    prior = verdict.Params().prior
+    assert model().probability(GOOD, prior) > 0.97
+    assert model().probability(BAD, prior) < 0.05
+    unseen = GOOD | {"colour": float("nan"), "matches": float("nan")}
+    assert 0 < model().probability(unseen, prior) < 1
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_every_piece_counts_in_one_direction(name: str) -> None:
+    worth = np.diff(model().curves[name].worth)
+    falls = name in ("contradicted", "blocked", "sigma_m")
+    assert (worth <= 1e-9).all() if falls else (worth >= -1e-9).all()
+
+
+def test_what_is_not_probable_is_refused_with_its_weakest_evidence() -> None:
+    params = verdict.Params()
+    assert verdict.judge(GOOD, 0.99, SURE, 0.0, params) == ""
+    refused = verdict.judge(GOOD | {"explained": 0.2}, 0.5, SURE, 0.0, params)
+    assert "not probable enough: 50.0%" in refused
+    assert "explains 20%" in refused
+
+
+def test_a_twin_is_told_as_ambiguous() -> None:
+    assert "ambiguous" in verdict.judge(GOOD, 0.99, SURE, 0.6, verdict.Params())
+
+
+def test_a_pose_that_is_hardly_known_is_not_said() -> None:
+    assert "only to" in verdict.judge(GOOD, 0.99, (0.2, 0.01), 0.0, verdict.Params())
+    assert "only to" in verdict.judge(GOOD, 0.99, (0.01, 2.0), 0.0, verdict.Params())
+    assert "3 patches" in verdict.judge(GOOD | {"inliers": np.log10(4)}, 0.99, SURE, 0.0, verdict.Params())
+
+
+def test_what_scenes_err_is_carried_to_the_camera() -> None:
+    """The covariance of a camera fixed to a scene is that of random poses of the scene."""
+    rng = np.random.default_rng(0)
+    S = Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3), 0.7)
+    A = rng.normal(size=(7, 7)) * 0.002
+    scene = PlacedFeatures("s", S, 0, A @ A.T, None, None)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = exp_so3(rng.normal(size=3)), rng.normal(size=3) * 3
+    told = with_scene(np.zeros((6, 6)), T, [(scene, 1.0)])
+    errors = []
+    for _ in range(4000):
+        moved = retract(S, A @ rng.normal(size=7)) @ S.inverse()
+        at, turned = moved.apply(T[:3, 3]), moved.rotation @ T[:3, :3]
+        chord = T[:3, :3].T @ turned
+        turn = np.array([chord[2, 1] - chord[1, 2], chord[0, 2] - chord[2, 0], chord[1, 0] - chord[0, 1]]) / 2
+        errors.append(np.r_[turn, T[:3, :3].T @ (at - T[:3, 3])])
+    assert np.allclose(np.cov(np.array(errors).T), told, atol=0.12 * np.abs(told).max())
+    assert np.array_equal(with_scene(told, T, [(replace_covariance(scene), 1.0)]), told)
+
+
+def replace_covariance(scene: PlacedFeatures) -> PlacedFeatures:
+    return PlacedFeatures(scene.scene, scene.S_metric_scene, 0, None, scene.read_gaussians, scene.read_features)
+
+
+def test_depth_at_an_edge_is_not_sound() -> None:
+    depth = np.full((1, 20, 20), 2.0, np.float32)
+    depth[:, :, 10:] = 3.0
+    alpha = np.ones_like(depth)
+    alpha[:, 15:] = 0.5
+    sound = sound_depth(Rendered(np.zeros((1, 20, 20, 3), np.float32), alpha, depth)) > 0
+    assert sound[5, 2]
+    assert sound[5, 17]
+    assert not sound[5, 8:12].any()
+    assert not sound[17].any()
