@@ -18,7 +18,7 @@ from gsmap.errors import MALFORMED, CorruptError
 from gsmap.export.manifest import FILE_NAME as MANIFEST
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
-from gsmap.types import Gaussians, Tile
+from gsmap.types import Gaussians, Sim3, Tile
 
 FILE_NAME = "tileset.json"
 LEVELS_FOLDER = "levels"
@@ -60,6 +60,7 @@ def write_tilesets(
     tile_size_m: float,
     metres_per_unit: Mapping[int, float] | None = None,
     *,
+    S_ecef_map: Mapping[int, Sim3] | None = None,
     compressed: bool = True,
 ) -> list[Path]:
     """Write ``tileset.json`` into each component's folder, with coarser levels made by merging, never by dropping.
@@ -72,6 +73,8 @@ def write_tilesets(
         out: the export's folder; the tiles' ``.glb`` lie in it.
         tile_size_m: edge of the grid's tiles, > 0.
         metres_per_unit: of each component's frame; all 1 if None.
+        S_ecef_map: of components that are tied to the world: takes their frames to Earth-centred metres (EPSG:4978),
+            where globes draw them.
         compressed: whether the tiles are packed as SPZ, and levels are to be.
     """
     by_component: dict[int, list[Tile]] = defaultdict(list)
@@ -90,6 +93,8 @@ def write_tilesets(
         (root,) = cells.values()
         # The map's z is up where gsmap could tell.
         transform = np.diag([metres, metres, metres, 1.0])
+        if S_ecef_map is not None and component in S_ecef_map:
+            transform = S_ecef_map[component].matrix()
         write = partial(tiles3d.write_tileset, root=root.node, transform=transform, compressed=compressed)
         write_whole(folder / FILE_NAME, write)
         _remove_unnamed(folder, root.node)

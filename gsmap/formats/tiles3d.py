@@ -25,7 +25,8 @@ import numpy as np
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.formats import glb
 from gsmap.formats.quantise import require_writable
-from gsmap.geometry.voxels import axis_deviations, merge_groups, voxel_labels
+from gsmap.geometry.decimate import decimate
+from gsmap.geometry.voxels import axis_deviations
 from gsmap.types import Gaussians
 
 VERSION = 1
@@ -90,7 +91,7 @@ def write(
 ) -> None:
     """Write a tileset of an octree: the leaves hold the originals, every tile above a quarter of ``max_per_tile``.
 
-    What is coarse is merged voxel by voxel with its moments kept, never dropped. Content files are named by their
+    What is coarse is merged pair by pair with its moments kept, never dropped. Content files are named by their
     digest, so an older ``tileset.json`` in the same folder stays whole until it is replaced.
 
     Args:
@@ -149,25 +150,16 @@ def write_tileset(
 
 
 def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
-    """At most about ``max_count`` Gaussians that look alike from afar, and the voxel size that merged them (0: none).
+    """At most ``max_count`` Gaussians that look alike from afar, and how far what they draw is from where it was.
 
-    Moments and transmittance are kept; see `gsmap.geometry.voxels.merge_groups`.
+    Moments and transmittance are kept; see `gsmap.geometry.decimate`. The distance is the one that a twentieth of the
+    Gaussians lie beyond from the one that is drawn for them, in the frame's unit; 0 where none was merged.
     """
-    if len(gaussians) <= max_count:
-        return gaussians, 0.0
-    extent = max(float(np.ptp(gaussians.means.astype(np.float64), axis=0).max()), 1e-6)
-    finest, coarsest = extent / 2**20, extent * 2
-    labels, voxel = voxel_labels(gaussians.means, coarsest), coarsest
-    tried = extent / max_count**0.5
-    for _ in range(10):  # surfaces have as many voxels as the voxel size squared has room for
-        found = voxel_labels(gaussians.means, tried)
-        count = int(found.max()) + 1
-        if count <= max_count and tried < voxel:
-            labels, voxel = found, tried
-        if 0.7 * max_count <= count <= max_count:
-            break
-        tried = float(np.clip(tried * (count / (0.85 * max_count)) ** 0.5, finest, coarsest))
-    return merge_groups(gaussians, labels)[0], voxel
+    level, into = decimate(gaussians, max_count)
+    if len(level) == len(gaussians):
+        return level, 0.0
+    apart = np.linalg.norm(gaussians.means.astype(np.float64) - level.means[into], axis=1)
+    return level, float(np.quantile(apart, 0.95))
 
 
 def box_of(gaussians: Gaussians) -> np.ndarray:
@@ -191,11 +183,11 @@ def _octree(
             levels.append(level)
     if not children:
         return TileNode(box_of(gaussians), 0.0, _place(path, gaussians, name, compressed)), gaussians
-    level, voxel = coarser(Gaussians.concatenate(levels), max(1, max_per_tile // 4))
+    level, error_m = coarser(Gaussians.concatenate(levels), max(1, max_per_tile // 4))
     coarsest = max(child.error_m for child in children)
     boxes = np.stack([box_of(level), *(child.box for child in children)])
     box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
-    return TileNode(box, max(voxel, coarsest), _place(path, level, name, compressed), tuple(children)), level
+    return TileNode(box, max(error_m, 1.5 * coarsest), _place(path, level, name, compressed), tuple(children)), level
 
 
 def _place(path: Path, gaussians: Gaussians, name: str, compressed: bool) -> str:

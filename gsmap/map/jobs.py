@@ -10,6 +10,7 @@ from typing import Any
 
 from gsmap import change as changing
 from gsmap import describe as describing
+from gsmap import localize as localizing
 from gsmap import register as registering
 from gsmap.export import PlannedTile
 from gsmap.geometry.metres import in_metres, resized
@@ -17,9 +18,11 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge.placed import pulled_inside
 from gsmap.merge.sights import SightStore
 from gsmap.merge.tile import LazyScene, merge_tile
+from gsmap.methods import family
 from gsmap.register import SceneView
 from gsmap.store import Store, branches, homes, sqlite
 from gsmap.types import ChangeReport, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
+from gsmap.types.localization import SceneFeatures
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress
 
@@ -61,6 +64,16 @@ def describe_scene(path: str, scene_id: str, models: Mapping[str, ModelSpec], pa
     policy = scenes.get(scene_id).scale_policy
     gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
     return describing.describe(scene_id, gaussians, cameras, params, models, scale_policy=policy)
+
+
+def features_of_scene(
+    path: str, scene_id: str, models: Mapping[str, ModelSpec], params: localizing.Params
+) -> SceneFeatures:
+    """What the views of one scene of the map at ``path`` show."""
+    scenes = _store(path).scenes
+    extractor = family("extractor").get(params.extractor).make(models, params.extractors[params.extractor])
+    gaussians, cameras = scenes.gaussians(scene_id), scenes.cameras(scene_id)
+    return localizing.scene_features(scene_id, gaussians, cameras, extractor, params.views, params.features)
 
 
 def register_scenes(

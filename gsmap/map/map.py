@@ -39,7 +39,9 @@ from gsmap.types.rows import (
     GraphRow,
     HistoryReport,
     IngestRow,
+    LocalizeReport,
     MapStatus,
+    MeasureReport,
     MergeReport,
     ModelRow,
     ObjectsReport,
@@ -61,10 +63,12 @@ from gsmap.types.rows import (
     TileRow,
     UpdateReport,
     WhyReport,
+    WorldReport,
 )
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
+    from gsmap.map.stages.georeference import Localise, Request
     from gsmap.map.stages.register import Pairs
     from gsmap.view import ViewServer
 
@@ -355,8 +359,11 @@ class Map(AbstractContextManager["Map"]):
         return reports.prior_row(self.store, self.store.scenes.get(prior.scene))
 
     def remove_prior(self, scene: str) -> None:
-        """Take back what was told of where a scene lies."""
-        self.store.priors.remove(scene)
+        """Take back what was told of where a scene lies: in the world, where that was told last, else in the map."""
+        from gsmap.map.stages.georeference import forget_position
+
+        if not forget_position(self.store, scene):
+            self.store.priors.remove(scene)
 
     # --- changes -----------------------------------------------------------------------------------------------------
 
@@ -463,6 +470,42 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import history_report, known_objects
 
         return history_report(known_objects(self.store, self.settings, self._progress), place, box)
+
+    # --- localize ----------------------------------------------------------------------------------------------------
+
+    def localize(
+        self,
+        *files: str | os.PathLike[str],
+        intrinsics: str | Sequence[float] | None = None,
+        focal: str | float | None = None,
+        near: str | None = None,
+    ) -> LocalizeReport:
+        """``gsmap localize MAP FILE...``: where photographs were taken, or why that is not said.
+
+        What views are found by is made for every scene that lacks it, and kept unless the map is read-only.
+
+        Args:
+            intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright picture.
+            focal: focal length in pixels, or ``auto`` to solve for it; by default what the file says (EXIF).
+            near: only what this scene shows, or ``X,Y,Z,R`` around a point of the map.
+
+        Raises:
+            NotFoundError: no such file or scene, or nothing in the map has a place.
+            InputError: a file is no picture.
+            ConfigError: what is said of the lens or the place makes no sense.
+        """
+        from gsmap.map.localizing import localize_files
+
+        with at_work(self.store, "localize"):
+            return localize_files(
+                self.store,
+                self.settings,
+                files,
+                intrinsics=intrinsics,
+                focal=focal,
+                near=near,
+                progress=self._progress,
+            )
 
     def find(
         self,
@@ -666,9 +709,9 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap models list MAP``."""
         return reports.model_rows(self.store)
 
-    def pose_rows(self) -> list[PoseRow]:
-        """``gsmap poses MAP``: where every placed scene lies."""
-        return reports.pose_rows(self.store)
+    def pose_rows(self, crs: str | None = None) -> list[PoseRow]:
+        """``gsmap poses MAP``: where every placed scene lies, in the map and (``crs``, or the map's own) the world."""
+        return reports.pose_rows(self.store, crs)
 
     def status(self) -> MapStatus:
         """``gsmap status MAP``: what is missing, stale or wants a person, each with the verb that helps."""
@@ -793,11 +836,68 @@ class Map(AbstractContextManager["Map"]):
         except ValueError as error:  # a suffix that Pillow does not know
             raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 
-    def write_poses(self, out: str | os.PathLike[str], format: str) -> list[Path]:
+    def write_poses(self, out: str | os.PathLike[str], format: str, crs: str | None = None) -> list[Path]:
         """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); the files written."""
         from gsmap.map.poses import write_poses
 
-        return write_poses(self.store, Path(out), format)
+        return write_poses(self.store, Path(out), format, crs)
+
+    # --- the world ---------------------------------------------------------------------------------------------------
+
+    def georeference(
+        self,
+        request: Request | None = None,
+        *,
+        remove: Sequence[str] | None = None,
+        localise: Localise | None = None,
+    ) -> WorldReport:
+        """``gsmap georeference MAP``: note observations of the world, solve the poses with them, and say how they fit.
+
+        Args:
+            request: what to note (`gsmap.map.stages.georeference.Request`); None to look only.
+            remove: names of observations to take back; an empty sequence takes back all, with the CRS.
+            localise: places photos that are no scene's camera (`gsmap.map.placed_photos.localiser`).
+
+        Raises:
+            ConfigError, InputError, NotFoundError: see `gsmap.map.stages.georeference`; nothing is noted then.
+        """
+        from gsmap.map.stages.georeference import georeference, take_back
+        from gsmap.map.stages.optimize import is_solved, solve
+
+        notes: tuple[str, ...] = ()
+        if request is not None or remove is not None:
+            with at_work(self.store, "georeference"):
+                if remove is not None:
+                    notes = (f"{take_back(self.store, remove)} observations were taken back",)
+                if request is not None:
+                    notes += georeference(self.store, request, self.settings, localise)
+                solve(self.store, self.settings, self._progress)
+        return reports.world_report(self.store, stale=not is_solved(self.store, self.settings), notes=notes)
+
+    def set_world_position(
+        self, scene: str, position: Sequence[float], sigma_m: tuple[float, float], crs: str = "EPSG:4326"
+    ) -> None:
+        """``gsmap prior MAP SCENE --latitude ...``: where the origin of a scene's frame lies in the world.
+
+        Args:
+            position: (3,) longitude or easting first, then latitude or northing, then height.
+            sigma_m: horizontal and vertical standard deviations.
+        """
+        from gsmap.map.stages.georeference import survey_position
+
+        survey_position(self.store, scene, position, crs, sigma_m, self.settings)
+
+    def measure(self, a: str, b: str, *, component: int | None = None, crs: str | None = None) -> MeasureReport:
+        """``gsmap measure MAP A B``: how far two points are apart in metres, and how well that is known.
+
+        Args:
+            a, b: ``X,Y,Z`` (map), ``SCENE:X,Y,Z``, ``SCENE:CAMERA@COLUMN,ROW`` or ``world:X,Y,Z``.
+            component: of points given in the map, where it has several.
+            crs: of the world coordinates shown; the map's own by default.
+        """
+        from gsmap.map.measuring import measure
+
+        return measure(self.store, a, b, self.settings, component=component, crs=crs)
 
     # --- upkeep ------------------------------------------------------------------------------------------------------
 

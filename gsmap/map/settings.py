@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, merge, objects, optimize, register, retrieve, thin
+from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin, world
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
 from gsmap.localize import scan
@@ -59,12 +59,14 @@ class Settings:
         retrieve: which pairs are tried.
         register: how a pair is registered and judged.
         optimize: how poses are solved.
+        world: how observations of the world are read.
         thin: when a capture is kept compact.
         merge: how captures become one.
         export: how tiles are planned and kept.
         visits: which captures are compared for changes.
         change: how changes between two captures are found.
         objects: when things of several captures are one, and how they are looked for.
+        localize: how photographs are found.
         scan: how a scan is looked for.
         by_shape: how a scan without colours is compared with a scene.
         evaluate: when an edge counts as wrong.
@@ -75,12 +77,14 @@ class Settings:
     retrieve: retrieve.Params = field(default_factory=retrieve.Params)
     register: register.Params = field(default_factory=register.Params)
     optimize: optimize.Params = field(default_factory=optimize.Params)
+    world: world.Params = field(default_factory=world.Params)
     thin: thin.Params = field(default_factory=thin.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)
     visits: visits.Params = field(default_factory=visits.Params)
     change: change.Params = field(default_factory=change.Params)
     objects: objects.Params = field(default_factory=objects.Params)
+    localize: localize.Params = field(default_factory=localize.Params)
     scan: scan.Params = field(default_factory=scan.Params)
     by_shape: by_shape.Params = field(default_factory=by_shape.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)

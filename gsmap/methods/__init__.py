@@ -31,6 +31,7 @@ def families() -> dict[str, Family]:
     found = (
         Family("segmenter", "gsmap.describe.segmenters", ("MODELS", "make")),
         Family("embedder", "gsmap.describe.embedders", ("MODELS", "make")),
+        Family("extractor", "gsmap.localize.extractors", ("MODELS", "make")),
         Family("proposer", "gsmap.register.proposers", ("SCALES", "PACKAGES", "propose")),
         Family("refiner", "gsmap.register.refiners", ("SCALES", "refine")),
         Family(

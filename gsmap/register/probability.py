@@ -8,54 +8,24 @@ real capture had a part in it.
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 
 import numpy as np
 
+from gsmap.compare.odds import Curve, Odds
 from gsmap.register.evidence import PoseEvidence
 from gsmap.types.registration import Proposal
+
+__all__ = ["Curve", "Model", "evidence_of", "probability", "shortfalls", "worth"]
 
 VERSION = 1
 
 _FILE = "probability.json"
 
 
-@dataclass(frozen=True)
-class Curve:
-    """What one piece of evidence is worth.
-
-    Args:
-        knots: values of the evidence, rising.
-        worth: log-odds at each knot; straight between, constant beyond.
-        missing: log-odds where the evidence could not be had.
-    """
-
-    knots: tuple[float, ...]
-    worth: tuple[float, ...]
-    missing: float
-
-    def at(self, value: float) -> float:
-        """Log-odds for the pose (below 0: against it)."""
-        return self.missing if np.isnan(value) else float(np.interp(value, self.knots, self.worth))
-
-
-@dataclass(frozen=True)
-class Model:
-    """The fitted curves by the name of their evidence, and what none of them explains.
-
-    Args:
-        curves: of each piece of evidence of `evidence_of`.
-        base: log-odds before any evidence, where a right pose is as frequent as a wrong one.
-        least: probabilities lower than this, and higher than one minus it, were never seen often enough to be told
-            apart: the answer stays within.
-    """
-
-    curves: dict[str, Curve]
-    base: float
-    least: float
+class Model(Odds):
+    """The fitted curves of each piece of evidence of `evidence_of`."""
 
     @classmethod
     def load(cls) -> Model:
@@ -65,9 +35,7 @@ class Model:
 
 @lru_cache(maxsize=1)
 def _shipped() -> Model:
-    stored = json.loads((files("gsmap.register") / _FILE).read_text())
-    curves = {name: Curve(tuple(c["knots"]), tuple(c["worth"]), c["missing"]) for name, c in stored["curves"].items()}
-    return Model(curves, stored["base"], stored["least"])
+    return Model.of_json((files("gsmap.register") / _FILE).read_text())
 
 
 def evidence_of(proposal: Proposal, evidence: PoseEvidence) -> dict[str, float]:
@@ -92,17 +60,12 @@ def evidence_of(proposal: Proposal, evidence: PoseEvidence) -> dict[str, float]:
 
 def worth(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> dict[str, float]:
     """Log-odds that each piece of evidence adds, by its name."""
-    model = model or Model.load()
-    return {name: model.curves[name].at(value) for name, value in evidence_of(proposal, evidence).items()}
+    return (model or Model.load()).worth(evidence_of(proposal, evidence))
 
 
 def shortfalls(proposal: Proposal, evidence: PoseEvidence, model: Model | None = None) -> list[str]:
     """The names of the evidence that could be had, what lacks most of what it could be worth first."""
-    model, lacks = model or Model.load(), {}
-    for name, value in evidence_of(proposal, evidence).items():
-        if not np.isnan(value):
-            lacks[name] = max(model.curves[name].worth) - model.curves[name].at(value)
-    return sorted(lacks, key=lambda name: -lacks[name])
+    return (model or Model.load()).shortfalls(evidence_of(proposal, evidence))
 
 
 def probability(proposal: Proposal, evidence: PoseEvidence, prior: float = 0.5, model: Model | None = None) -> float:
@@ -113,6 +76,4 @@ def probability(proposal: Proposal, evidence: PoseEvidence, prior: float = 0.5, 
         evidence: under that pose.
         prior: share of judged poses that are right before anything is known of them.
     """
-    model = model or Model.load()
-    odds = model.base + np.log(prior / (1 - prior)) + sum(worth(proposal, evidence, model).values())
-    return float(np.clip(1 / (1 + np.exp(-odds)), model.least, 1 - model.least))
+    return (model or Model.load()).probability(evidence_of(proposal, evidence), prior)

@@ -20,7 +20,7 @@ from gsmap.errors import CorruptError, GsmapError, InputError
 from gsmap.texts import control_characters
 
 _DIGEST = re.compile(r"[0-9a-f]{32}|[0-9a-f]{64}")
-KINDS = ("scenes", "graphs", "changes", "indexes")
+KINDS = ("scenes", "graphs", "changes", "indexes", "views")
 """Of groups of arrays: the folders below ``arrays``."""
 
 
@@ -264,6 +264,13 @@ def a_pose(value: Any) -> bool:
         and _numbers(value.get("rotation"), 3, 3)
         and _numbers(value.get("translation"), 3)
         and _numbers(value.get("scale"))
+    )
+
+
+def ties(value: Any) -> bool:
+    """Where components lie in the world; `gsmap.store.ties` looks further."""
+    return isinstance(value, list) and all(
+        isinstance(one, dict) and isinstance(one.get("component"), int) for one in value
     )
 
 

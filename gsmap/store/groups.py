@@ -11,7 +11,7 @@ from gsmap.errors import CorruptError, NotFoundError
 from gsmap.store.arrays import Arrays, Staged, StoredFile
 from gsmap.store.branches import Others
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.schema import files, graphs, groups
+from gsmap.store.schema import files, graphs, groups, view_features
 
 
 def has_group(connection: Connection, group_id: str) -> bool:
@@ -47,12 +47,13 @@ def unname(connection: Connection, group_id: str) -> None:
 
 
 def drop_graphs(connection: Connection, scene: str) -> None:
-    """Forget the graphs of a scene whose Gaussians become others."""
-    made = graphs.c.scene == scene
-    old = list(connection.execute(select(graphs.c.group_id).where(made)).scalars())
-    connection.execute(delete(graphs).where(made))
-    for group in old:
-        unname(connection, group)
+    """Forget the graphs of a scene whose Gaussians become others, and the features of its views."""
+    for table in (graphs, view_features):
+        made = table.c.scene == scene
+        old = list(connection.execute(select(table.c.group_id).where(made)).scalars())
+        connection.execute(delete(table).where(made))
+        for group in old:
+            unname(connection, group)
 
 
 @contextlib.contextmanager

@@ -37,7 +37,9 @@ from gsmap.store.schema import (
     models,
     revisions,
     scenes,
+    view_features,
 )
+from gsmap.store.view_features import KIND as VIEWS
 from gsmap.types.progress import Progress
 
 _WORTH_BYTES = 64 << 10
@@ -282,6 +284,8 @@ def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
     lost = set(connection.execute(select(scenes.c.id).where(gone)).scalars())
     claimed |= {row.group_id for row in newest_of_all(connection) if not {row.older, row.newer} & lost}
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
+    views = select(view_features.c.group_id).where(view_features.c.scene.not_in(lost))
+    claimed |= set(connection.execute(views).scalars())
     known = {(g.kind, g.id) for g in connection.execute(select(groups))}
     return _Waste(
         dropped,
@@ -297,6 +301,7 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
         connection.execute(update(revisions).where(revisions.c.number.in_(waste.revisions)).values(dropped_at=now()))
         forget_dropped(connection)
         connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
+        connection.execute(delete(view_features).where(view_features.c.group_id.in_(ids)))
         for table in (scenes, comparisons):
             connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))
         for _, number in waste.scenes:
@@ -312,6 +317,8 @@ def _advice(connection: Connection, kind: str, group: str, location: str | None)
         return _comparison_advice(connection, group, location)
     if kind == INDEXES:
         return " (the index of retrieval: it is made anew when the next new scene asks it)"
+    if kind == VIEWS:
+        return " (features of a scene's views: they are made anew when the next photograph is localised)"
     if kind != "graphs":
         return ""
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)

@@ -37,6 +37,7 @@ from gsmap.store.schema import (
     index_segments,
     leases,
     lookups,
+    observations,
     poses,
     priors,
     purges,
@@ -47,6 +48,7 @@ from gsmap.store.schema import (
     scenes,
     set_aside,
     tiles,
+    view_features,
 )
 from gsmap.store.store import Store
 
@@ -56,7 +58,7 @@ _GONE = "a scene that was purged"
 _REMARKS: tuple[tuple[Table, tuple[str, ...]], ...] = (
     (scenes, ("notes",)),
     (registrations, ("reason", "notes")),
-    (revisions, ("notes", "provenance")),
+    (revisions, ("notes", "provenance", "world")),
     (edges, ("reason",)),
     (comparisons, ("notes",)),
     (tiles, ("notes",)),
@@ -245,6 +247,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     drop("edges", edges, (edges.c.target == scene) | (edges.c.source == scene))
     drop("poses", poses, poses.c.scene == scene)
     drop("priors", priors, priors.c.scene == scene)
+    drop("observations", observations, (observations.c.scene == scene) | (observations.c.other == scene))
     drop("facts", scene_facts, scene_facts.c.scene == scene)
     drop("leases", leases, leases.c.what.contains(scene))
     drop("set_aside", set_aside, set_aside.c.about.contains(scene))
@@ -254,12 +257,14 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     drop("tiles", tiles, tiles.c.number.in_(made_with_it))
     _forget_lookups(connection, scene)
     drop("graphs", graphs, graphs.c.scene == scene)
+    drop("view_features", view_features, view_features.c.scene == scene)
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
     claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
     claimed |= set(connection.execute(select(graphs.c.group_id)).scalars())
     claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(view_features.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
     sizes = select(files.c.group_id, func.sum(files.c.size_bytes)).where(files.c.group_id.in_(unclaimed))
     bodies = {group: int(size) for group, size in connection.execute(sizes.group_by(files.c.group_id))}
@@ -271,6 +276,10 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
         said = f"the pose of {_GONE} is no longer part of this revision"
         connection.execute(update(revisions).where(mine).values(notes=[*notes, said]))
     counts["revisions"] = len(affected)
+    for line in connection.execute(select(revisions.c.number, revisions.c.world)).all():
+        left = [tie | {"residuals": [row for row in tie["residuals"] if row["scene"] != scene]} for tie in line.world]
+        if left != line.world:
+            connection.execute(update(revisions).where(revisions.c.number == line.number).values(world=left))
     return counts, bodies
 
 

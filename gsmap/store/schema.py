@@ -13,6 +13,7 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
+    LargeBinary,
     MetaData,
     Table,
     Text,
@@ -43,6 +44,7 @@ from gsmap.store.columns import (
     poses_by_scene,
     sigmas,
     texts,
+    ties,
 )
 from gsmap.store.matrices import (
     covariance_bytes,
@@ -53,8 +55,9 @@ from gsmap.store.matrices import (
     pose_of_bytes,
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
+from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0007"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0008"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -110,7 +113,7 @@ about = _table(
 groups = _table(
     "groups",
     Column("id", Digest, primary_key=True),  # digest of the content
-    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes
+    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes, views
     Column("created_at", Text, nullable=False),
 )
 files = _table(
@@ -243,6 +246,19 @@ lookups = _table(
     Column("created_at", Text, nullable=False),
 )
 
+# What the views of a scene show, which photographs are found by; made anew where it is lost.
+view_features = _table(
+    "view_features",
+    Column("key", Key, primary_key=True),  # RecipeKey.digest
+    _recipe(),
+    _scene("scene", index=True),
+    Column("num_views", Integer, nullable=False),
+    Column("num_features", Integer, nullable=False),
+    Column("summaries", LargeBinary, nullable=False),  # int8, as many to each view
+    Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
+    Column("created_at", Text, nullable=False),
+)
+
 # Two captures of a place, looked at for what changed. Nothing is overwritten; of a pair the newest one counts.
 comparisons = _table(
     "comparisons",
@@ -296,6 +312,7 @@ revisions = _table(
     Column("settings", Json(an_object), nullable=False, server_default="{}"),
     Column("provenance", Json(an_object), nullable=False, server_default="{}"),
     Column("notes", Json(texts), nullable=False, server_default="[]"),
+    Column("world", Json(ties), nullable=False, server_default="[]"),  # where its components lie in the world
     Column("note", Lines, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("dropped_at", Text),  # prune may reclaim what only this revision names
@@ -339,6 +356,20 @@ priors = _table(
     Column("up_sigma_rad", Real, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
+)
+
+# What was observed of the world; nothing is overwritten.
+observations = _table(
+    "observations",
+    Column("number", Integer, primary_key=True),
+    Column("kind", Word(OBSERVATION_KINDS), nullable=False),
+    Column("name", Line, nullable=False),
+    Column("scene", Digest, ForeignKey("scenes.id"), index=True),  # whose frame it speaks of; null of points
+    Column("other", Digest, ForeignKey("scenes.id")),  # of a scale bar's other end
+    Column("value", Json(an_object), nullable=False),  # as of `gsmap.types.world`
+    Column("created_at", Text, nullable=False),
+    Column("removed_at", Text),
+    CheckConstraint("kind in ('frame', 'point', 'image', 'fix', 'bar')", name="kind"),
 )
 
 models = _table(

@@ -155,16 +155,18 @@ def film(
     shut: Iterable[int] = (),
     gain: float | np.ndarray = 1.0,
     gamma: float = 1.0,
+    focal: float = _FOCAL,
     name: str = "frame",
     progress: Callable[[float, str], None] | None = None,
 ) -> Frames:
     """Render colour (2 x 2 supersampled) and depth frames of a place from camera-to-place poses (C, 4, 4).
 
     ``shut`` names the doors (indices) that are closed meanwhile. ``gain`` (one, or one a channel: white balance) and
-    ``gamma`` imitate a camera's exposure: colours become ``clip(gain * colour ** gamma)``.
+    ``gamma`` imitate a camera's exposure: colours become ``clip(gain * colour ** gamma)``. ``focal`` is the focal
+    length as a share of the image's width.
     """
     width, height = size_px
-    focal = _FOCAL * width
+    focal *= width
     count = len(poses)
     cameras = Cameras(
         poses,

@@ -69,6 +69,8 @@ RUNS = {
     "why A:B": "why MAP left:right --pictures TMP/why",
     "diff": "diff MAP 1 2",
     "poses": "poses MAP",
+    "georeference": "georeference MAP --scale-bar left:0,0,0 left:1,0,0 1.02",
+    "measure": "measure MAP left:0,0,0 right:1,0,0",
     "settings": "settings MAP",
     "convert": "convert CAPTURES/left.ply TMP/left.spz",
     "models add": "models add MAP clip TMP/encoder.onnx --preset unit",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import gsmap
-from gsmap import change, describe, merge, optimize, register
+from gsmap import change, describe, localize, merge, optimize, register
 from gsmap.errors import ConfigError
 from gsmap.export import PlannedTile, TileRecipe
 from gsmap.map.settings import PRESETS, Settings, settings_of
@@ -24,7 +24,7 @@ from gsmap.methods import families
 from gsmap.settings import changed, leaves, load, parse, save
 from gsmap.types import Sim3
 
-GRAPH, EDGE, POSES, CHANGES = "graph", "edge", "poses", "changes"
+GRAPH, EDGE, POSES, CHANGES, VIEWS = "graph", "edge", "poses", "changes", "views"
 MERGERS = families()["merger"].names()
 TILE = PlannedTile(0, "map", np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), {"scene": Sim3.identity()}, "all")
 
@@ -47,6 +47,13 @@ ALTERNATIVES: dict[str, Any] = {
 }
 """Another value of a setting that takes only certain words."""
 
+JUDGING = tuple(
+    field.name
+    for field in fields(localize.Params)
+    if field.name not in ("extractor", "extractors", "views", "features")
+)
+"""What photographs are judged by; what is kept is what views show."""
+
 NAMES_NOTHING = (
     "objects.",  # made whenever they are asked for, and not kept
     "retrieve.",
@@ -57,8 +64,10 @@ NAMES_NOTHING = (
     "export.",
     "evaluate.",
     "engine.",
+    "world.",  # is in what was observed once it was read
     "merge.method",
     "describe.object.model_",
+    *(f"localize.{part}" for part in JUDGING),
 )
 """Settings that choose work (which pairs, which tiles, where it runs, when it is given up), and change no result."""
 
@@ -70,6 +79,7 @@ def _chosen_by(plural: str, switch: str, kind: str) -> dict[str, dict[str, Any]]
 ONLY_IF = {
     **_chosen_by("describe.object.segmenters", "describe.object.segmenter", "segmenter"),
     **_chosen_by("describe.object.embedders", "describe.object.embedder", "embedder"),
+    **_chosen_by("localize.extractors", "localize.extractor", "extractor"),
     **_chosen_by("register.proposers", "register.proposer", "proposer"),
     **_chosen_by("register.coarse_refiners", "register.coarse_refiner", "refiner"),
     **_chosen_by("register.refiners", "register.refiner", "refiner"),
@@ -79,6 +89,7 @@ ONLY_IF = {
 IDLE = {
     "describe.object.segmenters": {"describe.objects": False},
     "describe.object.embedders": {"describe.objects": False},
+    "localize.extractors": {},
     "register.proposers": {"register.fallback": "never"},
     "register.coarse_refiners": {},
     "register.refiners": {},
@@ -99,7 +110,9 @@ def keys(settings: Settings) -> dict[str, str]:
     poses = optimize.recipe_key(settings.optimize).of("scene", edge.digest)
     tiles = {f"tile {m}": TileRecipe(merge.recipe_key(m, settings.merge.mergers[m])).key(TILE) for m in MERGERS}
     changes = change.recipe_key(settings.change).of("older", "newer")
-    return {GRAPH: graph.digest, EDGE: edge.digest, POSES: poses.digest, CHANGES: changes.digest, **tiles}
+    views = localize.recipe_key(settings.localize).of("scene", "")
+    named = {GRAPH: graph, EDGE: edge, POSES: poses, CHANGES: changes, VIEWS: views}
+    return {kind: key.digest for kind, key in named.items()} | tiles
 
 
 def expected(name: str) -> set[str]:
@@ -110,7 +123,13 @@ def expected(name: str) -> set[str]:
     if room == "merge":
         return {f"tile {name.split('.')[2]}"}
     # An edge is made from graphs, and poses from edges: what changes the one changes the other.
-    return {"describe": {GRAPH, EDGE, POSES}, "register": {EDGE, POSES}, "optimize": {POSES}, "change": {CHANGES}}[room]
+    return {
+        "describe": {GRAPH, EDGE, POSES},
+        "register": {EDGE, POSES},
+        "optimize": {POSES},
+        "change": {CHANGES},
+        "localize": {VIEWS},
+    }[room]
 
 
 def another(name: str, value: Any) -> Iterator[Any]:
@@ -160,7 +179,7 @@ def test_a_setting_changes_the_keys_of_what_it_influences_and_no_others(name: st
             leaf = next(leaf for leaf in leaves(idle) if leaf.name == name)
             assert keys(with_another(idle, name, leaf.value)) == keys(idle), f"{name} counts though nothing asks for it"
         settings = changed(settings, condition)
-    elif name == "register.scale_refiner":
+    elif name in ("register.scale_refiner", "localize.extractor"):
         pytest.skip("there is only one built-in choice")
     leaf = next(leaf for leaf in leaves(settings) if leaf.name == name)
     before, after = keys(settings), keys(with_another(settings, name, leaf.value))
@@ -223,7 +242,9 @@ def test_a_version_changes_a_key(module: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(found, "VERSION", found.VERSION + 1)
     after = all_keys()
     assert before != after, f"{module} states a VERSION that no key knows"
-    room = {"describe": GRAPH, "register": EDGE, "optimize": POSES, "change": CHANGES}.get(module.split(".")[1], "tile")
+    room = {"describe": GRAPH, "register": EDGE, "optimize": POSES, "change": CHANGES, "localize": VIEWS}.get(
+        module.split(".")[1], "tile"
+    )
     for old, new in zip(before, after, strict=True):
         changed_kinds = {kind for kind in old if old[kind] != new[kind]}
         upstream = {EDGE: {GRAPH}, POSES: {GRAPH, EDGE}, "tile": {GRAPH, EDGE, POSES}}.get(room, set())

@@ -15,6 +15,7 @@ from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.find import FindHit, FindReport
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
+from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
 from gsmap.types.rows.localize_scan import ScanRow, ScanSupport
 from gsmap.types.rows.maps import (
     CheckReport,
@@ -57,8 +58,10 @@ from gsmap.types.rows.truth import (
     PoseErrorRow,
 )
 from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
+from gsmap.types.rows.world import MeasureReport, PlaceRow, ResidualRow, TieRow, WorldReport
 
 __all__ = [
+    "SCHEMA",
     "AtWorkRow",
     "BackupReport",
     "BandRow",
@@ -85,9 +88,12 @@ __all__ = [
     "IngestRow",
     "InitReport",
     "LayerRow",
+    "LocalizeReport",
+    "LocalizeRow",
     "MapStatus",
-    "MetreRow",
+    "MeasureReport",
     "MergeReport",
+    "MetreRow",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -97,6 +103,7 @@ __all__ = [
     "PairEventRow",
     "PairRef",
     "PairReport",
+    "PlaceRow",
     "PoseChangeRow",
     "PoseErrorRow",
     "PoseRow",
@@ -104,10 +111,10 @@ __all__ = [
     "PruneReport",
     "PurgeReport",
     "RelationRow",
+    "ResidualRow",
     "RestoreReport",
     "RevisionRow",
     "Row",
-    "SCHEMA",
     "ScanRow",
     "ScanSupport",
     "SceneEdgeRow",
@@ -120,6 +127,7 @@ __all__ = [
     "SplitReport",
     "ThinReport",
     "ThinRow",
+    "TieRow",
     "TileRow",
     "TodoRow",
     "TrustReport",
@@ -127,4 +135,5 @@ __all__ = [
     "ViewReport",
     "WhyReport",
     "WhyStep",
+    "WorldReport",
 ]

@@ -1,0 +1,60 @@
+"""gsmap localize: where photographs were taken."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import (
+    AsJson,
+    Executor,
+    MapPath,
+    Preset,
+    Scheduler,
+    Sets,
+    opened,
+    print_rows,
+    print_table,
+    say,
+)
+
+
+def command(
+    map: MapPath,
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Photographs.", show_default=False)],
+    intrinsics: Annotated[
+        str | None,
+        typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="Of all photos, in pixels of the upright picture."),
+    ] = None,
+    focal: Annotated[
+        str | None,
+        typer.Option(
+            "--focal",
+            metavar="auto|PX",
+            help="Focal length in pixels; auto solves for it, whatever the file says. By default the file's (EXIF).",
+        ),
+    ] = None,
+    near: Annotated[
+        str | None,
+        typer.Option("--near", metavar="SCENE|X,Y,Z,R", help="Look only at what this scene shows, or around a point."),
+    ] = None,
+    sets: Sets = None,
+    preset: Preset = None,
+    executor: Executor = None,
+    scheduler: Scheduler = None,
+    json: AsJson = False,
+) -> None:
+    """Find where photographs were taken, or say why not. What scenes are found by is made when first needed, and kept.
+
+    Example: `gsmap localize site.gsmap phone.jpg`
+    """
+    with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
+        report = m.localize(*files, intrinsics=intrinsics, focal=focal, near=near)
+    for note in report.notes:
+        say(note)
+    if json:
+        print_rows("localize", report, json)
+        return
+    print_table("localize", report.results[0].columns, report.results)
+    say(f"{sum(row.status == 'placed' for row in report.results)} of {len(report.results)} placed")

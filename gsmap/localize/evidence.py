@@ -1,0 +1,126 @@
+"""What speaks for and against a photograph's place: what the map shows from there, beside what the photograph shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from gsmap.localize.looks import Look
+
+
+@dataclass(frozen=True)
+class Params:
+    """How a photograph is compared with renders.
+
+    Args:
+        half_px: patterns are compared within patches that reach so far from their middle.
+        step_px: from one patch to the next.
+        min_structure: least contrast of a patch (standard deviation, grey in [0, 1]) in the photo or the render, for it
+            to be compared.
+        agree: normalised correlation from which on a patch is explained.
+        contradict: ... and under which it shows something else.
+        inlier_px: a patch that is found again this near to where the pose predicts it is an inlier, at 480 pixels.
+        blocks: columns and rows of the picture over which inliers should be spread.
+        near_m: surfaces nearer than this stand in a camera's face.
+    """
+
+    half_px: int = 8
+    step_px: int = 8
+    min_structure: float = 0.02
+    agree: float = 0.5
+    contradict: float = 0.15
+    inlier_px: float = 2.0
+    blocks: tuple[int, int] = (8, 6)
+    near_m: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A photograph beside what the map shows from one pose.
+
+    Args:
+        correlation: (R, C) of each patch with that scene's that shows it best; NaN where nothing can be compared.
+        seen: share of the picture where some scene is opaque.
+        colour: correlation of the chroma of photo and renders over patches; NaN where neither has any.
+        blocked: share of the picture where something stands in the camera's face.
+    """
+
+    correlation: np.ndarray
+    seen: float
+    colour: float
+    blocked: float
+
+    def explained(self, agree: float) -> float:
+        """Share of the patches that could be compared which agree; 0 of none."""
+        judged = self.correlation[np.isfinite(self.correlation)]
+        return float((judged >= agree).mean()) if len(judged) else 0.0
+
+    def contradicted(self, bar: float) -> float:
+        """Share of the patches that could be compared which show something else; 0 of none."""
+        judged = self.correlation[np.isfinite(self.correlation)]
+        return float((judged < bar).mean()) if len(judged) else 0.0
+
+    @property
+    def num_judged(self) -> int:
+        return int(np.isfinite(self.correlation).sum())
+
+
+def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Comparison:
+    """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose."""
+    grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
+    rows = slice(params.half_px, rgb.shape[0] - params.half_px, params.step_px)
+    columns = slice(params.half_px, rgb.shape[1] - params.half_px, params.step_px)
+    size = 2 * params.half_px + 1
+    mean = uniform_filter(grey, size)
+    variance = np.maximum(uniform_filter(grey * grey, size) - mean**2, 0)
+    best = np.full(grey[rows, columns].shape, -np.inf, np.float32)
+    judged = np.zeros(best.shape, bool)
+    seen, blocked = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
+    shown = np.zeros((*best.shape, 3), np.float32)
+    photo_colour = _patches(rgb, params)[rows, columns]
+    for one in looks:
+        opaque = one.alpha > 0.9
+        seen |= opaque
+        blocked |= opaque & (one.depth_m < params.near_m)
+        other = uniform_filter(one.grey, size)
+        spread = np.maximum(uniform_filter(one.grey**2, size) - other**2, 0)
+        both = uniform_filter(grey * one.grey, size) - mean * other
+        correlation = both / np.sqrt(np.maximum(variance * spread, 1e-12))
+        whole = uniform_filter(opaque.astype(np.float32), size) > 0.95
+        tells = whole & (np.maximum(variance, spread) > params.min_structure**2) & (np.minimum(variance, spread) > 4e-5)
+        correlation = np.where(tells, correlation, -np.inf)[rows, columns]
+        better = correlation > best
+        shown[better] = _patches(one.rgb, params)[rows, columns][better]
+        best = np.maximum(best, correlation)
+        judged |= tells[rows, columns]
+    best = np.where(judged, best, np.nan)
+    return Comparison(best, float(seen.mean()), _chroma(photo_colour[judged], shown[judged]), float(blocked.mean()))
+
+
+def _patches(rgb: np.ndarray, params: Params) -> np.ndarray:
+    return np.stack([uniform_filter(rgb[..., c], 2 * params.half_px + 1) for c in range(3)], axis=-1)
+
+
+def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:
+    """Correlation of two differences of channels, so that neither brightness nor white balance counts."""
+    if len(photo) < 12:
+        return float("nan")
+    products, squares = 0.0, [0.0, 0.0]
+    for one, two in ((0, 1), (2, 1)):
+        a, b = (np.log((x[:, one] + 0.02) / (x[:, two] + 0.02)) for x in (photo, shown))
+        a, b = a - a.mean(), b - b.mean()
+        products += float(a @ b)
+        squares[0] += float(a @ a)
+        squares[1] += float(b @ b)
+    if min(squares) < 1e-4 * len(photo):
+        return float("nan")
+    return products / float(np.sqrt(squares[0] * squares[1]))
+
+
+def spread(pixels: np.ndarray, size_px: tuple[int, int], blocks: tuple[int, int]) -> float:
+    """Share of the picture's blocks in which any of the pixels (K, 2) lies."""
+    at = np.clip((pixels / size_px * blocks).astype(int), 0, np.array(blocks) - 1)
+    return len(np.unique(at[:, 1] * blocks[0] + at[:, 0])) / (blocks[0] * blocks[1])

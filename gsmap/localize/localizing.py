@@ -1,0 +1,220 @@
+"""One photograph: where it was taken, how well that is known, or why nothing is said."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from gsmap.localize import covariance, evidence, matching, probability, verdict
+from gsmap.localize.candidates import Candidate, candidates, matches_by_component
+from gsmap.localize.features import quantised, turns
+from gsmap.localize.looks import GREY
+from gsmap.localize.params import Params
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.retrieval import ViewIndex
+from gsmap.localize.settling import Picture, Settled, inliers, settle
+from gsmap.localize.summaries import summarised
+from gsmap.methods.extractor import Extractor
+from gsmap.types.localization import Keypoints, Photo, Placement
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A pose of a photo that was looked into.
+
+    Args:
+        candidate: the rough pose.
+        settled: the sharp one.
+        covariance: (6, 6), metres; None where too little was found.
+        evidence: by name.
+        probability: of all of it.
+    """
+
+    candidate: Candidate
+    settled: Settled
+    covariance: np.ndarray | None
+    evidence: Mapping[str, float]
+    probability: float
+
+
+def localize_photo(
+    photo: Photo,
+    index: ViewIndex,
+    scenes: Mapping[str, PlacedFeatures],
+    extractor: Extractor,
+    params: Params,
+    metres_per_unit: Mapping[int, float] | None = None,
+) -> Placement:
+    """Find a photograph in the map.
+
+    Views that look like it are matched with it, poses that these matches agree on are sharpened on renders of the map,
+    and the best one is judged by what the map shows from there.
+
+    Args:
+        index: of the views that may show it.
+        scenes: by id, all that the index names.
+        metres_per_unit: of the frame of each component; 1 where it is not named.
+
+    Returns:
+        The pose in the frame and unit of its component, or the reason why there is none.
+    """
+    picture, factor = prepared(photo, params)
+    judged, why = judged_poses(picture, index, scenes, extractor, params)
+    if not judged:
+        return Placement(photo.name, why)
+    best = judged[0]
+    rival, sigmas = _rival(judged, params), sigmas_of(best.covariance)
+    reason = verdict.judge(best.evidence, best.probability, sigmas, rival, params.verdict)
+    component = best.candidate.component
+    metres = (metres_per_unit or {}).get(component, 1.0)
+    told = {**best.evidence, "rival": rival}
+    if reason:
+        return Placement(photo.name, reason, component=component, probability=best.probability, evidence=told)
+    support, seen = _support(best, scenes, params, picture)
+    pose = best.settled.T_metric_camera.copy()
+    pose[:3, 3] /= metres
+    assert best.covariance is not None
+    known = covariance.with_scene(best.covariance, best.settled.T_metric_camera, support)
+    unit = np.r_[np.ones(3), np.full(3, 1 / metres)]
+    return Placement(
+        photo.name,
+        "",
+        pose,
+        known * np.outer(unit, unit),
+        component,
+        tuple(scene.scene for scene, _ in support),
+        best.settled.intrinsics_px / factor,
+        best.probability,
+        told,
+        seen,
+    )
+
+
+def prepared(photo: Photo, params: Params) -> tuple[Picture, float]:
+    """The photo as it is worked on, and how many of its pixels are one of the original's."""
+    width, height = photo.size_px
+    factor = min(1.0, params.views.image_size_px / max(width, height))
+    rgb = photo.rgb
+    if factor < 1:
+        size = (max(1, round(width * factor)), max(1, round(height * factor)))
+        rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BOX, reducing_gap=3.0))
+        factor = size[0] / width
+    real = rgb.astype(np.float32) / 255
+    return Picture(real, real @ GREY, photo.intrinsics_px * factor, photo.focal_sigma), factor
+
+
+def judged_poses(
+    picture: Picture,
+    index: ViewIndex,
+    scenes: Mapping[str, PlacedFeatures],
+    extractor: Extractor,
+    params: Params,
+) -> tuple[list[Judged], str]:
+    """Poses that were looked into, the most probable first; and why there are none."""
+    if not len(index):
+        return [], "the map shows nothing to compare it with"
+    found = photo_features(picture, extractor, params)
+    if len(found) < params.resection.min_inliers:
+        return [], f"it shows too little: {len(found)} features"
+    described = matching.Described(quantised(found.descriptors), turns(found))
+    matches = matches_by_component(described, summarised(found.descriptors), index, scenes, params.matching)
+    rough = candidates(
+        found.pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma, params.resection
+    )
+    if not rough:
+        most = max((len(one.feature) for one in matches.values()), default=0)
+        fewest = params.resection.min_inliers
+        return [], f"nothing in the map looks like it: {most} features match, no {fewest} agree on a pose"
+    out: list[Judged] = []
+    for candidate in rough[: params.max_candidates]:
+        sure = max((one.probability for one in out), default=0.0) >= params.sure
+        if sure and candidate.num_inliers < params.rival_inliers * out[0].candidate.num_inliers:
+            break
+        out.append(judged_pose(picture, candidate, scenes, params))
+    return sorted(out, key=lambda one: -one.probability), ""
+
+
+def photo_features(picture: Picture, extractor: Extractor, params: Params) -> Keypoints:
+    """Features of a photo, without what is finer than renders are."""
+    smooth = params.matching.smooth_px
+    rgb = gaussian_filter(picture.rgb, (smooth, smooth, 0)) if smooth > 0 else picture.rgb
+    return extractor.extract((rgb * 255 + 0.5).astype(np.uint8))
+
+
+def judged_pose(picture: Picture, candidate: Candidate, scenes: Mapping[str, PlacedFeatures], params: Params) -> Judged:
+    """A rough pose, sharpened and compared with what the map shows there."""
+    settled = settle(
+        picture,
+        candidate.T_metric_camera,
+        candidate.intrinsics_px,
+        [scenes[scene] for scene in candidate.scenes],
+        params.settling,
+        params.features,
+        params.tracking,
+        params.resection,
+    )
+    comparison = evidence.compare(picture.rgb, settled.looks, params.evidence)
+    known = None
+    if settled.fit is not None:
+        known = covariance.pose_covariance(
+            settled.fit, settled.pixels, picture.size_px, params.covariance, focal_sigma=picture.focal_sigma
+        )
+    told = probability.evidence_of(
+        picture, settled, comparison, sigmas_of(known), candidate.num_inliers, params.evidence
+    )
+    return Judged(candidate, settled, known, told, probability.model().probability(told, params.verdict.prior))
+
+
+def sigmas_of(covariance: np.ndarray | None) -> tuple[float, float]:
+    """Largest standard deviation of rotation (rad) and translation; inf of none."""
+    if covariance is None:
+        return np.inf, np.inf
+    turn, shift = (
+        float(np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1].clip(0))) for part in (slice(3), slice(3, 6))
+    )
+    return turn, shift
+
+
+def _rival(judged: Sequence[Judged], params: Params) -> float:
+    """The probability of the best pose that is another place than the best one's; 0 where there is none."""
+    best = judged[0]
+    for other in judged[1:]:
+        far = np.linalg.norm(best.settled.T_metric_camera[:3, 3] - other.settled.T_metric_camera[:3, 3])
+        apart = other.candidate.component != best.candidate.component or far > params.apart_m
+        if apart:
+            return other.probability
+    return 0.0
+
+
+def _support(
+    best: Judged, scenes: Mapping[str, PlacedFeatures], params: Params, picture: Picture
+) -> tuple[list[tuple[PlacedFeatures, float]], int]:
+    """The scenes in which patches were found again, with their shares, most first; and how many of their Gaussians the
+    photo shows."""
+    kept = inliers(best.settled, params.evidence, picture.size_px)
+    counts = np.bincount(best.settled.scene[kept], minlength=len(best.settled.looks))
+    order = [k for k in np.argsort(-counts, kind="stable") if counts[k]]
+    held = [(scenes[best.settled.looks[k].scene], counts[k] / counts.sum()) for k in order]
+    return held, sum(_num_seen(scene, best.settled, picture) for scene, _ in held)
+
+
+def _num_seen(scene: PlacedFeatures, settled: Settled, picture: Picture) -> int:
+    from gsmap.geometry.projection import in_image, project
+
+    camera = scene.camera(settled.T_metric_camera, settled.intrinsics_px, picture.size_px)
+    means = scene.gaussians.means
+    pixels, depth = project(means, camera.T_camera_frame[0], camera.intrinsics_px[0])
+    inside = np.flatnonzero(in_image(pixels, depth, camera.sizes_px[0]))
+    one = next(look for look in settled.looks if look.scene == scene.scene)
+    column, row = pixels[inside].astype(np.int64).T
+    return int((depth[inside] * scene.S_metric_scene.scale <= 1.05 * one.depth_m[row, column]).sum())
+
+
+def near(index: ViewIndex, wanted: Collection[str]) -> ViewIndex:
+    """The views of some scenes."""
+    keep = np.array([scene in wanted for scene in index.scenes], bool)
+    return index.only(np.flatnonzero(keep[index.scene])) if len(index) else index

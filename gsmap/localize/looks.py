@@ -1,0 +1,62 @@
+"""What the scenes of the map show from where a photograph may have been taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.localize import features
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.render import render
+
+GREY = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A render of one scene through a camera of the map.
+
+    Args:
+        scene: whose it is.
+        rgb: (H, W, 3) float32 in [0, 1].
+        grey: (H, W) float32.
+        alpha: (H, W) float32.
+        depth_m: (H, W) float32 along the axis, 0 where nothing is.
+        sound: (H, W) bool: opaque, and not at an edge in depth.
+    """
+
+    scene: str
+    rgb: np.ndarray
+    grey: np.ndarray
+    alpha: np.ndarray
+    depth_m: np.ndarray
+    sound: np.ndarray
+
+    def points(self, pixels: np.ndarray, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray) -> np.ndarray:
+        """(K, 3) places in the map, in metres, of pixels (K, 2) of the render."""
+        column, row = pixels.astype(np.int64).T
+        z = self.depth_m[row, column].astype(np.float64)
+        fx, fy, cx, cy = intrinsics_px
+        local = np.stack([(pixels[:, 0] - cx) / fx * z, (pixels[:, 1] - cy) / fy * z, z], axis=1)
+        out: np.ndarray = local @ T_metric_camera[:3, :3].T + T_metric_camera[:3, 3]
+        return out
+
+
+def look(
+    scenes: Sequence[PlacedFeatures],
+    T_metric_camera: np.ndarray,
+    intrinsics_px: np.ndarray,
+    size_px: tuple[int, int],
+    params: features.Params,
+) -> list[Look]:
+    """Every scene through one camera of the map; each alone, for two captures laid over each other blur each other."""
+    out = []
+    for one in scenes:
+        camera = one.camera(T_metric_camera, intrinsics_px, size_px)
+        shown = render(one.gaussians, camera, dominant_id=False, backend="native")
+        rgb = np.clip(np.nan_to_num(shown.colour[0]), 0, 1)
+        depth = shown.depth[0] * np.float32(one.S_metric_scene.scale)
+        out.append(Look(one.scene, rgb, rgb @ GREY, shown.alpha[0], depth, features.sound_depth(shown, params) > 0))
+    return out

@@ -1,0 +1,51 @@
+"""How photographs are localised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gsmap.localize import covariance, evidence, features, matching, resection, settling, tracking, verdict, views
+from gsmap.methods import MethodParams, family
+
+
+@dataclass(frozen=True)
+class Params:
+    """How photographs are localised.
+
+    Args:
+        extractor: finds local features: ``sift``, ``onnx`` (a model of the kind ``extractor``), or one that another
+            package adds.
+        extractors: settings of each extractor.
+        views: which views of a scene are rendered.
+        features: which of their features are kept.
+        matching: when features of a photo and of a view are the same.
+        resection: how a pose is found among matches.
+        settling: how a rough pose is sharpened.
+        tracking: how patches of renders are found again in a photo.
+        evidence: how a photo is compared with renders.
+        covariance: how well a pose is known.
+        verdict: the bars that a pose must clear.
+        max_candidates: rough poses that are looked into.
+        sure: once one is this probable, others are looked into only ...
+        rival_inliers: ... where so large a share of its matches agrees on them.
+        apart_m: settled poses farther from each other than this are different places.
+    """
+
+    extractor: str = "sift"
+    extractors: MethodParams = field(default_factory=lambda: MethodParams("extractor"))
+    views: views.Params = field(default_factory=views.Params)
+    features: features.Params = field(default_factory=features.Params)
+    matching: matching.Params = field(default_factory=matching.Params)
+    resection: resection.Params = field(default_factory=resection.Params)
+    settling: settling.Params = field(default_factory=settling.Params)
+    tracking: tracking.Params = field(default_factory=tracking.Params)
+    evidence: evidence.Params = field(default_factory=evidence.Params)
+    covariance: covariance.Params = field(default_factory=covariance.Params)
+    verdict: verdict.Params = field(default_factory=verdict.Params)
+    max_candidates: int = 5
+    sure: float = 0.97
+    rival_inliers: float = 0.5
+    apart_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        family("extractor").get(self.extractor)

@@ -1,0 +1,32 @@
+"""What names the stored features of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gsmap.localize import features, summaries
+from gsmap.localize.params import Params
+from gsmap.methods import RecipeKey, family
+from gsmap.types.model import ModelSpec
+from gsmap.types.plain import plain
+
+
+def recipe_key(params: Params, models: Mapping[str, ModelSpec] | None = None) -> RecipeKey:
+    """The recipe of the features of a scene's views: what takes part in them, and nothing of how photos are judged.
+
+    The input, which the caller adds with `RecipeKey.of`, is the scene.
+    """
+    name = params.extractor
+    needed = [models[kind] for kind in family("extractor").get(name).MODELS] if models else []
+    return RecipeKey(
+        stage="localize",
+        method=name,
+        version={"features": features.VERSION, "summaries": summaries.VERSION, **family("extractor").version(name)},
+        settings={
+            "views": plain(params.views),
+            "features": plain(params.features),
+            "extractor": plain(params.extractors[name]),
+            "models": [spec.digest for spec in needed],
+        },
+        backend="native",
+    )

@@ -1,0 +1,189 @@
+"""What the views of each scene show (`SceneFeatures`), kept under what they were made from and how.
+
+The summaries of all views lie in the catalog's own rows, so that a photograph is compared with those of a thousand
+scenes without opening one of their archives. Losing any of it costs time only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy import delete, insert, select
+
+from gsmap.errors import MALFORMED, CorruptError, InputError
+from gsmap.methods import RecipeKey
+from gsmap.store import recipes
+from gsmap.store.arrays import Arrays, digest
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.explained import NOT_KEPT, explained
+from gsmap.store.groups import manifest, publish, unless_pruned, unname
+from gsmap.store.scene_refs import resolve
+from gsmap.store.schema import scenes, view_features
+from gsmap.types import Cameras
+from gsmap.types.localization import SceneFeatures
+
+KIND = "views"
+
+_ARRAYS = {
+    "starts": np.dtype(np.int64),
+    "points": np.dtype(np.float32),
+    "descriptors": np.dtype(np.int8),
+    "angles": np.dtype(np.uint8),
+    "poses": np.dtype(np.float64),
+    "intrinsics": np.dtype(np.float64),
+    "sizes": np.dtype(np.int64),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StoredViews:
+    """What the catalog knows of a scene's views without reading their features.
+
+    Args:
+        key: `RecipeKey.digest`.
+        scene: its id.
+        num_features: of all views.
+        summaries: (V, S) int8.
+    """
+
+    key: str
+    scene: str
+    num_features: int
+    summaries: np.ndarray
+
+
+class ViewFeatures:
+    """The features of the scenes of a map, of each scene one set for every key that they were made under."""
+
+    def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
+        self._catalog = catalog
+        self._arrays = arrays
+
+    def save(self, found: SceneFeatures, key: RecipeKey) -> None:
+        """Keep the features of a scene; others of the same key, and of older recipes of that scene, go.
+
+        Args:
+            key: its recipe; among its inputs is the scene.
+        """
+        if found.scene not in key.inputs:
+            raise InputError(f"the key of features must name their scene {found.scene} among its inputs")
+        arrays = {
+            "starts": found.starts.astype(np.int64),
+            "points": found.points.astype(np.float32),
+            "descriptors": found.descriptors,
+            "angles": found.angles,
+            "poses": found.cameras.T_frame_camera.reshape(-1, 16),
+            "intrinsics": found.cameras.intrinsics_px,
+            "sizes": found.cameras.sizes_px,
+        }
+        group_id = digest(*arrays.values(), text=key.digest)
+        row = {
+            "key": key.digest,
+            "scene": found.scene,
+            "num_views": found.num_views,
+            "num_features": found.num_features,
+            "summaries": np.ascontiguousarray(found.summaries, np.int8).tobytes(),
+            "group_id": group_id,
+        }
+        staging = self._arrays.stage(arrays, KIND, group_id)
+        with explained(self._catalog.folder, NOT_KEPT), staging as staged, self._catalog.write() as connection:
+            resolve(connection, found.scene)
+            known = manifest(connection, group_id)
+            if not known or self._arrays.problems(KIND, group_id, known):
+                publish(self._catalog, connection, self._arrays, staged, KIND, group_id)
+            mine = view_features.c.scene == found.scene
+            older = set(connection.execute(select(view_features.c.group_id).where(mine)).scalars()) - {group_id}
+            connection.execute(delete(view_features).where(mine))
+            for gone in older:
+                unname(connection, gone)
+            made = {"recipe": recipes.keep(connection, key), "created_at": now()}
+            connection.execute(insert(view_features), row | made)
+
+    def kept(self, keys: Iterable[RecipeKey | str]) -> set[str]:
+        """Those of the keys (as digests) that features are kept under."""
+        with self._catalog.read() as connection:
+            return recipes.kept(connection, view_features.c.key, keys)
+
+    def list(self) -> list[StoredViews]:
+        """Of all living scenes, by id of the scene; no archive is opened.
+
+        Raises:
+            CorruptError: what the catalog holds makes no sense.
+        """
+        query = select(view_features).join(scenes, scenes.c.id == view_features.c.scene)
+        with self._catalog.read() as connection:
+            rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).order_by(view_features.c.scene)).all()
+        out = []
+        for row in rows:
+            flat = np.frombuffer(row.summaries, np.int8)
+            if row.num_views < 0 or (row.num_views and len(flat) % row.num_views) or (len(flat) and not row.num_views):
+                raise CorruptError(
+                    f"the catalog holds {len(flat)} bytes in view_features.summaries for {row.num_views} views: gsmap "
+                    "did not write that; restore the catalog from a backup"
+                )
+            out.append(
+                StoredViews(
+                    row.key,
+                    row.scene,
+                    row.num_features,
+                    flat.reshape(row.num_views, -1) if row.num_views else flat.reshape(0, 0),
+                )
+            )
+        return out
+
+    def load(self, scene: str, key: RecipeKey | str) -> SceneFeatures | None:
+        """Read the features of a scene; None where none are kept under this key.
+
+        Raises:
+            CorruptError: bytes on disk are missing or differ, or are no features.
+            NotFoundError: others made them anew meanwhile.
+        """
+        wanted = view_features.c.key == recipes.digest_of(key)
+        with self._catalog.read() as connection:
+            row = connection.execute(select(view_features).where(wanted, view_features.c.scene == scene)).first()
+            if row is None:
+                return None
+            files = manifest(connection, row.group_id)
+        V, N = row.num_views, row.num_features
+        shapes = {
+            "starts": (V + 1,),
+            "points": (N, 3),
+            "descriptors": (N, None),
+            "angles": (N,),
+            "poses": (V, 16),
+            "intrinsics": (V, 4),
+            "sizes": (V, 2),
+        }
+        with unless_pruned(self._catalog, row.group_id, f"the features of scene {scene[:12]} were made anew"):
+            arrays = self._arrays.read(KIND, row.group_id, files, shapes=shapes)
+        try:
+            return _features(scene, arrays, np.frombuffer(row.summaries, np.int8), V, N)
+        except (InputError, *MALFORMED) as error:
+            raise CorruptError(
+                f"the features of scene {scene[:12]} make no sense ({error}): run gsmap check"
+            ) from error
+
+
+def _features(
+    scene: str, arrays: dict[str, np.ndarray], summaries: np.ndarray, num_views: int, num_features: int
+) -> SceneFeatures:
+    for name, dtype in _ARRAYS.items():
+        if arrays[name].dtype != dtype:
+            raise InputError(f"{name} are {arrays[name].dtype}")
+    starts = arrays["starts"]
+    if starts[0] != 0 or starts[-1] != num_features or (np.diff(starts) < 0).any():
+        raise InputError("its views do not divide its features")
+    if not np.isfinite(arrays["points"]).all():
+        raise InputError("a point holds NaN or infinity")
+    cameras = Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"])
+    return SceneFeatures(
+        scene,
+        cameras,
+        starts,
+        arrays["points"],
+        arrays["descriptors"],
+        arrays["angles"],
+        summaries.reshape(num_views, -1) if num_views else np.zeros((0, 0), np.int8),
+    )

@@ -1,0 +1,89 @@
+"""Where photographs and scans were taken."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from gsmap.types.rows.base import Row
+from gsmap.types.sim3 import Sim3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalizeRow(Row):
+    """One photograph, frame of a clip, or scan.
+
+    Args:
+        file: as it was given; of a frame of a clip, ``FILE#SECONDS``.
+        status: ``placed`` or ``refused``.
+        reason: why it is refused; empty where it is placed.
+        T_map_camera: (4, 4) camera-to-map of a photo (OpenCV axes), in the frame and unit of its component; else null.
+        S_map_scan: takes a scan to the map, in the same frame and unit; null for photos, and where it is refused.
+        covariance: (6, 6) over [rot_rad (3), trans (3)], of a scan (7, 7) with the logarithm of its scale, on the
+            camera's or scan's side: ``T = T_hat Exp(xi)``, translation in the map's unit (a scan's: in its own).
+        component: in whose frame that is; null where nothing was found.
+        scenes: names of the scenes that support it, those that support most first.
+        intrinsics_px: (4,) ``fx fy cx cy`` of the photo, given or solved for; null for a scan.
+        probability: that the pose is right, of all evidence together; 0 where there was none to judge.
+        evidence: numbers behind it, by name.
+        num_gaussians: of the supporting scenes, that the photo shows.
+        seconds: it took, of the wall clock.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "file": "file",
+        "status": "status",
+        "position": "at",
+        "sigma": "sigma",
+        "probability": "probability",
+        "scenes": "scenes",
+        "reason": "reason",
+    }
+
+    file: str
+    status: str
+    reason: str
+    T_map_camera: np.ndarray | None = None
+    S_map_scan: Sim3 | None = None
+    covariance: np.ndarray | None = None
+    component: int | None = None
+    scenes: tuple[str, ...] = ()
+    intrinsics_px: np.ndarray | None = None
+    probability: float = 0.0
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    num_gaussians: int = 0
+    seconds: float = 0.0
+
+    @property
+    def position(self) -> str:
+        """Where the camera stood, or the scan's origin lies, map unit."""
+        at = self.T_map_camera[:3, 3] if self.T_map_camera is not None else None
+        if self.S_map_scan is not None:
+            at = self.S_map_scan.translation
+        return "-" if at is None else " ".join(f"{value:.3f}" for value in at)
+
+    @property
+    def sigma(self) -> str:
+        """Standard deviations of the worst direction: degrees, and map units."""
+        if self.covariance is None:
+            return "-"
+        turn, shift = (np.sqrt(np.linalg.eigvalsh(self.covariance[p, p])[-1]) for p in (slice(3), slice(3, 6)))
+        return f"{np.degrees(turn):.2f} deg {shift:.3f}"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalizeReport(Row):
+    """Where photographs, clips and scans were taken.
+
+    Args:
+        results: one for each file, in the order in which they were given.
+        notes: what a person should know of the map.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"results": "results"}
+
+    results: tuple[LocalizeRow, ...]
+    notes: tuple[str, ...] = ()

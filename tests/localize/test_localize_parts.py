@@ -1,0 +1,176 @@
+"""Parts of localisation beside arithmetic: adjustment, tracks, matches, views, summaries, pictures in files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter, shift
+
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.geometry.projection import project
+from gsmap.geometry.rotations import exp_so3
+from gsmap.localize import Lens, covariance, matching, read_photo, resection, summaries, tracking, views
+from gsmap.localize.extractors import sift
+from gsmap.localize.features import quantised
+from gsmap.localize.resection import moved
+
+SIFT = sift.make({}, sift.Params())
+LENS = np.array([400.0, 390.0, 240.0, 180.0])
+
+
+def points_seen(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A pose, points before it, and where it sees them."""
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = exp_so3(rng.normal(size=3)), rng.normal(size=3)
+    local = np.stack([rng.uniform(-1, 1, count), rng.uniform(-0.8, 0.8, count), rng.uniform(2, 5, count)], 1)
+    points = local @ pose[:3, :3].T + pose[:3, 3]
+    return pose, points, project(points, np.linalg.inv(pose), LENS)[0]
+
+
+def test_a_pose_is_found_among_wrong_matches() -> None:
+    pose, points, pixels = points_seen(80)
+    rng = np.random.default_rng(1)
+    pixels[:40] = rng.uniform(0, 480, (40, 2))
+    found = resection.resect(pixels, points, LENS, (480, 360), 0.0, resection.Params())
+    assert found is not None
+    assert found.inliers[40:].all()
+    refined = resection.refine(pixels, points, found.T_map_camera, LENS, resection.Params())
+    assert np.allclose(refined.T_map_camera, pose, atol=1e-3)
+
+
+def test_the_focal_length_is_found_with_the_pose() -> None:
+    pose, points, pixels = points_seen(60)
+    start = moved(pose, np.full(6, 0.01))
+    lens = np.array([430.0, 430.0, 240.0, 180.0]) * [1, 390 / 400, 1, 1]
+    refined = resection.refine(pixels, points, start, lens, resection.Params(), focal=(430.0, np.inf))
+    assert refined.intrinsics_px[0] == pytest.approx(400, abs=0.01)
+    assert np.allclose(refined.T_map_camera, pose, atol=1e-5)
+
+
+def test_the_jacobian_is_that_of_differences() -> None:
+    pose, points, pixels = points_seen(5)
+    still = resection.Params(iterations=0)
+    at = resection.refine(pixels, points, pose, LENS, still, focal=(400.0, np.inf))
+    for k in range(7):
+        step = np.zeros(6)
+        lens = LENS.copy()
+        if k < 6:
+            step[k] = 1e-6
+        else:
+            lens[:2] *= np.exp(1e-6)
+        after = resection.refine(pixels, points, moved(pose, step), lens, still)
+        numeric = (at.residuals_px - after.residuals_px) / 1e-6
+        assert np.allclose(numeric, at.jacobian[:, :, k], rtol=1e-3, atol=1e-2)
+
+
+def test_the_covariance_is_that_of_repeated_noise() -> None:
+    """Independent noise of a pixel: what the residuals tell is what repetitions show, within a factor."""
+    pose, points, clean = points_seen(300)
+    rng, params = np.random.default_rng(2), covariance.Params(hidden_m=0, hidden_rad=0, swell=1.0)
+    errors, told = [], []
+    for _ in range(60):
+        pixels = clean + rng.normal(size=clean.shape)
+        fit = resection.refine(pixels, points, pose, LENS, resection.Params(doubt_px=10.0))
+        errors.append(np.linalg.inv(pose)[:3] @ fit.T_map_camera[:, 3])
+        told.append(np.diag(covariance.pose_covariance(fit, pixels, (480, 360), params))[3:])
+    ratio = np.mean(told, axis=0) / np.mean(np.square(errors), axis=0)
+    assert (ratio > 0.7).all()
+    assert (ratio < 4.0).all()
+
+
+def test_patches_are_found_again_to_a_tenth_of_a_pixel() -> None:
+    rng = np.random.default_rng(0)
+    picture = gaussian_filter(rng.random((120, 160)), 2.0).astype(np.float32)
+    picture = (picture - picture.min()) / (picture.max() - picture.min())
+    there = shift(picture, (3.3, -2.6), order=3, mode="nearest").astype(np.float32)
+    found = tracking.track(picture, np.ones(picture.shape, bool), 0.5 * there + 0.2, 6, tracking.Params())
+    assert found.found.sum() > 20
+    moved_by = (found.photo_px - found.render_px)[found.found]
+    assert np.abs(np.median(moved_by, axis=0) - [-2.6, 3.3]).max() < 0.1
+
+
+def test_what_is_farther_than_the_reach_is_not_found() -> None:
+    rng = np.random.default_rng(0)
+    picture = gaussian_filter(rng.random((120, 160)), 2.0).astype(np.float32) * 5 - 2
+    there = np.roll(picture, 15, axis=1)
+    found = tracking.track(picture, np.ones(picture.shape, bool), there, 5, tracking.Params())
+    assert found.found.mean() < 0.1
+
+
+def test_matches_agree_both_ways_and_in_how_the_camera_was_held() -> None:
+    rng = np.random.default_rng(0)
+    vectors = rng.normal(size=(50, 64)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    angles = rng.integers(0, 256, 50).astype(np.uint8)
+    order = rng.permutation(50)
+    turned = (angles[order] + np.uint8(40)).astype(np.uint8)
+    turned[:5] += np.uint8(100)
+    photo = matching.Described(quantised(vectors), angles)
+    rows, columns = matching.matched(photo, matching.Described(quantised(vectors[order]), turned), matching.Params())
+    assert (order[columns] == rows).all()
+    assert sorted(columns) == list(range(5, 50))
+
+
+def test_summaries_of_the_same_features_are_alike(world) -> None:
+    one, two = (SIFT.extract(photo.rgb).descriptors for photo in world.photos[:2])
+    a, b, c = (summaries.summarised(x).astype(float) for x in (one, one[: len(one) * 9 // 10], two))
+    assert a @ b / np.linalg.norm(a) / np.linalg.norm(b) > 0.7
+    assert abs(a @ c / np.linalg.norm(a) / np.linalg.norm(c)) < 0.5
+    assert summaries.summarised(one[:0]).shape == a.shape
+    assert summaries.random_vocabulary(64).summary(one[:, :64]).shape == a.shape
+
+
+def test_views_are_few_and_some_stand_off_the_path(world) -> None:
+    params = views.Params(own=10, made=4)
+    chosen = views.choose_views(world.capture.gaussians, world.capture.cameras, params)
+    own = {tuple(c) for c in np.round(world.capture.cameras.centers, 6)}
+    stand = [tuple(c) in own for c in np.round(chosen.centers, 6)]
+    assert sum(stand) == 10
+    assert 1 <= len(stand) - sum(stand) <= 4
+    assert chosen.sizes_px.max() <= params.image_size_px
+
+
+def test_features_lie_on_the_surface(world) -> None:
+    """Every stored point lies near a Gaussian's centre."""
+    from scipy.spatial import cKDTree
+
+    solid = world.capture.gaussians.means[world.capture.gaussians.opacities > 0.5]
+    distance, _ = cKDTree(solid).query(world.placed.features.points)
+    assert np.quantile(distance, 0.95) < 0.1
+
+
+def exif_file(path, focal_mm: int, orientation: int = 1, size: tuple[int, int] = (400, 300)) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769)[0xA405] = focal_mm
+    Image.new("RGB", size, (90, 90, 90)).save(path, exif=exif.tobytes())
+
+
+def test_focal_lengths_come_from_whoever_tells(tmp_path) -> None:
+    exif_file(tmp_path / "a.jpg", 26)
+    told = read_photo(tmp_path / "a.jpg")
+    assert told.intrinsics_px[0] == pytest.approx(26 / 43.267 * 500)
+    assert 0 < told.focal_sigma < 0.2
+    assert np.isinf(read_photo(tmp_path / "a.jpg", Lens(ask_file=False)).focal_sigma)
+    assert read_photo(tmp_path / "a.jpg", Lens(focal_px=333.0)).intrinsics_px.tolist() == [333, 333, 200, 150]
+    assert read_photo(tmp_path / "a.jpg", Lens((300, 301, 199, 151))).focal_sigma == 0
+
+
+def test_pictures_stand_upright(tmp_path) -> None:
+    exif_file(tmp_path / "a.jpg", 26, orientation=6)
+    assert read_photo(tmp_path / "a.jpg").size_px == (300, 400)
+
+
+def test_what_cannot_be_is_refused(tmp_path) -> None:
+    with pytest.raises(NotFoundError, match="no photo"):
+        read_photo(tmp_path / "none.jpg")
+    (tmp_path / "text.jpg").write_text("no picture")
+    with pytest.raises(InputError, match="not a picture"):
+        read_photo(tmp_path / "text.jpg")
+    exif_file(tmp_path / "a.jpg", 26)
+    with pytest.raises(InputError, match="principal point"):
+        read_photo(tmp_path / "a.jpg", Lens((300, 300, 900, 100)))
+    with pytest.raises(ConfigError):
+        Lens(focal_px=-1.0)

@@ -1,0 +1,81 @@
+"""A photograph is found where it was taken, with an honest covariance, or refused; never somewhere else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmap.geometry.rotations import angle_between
+from gsmap.localize import Params, localize_photo
+from gsmap.localize.extractors import sift
+from gsmap.types.localization import Photo, Placement
+
+SIFT = sift.make({}, sift.Params())
+
+
+def found(world, photo: Photo, metres: float = 1.0) -> Placement:
+    return localize_photo(photo, world.index, {"scene": world.placed}, SIFT, Params(), {0: metres})
+
+
+def off(placement: Placement, truth: np.ndarray) -> tuple[float, float]:
+    pose = placement.T_map_camera
+    assert pose is not None, placement.reason
+    angle = np.degrees(angle_between(pose[:3, :3], truth[:3, :3]))
+    return angle, float(np.linalg.norm(pose[:3, 3] - truth[:3, 3]))
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_a_photo_is_placed_where_it_was_taken(world, number: int) -> None:
+    one = found(world, world.photos[number])
+    assert one.is_placed, one.reason
+    angle, far = off(one, world.poses[number])
+    assert angle < 1.0
+    assert far < 0.05
+    assert one.scenes == ("scene",)
+    assert one.num_gaussians > 1000
+    sigma = np.sqrt(np.diag(one.covariance))
+    assert 0.0005 < sigma[3:].max() < 0.1
+
+
+def test_photos_of_another_place_are_refused(world, elsewhere) -> None:
+    for photo in elsewhere.photos:
+        one = found(world, photo)
+        assert not one.is_placed
+        assert one.T_map_camera is None
+
+
+def test_poses_are_in_the_unit_of_the_map(world) -> None:
+    """A frame whose unit is half a metre has twice the numbers, and four times the variances."""
+    metric, other = found(world, world.photos[0]), found(world, world.photos[0], metres=0.5)
+    assert np.allclose(other.T_map_camera[:3, 3], 2 * metric.T_map_camera[:3, 3])
+    assert np.allclose(other.covariance[3:, 3:], 4 * metric.covariance[3:, 3:])
+    assert np.allclose(other.covariance[:3, :3], metric.covariance[:3, :3])
+
+
+def test_an_unknown_focal_length_is_solved_for(world) -> None:
+    photo = world.photos[1]
+    blind = Photo(photo.rgb, photo.intrinsics_px * [1.15, 1.15, 1, 1], np.inf, "blind")
+    one = found(world, blind)
+    assert one.is_placed, one.reason
+    assert abs(one.intrinsics_px[0] / photo.intrinsics_px[0] - 1) < 0.05
+    assert off(one, world.poses[1])[1] < 0.2
+
+
+def test_a_large_photo_answers_in_its_own_pixels(world) -> None:
+    photo = world.photos[0]
+    large = Photo(photo.rgb.repeat(2, 0).repeat(2, 1), photo.intrinsics_px * 2, 0.0, "large")
+    one = found(world, large)
+    assert one.is_placed, one.reason
+    assert np.allclose(one.intrinsics_px, photo.intrinsics_px * 2)
+
+
+def test_an_empty_picture_says_so(world) -> None:
+    blank = Photo(np.full((120, 160, 3), 128, np.uint8), np.array([128.0, 128, 80, 60]), 0.0, "blank")
+    assert "too little" in found(world, blank).reason
+
+
+def test_the_same_photo_gives_the_same_bits(world) -> None:
+    one, two = (found(world, world.photos[1]) for _ in range(2))
+    assert np.array_equal(one.T_map_camera, two.T_map_camera)
+    assert np.array_equal(one.covariance, two.covariance)
+    assert one.probability == two.probability

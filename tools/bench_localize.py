@@ -1,0 +1,296 @@
+"""How well photographs are localised: given captures crosswise, photographs of other places, and how much they may lack.
+
+    python tools/bench_localize.py DATA WORK                 # the house: every photograph in a map without its capture
+    python tools/bench_localize.py DATA WORK --kitchen       # the same of the real kitchen, with its eight RGB-D frames
+    python tools/bench_localize.py DATA WORK --only c0 c1    # photographs of these captures alone
+    python tools/bench_localize.py DATA WORK --perturb       # exposure, resolution, focal length, somebody in the picture
+    python tools/bench_localize.py DATA WORK --elsewhere     # photographs of other places: none may be placed
+    python tools/bench_localize.py DATA WORK --plain         # beside SIFT and PnP on photographs, and retrieval alone
+
+DATA is the folder of the given captures; maps are made in WORK once. The captures' poses in the map are gsmap's own, and
+the truth of a photograph is taken to the map through the scene that supports it most. A photograph's coverage is the
+share of its pixels whose surface another capture of the map shows where it is (5 cm and 2 % of the depth).
+"""
+
+# Thread counts must be set before numpy comes in.
+# ruff: noqa: E402
+from __future__ import annotations
+
+import os
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+import gsmap.map
+from gsmap.geometry.rotations import angle_between
+from gsmap.localize import localize_photo
+from gsmap.localize.localizing import near
+from gsmap.map.logs import logged
+from gsmap.map.stages.localize import Localizer
+from gsmap.render import render
+from gsmap.types import Cameras, Sim3
+from gsmap.types.localization import Photo, Placement
+
+
+@dataclass(eq=False)
+class Shot:
+    """A photograph with truth: the pose of its camera in the world, and how much of it the map covers."""
+
+    photo: Photo
+    T_world_camera: np.ndarray
+    coverage: float
+    allowed: set[str]
+
+
+@dataclass(eq=False)
+class World:
+    """A map and what is true of it."""
+
+    localizer: Localizer
+    S_scene_world: dict[str, Sim3]  # by scene id
+    ids: dict[str, str]  # by name
+
+    def localize(self, photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
+        """In a map of some of its scenes; and CPU seconds."""
+        held = self.localizer
+        began = time.process_time()
+        index = near(held.index, allowed)
+        found = localize_photo(photo, index, held.placed, held.extractor, held.params, held.metres)
+        return found, time.process_time() - began
+
+    def truth(self, shot: Shot, scene: str) -> np.ndarray:
+        """(4, 4) the camera in the frame of the map that a scene says."""
+        placed = self.localizer.placed[scene]
+        unit = self.localizer.metres.get(placed.component, 1.0)
+        S = placed.S_metric_scene @ self.S_scene_world[scene]
+        out = np.eye(4)
+        out[:3, :3] = S.rotation @ shot.T_world_camera[:3, :3]
+        out[:3, 3] = S.apply(shot.T_world_camera[:3, 3]) / unit
+        return out
+
+
+def world(data: Path, work: Path, names: list[str]) -> World:
+    """The map of some captures, made where it is missing; the features of its views are made as well."""
+    path = work / f"{data.name}.gsmap"
+    fresh = not path.exists()
+    m = gsmap.map.open_or_create(path)
+    if fresh:
+        began = time.process_time()
+        m.update(*(data / f"{name}.ply" for name in names))
+        print(f"{path.name}: {time.process_time() - began:.0f} CPU s in this process")
+    began = time.process_time()
+    localizer = Localizer(m.store, m.settings, logged(None))
+    print(f"{len(localizer.scenes)} scenes, {len(localizer.index)} views, {time.process_time() - began:.1f} CPU s here")
+    truth, ids = {}, {}
+    for scene in localizer.scenes.values():
+        told = json.loads((data / "truth" / f"{scene.name}.json").read_text())
+        truth[scene.id], ids[scene.name] = Sim3.from_matrix(np.array(told["T_scene_world"])), scene.id
+    return World(localizer, truth, ids)
+
+
+def house_shots(data: Path, held: World, only: list[str]) -> Iterator[Shot]:
+    """Photographs that captures were trained on, each in the map of all other captures."""
+    for name, scene in sorted(held.ids.items()):
+        if name not in only:
+            continue
+        cameras = held.localizer.store.scenes.cameras(scene)
+        numbers = {int(camera): row for row, camera in enumerate(cameras.names)} if cameras.names[0].isdigit() else {}
+        for path in sorted((data / "frames").glob(f"{name}_*.jpg")):
+            row = numbers.get(int(path.stem[-3:]), int(path.stem[-3:]))
+            S = held.S_scene_world[scene].inverse()
+            pose = np.eye(4)
+            pose[:3, :3] = S.rotation @ cameras.T_frame_camera[row, :3, :3]
+            pose[:3, 3] = S.apply(cameras.centers[row])
+            photo = Photo(np.asarray(Image.open(path).convert("RGB")), cameras.intrinsics_px[row], 0.0, path.name)
+            depth = _depth(held, scene, cameras[[row]].resized(120))
+            others = {other for other in held.ids.values() if other != scene}
+            yield Shot(photo, pose, _coverage(held, photo, pose, depth, others), others)
+
+
+def kitchen_shots(data: Path, held: World) -> Iterator[Shot]:
+    """The eight frames of a sensor: in the whole map, which was trained on others of them."""
+    frames = data.parent / "kitchen"
+    fx, _, cx, _, fy, cy, *_ = np.loadtxt(frames / "camera-intrinsics.txt").ravel()
+    for path in sorted(frames.glob("*.color.jpg")):
+        pose = np.loadtxt(path.with_name(path.name.replace("color.jpg", "pose.txt")))
+        image = np.asarray(Image.open(path).convert("RGB"))
+        photo = Photo(image, np.array([fx, fy, cx, cy]), 0.0, path.name)
+        raw = np.asarray(Image.open(path.with_name(path.name.replace("color.jpg", "depth.png")))).astype(np.float32)
+        depth = np.where(raw < 65535, raw / 1000, 0)[::5, ::5]
+        scenes = set(held.ids.values())
+        yield Shot(photo, pose, _coverage(held, photo, pose, depth, scenes), scenes)
+
+
+def _depth(held: World, scene: str, camera: Cameras) -> np.ndarray:
+    shown = render(held.localizer.placed[scene].gaussians, camera, dominant_id=False, backend="native")
+    return np.where(shown.alpha[0] > 0.9, shown.depth[0], 0)
+
+
+def _coverage(held: World, photo: Photo, pose: np.ndarray, depth: np.ndarray, scenes: set[str]) -> float:
+    """Share of the pixels of a small depth image whose surface some of the scenes has."""
+    height, width = depth.shape
+    intrinsics = photo.intrinsics_px * (width / photo.size_px[0])
+    has = np.zeros(depth.shape, bool)
+    for scene in scenes:
+        S = held.S_scene_world[scene]
+        inside = np.eye(4)
+        inside[:3, :3], inside[:3, 3] = S.rotation @ pose[:3, :3], S.apply(pose[:3, 3])
+        other = _depth(held, scene, Cameras(inside[None], intrinsics[None], np.array([[width, height]])))
+        has |= (depth > 0) & (other > 0) & (np.abs(other - depth) < 0.05 + 0.02 * depth)
+    return float(has.mean())
+
+
+# --- perturbations ---------------------------------------------------------------------------------------------------
+
+
+def exposed(stops: float) -> Callable[[Photo], Photo]:
+    def change(photo: Photo) -> Photo:
+        rgb = np.clip(255 * (photo.rgb / 255.0) * 2 ** (stops / 2.2), 0, 255).astype(np.uint8)
+        return Photo(rgb, photo.intrinsics_px, 0.0, photo.name)
+
+    return change
+
+
+def halved(photo: Photo) -> Photo:
+    width, height = photo.size_px
+    rgb = np.asarray(Image.fromarray(photo.rgb).resize((width // 2, height // 2), Image.Resampling.BOX))
+    return Photo(rgb, photo.intrinsics_px / 2, 0.0, photo.name)
+
+
+def nearer(photo: Photo) -> Photo:
+    """Another lens: the middle three quarters, as large as before."""
+    width, height = photo.size_px
+    x, y = width // 8, height // 8
+    part = Image.fromarray(photo.rgb).crop((x, y, width - x, height - y))
+    fx, fy, cx, cy = photo.intrinsics_px
+    factor = width / (width - 2 * x)
+    rgb = np.asarray(part.resize((width, height), Image.Resampling.BICUBIC))
+    return Photo(rgb, np.array([fx, fy, cx - x, cy - y]) * factor, 0.0, photo.name)
+
+
+def hidden(photo: Photo) -> Photo:
+    """Somebody upright in a tenth of the picture."""
+    width, height = photo.size_px
+    rng = np.random.default_rng(abs(hash(photo.name)) % 2**32 if False else sum(photo.name.encode()))
+    tall, wide = 0.8 * height, 0.125 * width
+    x = rng.uniform(wide / 2, width - wide / 2)
+    v, u = np.mgrid[0:height, 0:width]
+    body = (np.abs(u - x) < wide / 2) & (v > height - tall)
+    stripes = rng.uniform(0, 255, (8, 3))[(v // 25) % 8] + rng.normal(0, 12, photo.rgb.shape)
+    rgb = np.where(body[..., None], np.clip(stripes, 0, 255), photo.rgb).astype(np.uint8)
+    return Photo(rgb, photo.intrinsics_px, 0.0, photo.name)
+
+
+def unknown_focal(photo: Photo) -> Photo:
+    fx, fy, cx, cy = photo.intrinsics_px
+    likely = 0.8 * max(photo.size_px)
+    return Photo(photo.rgb, np.array([likely, likely, cx, cy]), np.inf, photo.name)
+
+
+PERTURBED: dict[str, Callable[[Photo], Photo]] = {
+    "as it is": lambda photo: photo,
+    "+1 EV": exposed(1.0),
+    "-1 EV": exposed(-1.0),
+    "half resolution": halved,
+    "another focal length": nearer,
+    "a tenth hidden": hidden,
+    "focal length unknown": unknown_focal,
+}
+
+# --- what is said ----------------------------------------------------------------------------------------------------
+
+
+def measure(held: World, shots: list[Shot], change: Callable[[Photo], Photo], verbose: bool) -> list[dict]:
+    rows = []
+    for shot in shots:
+        found, seconds = held.localize(change(shot.photo), shot.allowed)
+        row = {"name": shot.photo.name, "coverage": shot.coverage, "cpu": seconds, "placed": found.is_placed}
+        if found.is_placed:
+            truth = held.truth(shot, found.scenes[0])
+            pose = found.T_map_camera
+            turn = pose[:3, :3].T @ truth[:3, :3]
+            row["deg"] = float(np.degrees(angle_between(pose[:3, :3], truth[:3, :3])))
+            unit = held.localizer.metres.get(found.component, 1.0)
+            row["m"] = float(np.linalg.norm(pose[:3, 3] - truth[:3, 3]) * unit)
+            xi = np.r_[_log(turn), pose[:3, :3].T @ (truth[:3, 3] - pose[:3, 3])]
+            row["nees"] = float(xi @ np.linalg.solve(found.covariance, xi))
+        rows.append(row)
+        if verbose:
+            told = (
+                f"{row['deg']:.2f} deg {100 * row['m']:.1f} cm NEES {row['nees']:.1f}"
+                if found.is_placed
+                else found.reason
+            )
+            print(f"  {row['name']} covered {shot.coverage:.0%}: {told} ({seconds:.2f} CPU s)", flush=True)
+    return rows
+
+
+def _log(rotation: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()
+
+
+def say(name: str, rows: list[dict], deg: float, metres: float) -> None:
+    """One line: recall of the well-covered, errors, wrong ones, cost."""
+    well = [row for row in rows if row["coverage"] >= 0.4]
+    good = [row for row in rows if row["placed"] and row["deg"] < deg and row["m"] < metres]
+    wrong = [row for row in rows if row["placed"] and (row["deg"] > 5 or row["m"] > 0.3)]
+    errors = np.array([(row["deg"], 100 * row["m"]) for row in rows if row["placed"]]).reshape(-1, 2)
+    nees = np.median([row["nees"] for row in rows if row["placed"]] or [np.nan]) / 5.35
+    of_well = sum(row in good for row in well)
+    middle = np.median(errors, axis=0) if len(errors) else (np.nan, np.nan)
+    print(
+        f"{name}: {of_well} of {len(well)} covered by 40 % within {deg:g} deg / {100 * metres:g} cm "
+        f"({of_well / max(len(well), 1):.0%}); {len(errors)} of {len(rows)} placed, {len(wrong)} wrong; median "
+        f"{middle[0]:.2f} deg {middle[1]:.1f} cm; median NEES {nees:.2f} of expectation; "
+        f"{np.mean([row['cpu'] for row in rows]):.2f} CPU s a photo",
+        flush=True,
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--only", nargs="+", default=["c0", "c1", "c2", "c3"])
+    parser.add_argument("--kitchen", action="store_true")
+    parser.add_argument("--perturb", action="store_true")
+    parser.add_argument("--elsewhere", action="store_true")
+    parser.add_argument("--set", action="append", default=[])
+    parser.add_argument("-v", action="store_true")
+    args = parser.parse_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    if args.kitchen:
+        held = world(args.data / "kitchen_splats", args.work, ["k0", "k3", "k5"])
+        shots, deg, metres = list(kitchen_shots(args.data / "kitchen_splats", held)), 2.0, 0.08
+    else:
+        held = world(args.data / "house", args.work, ["c0", "c1", "c2", "c3", "c5"])
+        shots, deg, metres = list(house_shots(args.data / "house", held, args.only)), 1.0, 0.05
+    if args.elsewhere:
+        if args.kitchen:
+            house = sorted((args.data / "house" / "frames").glob("*.jpg"))
+            strangers = [Photo(np.asarray(Image.open(p)), np.array([280.0, 280, 240, 180]), 0.0, p.name) for p in house]
+        else:
+            strangers = [s.photo for s in kitchen_photos(args.data)]
+        placed = [held.localize(photo, set(held.ids.values()))[0] for photo in strangers]
+        print(f"photographs of another place: {sum(p.is_placed for p in placed)} of {len(placed)} placed")
+        return 0
+    for name, change in PERTURBED.items() if args.perturb else [("as it is", PERTURBED["as it is"])]:
+        say(name, measure(held, shots, change, args.v), deg, metres)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,390 @@
+"""Fits what localisation knows before it sees a map: the words of its summaries, and what its evidence is worth.
+
+    python tools/make_localize_places.py PLACES --set fit && python tools/make_localize_places.py PLACES --set test
+    python tools/fit_localize.py PLACES words --cache FOLDER     # writes gsmap/localize/vocabulary.npz
+    python tools/fit_localize.py PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
+    python tools/fit_localize.py PLACES test --cache FOLDER      # says how both do on places that they have not seen
+
+Everything comes from made places (`gsmap_synthetic`).
+"""
+
+# Thread counts must be set before numpy comes in.
+# ruff: noqa: E402
+from __future__ import annotations
+
+import os
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import argparse
+import hashlib
+import json
+import pickle
+import sys
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy.optimize import minimize
+
+from gsmap.compare.odds import Curve, Odds
+from gsmap.ingest import read_captures
+from gsmap.localize import features, localizing, probability, summaries
+from gsmap.localize.candidates import Candidate
+from gsmap.localize.params import Params
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.resection import moved
+from gsmap.localize.retrieval import ViewIndex
+from gsmap.methods import family
+from gsmap.types import Sim3
+from gsmap.types.localization import Photo, SceneFeatures
+from gsmap.types.plain import canonical, plain
+
+ROOT = Path(__file__).resolve().parents[1] / "gsmap" / "localize"
+
+
+@dataclass
+class Place:
+    """A made place: its captures where they truly lie, and its photographs."""
+
+    seed: str
+    scenes: list[PlacedFeatures]
+    photos: list[dict]
+    folder: Path
+
+    def photo(self, told: dict) -> Photo:
+        rgb = np.asarray(Image.open(self.folder / "photos" / told["file"]).convert("RGB"))
+        return Photo(rgb, np.array(told["intrinsics"]), 0.0, f"{self.seed}/{told['file']}")
+
+
+def places(folder: Path, split: str, cache: Path, params: Params) -> list[Place]:
+    """The places of a set, with the features of their captures, which are kept."""
+    return [_place(path, cache, params) for path in sorted((folder / split).iterdir()) if (path / "done").exists()]
+
+
+def _place(folder: Path, cache: Path, params: Params) -> Place:
+    scenes = []
+    for path in sorted(folder.glob("*.ply")):
+        truth = np.array(json.loads((folder / "truth" / f"{path.stem}.json").read_text())["T_scene_world"])
+        read = partial(_gaussians, path)
+        found = partial(_features, path, cache, params)
+        scene = f"{folder.name}/{path.stem}"
+        scenes.append(PlacedFeatures(scene, Sim3.from_matrix(truth).inverse(), 0, None, read, found))
+    return Place(folder.name, scenes, json.loads((folder / "photos.json").read_text()), folder)
+
+
+def _gaussians(path: Path):
+    return next(iter(read_captures([str(path)]))).gaussians
+
+
+def _features(path: Path, cache: Path, params: Params) -> SceneFeatures:
+    settings = canonical(plain([params.views, params.features, params.extractors[params.extractor]]))
+    code = hashlib.sha256(settings.encode()).hexdigest()[:8]
+    kept = cache / f"{path.parent.name}-{path.stem}-{code}.pickle"
+    if kept.exists():
+        found = pickle.loads(kept.read_bytes())
+        views = zip(found.starts[:-1], found.starts[1:], strict=True)
+        return replace(
+            found,
+            summaries=np.stack([summaries.summarised(found.descriptors[a:b] / np.float32(254)) for a, b in views]),
+        )
+    cache.mkdir(parents=True, exist_ok=True)
+    capture = next(iter(read_captures([str(path)])))
+    extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
+    began = time.process_time()
+    found = features.scene_features(
+        f"{path.parent.name}/{path.stem}", capture.gaussians, capture.cameras, extractor, params.views, params.features
+    )
+    seconds = time.process_time() - began
+    print(f"{found.scene}: {found.num_views} views, {found.num_features} features, {seconds:.1f} CPU s")
+    kept.write_bytes(pickle.dumps(found))
+    return found
+
+
+# --- words -----------------------------------------------------------------------------------------------------------
+
+
+def fit_words(found: list[Place], params: Params, num_words: int = 64, short: int = 32, length: int = 256) -> None:
+    """Principal axes of descriptors, their k-means, and the whitening of what becomes of pictures."""
+    from scipy.cluster.vq import kmeans2
+
+    extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
+    pictures = []
+    for place in found:
+        for scene in place.scenes:
+            held = scene.features
+            pictures += [
+                held.descriptors[a:b] / np.float32(254) for a, b in zip(held.starts[:-1], held.starts[1:], strict=True)
+            ]
+        pictures += [extractor.extract(place.photo(told).rgb).descriptors for told in place.photos]
+    pictures = [picture for picture in pictures if len(picture) > 10]
+    everything = np.concatenate(pictures)
+    some = everything[np.random.default_rng(0).permutation(len(everything))[:60_000]]
+    mean = some.mean(0)
+    values, axes = np.linalg.eigh(np.cov((some - mean).T))
+    axes = axes[:, ::-1][:, :short] / np.sqrt(values[::-1][:short] + values[::-1][:short].mean())
+    axes = axes.astype(np.float32)
+    words, _ = kmeans2((some - mean) @ axes, num_words, iter=30, minit="++", rng=np.random.default_rng(1))
+    words = words.astype(np.float32)
+    first = summaries.Vocabulary(
+        mean, axes, words, np.zeros(words.size, np.float32), np.eye(words.size, dtype=np.float32)
+    )
+    vectors = np.stack([first.residuals(picture) for picture in pictures])
+    centre = vectors.mean(0)
+    _, singular, turned = np.linalg.svd(vectors - centre, full_matrices=False)
+    power = singular[:length] ** 2 / len(vectors)
+    # Half whitened: the last directions of a thousand pictures are noise.
+    whitening = (turned[:length].T / np.sqrt(power + 0.5 * power.mean())).astype(np.float32)
+    steps = np.abs(whitening).max(0) / 127
+    np.savez_compressed(
+        ROOT / "vocabulary.npz",
+        mean=mean.astype(np.float16),
+        axes=axes.astype(np.float16),
+        words=words.astype(np.float16),
+        centre=centre.astype(np.float16),
+        whitening=np.round(whitening / steps).astype(np.int8),
+        steps=steps.astype(np.float32),
+    )
+    print(f"{len(pictures)} pictures, {len(everything)} features: {(ROOT / 'vocabulary.npz').stat().st_size >> 10} KB")
+
+
+# --- verdict ---------------------------------------------------------------------------------------------------------
+
+RIGHT_DEG, RIGHT_M = 3.0, 0.15
+WRONG_DEG, WRONG_M = 5.0, 0.3  # between the two a pose is neither
+FEWEST = 6  # inliers of a pose that nobody found, to be worth a judgement
+RISES = {"matches", "inliers", "found_again", "spread", "explained", "compared", "colour", "seen"}
+KNOTS = {
+    "matches": tuple(np.log10(np.array([6.0, 8, 11, 15, 21, 41, 81]))),
+    "inliers": tuple(np.log10(np.array([1.0, 6, 11, 16, 26, 41, 81, 161]))),
+    "found_again": (0.0, 0.03, 0.07, 0.12, 0.2, 0.35),
+    "spread": (0.05, 0.15, 0.25, 0.4, 0.6),
+    "explained": (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8),
+    "contradicted": (0.05, 0.1, 0.2, 0.3, 0.45, 0.6),
+    "compared": tuple(np.log10(np.array([31.0, 101, 301, 801, 1501]))),
+    "colour": (0.0, 0.2, 0.4, 0.6, 0.8, 0.95),
+    "seen": (0.1, 0.3, 0.5, 0.8),
+    "blocked": (0.0, 0.05, 0.2, 0.5),
+    "sigma_m": tuple(np.log10(np.array([0.003, 0.01, 0.03, 0.08, 0.2, 0.6]))),
+}
+
+
+@dataclass
+class Row:
+    """One pose that was looked into, and what is known of it."""
+
+    photo: str
+    kind: str  # found, elsewhere, moved
+    evidence: dict[str, float]
+    error: tuple[float, float]  # deg, m; inf in another place
+    nees: float
+    changed: bool
+
+    @property
+    def right(self) -> bool:
+        return self.error[0] < RIGHT_DEG and self.error[1] < RIGHT_M
+
+    @property
+    def tells(self) -> bool:
+        """Whether it teaches anything: not a pose that is neither right nor wrong, nor one on the exact twin of its
+        wing, which nothing in the picture tells apart."""
+        twin = self.kind != "elsewhere" and self.error[0] < RIGHT_DEG and self.error[1] > 4.0
+        between = not self.right and self.error[0] < WRONG_DEG and self.error[1] < WRONG_M
+        idle = self.kind == "moved" and self.evidence["inliers"] < np.log10(FEWEST + 1)
+        return not (twin or between or idle)
+
+
+def judge_all(found: list[Place], params: Params) -> list[Row]:
+    """Poses of every photo in its own place and in two others, those that were found and some that were not."""
+    extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
+    probability.model = lambda: Odds({name: Curve((0.0, 1.0), (0.0, 0.0), 0.0) for name in KNOTS}, 0.0, 1e-3)
+    params = replace(params, max_candidates=4, sure=2.0)
+    rng, out = np.random.default_rng(5), []
+    indexes = {place.seed: index_of(place.scenes) for place in found}
+    for number, place in enumerate(found):
+        own = {scene.scene: scene for scene in place.scenes}
+        others = [found[(number + k) % len(found)] for k in (1, 4)]
+        for told in place.photos:
+            photo, truth = place.photo(told), np.array(told["T_world_camera"])
+            picture, _ = localizing.prepared(photo, params)
+
+            def row(judged, kind, truth=truth, told=told, name=photo.name):
+                return Row(name, kind, dict(judged.evidence), *errors(judged, truth, kind), told["changed"])
+
+            judged, _ = localizing.judged_poses(picture, indexes[place.seed], own, extractor, params)
+            out += [row(one, "found") for one in judged]
+            for other in others:
+                scenes = {scene.scene: scene for scene in other.scenes}
+                fewer = replace(params, max_candidates=2)
+                judged, _ = localizing.judged_poses(picture, indexes[other.seed], scenes, extractor, fewer)
+                out += [row(one, "elsewhere") for one in judged]
+            for size in (0.05, rng.uniform(0.2, 1.2)):
+                xi = np.r_[rng.normal(size=3) * size * 0.4, rng.normal(size=3) * size]
+                start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
+                one = localizing.judged_pose(picture, start, own, params)
+                one.evidence["matches"] = float("nan")
+                out.append(row(one, "moved"))
+        print(f"{place.seed}: {len(out)} poses, {time.process_time():.0f} CPU s", flush=True)
+    return out
+
+
+def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], float]:
+    """Error in degrees and metres, and the normalised squared error by the covariance."""
+    if kind == "elsewhere":
+        return (180.0, np.inf), np.nan
+    T = judged.settled.T_metric_camera
+    turn = log_so3(T[:3, :3].T @ truth[:3, :3])
+    shift = T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])
+    error = float(np.degrees(np.linalg.norm(turn))), float(np.linalg.norm(shift))
+    if judged.covariance is None:
+        return error, np.nan
+    xi = np.r_[turn, shift]
+    return error, float(xi @ np.linalg.solve(judged.covariance, xi))
+
+
+def log_so3(rotation: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()
+
+
+def index_of(scenes: list[PlacedFeatures]) -> ViewIndex:
+    """All views of some scenes."""
+    counts = [scene.features.num_views for scene in scenes]
+    return ViewIndex(
+        tuple(scene.scene for scene in scenes),
+        np.concatenate([scene.features.summaries for scene in scenes]),
+        np.repeat(np.arange(len(scenes)), counts),
+        np.concatenate([np.arange(count) for count in counts]),
+    )
+
+
+def design(rows: list[dict[str, float]]) -> np.ndarray:
+    """(N, columns) how far each piece has gone through each step between its knots, and whether it is missing."""
+    columns = []
+    for name, knots in KNOTS.items():
+        value = np.array([row[name] for row in rows])
+        known = np.isfinite(value)
+        for low, high in pairwise(knots):
+            step = np.clip((np.where(known, value, low) - low) / (high - low), 0, 1)
+            columns.append(np.where(known, step if name in RISES else 1 - step, 0.0))
+        columns.append(np.where(known, 0.0, 1.0))
+    return np.stack(columns, axis=1)
+
+
+def fit(rows: list[Row], penalty: float = 0.0005) -> Odds:
+    """Monotone curves of largest likelihood with a penalty on steep ones; right and wrong poses weigh the same."""
+    x = design([row.evidence for row in rows])
+    y = np.array([row.right for row in rows], float)
+    weight = np.where(y > 0, 0.5 / y.sum(), 0.5 / (1 - y).sum())
+    bounds, free = [], []
+    for name, knots in KNOTS.items():
+        bounds += [(0, None)] * (len(knots) - 1) + [(None, None)]
+        free.append(name)
+    bounds.append((None, None))
+
+    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
+        z = x @ w[:-1] + w[-1]
+        p = 1 / (1 + np.exp(-np.clip(z, -40, 40)))
+        g = weight * (p - y)
+        value = (weight * (np.logaddexp(0, z) - y * z)).sum() + penalty * (w[:-1] ** 2).sum()
+        return float(value), np.r_[x.T @ g + 2 * penalty * w[:-1], g.sum()]
+
+    w = minimize(
+        loss, np.zeros(x.shape[1] + 1), jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": 3000}
+    ).x
+    curves, at = {}, 0
+    for name, knots in KNOTS.items():
+        rises = w[at : at + len(knots) - 1]
+        worth = np.r_[0, np.cumsum(rises)] if name in RISES else np.r_[np.cumsum(rises[::-1])[::-1], 0]
+        curves[name] = Curve(tuple(map(float, knots)), tuple(map(float, worth)), float(w[at + len(knots) - 1]))
+        at += len(knots)
+    return Odds(curves, float(w[-1]), 1e-4)
+
+
+def log_odds(model: Odds, rows: list[Row]) -> np.ndarray:
+    return np.array([model.base + sum(model.worth(row.evidence).values()) for row in rows])
+
+
+def calibrated(rows: list[Row], folds: int = 6) -> Odds:
+    """The curves, stretched until places that were left out bear out what they say (Platt 1999)."""
+    model = fit(rows)
+    seeds = sorted({row.photo.split("/")[0] for row in rows})
+    fold = np.array([seeds.index(row.photo.split("/")[0]) % folds for row in rows])
+    odds, y = np.zeros(len(rows)), np.array([row.right for row in rows], float)
+    for k in range(folds):
+        held = np.flatnonzero(fold == k)
+        odds[held] = log_odds(fit([row for row, f in zip(rows, fold, strict=True) if f != k]), [rows[i] for i in held])
+    weight = np.where(y > 0, 0.5 / y.sum(), 0.5 / (1 - y).sum())
+
+    def loss(ab: np.ndarray) -> float:
+        z = ab[0] * odds + ab[1]
+        return float((weight * (np.logaddexp(0, z) - y * z)).sum())
+
+    a, b = minimize(loss, [1.0, 0.0], method="Nelder-Mead").x
+    curves = {n: Curve(c.knots, tuple(a * v for v in c.worth), a * c.missing) for n, c in model.curves.items()}
+    print(f"left out: stretched by {a:.2f}, moved by {b:.2f}")
+    report("places left out", rows, a * odds + b)
+    return Odds(curves, a * model.base + b, 1.0 / max((y == 0).sum(), 1))
+
+
+def report(name: str, rows: list[Row], odds: np.ndarray) -> None:
+    prior = Params().verdict.prior
+    p = 1 / (1 + np.exp(-(odds + np.log(prior / (1 - prior)))))
+    right = np.array([row.right for row in rows])
+    print(f"{name}: {right.sum()} right poses, {(~right).sum()} wrong ones")
+    for bar in (0.5, 0.8, 0.9, 0.95, 0.99):
+        print(f"  p >= {bar}: {((p >= bar) & right).sum()} right, {((p >= bar) & ~right).sum()} wrong")
+    for low, high in ((0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01)):
+        those = (p >= low) & (p < high)
+        if those.any():
+            print(f"  said {low:.2f} to {min(high, 1):.2f}: {those.sum():5d} poses, {right[those].mean():.3f} right")
+    good = [row for row, q in zip(rows, p, strict=True) if row.right and q > 0.9 and np.isfinite(row.nees)]
+    if good:
+        nees = np.array([row.nees for row in good])
+        told = f"median {np.median(nees):.1f} (expected 5.3), 90th {np.quantile(nees, 0.9):.1f} (expected 10.6)"
+        print(f"  NEES of {len(nees)}: {told}; error {np.median([row.error for row in good], axis=0)}")
+
+
+def save(model: Odds) -> None:
+    curves = {
+        name: {
+            "knots": [round(v, 5) for v in c.knots],
+            "worth": [round(v, 4) for v in c.worth],
+            "missing": round(c.missing, 4),
+        }
+        for name, c in model.curves.items()
+    }
+    text = json.dumps({"base": round(model.base, 4), "least": model.least, "curves": curves}, indent=1)
+    (ROOT / "probability.json").write_text(text + "\n")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("places", type=Path)
+    parser.add_argument("what", choices=("words", "verdict", "test"))
+    parser.add_argument("--cache", type=Path, required=True)
+    args = parser.parse_args()
+    params = Params()
+    if args.what == "words":
+        fit_words(places(args.places, "fit", args.cache, params), params)
+        return 0
+    split = "fit" if args.what == "verdict" else "test"
+    kept = args.cache / f"judged-{split}.pickle"
+    if not kept.exists():
+        kept.write_bytes(pickle.dumps(judge_all(places(args.places, split, args.cache, params), params)))
+    rows = [row for row in pickle.loads(kept.read_bytes()) if row.tells]
+    if args.what == "verdict":
+        save(calibrated(rows))
+    else:
+        report("test", rows, log_odds(Odds.of_json((ROOT / "probability.json").read_text()), rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

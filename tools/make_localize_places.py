@@ -1,0 +1,143 @@
+"""Made places with photographs: what localisation's model is fitted on and tested on.
+
+    tools/make_localize_places.py OUT --set fit          # OUT/fit/SEED/ for every place of the set
+    tools/make_localize_places.py OUT --set test
+
+Of a place: captures (NAME.ply, NAME.cameras.json, truth/NAME.json with ``T_scene_world``), photos/NAME.jpg taken at
+other times by other lenses from other standpoints, and photos.json with the truth of each. Seeds of the two sets are
+apart, and so are their places. What is made already is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+import gsmap_synthetic as synthetic
+from gsmap.errors import ConfigError
+from gsmap_synthetic import perturb
+from gsmap_synthetic.capture import default_routes, look_along, unused_doors
+from gsmap_synthetic.edits import edit_place
+from gsmap_synthetic.make import fit_frames, put_in_own_frame
+from gsmap_synthetic.place import Place
+from gsmap_synthetic.script import random_edits
+
+SETS = {"fit": range(50_000, 50_012), "test": range(60_000, 60_006)}
+CAPTURE_PX, PHOTO_PX = (400, 300), (480, 360)
+PHOTOS = 24
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--set", choices=SETS, required=True)
+    parser.add_argument("--only", type=int)
+    args = parser.parse_args()
+    for seed in SETS[args.set]:
+        if args.only in (None, seed):
+            make(args.out / args.set / str(seed), seed)
+    return 0
+
+
+def make(folder: Path, seed: int) -> None:
+    """A place, its captures, each with faults of its own, and photographs of it."""
+    if (folder / "done").exists():
+        return
+    began = time.process_time()
+    rng = np.random.default_rng([seed, 31])
+    twin = bool(rng.random() < 0.2)
+    place = synthetic.make_place(seed, rooms=3, twin=twin, texel_m=0.008)
+    for k, route in enumerate(default_routes(place, 2)):
+        synthetic.write_captures(folder, [_capture(place, route, k, seed, rng)])
+    _photograph(place, folder, rng)
+    (folder / "done").touch()
+    print(f"{seed}: {'a twin, ' if twin else ''}{time.process_time() - began:.0f} CPU s", flush=True)
+
+
+def _capture(
+    place: Place, route: tuple[int, ...], k: int, seed: int, rng: np.random.Generator
+) -> synthetic.DemoCapture:
+    frames = synthetic.film(
+        place,
+        synthetic.walk(place, route, 40, seed=k),
+        size_px=CAPTURE_PX,
+        shut=unused_doors(place, route),
+        gain=rng.uniform(0.8, 1.15),
+        gamma=rng.uniform(0.9, 1.15),
+        name=f"c{k}",
+    )
+    if rng.random() < 0.3:
+        frames = perturb.sensed(frames, rng, rng.uniform(0.3, 1.2))
+    gaussians = fit_frames(frames, steps=int(rng.choice([120, 250])), num_gaussians=60_000, seed=k)
+    if rng.random() < 0.3:
+        gaussians = perturb.strewn(gaussians, rng, rng.uniform(0.005, 0.03), size_m=0.05, opacity=0.6)
+    if rng.random() < 0.3:
+        gaussians = perturb.bent(gaussians, rng, rng.uniform(0.001, 0.006), rng.uniform(0.002, 0.015))
+    return put_in_own_frame(gaussians, frames, f"c{k}", np.random.default_rng([seed, k, 8]))
+
+
+def _photograph(place: Place, folder: Path, rng: np.random.Generator) -> None:
+    """Photographs: along other walks and from anywhere, by other lenses, in other light, of what has changed."""
+    (folder / "photos").mkdir(exist_ok=True)
+    changed = place
+    with contextlib.suppress(ConfigError):  # some rooms hold too little to change so much of
+        changed = edit_place(place, random_edits(place, rng, rooms=list(range(len(place.rooms))), share=0.3))
+    told = []
+    for i in range(PHOTOS):
+        pose = _pose(place, rng)
+        width = PHOTO_PX[0]
+        focal, gain, gamma = rng.uniform(0.55, 0.95), rng.uniform(0.6, 1.4), rng.uniform(0.85, 1.2)
+        seen = changed if i % 4 == 3 else place
+        shot = synthetic.film(
+            seen, pose[None], size_px=PHOTO_PX, gain=gain * rng.uniform(0.95, 1.05, 3), gamma=gamma, focal=focal
+        ).images[0]
+        occluded = 0.0
+        if i % 6 == 5:
+            shot, occluded = _occluded(shot, rng)
+        Image.fromarray(shot).save(folder / "photos" / f"p{i:03d}.jpg", quality=88)
+        told.append(
+            {
+                "file": f"p{i:03d}.jpg",
+                "T_world_camera": pose.tolist(),
+                "intrinsics": [focal * width, focal * width, width / 2, PHOTO_PX[1] / 2],
+                "gain": gain,
+                "changed": seen is not place,
+                "occluded": occluded,
+            }
+        )
+    (folder / "photos.json").write_text(json.dumps(told))
+
+
+def _pose(place: Place, rng: np.random.Generator) -> np.ndarray:
+    """A standpoint in the free part of a room, at the height of a hand, looking about level."""
+    while True:
+        room = place.rooms[int(rng.integers(len(place.rooms)))]
+        xy = room.center + (rng.random(2) - 0.5) * (room.size_m - 0.6)
+        if room.is_free(xy[None])[0]:
+            break
+    return look_along(*xy, rng.uniform(0.9, 1.8), rng.uniform(0, 2 * np.pi), rng.normal(-0.1, 0.2))
+
+
+def _occluded(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """Somebody stands in the picture: an upright blob of 5 to 20 % of it, clothed in stripes."""
+    height, width = image.shape[:2]
+    share = rng.uniform(0.05, 0.2)
+    tall = rng.uniform(0.5, 0.95) * height
+    wide = share * width * height / tall
+    x = rng.uniform(wide / 2, width - wide / 2)
+    v, u = np.mgrid[0:height, 0:width]
+    body = (np.abs(u - x) < wide / 2 * np.clip((v - (height - tall)) / (0.15 * tall), 0, 1)) & (v > height - tall)
+    stripes = rng.uniform(0, 255, (6, 3))[(v // max(4, int(tall / 12))) % 6]
+    out = np.where(body[..., None], stripes + rng.normal(0, 12, image.shape), image)
+    return np.clip(out, 0, 255).astype(np.uint8), float(body.mean())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
