@@ -1,4 +1,4 @@
-"""gsmap localize: where photographs were taken."""
+"""gsmap localize: where photographs were taken, and where scans lie."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ from gsmap.cli.console import (
 
 def command(
     map: MapPath,
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Photographs.", show_default=False)],
+    files: Annotated[
+        list[str],
+        typer.Argument(metavar="FILE...", help="Photographs, point clouds, meshes, splats.", show_default=False),
+    ],
     intrinsics: Annotated[
         str | None,
         typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="Of all photos, in pixels of the upright picture."),
@@ -39,18 +42,25 @@ def command(
         str | None,
         typer.Option("--near", metavar="SCENE|X,Y,Z,R", help="Look only at what this scene shows, or around a point."),
     ] = None,
+    depth: Annotated[
+        str | None,
+        typer.Option("--depth", metavar="PNG", help="A depth picture of the one photo's view; needs --intrinsics."),
+    ] = None,
+    depth_scale: Annotated[
+        float, typer.Option("--depth-scale", help="Values of the depth picture that make a metre.")
+    ] = 1000.0,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Find where photographs were taken, or say why not. What scenes are found by is made when first needed, and kept.
+    """Find where photographs were taken and scans lie, or say why not. What scenes are found by is made once, and kept.
 
     Example: `gsmap localize site.gsmap phone.jpg`
     """
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
-        report = m.localize(*files, intrinsics=intrinsics, focal=focal, near=near)
+        report = m.localize(*files, intrinsics=intrinsics, focal=focal, near=near, depth=depth, depth_scale=depth_scale)
     for note in report.notes:
         say(note)
     if json:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from gsmap.errors import ConfigError
 from gsmap.localize import Lens, read_photo
+from gsmap.map.localizing_scans import scan_rows
 from gsmap.map.metres import metre_notes, metres_at
 from gsmap.map.stages.localize import Localizer, localize, parse_near
 from gsmap.store import Store
@@ -30,10 +31,41 @@ def localize_files(
     focal: str | float | None,
     near: str | None,
     progress: StageProgress,
+    depth: str | os.PathLike[str] | None = None,
+    depth_scale: float = 1000.0,
 ) -> LocalizeReport:
-    """Read photographs, find them, and tell of each; nothing is begun where one cannot be read."""
+    """Read photographs, find them, and tell of each; nothing is begun where one cannot be read. Scans go their own way.
+
+    Args:
+        depth: a depth picture of the view of the one photo given, which makes a scan of it.
+        depth_scale: its values that make a metre.
+    """
     if not files:
         raise ConfigError("name the photographs to localise")
+    of_scans, notes = scan_rows(
+        store, settings, files, depth, depth_scale, parse_lens(intrinsics, focal), near, progress
+    )
+    pictures = [path for number, path in enumerate(files) if number not in of_scans]
+    report = LocalizeReport(results=())
+    if pictures:
+        report = _of_pictures(
+            store, settings, pictures, intrinsics=intrinsics, focal=focal, near=near, progress=progress
+        )
+    told = iter(report.results)
+    rows = tuple(of_scans[number] if number in of_scans else next(told) for number in range(len(files)))
+    return LocalizeReport(results=rows, notes=(*notes, *report.notes))
+
+
+def _of_pictures(
+    store: Store,
+    settings: Settings,
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    intrinsics: Numbers,
+    focal: str | float | None,
+    near: str | None,
+    progress: StageProgress,
+) -> LocalizeReport:
     lens = parse_lens(intrinsics, focal)
     photos = [read_photo(path, lens) for path in files]
     where = None if near is None else parse_near(store, near)

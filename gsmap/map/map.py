@@ -479,8 +479,10 @@ class Map(AbstractContextManager["Map"]):
         intrinsics: str | Sequence[float] | None = None,
         focal: str | float | None = None,
         near: str | None = None,
+        depth: str | os.PathLike[str] | None = None,
+        depth_scale: float = 1000.0,
     ) -> LocalizeReport:
-        """``gsmap localize MAP FILE...``: where photographs were taken, or why that is not said.
+        """``gsmap localize MAP FILE...``: where photographs were taken and scans lie, or why that is not said.
 
         What views are found by is made for every scene that lacks it, and kept unless the map is read-only.
 
@@ -488,10 +490,11 @@ class Map(AbstractContextManager["Map"]):
             intrinsics: ``fx fy cx cy`` of all photos, in pixels of the upright picture.
             focal: focal length in pixels, or ``auto`` to solve for it; by default what the file says (EXIF).
             near: only what this scene shows, or ``X,Y,Z,R`` around a point of the map.
+            depth, depth_scale: a depth picture of the view of the one photo given, and its values that make a metre.
 
         Raises:
             NotFoundError: no such file or scene, or nothing in the map has a place.
-            InputError: a file is no picture.
+            InputError: a file is neither a picture nor a scan.
             ConfigError: what is said of the lens or the place makes no sense.
         """
         from gsmap.map.localizing import localize_files
@@ -505,6 +508,8 @@ class Map(AbstractContextManager["Map"]):
                 focal=focal,
                 near=near,
                 progress=self._progress,
+                depth=depth,
+                depth_scale=depth_scale,
             )
 
     def find(
