@@ -4,8 +4,8 @@
 
 A level of a quarter of the Gaussians has half the detail of a surface: it is seen from twice as far, which is a picture
 of half the size; one of a sixteenth (6 %) from four times as far. PSNR against the capture's own render at that size,
-from its own cameras (CAPTURE.cameras.json), none of which the level was fitted to. splat-transform (npm: @playcanvas/splat-transform, node 22) needs a GPU or,
-as here, ``-g cpu``.
+from cameras of its own (CAPTURE.cameras.json) that the level was not fitted to. splat-transform (npm:
+@playcanvas/splat-transform, node 22) needs a GPU or, as here, ``-g cpu``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""gsmap localize: where photographs were taken."""
+"""gsmap localize: where photographs were taken, and where scans lie."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from gsmap.cli.console import (
 def command(
     map: MapPath,
     files: Annotated[
-        list[str] | None, typer.Argument(metavar="FILE...", help="Photographs.", show_default=False)
+        list[str] | None,
+        typer.Argument(metavar="FILE...", help="Photographs, point clouds, meshes, splats.", show_default=False),
     ] = None,
     intrinsics: Annotated[
         str | None,
@@ -48,19 +49,33 @@ def command(
     video: Annotated[
         str | None, typer.Option("--video", metavar="FILE", help="A clip: its sharpest frames, together.")
     ] = None,
+    depth: Annotated[
+        str | None,
+        typer.Option("--depth", metavar="PNG", help="A depth picture of the one photo's view; needs --intrinsics."),
+    ] = None,
+    depth_scale: Annotated[
+        float, typer.Option("--depth-scale", help="Values of the depth picture that make a metre.")
+    ] = 1000.0,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
     scheduler: Scheduler = None,
     json: AsJson = False,
 ) -> None:
-    """Find where photographs were taken, or say why not. What scenes are found by is made when first needed, and kept.
+    """Find where photographs were taken and scans lie, or say why not. What scenes are found by is made once, and kept.
 
     Example: `gsmap localize site.gsmap phone.jpg`
     """
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         report = m.localize(
-            *(files or ()), intrinsics=intrinsics, focal=focal, near=near, together=together, video=video
+            *(files or ()),
+            intrinsics=intrinsics,
+            focal=focal,
+            near=near,
+            together=together,
+            video=video,
+            depth=depth,
+            depth_scale=depth_scale,
         )
     for note in report.notes:
         say(note)

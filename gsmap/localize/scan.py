@@ -32,7 +32,6 @@ class Params:
         neighbours: that a normal and a spacing are told from.
         spread: standard deviation of a disc in its plane, as a share of the spacing of the points around it.
         flatness: and across it, as a share of that.
-        enough: scenes in which a scan is found at one place, after which no further ones are asked.
         most_by_shape: scenes that a scan without colours is compared with at most.
         agree_sigmas: places that two scenes give contradict each other beyond so many standard deviations, and beyond
             what `register.same_pose` takes for one.
@@ -44,7 +43,6 @@ class Params:
     neighbours: int = 10
     spread: float = 0.7
     flatness: float = 0.1
-    enough: int = 3
     most_by_shape: int = 24
     agree_sigmas: float = 5.0
     reading: ReadingParams = field(default_factory=ReadingParams)

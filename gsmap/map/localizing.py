@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gsmap.errors import ConfigError
+from gsmap.formats.scans import is_scan
 from gsmap.localize import Lens, read_clip, read_photo
+from gsmap.map.localizing_scans import scan_rows
 from gsmap.map.metres import metre_notes, metres_at
 from gsmap.map.stages.localize import Localizer, localize, localize_all, parse_near
 from gsmap.store import Store
-from gsmap.types.localization import Placement
+from gsmap.types.localization import Photo, Placement
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
 
@@ -32,20 +34,47 @@ def localize_files(
     together: bool,
     video: str | os.PathLike[str] | None,
     progress: StageProgress,
+    depth: str | os.PathLike[str] | None = None,
+    depth_scale: float = 1000.0,
 ) -> LocalizeReport:
-    """Read photographs, find them, and tell of each; nothing is begun where one cannot be read."""
+    """Read photographs, find them, and tell of each; nothing is begun where one cannot be read. Scans go their own way.
+
+    Args:
+        together: the photographs show one place.
+        video: a clip, in place of files.
+        depth: a depth picture of the view of the one photo given, which makes a scan of it.
+        depth_scale: its values that make a metre.
+    """
     if bool(files) == (video is not None):
         raise ConfigError("name the photographs to localise, or one clip by --video")
     lens = parse_lens(intrinsics, focal)
     if video is not None:
         clip = read_clip(video, lens, settings.localize.clips)
-        named = [(f"{os.fspath(video)}#{at:.2f}", photo) for at, photo in clip]
-    else:
-        named = [(os.fspath(path), read_photo(path, lens)) for path in files]
+        frames = [(f"{os.fspath(video)}#{at:.2f}", photo) for at, photo in clip]
+        return _of_pictures(store, settings, frames, near, True, progress)
+    pictures = [(os.fspath(path), read_photo(path, lens)) for path in files if depth is None and not is_scan(path)]
+    of_scans, notes = scan_rows(store, settings, files, depth, depth_scale, lens, near, progress)
+    report = LocalizeReport(results=())
+    if pictures:
+        report = _of_pictures(store, settings, pictures, near, together, progress)
+    told = iter(report.results)
+    rows = tuple(of_scans[number] if number in of_scans else next(told) for number in range(len(files)))
+    return LocalizeReport(results=rows, notes=(*notes, *report.notes))
+
+
+def _of_pictures(
+    store: Store,
+    settings: Settings,
+    named: Sequence[tuple[str, Photo]],
+    near: str | None,
+    together: bool,
+    progress: StageProgress,
+) -> LocalizeReport:
+    """What is told of photographs, by name."""
     where = None if near is None else parse_near(store, near)
     localizer = Localizer(store, settings, progress)
     photos = [photo for _, photo in named]
-    if together or video is not None:
+    if together:
         found = localize_all(localizer, photos, where)
     else:
         found = localize(localizer, photos, where, progress)

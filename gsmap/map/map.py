@@ -482,8 +482,10 @@ class Map(AbstractContextManager["Map"]):
         near: str | None = None,
         together: bool = False,
         video: str | os.PathLike[str] | None = None,
+        depth: str | os.PathLike[str] | None = None,
+        depth_scale: float = 1000.0,
     ) -> LocalizeReport:
-        """``gsmap localize MAP FILE...``: where photographs were taken, or why that is not said.
+        """``gsmap localize MAP FILE...``: where photographs were taken and scans lie, or why that is not said.
 
         What views are found by is made for every scene that lacks it, and kept unless the map is read-only.
 
@@ -493,10 +495,11 @@ class Map(AbstractContextManager["Map"]):
             near: only what this scene shows, or ``X,Y,Z,R`` around a point of the map.
             together: the photos show one place and overlap: whoever is placed helps the others.
             video: a clip, whose sharpest frames are photos of one place; needs the extra ``video``.
+            depth, depth_scale: a depth picture of the view of the one photo given, and its values that make a metre.
 
         Raises:
             NotFoundError: no such file or scene, or nothing in the map has a place.
-            InputError: a file is no picture.
+            InputError: a file is neither a picture nor a scan.
             ConfigError: what is said of the lens or the place makes no sense.
         """
         from gsmap.map.localizing import localize_files
@@ -512,6 +515,8 @@ class Map(AbstractContextManager["Map"]):
                 together=together,
                 video=video,
                 progress=self._progress,
+                depth=depth,
+                depth_scale=depth_scale,
             )
 
     def find(

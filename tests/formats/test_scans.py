@@ -143,9 +143,15 @@ def test_las_without_colours_has_none_and_a_damaged_one_is_refused(tmp_path: Pat
     (tmp_path / "c.las").write_bytes(whole[:100])
     with pytest.raises(InputError, match=r"c\.las"):
         scans.read(tmp_path / "c.las")
+    for at, count in ((100, 1 << 31), (96, 1 << 31), (243, 1 << 31), (105, 0)):  # records, where points begin, ...
+        lying = bytearray(whole)
+        lying[at : at + 4] = count.to_bytes(4, "little") if count else b"\0\0" + bytes(lying[at + 2 : at + 4])
+        (tmp_path / "e.las").write_bytes(lying)
+        with pytest.raises(InputError, match="does not fit the file"):
+            scans.read(tmp_path / "e.las")
     las.write(tmp_path / "d.laz")
     packed = bytearray((tmp_path / "d.laz").read_bytes())
-    packed[247:255] = (1 << 40).to_bytes(8, "little")  # the number of points, LAS 1.4
+    packed[247:255] = (1 << 13).to_bytes(8, "little")  # the number of points, LAS 1.4: 400 are there
     (tmp_path / "d.laz").write_bytes(packed)
     with pytest.raises(InputError, match=r"d\.laz"):
         scans.read(tmp_path / "d.laz")

@@ -112,6 +112,31 @@ def test_a_depth_picture_tells_where_its_camera_is(
     assert placed
 
 
+def test_localize_takes_scans_and_depth_pictures(opened: gsmap.map.Map, room: Scanned, tmp_path: Path) -> None:
+    path = ply(tmp_path / "room.ply", room.points, room.colours)
+    report = opened.localize(path)
+    (row,) = report.results
+    alone = opened.localize_scan(path)
+    assert row.status == "placed"
+    assert row.S_map_scan is not None
+    assert alone.S_map_scan is not None
+    np.testing.assert_array_equal(row.S_map_scan.matrix(), alone.S_map_scan.matrix())
+    np.testing.assert_array_equal(row.covariance, alone.covariance)
+    assert row.origin is not None
+    assert not row.origin.any()
+    assert row.evidence["coloured"] == 1
+    assert any("room.ply" in note for note in report.notes) == bool(alone.notes)
+    depth, colour = save_depth(tmp_path, room.frames, 1)
+    for options in ({}, {"focal": 100}):
+        with pytest.raises(ConfigError, match="intrinsics"):
+            opened.localize(colour, depth=depth, **options)
+    with pytest.raises(ConfigError, match="one photo"):
+        opened.localize(colour, colour, depth=depth, intrinsics=room.frames.cameras.intrinsics_px[1])
+    (row,) = opened.localize(colour, depth=depth, intrinsics=room.frames.cameras.intrinsics_px[1]).results
+    assert row.file == str(colour)
+    assert (row.T_map_camera is None) == (row.status == "refused")
+
+
 @pytest.mark.slow
 def test_a_splat_is_found_without_being_ingested(
     opened: gsmap.map.Map, flat: Flat, room: Scanned, tmp_path: Path

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.networks.session import misfit, open_session, run
 from gsmap.errors import ConfigError, InputError, MissingDependencyError, NotFoundError
+from gsmap.networks.session import misfit, open_session, run
 from gsmap.types.model import ModelSpec, Tensor
 
 TEXT, TOKENIZER = "clip-text", "clip-tokenizer"

@@ -1,7 +1,7 @@
-"""The process that reads one mesh or cloud by open3d, within limits that it sets itself.
+"""The process that reads one mesh, cloud or LAS file by a library, within limits that it sets itself.
 
-It is run as a script, knows nothing of gsmap, and writes one ``.npz`` to the descriptor it is given: vertices,
-triangles, colours, and of a textured mesh its pictures. What a file makes of the library ends here.
+It is run as a script, knows nothing of gsmap, and writes one ``.npz`` to the descriptor it is given. What a file makes
+of the library ends here: crashes, aborts for want of memory, and loops.
 """
 
 from __future__ import annotations
@@ -16,33 +16,74 @@ from typing import Any
 
 import numpy as np
 
+_CHUNK = 1 << 20  # points
 
-def main(out: int, path: str, kind: str, memory_bytes: int) -> None:
+
+def main(out: int, path: str, kind: str, memory_bytes: int, max_points: int) -> None:
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
-    import open3d
-
-    _limit(memory_bytes)
-    if kind == "cloud":
-        cloud = open3d.io.read_point_cloud(Path(path))
-        arrays: dict[str, Any] = {"vertices": np.asarray(cloud.points), "colours": np.asarray(cloud.colors)}
+    if kind == "las":
+        import laspy  # noqa: F401
+        import lazrs  # noqa: F401
     else:
-        mesh = open3d.io.read_triangle_mesh(Path(path), True)
-        arrays = {
-            "vertices": np.asarray(mesh.vertices),
-            "triangles": np.asarray(mesh.triangles),
-            "colours": np.asarray(mesh.vertex_colors),
-            "uvs": np.asarray(mesh.triangle_uvs),
-            "materials": np.asarray(mesh.triangle_material_ids),
-        }
-        for number, picture in enumerate(mesh.textures):
-            # A material without a picture has an empty one, which numpy cannot see.
-            arrays[f"texture{number}"] = np.zeros((0, 0, 3), np.uint8) if picture.is_empty() else np.asarray(picture)
+        import open3d  # noqa: F401
+    _limit(memory_bytes)
+    read = {"cloud": _cloud, "mesh": _mesh, "las": _las}[kind]
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **read(Path(path), max_points))
     with os.fdopen(out, "wb") as file:
         file.write(buffer.getbuffer())
+
+
+def _cloud(path: Path, max_points: int) -> dict[str, Any]:
+    import open3d
+
+    cloud = open3d.io.read_point_cloud(path)
+    return {"vertices": np.asarray(cloud.points), "colours": np.asarray(cloud.colors)}
+
+
+def _mesh(path: Path, max_points: int) -> dict[str, Any]:
+    import open3d
+
+    mesh = open3d.io.read_triangle_mesh(path, True)
+    arrays: dict[str, Any] = {
+        "vertices": np.asarray(mesh.vertices),
+        "triangles": np.asarray(mesh.triangles),
+        "colours": np.asarray(mesh.vertex_colors),
+        "uvs": np.asarray(mesh.triangle_uvs),
+        "materials": np.asarray(mesh.triangle_material_ids),
+    }
+    for number, picture in enumerate(mesh.textures):
+        # A material without a picture has an empty one, which numpy cannot see.
+        arrays[f"texture{number}"] = np.zeros((0, 0, 3), np.uint8) if picture.is_empty() else np.asarray(picture)
+    return arrays
+
+
+def _las(path: Path, max_points: int) -> dict[str, Any]:
+    """The integers of an even share of the points, their scales and offsets, and their colours where they have some."""
+    import laspy
+
+    with laspy.open(path) as reader:
+        header = reader.header
+        total = int(header.point_count)
+        step = max(1, -(-total // max_points))
+        names = set(header.point_format.dimension_names)
+        columns: dict[str, list[Any]] = {"counts": []}
+        if {"red", "green", "blue"} <= names:
+            columns["colours"] = []
+        seen = 0
+        for chunk in reader.chunk_iterator(_CHUNK):
+            rows = slice(-seen % step, None, step)
+            columns["counts"].append(np.stack([np.asarray(chunk[axis])[rows] for axis in "XYZ"], axis=1))
+            if "colours" in columns:
+                columns["colours"].append(
+                    np.stack([np.asarray(chunk[name])[rows] for name in ("red", "green", "blue")], axis=1)
+                )
+            seen += len(chunk)
+        arrays = {name: np.concatenate(parts) for name, parts in columns.items() if parts}
+        scales, offsets = np.array(header.scales, float), np.array(header.offsets, float)
+        return arrays | {"total": np.array([total, seen]), "scales": scales, "offsets": offsets}
 
 
 def _limit(memory_bytes: int) -> None:
@@ -56,4 +97,4 @@ def _limit(memory_bytes: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4]))
+    main(int(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5]))

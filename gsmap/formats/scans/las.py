@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +11,11 @@ import numpy as np
 from gsmap.errors import InputError, MissingDependencyError
 from gsmap.formats.scans.params import Params
 from gsmap.formats.scans.points import scan_of
+from gsmap.formats.scans.process import asked
 from gsmap.types.scan import Scan
 
-_CHUNK = 1 << 20
+_HEADER_BYTES, _LEAST_HEADER_BYTES = 375, 227
+_RECORD_BYTES, _EXTENDED_BYTES = 54, 60  # of the header of a record of variable length
 _SIXTEEN_BITS, _EIGHT_BITS = 65535.0, 255.0
 
 
@@ -22,62 +26,48 @@ def read(path: Path, params: Params) -> Scan:
         InputError: damaged, truncated, or a scale or offset that is no number.
         MissingDependencyError: laspy or lazrs is not installed.
     """
-    try:
-        import laspy
-        import lazrs  # noqa: F401  # laspy reads no .laz without it, and says so obscurely
-    except ImportError as error:
+    if not all(importlib.util.find_spec(name) for name in ("laspy", "lazrs")):
         raise MissingDependencyError(
             f"{path}: .las and .laz are read by laspy, which is not installed: pip install 'gsmap[las]'"
-        ) from error
-
-    try:
-        with laspy.open(path) as reader:
-            header = reader.header
-            total, scales, offsets = int(header.point_count), np.array(header.scales), np.array(header.offsets)
-            if not (np.isfinite(scales).all() and np.isfinite(offsets).all() and (scales > 0).all()):
-                raise InputError(f"{path}: its scales {scales.tolist()} or offsets {offsets.tolist()} make no sense")
-            is_packed = header.are_points_compressed
-            _require_room(path, total, int(header.offset_to_point_data), int(header.point_format.size), is_packed)
-            step = max(1, -(-total // params.max_points))
-            raw, colours, seen = [], [], 0
-            has_colour = {"red", "green", "blue"} <= set(header.point_format.dimension_names)
-            for chunk in reader.chunk_iterator(_CHUNK):
-                rows = slice(-seen % step, None, step)
-                raw.append(np.stack([np.asarray(chunk[axis])[rows] for axis in "XYZ"], axis=1).astype(np.float64))
-                if has_colour:
-                    colours.append(np.stack([np.asarray(chunk[c])[rows] for c in ("red", "green", "blue")], axis=1))
-                seen += len(chunk)
-    except InputError:
-        raise
-    except Exception as error:  # laspy and lazrs raise what they meet: struct.error, LaspyException, panics of Rust
-        raise InputError(f"{path} is not a LAS file that can be read: {type(error).__name__}: {error}") from error
-    except BaseException as error:
-        if type(error).__name__ != "PanicException":  # of lazrs, which is no Exception
-            raise
-        raise InputError(f"{path} is a damaged LAZ file: {error}") from error
-    counts = np.concatenate(raw) if raw else np.zeros((0, 3))
+        )
+    _require_header(path)
+    found = asked(path, "las", params)
+    counts, scales, offsets = found.get("counts", np.zeros((0, 3))), found["scales"], found["offsets"]
+    total, seen = found["total"].tolist()
+    if not (np.isfinite(scales).all() and np.isfinite(offsets).all() and (scales > 0).all()):
+        raise InputError(f"{path}: its scales {scales.tolist()} or offsets {offsets.tolist()} make no sense")
     if seen < total:
         raise InputError(f"{path} is truncated: its header promises {total:,} points, {seen:,} were found")
-    # The integers are exact, and so is an origin that is one of them: nothing is lost to large coordinates.
-    middle = np.round(np.median(counts, axis=0)) if len(counts) else np.zeros(3)
-    points = (counts - middle) * scales
-    seen_colours = _colours(np.concatenate(colours)) if has_colour and colours else None
-    return scan_of(points, seen_colours, path, total, origin=middle * scales + offsets)
-
-
-def _require_room(path: Path, total: int, offset: int, stride: int, is_packed: bool) -> None:
-    """Refuse a header that promises more points than the file can hold.
-
-    A packed point of a real scan takes more than a bit, however it is coded.
-    """
-    present = path.stat().st_size - offset
-    if total <= 0:
+    if not len(counts):
         raise InputError(f"{path} has no points: there is nothing to look for")
-    if total * stride > (present * 8 * stride if is_packed else present):
-        raise InputError(
-            f"{path} is truncated: its header promises {total:,} points of {stride} bytes, "
-            f"but {max(0, present):,} bytes follow"
-        )
+    # The integers are exact, and so is an origin that is one of them: nothing is lost to large coordinates.
+    middle = np.round(np.median(counts, axis=0))
+    points = (counts - middle) * scales
+    colours = _colours(found["colours"]) if "colours" in found else None
+    return scan_of(points, colours, path, total, origin=middle * scales + offsets)
+
+
+def _require_header(path: Path) -> None:
+    """Refuse a header whose records the file has no room for: laspy would look for each of them.
+
+    The layout is that of the public header block (ASPRS LAS 1.4 R15, 2.4).
+    """
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        head = file.read(_HEADER_BYTES)
+    if len(head) < _LEAST_HEADER_BYTES or head[:4] != b"LASF":
+        raise InputError(f"{path} is not a LAS file: it has no LAS header")
+    own, points, records = struct.unpack_from("<HII", head, 94)
+    (length,) = struct.unpack_from("<H", head, 105)
+    extended = struct.unpack_from("<I", head, 243)[0] if head[25] >= 4 and len(head) == _HEADER_BYTES else 0
+    room = _LEAST_HEADER_BYTES <= own <= points <= size
+    packed = bool(head[104] & 0x80)
+    total = struct.unpack_from("<Q", head, 247)[0] if head[25] >= 4 and len(head) == _HEADER_BYTES else 0
+    total = max(total, struct.unpack_from("<I", head, 107)[0])
+    room &= total * (1 if packed else 8 * length) <= 8 * (size - points)  # a packed point has a bit at the least
+    room &= own + records * _RECORD_BYTES <= points and extended * _EXTENDED_BYTES <= size
+    if not room or not length:
+        raise InputError(f"{path}: its LAS header does not fit the file of {size:,} bytes: it is truncated or damaged")
 
 
 def _colours(values: np.ndarray) -> np.ndarray | None:

@@ -5,23 +5,17 @@ A mesh becomes points spread evenly over its area, coloured by its textures, els
 
 from __future__ import annotations
 
-import io
-import os
-import subprocess
-import sys
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.formats.scans import child
 from gsmap.formats.scans.params import Params
 from gsmap.formats.scans.points import scan_of
+from gsmap.formats.scans.process import asked
 from gsmap.types.scan import Scan
 
-_MIB = 1 << 20
 _SEED = 0
 
 
@@ -32,7 +26,9 @@ def read(path: Path, params: Params) -> Scan:
         InputError: not what its suffix says, damaged, or beyond the limits of time and memory.
     """
     kind = "cloud" if path.suffix.lower() == ".pcd" else "mesh"
-    found = _asked(path, kind, params)
+    if path.suffix.lower() == ".ply":
+        _require_vertices(path)
+    found = asked(path, kind, params)
     vertices, colours = _checked(found, "vertices", 3, path), found.get("colours")
     if colours is not None:
         colours = _checked(found, "colours", 3, path) if len(colours) == len(vertices) else None
@@ -96,57 +92,6 @@ def _textured(found: dict[str, Any], rows: np.ndarray, shares: np.ndarray, path:
         pixels = picture[row, column].astype(np.float64) / 255
         out[mine] = pixels[:, :3] if channels >= 3 else pixels[:, :1]
     return out
-
-
-def _asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
-    """What open3d reads of a file."""
-    if path.suffix.lower() == ".ply":
-        _require_vertices(path)
-    end, out = os.pipe()
-    command = [sys.executable, "-P", child.__file__, str(out), str(path.resolve()), kind]
-    with os.fdopen(end, "rb") as pipe:
-        process = subprocess.Popen(
-            [*command, str(params.memory_mb * _MIB)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            pass_fds=(out,),
-            start_new_session=True,
-        )
-        os.close(out)
-        try:
-            said = _until_end(pipe, process, params, path)
-        finally:
-            process.kill()
-            process.wait()
-    try:
-        with np.load(io.BytesIO(said), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(
-            f"{path} cannot be read: open3d gave it up, or it needs more than {params.memory_mb} MB: it is damaged, or "
-            "too large; convert it to a .ply point cloud"
-        ) from error
-
-
-def _until_end(pipe: Any, process: subprocess.Popen[bytes], params: Params, path: Path) -> bytes:
-    """All that the process writes, before its time is up."""
-    import threading
-
-    timer = threading.Timer(params.time_s, process.kill)
-    timer.start()
-    parts, size = [], 0
-    try:
-        while part := pipe.read(_MIB):
-            parts.append(part)
-            size += len(part)
-            if size > params.memory_mb * _MIB:
-                raise InputError(f"{path} is larger than {params.memory_mb} MB in memory: thin it first")
-        if not timer.is_alive():
-            raise InputError(f"{path} takes longer than {params.time_s:g} s to read: thin it first")
-    finally:
-        timer.cancel()
-    return b"".join(parts)
 
 
 def _checked(found: dict[str, np.ndarray], name: str, width: int, path: Path) -> np.ndarray:

@@ -23,6 +23,7 @@ from gsmap.map.looking_up import ask_once
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, without_graph
+from gsmap.map.stages.localize import parse_near
 from gsmap.map.stages.register import placed_scenes
 from gsmap.methods import RecipeKey
 from gsmap.register import SceneView
@@ -81,7 +82,8 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     """Where a scan lies in the map, by the scenes that show it; nothing is written.
 
     It is described by the recipe of the map's graphs, the index tells the likeliest scenes, and it is registered with
-    each of these in turn as any pair is, until enough of them put it at one place.
+    each of these as any pair is. All are asked, however many show it: one that shows it elsewhere says that the map
+    holds places that look alike.
 
     Raises:
         NotFoundError: no such file, or no scene of the map is described and placed.
@@ -129,8 +131,6 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
             found.append(register.register_by_shape(target, source, settings.by_shape, settings.register))
         if found[-1].status == "accepted":
             supports.append(Support.of(poses.poses[scene], found[-1]))
-        if sought.coloured and len(supports) >= settings.scan.enough:
-            break
     told(1.0, "done")
     joined = None
     if supports:
@@ -198,19 +198,15 @@ def _near(store: Store, near: str) -> set[str]:
         NotFoundError: no such scene, or none is there.
         ConfigError: four numbers that make no ball.
     """
-    placed = placed_scenes(store)
-    parts = near.split(",")
-    try:
-        numbers = [float(part) for part in parts]
-    except ValueError:
-        scene = store.scenes.get(near).id
-        if scene not in placed:
-            raise NotFoundError(f"scene {near} has no place in the map yet: run gsmap update first") from None
-        at, radius, component = placed[scene].centre, placed[scene].radius, placed[scene].component
+    placed, said = placed_scenes(store), parse_near(store, near)
+    if said.point is not None:
+        at, radius, component = np.array(said.point), said.radius, 0
     else:
-        if len(numbers) != 4 or not np.isfinite(numbers).all() or not numbers[3] > 0:
-            raise ConfigError(f"near is a scene, or X,Y,Z,R with a positive radius, got {near!r}")
-        at, radius, component = np.array(numbers[:3]), numbers[3], 0
+        assert said.scene is not None
+        if said.scene not in placed:
+            raise NotFoundError(f"scene {near} has no place in the map yet: run gsmap update first")
+        one = placed[said.scene]
+        at, radius, component = one.centre, one.radius, one.component
     found = {
         scene
         for scene, one in placed.items()

@@ -21,7 +21,9 @@ class LocalizeRow(Row):
         status: ``placed`` or ``refused``.
         reason: why it is refused; empty where it is placed.
         T_map_camera: (4, 4) camera-to-map of a photo (OpenCV axes), in the frame and unit of its component; else null.
-        S_map_scan: takes a scan to the map, in the same frame and unit; null for photos, and where it is refused.
+        S_map_scan: takes a scan, less ``origin``, to the map, in the same frame and unit; null for photos, and where
+            it is refused.
+        origin: what is taken from a scan's coordinates first: zeros unless they are large; null for photos.
         covariance: (6, 6) over [rot_rad (3), trans (3)], of a scan (7, 7) with the logarithm of its scale, on the
             camera's or scan's side: ``T = T_hat Exp(xi)``, translation in the map's unit (a scan's: in its own).
         component: in whose frame that is; null where nothing was found.
@@ -48,6 +50,7 @@ class LocalizeRow(Row):
     reason: str
     T_map_camera: np.ndarray | None = None
     S_map_scan: Sim3 | None = None
+    origin: np.ndarray | None = None
     covariance: np.ndarray | None = None
     component: int | None = None
     scenes: tuple[str, ...] = ()

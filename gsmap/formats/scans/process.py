@@ -1,0 +1,74 @@
+"""Files that only libraries read, which may abort, are read by a process of its own (`gsmap.formats.scans.child`)."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+import threading
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.formats.scans import child
+from gsmap.formats.scans.params import Params
+
+_MIB = 1 << 20
+
+
+def asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
+    """What a library reads of a file, in a process of its own that ends when it takes too long or too much memory.
+
+    Args:
+        kind: ``cloud`` or ``mesh`` (open3d), or ``las`` (laspy).
+
+    Raises:
+        InputError: it does not read it, or not within the limits.
+    """
+    end, out = os.pipe()
+    command = [sys.executable, "-P", child.__file__, str(out), str(path.resolve()), kind]
+    with os.fdopen(end, "rb") as pipe:
+        process = subprocess.Popen(
+            [*command, str(params.memory_mb * _MIB), str(params.max_points)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=(out,),
+            start_new_session=True,
+        )
+        os.close(out)
+        try:
+            said = _until_end(pipe, process, params, path)
+        finally:
+            process.kill()
+            process.wait()
+    try:
+        with np.load(io.BytesIO(said), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(
+            f"{path} cannot be read: its reader gave it up, or needs more than {params.memory_mb} MB: it is damaged "
+            "or too large; convert it to a .ply point cloud"
+        ) from error
+
+
+def _until_end(pipe: Any, process: subprocess.Popen[bytes], params: Params, path: Path) -> bytes:
+    """All that the process writes, before its time is up."""
+    timer = threading.Timer(params.time_s, process.kill)
+    timer.start()
+    parts, size = [], 0
+    try:
+        while part := pipe.read(_MIB):
+            parts.append(part)
+            size += len(part)
+            if size > params.memory_mb * _MIB:
+                raise InputError(f"{path} is larger than {params.memory_mb} MB in memory: thin it first")
+        if not timer.is_alive():
+            raise InputError(f"{path} takes longer than {params.time_s:g} s to read: thin it first")
+    finally:
+        timer.cancel()
+    return b"".join(parts)
