@@ -88,4 +88,5 @@ def _neighbours(points: np.ndarray) -> np.ndarray:
     rows = np.repeat(np.arange(len(points), dtype=np.int32), count + 1)
     others = near.ravel()
     apart = rows != others  # among points that coincide a point need not be the first of its own neighbours
-    return np.stack([np.minimum(rows, others), np.maximum(rows, others)], axis=1)[apart]
+    pairs: np.ndarray = np.stack([np.minimum(rows, others), np.maximum(rows, others)], axis=1)[apart]
+    return pairs
