@@ -48,6 +48,9 @@ def command(
         bool,
         typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
     ] = False,
+    uncompressed: Annotated[
+        bool, typer.Option("--uncompressed", help="3dtiles as float32, for viewers that read no SPZ in glTF.")
+    ] = False,
     prefer: Annotated[
         str | None,
         typer.Option("--prefer", help="Where captures disagree: newest, best (who saw it best) or both; newest else."),
@@ -78,6 +81,7 @@ def command(
             steps=steps,
             budget_s=budget,
             provenance=provenance,
+            uncompressed=uncompressed,
             prefer=prefer,
             as_of=as_of,
             wait=wait,

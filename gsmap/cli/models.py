@@ -10,7 +10,7 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="ONNX models for masks (`sam`), image features (`clip`), local features (`extractor`).",
+    help="ONNX models for masks (`sam`), image features (`clip`), words (`clip-text`), local features (`extractor`).",
 )
 
 
@@ -19,9 +19,13 @@ def add(
     map: MapPath,
     kind: Annotated[
         str,
-        typer.Argument(help="`sam-encoder`, `sam-decoder`, `clip` (image encoder) or `extractor` (features)."),
+        typer.Argument(
+            help="`sam-encoder`, `sam-decoder`, `clip` (image encoder), `clip-text`, `clip-tokenizer`, or `extractor`."
+        ),
     ],
-    path: Annotated[str, typer.Argument(metavar="FILE", help="The .onnx file.")],
+    path: Annotated[
+        str, typer.Argument(metavar="FILE", help="The .onnx file; of `clip-tokenizer` the tokenizer.json.")
+    ],
     preset: Annotated[
         str,
         typer.Option("--preset", help="Pixel scaling: `clip`, `imagenet`, `unit`, or `mean=..,..,..;std=..,..,..`."),
@@ -38,7 +42,7 @@ def add(
     with opened(map) as m:
         m.add_model(kind, path, preset=preset, copy=not reference)
         row = next(row for row in m.model_rows() if row.kind == kind)
-    say(f"registered {kind}; run: gsmap update {map}")
+    say(f"registered {kind}" + ("" if kind in ("clip-text", "clip-tokenizer") else f"; run: gsmap update {map}"))
     if json:
         print_rows("models add", row, json)
 

@@ -25,6 +25,12 @@ def command(
             "by default `json`.",
         ),
     ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(
+            "--crs", metavar="EPSG:N", help="Of the world coordinates shown; by default that of `gsmap georeference`."
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Show where the scenes lie, and write it for other programs.
@@ -36,9 +42,9 @@ def command(
     if format is not None and out is None:
         raise ConfigError(f"name a file to write as {format}: gsmap poses {map} OUT --format {format}")
     with opened(map) as m:
-        rows = m.pose_rows()
+        rows = m.pose_rows(crs)
         if out is not None:
-            for path in m.write_poses(out, format or "json"):
+            for path in m.write_poses(out, format or "json", crs):
                 say(f"wrote {path}")
     if json or out is None:
         print_rows("poses", rows, json)

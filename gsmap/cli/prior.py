@@ -19,7 +19,17 @@ def command(
         tuple[float, float, float] | None,
         typer.Option("--position", metavar="X Y Z", help="Where the scene's origin lies in the map (GPS, survey)."),
     ] = None,
-    sigma: Annotated[float, typer.Option("--sigma", help="Standard deviation of the position, per axis.")] = 1.0,
+    sigma: Annotated[
+        float,
+        typer.Option("--sigma", help="Standard deviation of the position, per axis; of one in the world in metres."),
+    ] = 1.0,
+    latitude: Annotated[
+        float | None, typer.Option("--latitude", help="Where the scene's origin lies in the world, degrees north.")
+    ] = None,
+    longitude: Annotated[float | None, typer.Option("--longitude", help="The same, degrees east.")] = None,
+    height: Annotated[
+        float | None, typer.Option("--height", help="The same, metres above the WGS 84 ellipsoid (not sea level).")
+    ] = None,
     scale: Annotated[float | None, typer.Option("--scale", help="Map units per unit of the scene, to 1 %.")] = None,
     up: Annotated[
         tuple[float, float, float] | None,
@@ -38,9 +48,16 @@ def command(
     from gsmap.errors import ConfigError
     from gsmap.types import Prior, Sim3
 
-    said = [position is not None or scale is not None or up is not None, anchor, remove]
+    world = [latitude, longitude, height]
+    in_world = any(one is not None for one in world)
+    if in_world and None in world:
+        raise ConfigError("a position in the world has --latitude, --longitude and --height")
+    said = [position is not None or scale is not None or up is not None, anchor, remove, in_world]
     if sum(said) != 1:
-        raise ConfigError("say where the scene lies (--position, --scale, --up), or --anchor, or --remove")
+        raise ConfigError(
+            "say where the scene lies (--position, --scale, --up, or --latitude, --longitude and --height), or "
+            "--anchor, or --remove"
+        )
     if not sigma > 0 or (scale is not None and not scale > 0):
         raise ConfigError("--sigma and --scale must be positive")
     sigmas = np.full(7, np.inf)
@@ -55,6 +72,8 @@ def command(
     with opened(map) as m:
         if remove:
             m.remove_prior(scene)
+        elif latitude is not None and longitude is not None and height is not None:
+            m.set_world_position(scene, (longitude, latitude, height), (sigma, sigma))
         else:
             pose = Sim3(np.eye(3), np.array(position or (0.0, 0.0, 0.0)), scale or 1.0)
             row = m.set_prior(Prior(scene, pose, sigmas, None if up is None else np.array(up)))

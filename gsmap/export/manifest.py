@@ -41,6 +41,7 @@ class Manifest:
         notes: what a person should know about the folder as it was found.
         doomed: paths of files that are no longer a tile's and are still to be deleted.
         metres: how long a metre is in the frame of each component, as the tiles were made.
+        world: where each component that is tied to the world lies in it, as JSON has it (docs/world.md).
     """
 
     map_id: str
@@ -49,6 +50,7 @@ class Manifest:
     notes: tuple[str, ...] = ()
     doomed: set[str] = field(default_factory=set)
     metres: dict[int, Metre] = field(default_factory=dict)
+    world: dict[int, dict[str, Any]] = field(default_factory=dict)
     _saved_at: float = field(default_factory=time.monotonic, repr=False)
     _save_took_s: float = field(default=0.0, repr=False)
 
@@ -79,6 +81,7 @@ class Manifest:
             entries = [(str(e["name"]), _tile(e, version), int(e["num_bytes"])) for e in content["tiles"]]
             doomed = {_checked_path(p) for p in content.get("doomed", ())}
             metres = {int(c["component"]): _metre(c) for c in content.get("components", ())}
+            world = {int(c["component"]): dict(c["world"]) for c in content.get("components", ()) if c.get("world")}
         except (OSError, *MALFORMED) as error:
             if isinstance(error, ConfigError):
                 raise
@@ -97,6 +100,7 @@ class Manifest:
             notes,
             doomed,
             metres,
+            world,
         )
 
     def metres_per_unit(self, component: int) -> float:
@@ -126,7 +130,7 @@ class Manifest:
         ]
         content = {"version": _VERSION, "map_id": self.map_id, "tiles": entries}
         if self.metres:
-            content["components"] = [_component(c, self.metres[c]) for c in sorted(self.metres)]
+            content["components"] = [_component(c, self.metres[c], self.world.get(c)) for c in sorted(self.metres)]
         if self.doomed:
             content["doomed"] = sorted(self.doomed)
         began = time.process_time()
@@ -134,14 +138,15 @@ class Manifest:
         self._saved_at, self._save_took_s = time.monotonic(), time.process_time() - began
 
 
-def _component(component: int, metre: Metre) -> dict[str, object]:
+def _component(component: int, metre: Metre, world: dict[str, Any] | None) -> dict[str, object]:
+    told: dict[str, object] = {} if world is None else {"world": world}
     return {
         "component": component,
         "metres_per_unit": metre.metres_per_unit,
         "metre_sigma": metre.sigma if math.isfinite(metre.sigma) else None,
         "metre_known_by": metre.known_by,
         "metre_note": metre.note,
-    }
+    } | told
 
 
 def _metre(entry: Mapping[str, Any]) -> Metre:

@@ -30,16 +30,18 @@ class TileRecipe:
         format: suffix of the tiles' files without the dot, or ``3dtiles`` (``.glb`` below a tree of coarser levels).
         provenance: whether the file says of each Gaussian which scene it is from (``.ply`` alone).
         budget_s: ceiling on the seconds that merging one tile may take, None for none.
+        uncompressed: whether the content of ``3dtiles`` is float32 rather than SPZ.
         dates: when each scene was captured, by scene id, if the merger uses dates; None if it does not.
 
     Raises:
-        ConfigError: a format that cannot be written, or provenance in one that cannot hold it.
+        ConfigError: a format that cannot be written, or one that cannot be had with provenance or uncompressed.
     """
 
     merge: RecipeKey
     format: str = "ply"
     provenance: bool = False
     budget_s: float | None = None
+    uncompressed: bool = False
     dates: Mapping[str, str | None] | None = None
 
     def __post_init__(self) -> None:
@@ -49,6 +51,9 @@ class TileRecipe:
             raise ConfigError(f"cannot write {self.format!r}: choose one of {known}")
         if self.provenance and self.format != "ply":
             raise ConfigError(f"provenance is a property of .ply files, the format asked for is {self.format}")
+
+        if self.uncompressed and self.format != _TILES_3D:
+            raise ConfigError(f"uncompressed is of {_TILES_3D} alone, the format asked for is {self.format}")
 
     @property
     def is_tileset(self) -> bool:
@@ -69,7 +74,7 @@ class TileRecipe:
         scenes = sorted(planned.poses)
         inputs = [
             f"export {VERSION}",
-            f"format {self.format}",
+            f"format {self.format}{' spz' * (self.is_tileset and not self.uncompressed)}",
             f"provenance {self.provenance}",
             f"budget_s {self.budget_s}",
             f"component {planned.component}",

@@ -18,7 +18,7 @@ from gsmap.errors import MALFORMED, CorruptError
 from gsmap.export.manifest import FILE_NAME as MANIFEST
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import TileNode
-from gsmap.types import Gaussians, Tile
+from gsmap.types import Gaussians, Sim3, Tile
 
 FILE_NAME = "tileset.json"
 LEVELS_FOLDER = "levels"
@@ -55,7 +55,13 @@ def is_stale(out: Path, tiles: Sequence[Tile]) -> bool:
 
 
 def write_tilesets(
-    out: Path, tiles: Sequence[Tile], tile_size_m: float, metres_per_unit: Mapping[int, float] | None = None
+    out: Path,
+    tiles: Sequence[Tile],
+    tile_size_m: float,
+    metres_per_unit: Mapping[int, float] | None = None,
+    *,
+    S_ecef_map: Mapping[int, Sim3] | None = None,
+    compressed: bool = True,
 ) -> list[Path]:
     """Write ``tileset.json`` into each component's folder, with coarser levels made by merging, never by dropping.
 
@@ -67,6 +73,9 @@ def write_tilesets(
         out: the export's folder; the tiles' ``.glb`` lie in it.
         tile_size_m: edge of the grid's tiles, > 0.
         metres_per_unit: of each component's frame; all 1 if None.
+        S_ecef_map: of components that are tied to the world: takes their frames to Earth-centred metres (EPSG:4978),
+            where globes draw them.
+        compressed: whether the tiles are packed as SPZ, and levels are to be.
     """
     by_component: dict[int, list[Tile]] = defaultdict(list)
     for tile in tiles:
@@ -80,11 +89,14 @@ def write_tilesets(
         known = _known_boxes(folder)
         cells = {_cell(tile, tile_size_m / metres): _leaf(folder, tile) for tile in members}
         while len(cells) > 1:
-            cells = _one_level_up(folder, cells, known)
+            cells = _one_level_up(folder, cells, known, compressed)
         (root,) = cells.values()
         # The map's z is up where gsmap could tell.
         transform = np.diag([metres, metres, metres, 1.0])
-        write_whole(folder / FILE_NAME, partial(tiles3d.write_tileset, root=root.node, transform=transform))
+        if S_ecef_map is not None and component in S_ecef_map:
+            transform = S_ecef_map[component].matrix()
+        write = partial(tiles3d.write_tileset, root=root.node, transform=transform, compressed=compressed)
+        write_whole(folder / FILE_NAME, write)
         _remove_unnamed(folder, root.node)
         written.append(folder / FILE_NAME)
     return written
@@ -101,7 +113,7 @@ def _leaf(folder: Path, tile: Tile) -> _Drawn:
 
 
 def _one_level_up(
-    folder: Path, cells: dict[_Cell, _Drawn], known: dict[str, tuple[np.ndarray, float]]
+    folder: Path, cells: dict[_Cell, _Drawn], known: dict[str, tuple[np.ndarray, float]], compressed: bool
 ) -> dict[_Cell, _Drawn]:
     """Join every two by two by two cells, counted from the lowest one, so that each component ends in one root."""
     low = np.min(list(cells), axis=0)
@@ -110,12 +122,14 @@ def _one_level_up(
         x, y, z = ((np.array(cell) - low) // 2).tolist()
         groups[x, y, z].append(cells[cell])
     return {
-        cell: children[0] if len(children) == 1 else _parent(folder, children, known)
+        cell: children[0] if len(children) == 1 else _parent(folder, children, known, compressed)
         for cell, children in groups.items()
     }
 
 
-def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndarray, float]]) -> _Drawn:
+def _parent(
+    folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndarray, float]], compressed: bool
+) -> _Drawn:
     digest = hashlib.sha256("\n".join(child.digest for child in children).encode()).hexdigest()
     uri = f"{LEVELS_FOLDER}/{digest[:24]}.glb"
     path = folder / uri
@@ -126,7 +140,7 @@ def _parent(folder: Path, children: list[_Drawn], known: dict[str, tuple[np.ndar
         level, voxel_m = tiles3d.coarser(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)))
         make_folder(path.parent)
         written: list[np.ndarray] = []
-        write_whole(path, lambda staged: written.append(tiles3d.write_content(staged, level)))
+        write_whole(path, lambda staged: written.append(tiles3d.write_content(staged, level, compressed=compressed)))
         boxes = np.stack([*written, *(c.node.box for c in children)])
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level must never be finer than what replaces it, or viewers would stop at it too early.

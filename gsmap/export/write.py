@@ -100,6 +100,7 @@ def export_tiles(
     map_id: str,
     recipe: TileRecipe,
     metres: Mapping[int, Metre] | None = None,
+    world: Mapping[int, dict[str, Any]] | None = None,
     params: Params | None = None,
     run: Run = run_here,
     made: Callable[[Tile], None] | None = None,
@@ -119,6 +120,7 @@ def export_tiles(
         map_id: a folder keeps to one map.
         recipe: how tiles are made and written; where it differs from a tile's, that tile is made again.
         metres: how long a metre is in each component's frame, to be told in the manifest.
+        world: where components lie in the world, to be told there, too.
         params: from which movement on a tile is made again.
         run: makes tiles, here or elsewhere (`gsmap.engine.run_jobs`).
         made: told each new tile once its file is in place; called from the calling thread.
@@ -139,7 +141,9 @@ def export_tiles(
     planned = {(t.component, t.name): t for t in plan}
     gone = [tile for at, tile in old.items() if at not in planned]
     reused = len(plan) - len(todo)
-    retold, manifest.metres = manifest.metres != dict(metres or {}), dict(metres or {})
+    told = dict(metres or {}), dict(world or {})
+    retold = (manifest.metres, manifest.world) != told
+    manifest.metres, manifest.world = told
     report = _Report(progress or silent, len(plan), reused)
     news: dict[_At, Tile] = {}
     aside: list[tuple[PlannedTile, str]] = []
@@ -281,7 +285,7 @@ def _placed(
 
 def _write(path: Path, content: MergeResult, recipe: TileRecipe) -> None:
     if recipe.is_tileset:
-        tiles3d.write_content(path, content.gaussians)
+        tiles3d.write_content(path, content.gaussians, compressed=not recipe.uncompressed)
     elif recipe.provenance:
         formats.write(path, content.gaussians, extra={"scene": content.origin.astype(np.float32)})
     else:

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 (``.glb``) with the ratified ``KHR_gaussian_splatting``, uncompressed.
+"""Binary glTF 2.0 (``.glb``) with the ratified ``KHR_gaussian_splatting``, as float32 or packed as SPZ.
 
 Scales are linear, opacities in [0, 1], quaternions xyzw, and the axes left-up-front; colours are as trained (sRGB).
 A file is written with an identity transform and everything, SH included, turned into glTF's axes, so that viewers
@@ -10,13 +10,15 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmap.errors import MALFORMED, InputError
+from gsmap.formats import spz
 from gsmap.formats.axes import GLTF, PLY, change_axes
 from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
 from gsmap.geometry.sh import rgb_of_sh0
@@ -26,6 +28,9 @@ from gsmap.types import Gaussians, Sim3
 VERSION = 1
 
 EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
+"""A draft. Its text asks for left-up-front axes; CesiumJS and cesium-native, whose makers wrote it, take the numbers of
+the SPZ as they are in the node's frame, and so are they written and read here."""
 _MAX_JSON_BYTES = 16 << 20
 _MAX_NODES = 10_000
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -45,10 +50,25 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     return change_axes(read_world(path), PLY, GLTF)
 
 
-def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a ``.glb``, in the order given, with point colours for viewers that know no splats."""
+def write(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: bool = False) -> None:
+    """Write a ``.glb``, in the order given, with point colours for viewers that know no splats.
+
+    Args:
+        compressed: pack it as SPZ: about a fifth of the bytes, for viewers that read `SPZ_EXTENSION`.
+    """
     require_writable(path, gaussians)
-    write_world(path, change_axes(gaussians, GLTF, PLY))
+    writer = write_packed if compressed else write_world
+    writer(path, change_axes(gaussians, GLTF, PLY))
+
+
+def holds_splats(path: str | os.PathLike[str]) -> bool:
+    """Whether the file says that it holds Gaussians; a mesh or a point cloud does not.
+
+    Raises:
+        InputError: not a GLB, or damaged.
+    """
+    used = _read_container(path)[0].get("extensionsUsed", [])
+    return isinstance(used, list) and EXTENSION in used
 
 
 def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -> Gaussians:
@@ -72,7 +92,6 @@ def read_world(path: str | os.PathLike[str], matrix: np.ndarray | None = None) -
 def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.ndarray | None = None) -> None:
     """Write Gaussians as they are; ``matrix`` (4, 4) takes them to glTF's world, as the transform of their node."""
     g = gaussians
-    degree_of = np.repeat(np.arange(4), [1, 3, 5, 7])
     unit = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-30)
     unit[~unit.any(1), 0] = 1
     arrays: dict[str, np.ndarray] = {
@@ -81,57 +100,100 @@ def write_world(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.n
         f"{EXTENSION}:ROTATION": unit[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": g.scales,
         f"{EXTENSION}:OPACITY": g.opacities,
+        **{name: g.sh[:, k] for k, name in enumerate(_sh_names(g.sh.shape[1]))},
     }
-    for k in range(g.sh.shape[1]):
-        degree = degree_of[k]
-        arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = g.sh[:, k]
+    sizes = [values.size * values.itemsize for values in arrays.values()]  # each a multiple of 4 bytes
+    starts = np.cumsum([0, *sizes]).tolist()
+    gltf = _gltf({name: _accessor_of(name, values) for name, values in arrays.items()}, matrix)
+    for accessor, view in zip(gltf["accessors"], range(len(arrays)), strict=True):
+        accessor["bufferView"] = view
+    gltf["bufferViews"] = [
+        {"buffer": 0, "byteOffset": start, "byteLength": size, "target": _ARRAY_BUFFER}
+        for start, size in zip(starts, sizes, strict=False)
+    ]
+    _write_container(path, gltf, [np.ascontiguousarray(values).data for values in arrays.values()])
 
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    length = 0
-    for name, values in arrays.items():
-        width = values.shape[1] if values.ndim == 2 else 1
-        accessor: dict[str, Any] = {
-            "bufferView": len(views),
-            "componentType": 5121 if values.dtype == np.uint8 else 5126,
-            "count": len(g),
-            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width],
-        }
-        if values.dtype == np.uint8:
-            accessor["normalized"] = True
-        if name == "POSITION":  # the one attribute whose bounds glTF asks for
-            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
-        size = len(g) * width * values.itemsize
-        views.append({"buffer": 0, "byteOffset": length, "byteLength": size, "target": _ARRAY_BUFFER})
-        accessors.append(accessor)
-        length += size  # every attribute is a multiple of 4 bytes
+
+def write_packed(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.ndarray | None = None) -> None:
+    """As `write_world`, packed as SPZ; positions are kept to about a part in 100,000 of the extent.
+
+    They are counted from the middle, which the node's transform gives back: SPZ has 24 bits for a position.
+    """
+    low, high = gaussians.means.min(0).astype(np.float64), gaussians.means.max(0).astype(np.float64)
+    middle = np.eye(4)
+    middle[:3, 3] = (low + high) / 2
+    g = replace(gaussians, means=(gaussians.means - middle[:3, 3]).astype(np.float32))
+    data = spz.pack(path, g)
+    data += b"\0" * (-len(data) % 4)
+    names = ["POSITION", "COLOR_0", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE"))]
+    three, four = (np.broadcast_to(np.float32(0), (len(g), width)) for width in (3, 4))
+    colour = np.broadcast_to(np.uint8(0), (len(g), 4))  # CesiumJS makes bytes of it, and believes what stands here
+    # What the attributes are once unpacked; degree 0 is in COLOR_0.
+    shown: dict[str, np.ndarray] = dict.fromkeys([*names, *_sh_names(g.sh.shape[1])[1:]], three)
+    shown |= {"POSITION": g.means, "COLOR_0": colour, f"{EXTENSION}:ROTATION": four}
+    gltf = _gltf(
+        {name: _accessor_of(name, values) for name, values in shown.items()},
+        middle if matrix is None else np.asarray(matrix, float) @ middle,
+    )
+    gltf["meshes"][0]["primitives"][0]["extensions"][EXTENSION]["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
+    gltf["extensionsUsed"] = gltf["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
+    gltf["bufferViews"] = [{"buffer": 0, "byteLength": len(data)}]
+    _write_container(path, gltf, [data])
+
+
+def _gltf(accessors: dict[str, dict[str, Any]], matrix: np.ndarray | None) -> dict[str, Any]:
+    """A scene of one node with one splat primitive, whose attributes these are; buffers are left to the caller."""
     splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     splatting |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
-    primitive = {"attributes": {name: i for i, name in enumerate(arrays)}, "mode": 0}
+    attributes = {name: i for i, name in enumerate(accessors)}
     node: dict[str, Any] = {"mesh": 0}
     if matrix is not None:
         node["matrix"] = np.asarray(matrix, float).T.ravel().tolist()
-    gltf = {
+    return {
         "asset": {"version": "2.0", "generator": "gsmap"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
-        "meshes": [{"primitives": [primitive | {"extensions": {EXTENSION: splatting}}]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": length}],
+        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: splatting}}]}],
+        "accessors": list(accessors.values()),
     }
+
+
+def _accessor_of(name: str, values: np.ndarray) -> dict[str, Any]:
+    width = values.shape[1] if values.ndim == 2 else 1
+    accessor: dict[str, Any] = {
+        "componentType": 5121 if values.dtype == np.uint8 else 5126,
+        "count": len(values),
+        "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width],
+    }
+    if values.dtype == np.uint8:
+        accessor["normalized"] = True
+    if name == "POSITION":  # the one attribute whose bounds glTF asks for
+        accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+    return accessor
+
+
+def _sh_names(count: int) -> list[str]:
+    degree_of = np.repeat(np.arange(4), [1, 3, 5, 7])[:count].tolist()
+    return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree * degree}" for k, degree in enumerate(degree_of)]
+
+
+def _write_container(path: str | os.PathLike[str], gltf: dict[str, Any], chunks: Sequence[bytes | memoryview]) -> None:
+    """Write a GLB of one buffer: the chunks one after another, each a multiple of 4 bytes."""
+    length = sum(memoryview(chunk).nbytes for chunk in chunks)
+    gltf["buffers"] = [{"byteLength": length}]
     text = json.dumps(gltf, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + length
     if total >= 2**32:
-        raise InputError(f"{path}: {len(g)} Gaussians do not fit a GLB of 4 GiB; write 3D Tiles instead")
+        count = gltf["accessors"][0]["count"]
+        raise InputError(f"{path}: {count} Gaussians do not fit a GLB of 4 GiB; write 3D Tiles instead")
     with open(path, "wb") as file:
         file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), _JSON) + text)
         file.write(struct.pack("<II", length, _BIN))
-        for values in arrays.values():
-            file.write(np.ascontiguousarray(values).data)
+        for chunk in chunks:
+            file.write(chunk)
 
 
 def _point_colours(g: Gaussians) -> np.ndarray:
@@ -217,6 +279,11 @@ def _read_primitive(
     splatting = primitive["extensions"][EXTENSION]
     attributes = primitive["attributes"]
     nested = splatting.get("extensions", {})
+    if SPZ_EXTENSION in nested:
+        local = spz.unpack(path, _view(path, gltf, binary, nested[SPZ_EXTENSION]["bufferView"]).tobytes())
+        if len(local) != gltf["accessors"][attributes["POSITION"]]["count"]:
+            raise InputError(f"{path}: its SPZ holds {len(local)} Gaussians, its accessors do not; it is damaged")
+        return _placed(path, local, world)
     if nested:
         raise InputError(f"{path} is compressed or extended by {', '.join(nested)}: convert it to plain {EXTENSION}")
     if splatting.get("kernel") != "ellipse" or splatting.get("colorSpace") != "srgb_rec709_display":
@@ -251,12 +318,31 @@ def _read_primitive(
         np.log(bounded) - np.log1p(-bounded),
         np.stack(sh, axis=1),
     )
+    return _placed(path, local, world)
+
+
+def _placed(path: str | os.PathLike[str], local: Gaussians, world: np.ndarray) -> Gaussians:
     if np.array_equal(world, np.eye(4)):
         return local
     try:
         return transform_gaussians(local, Sim3.from_matrix(world))
     except InputError as error:
         raise InputError(f"{path}: a node or tile is placed by more than a turn, shift and scale: {error}") from error
+
+
+def _require_inside(path: str | os.PathLike[str], gltf: dict[str, Any], view: dict[str, Any]) -> None:
+    if view["buffer"] != 0 or "uri" in gltf["buffers"][0]:
+        raise InputError(f"{path}: its data lies outside the file; gsmap reads self-contained .glb only")
+
+
+def _view(path: str | os.PathLike[str], gltf: dict[str, Any], binary: np.ndarray, index: int) -> np.ndarray:
+    """The bytes of one buffer view, its place in the file checked."""
+    view = gltf["bufferViews"][index]
+    _require_inside(path, gltf, view)
+    begin, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
+    if not (begin >= 0 and length > 0 and begin + length <= len(binary)):
+        raise InputError(f"{path} is damaged: view {index} needs bytes up to {begin + length:,} of {len(binary):,}")
+    return binary[begin : begin + length]
 
 
 def _accessor(
@@ -270,8 +356,7 @@ def _accessor(
     if accessor["count"] != count:
         raise InputError(f"{path}: accessor {index} has {accessor['count']} values for {count} Gaussians")
     view = gltf["bufferViews"][accessor["bufferView"]]
-    if view["buffer"] != 0 or "uri" in gltf["buffers"][0]:
-        raise InputError(f"{path}: its data lies outside the file; gsmap reads self-contained .glb only")
+    _require_inside(path, gltf, view)
     item = np.dtype(kind)
     stride = int(view.get("byteStride", item.itemsize * width))
     start, begin, length = int(accessor.get("byteOffset", 0)), int(view.get("byteOffset", 0)), int(view["byteLength"])

@@ -7,11 +7,13 @@ Layout after the format's README and reference library (nianticlabs/spz, MIT).
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -72,7 +74,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     Raises:
         InputError: not an SPZ, an unknown version, truncated, or a decompression bomb.
     """
-    header, streams, axes = _load(path)
+    with open(path, "rb") as file:
+        header, streams, axes = _load(path, file, Path(path).stat().st_size)
     return change_axes(_decode(header, streams), PLY, axes)
 
 
@@ -106,51 +109,72 @@ def write(
         ConfigError: another version or number of bits.
         InputError: nothing to write, values that are not finite, or positions beyond 8388 km.
     """
+    require_writable(path, gaussians)
+    packed = pack(path, change_axes(gaussians, SPZ, PLY), version=version, sh_bits=sh_bits, antialiased=antialiased)
+    Path(path).write_bytes(packed)
+
+
+def pack(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    version: int = 3,
+    sh_bits: tuple[int, int] = (5, 4),
+    antialiased: bool = False,
+) -> bytes:
+    """The bytes of an SPZ of Gaussians in the axes that they are in; see `write`.
+
+    Args:
+        path: of the file that they are for, to say where something is wrong.
+    """
     if version not in (3, 4):
         raise ConfigError(f"cannot write SPZ version {version!r}: choose 3 or 4")
     if len(sh_bits) != 2 or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ConfigError(f"sh_bits must be two numbers from 1 to 8, got {sh_bits!r}")
-    require_writable(path, gaussians)
-    g = change_axes(gaussians, SPZ, PLY)
+    g = gaussians
     header = _Header(version, len(g), g.sh_degree, _fractional_bits(path, g.means), int(antialiased))
     streams = _encode(header, g, sh_bits)
     fields = (_MAGIC, version, len(g), header.degree, header.fractional_bits, header.flags)
-    with open(path, "wb") as file:
-        if version == 3:
-            squeeze = zlib.compressobj(wbits=31, level=3)
-            file.write(squeeze.compress(struct.pack("<4sIIBBBB", *fields, 0)))
-            for stream in streams:
-                file.write(squeeze.compress(stream.data))
-            file.write(squeeze.flush())
-        else:
-            from numcodecs import zstd
+    if version == 3:
+        squeeze = zlib.compressobj(wbits=31, level=3)
+        parts = [squeeze.compress(struct.pack("<4sIIBBBB", *fields, 0))]
+        parts += [squeeze.compress(stream.data) for stream in streams]
+        return b"".join([*parts, squeeze.flush()])
+    from numcodecs import zstd
 
-            packed = [bytes(zstd.compress(stream, 3)) for stream in streams]
-            file.write(struct.pack("<4sIIBBBBI12x", *fields, len(packed), 32))
-            for stream, squeezed in zip(streams, packed, strict=True):
-                file.write(struct.pack("<QQ", len(squeezed), stream.nbytes))
-            file.write(b"".join(packed))
+    packed = [bytes(zstd.compress(stream, 3)) for stream in streams]
+    sizes = [struct.pack("<QQ", len(one), stream.nbytes) for stream, one in zip(streams, packed, strict=True)]
+    return b"".join([struct.pack("<4sIIBBBBI12x", *fields, len(packed), 32), *sizes, *packed])
 
 
-def _load(path: str | os.PathLike[str]) -> tuple[_Header, dict[str, np.ndarray], str]:
-    """Header, raw uint8 streams by attribute, and the axes that the file is in."""
-    with open(path, "rb") as file:
-        head = file.read(4)
-        file.seek(0)
-        if head.startswith(_GZIP):
-            return _load_gzip(path, file)
-        if head == _MAGIC:
-            return _load_zstd(path, file)
+def unpack(path: str | os.PathLike[str], data: bytes) -> Gaussians:
+    """The Gaussians of an SPZ within another file, in the axes that its bytes are in; see `read`.
+
+    Args:
+        path: of that file, to say where something is wrong.
+    """
+    header, streams, _ = _load(path, io.BytesIO(data), len(data))
+    return _decode(header, streams)
+
+
+def _load(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple[_Header, dict[str, np.ndarray], str]:
+    """Header, raw uint8 streams by attribute, and the axes that the file, of so many bytes, is in."""
+    head = file.read(4)
+    file.seek(0)
+    if head.startswith(_GZIP):
+        return _load_gzip(path, file, size)
+    if head == _MAGIC:
+        return _load_zstd(path, file, size)
     what = "is empty" if not head else f"begins with {head!r}, not with gzip's mark or NGSP"
     raise InputError(f"{path} is not an SPZ file: it {what}")
 
 
-def _load_gzip(path, file) -> tuple[_Header, dict[str, np.ndarray], str]:
+def _load_gzip(path, file, size) -> tuple[_Header, dict[str, np.ndarray], str]:
     inflater = _Inflater(path, file)
     header = _parse_header(path, inflater.take(16))
     if header.version > 3:
         raise InputError(f"{path}: SPZ version {header.version} cannot be gzip compressed; the file is damaged")
-    check_size(path, header.payload_bytes, Path(path).stat().st_size)
+    check_size(path, header.payload_bytes, size)
     data = np.frombuffer(inflater.take(header.payload_bytes), np.uint8)
     streams, at = {}, 0
     for name, stride in header.strides.items():
@@ -160,10 +184,9 @@ def _load_gzip(path, file) -> tuple[_Header, dict[str, np.ndarray], str]:
     return header, streams, _axes(path, extensions)
 
 
-def _load_zstd(path, file) -> tuple[_Header, dict[str, np.ndarray], str]:
+def _load_zstd(path, file, size) -> tuple[_Header, dict[str, np.ndarray], str]:
     from numcodecs import zstd
 
-    size = Path(path).stat().st_size
     head = file.read(32)
     header = _parse_header(path, head)
     if header.version != 4 or len(head) < 32:

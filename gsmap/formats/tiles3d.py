@@ -25,7 +25,8 @@ import numpy as np
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.formats import glb
 from gsmap.formats.quantise import require_writable
-from gsmap.geometry.voxels import axis_deviations, merge_groups, voxel_labels
+from gsmap.geometry.decimate import decimate
+from gsmap.geometry.voxels import axis_deviations
 from gsmap.types import Gaussians
 
 VERSION = 1
@@ -86,15 +87,17 @@ def write(
     *,
     max_per_tile: int = 100_000,
     transform: np.ndarray | None = None,
+    compressed: bool = True,
 ) -> None:
     """Write a tileset of an octree: the leaves hold the originals, every tile above a quarter of ``max_per_tile``.
 
-    What is coarse is merged voxel by voxel with its moments kept, never dropped. Content files are named by their
+    What is coarse is merged pair by pair with its moments kept, never dropped. Content files are named by their
     digest, so an older ``tileset.json`` in the same folder stays whole until it is replaced.
 
     Args:
         max_per_tile: Gaussians in one leaf; what is above costs about a third more bytes in all.
         transform: (4, 4) from the Gaussians' frame to the viewer's world; upright for right-down-front if None.
+        compressed: pack the content as SPZ, which CesiumJS asks for; float32 else, five times the bytes.
     """
     path = Path(path)
     if max_per_tile < 1:
@@ -102,14 +105,15 @@ def write(
     require_writable(path, gaussians)
     low, high = gaussians.means.min(0).astype(np.float64), gaussians.means.max(0).astype(np.float64)
     side = float(max((high - low).max(), 1e-6))
-    root, _ = _octree(path, gaussians, (low + high) / 2, side, max_per_tile, "0")
-    write_tileset(path, root, transform=transform)
+    root, _ = _octree(path, gaussians, (low + high) / 2, side, max_per_tile, "0", compressed)
+    write_tileset(path, root, transform=transform, compressed=compressed)
 
 
-def write_content(path: str | os.PathLike[str], gaussians: Gaussians) -> np.ndarray:
+def write_content(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: bool = True) -> np.ndarray:
     """Write one tile's GLB; returns the box (2, 3) of its Gaussians, widened by three standard deviations."""
     require_writable(path, gaussians)
-    glb.write_world(path, gaussians, np.linalg.inv(_Y_UP_TO_Z_UP))
+    writer = glb.write_packed if compressed else glb.write_world
+    writer(path, gaussians, np.linalg.inv(_Y_UP_TO_Z_UP))
     return box_of(gaussians)
 
 
@@ -118,10 +122,13 @@ def read_content(path: str | os.PathLike[str]) -> Gaussians:
     return glb.read_world(Path(path), _Y_UP_TO_Z_UP)
 
 
-def write_tileset(path: str | os.PathLike[str], root: TileNode, *, transform: np.ndarray | None = None) -> None:
+def write_tileset(
+    path: str | os.PathLike[str], root: TileNode, *, transform: np.ndarray | None = None, compressed: bool = True
+) -> None:
     """Write ``tileset.json``; write it last, when the content that it names is there.
 
     Args:
+        compressed: whether the content is packed as SPZ.
         transform: (4, 4) from the root's frame to the viewer's world; upright for right-down-front if None.
     """
     tile = _tile_json(root) | {"refine": "REPLACE"}
@@ -129,36 +136,30 @@ def write_tileset(path: str | os.PathLike[str], root: TileNode, *, transform: np
     tile["transform"] = matrix.T.ravel().tolist()
     diagonal = float(np.linalg.norm(root.box[1] - root.box[0]))
     scale = float(np.linalg.norm(matrix[:3, :3], axis=0).max())  # a tile's own transform scales its error, not this one
+    used: dict[str, Any] = {"extensionsUsed": [glb.EXTENSION]}
+    if compressed:  # CesiumJS looks for them here before it loads any content
+        used = {key: [glb.EXTENSION, glb.SPZ_EXTENSION] for key in ("extensionsUsed", "extensionsRequired")}
     tileset = {
         "asset": {"version": "1.1", "generator": "gsmap"},
         "geometricError": scale * max(diagonal, root.error_m),  # of drawing nothing at all
         "extensionsUsed": ["3DTILES_content_gltf"],
-        "extensions": {"3DTILES_content_gltf": {"extensionsUsed": [glb.EXTENSION]}},
+        "extensions": {"3DTILES_content_gltf": used},
         "root": tile,
     }
     Path(path).write_text(json.dumps(tileset, indent=1))
 
 
 def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
-    """At most about ``max_count`` Gaussians that look alike from afar, and the voxel size that merged them (0: none).
+    """At most ``max_count`` Gaussians that look alike from afar, and how far what they draw is from where it was.
 
-    Moments and transmittance are kept; see `gsmap.geometry.voxels.merge_groups`.
+    Moments and transmittance are kept; see `gsmap.geometry.decimate`. The distance is the one that a twentieth of the
+    Gaussians lie beyond from the one that is drawn for them, in the frame's unit; 0 where none was merged.
     """
-    if len(gaussians) <= max_count:
-        return gaussians, 0.0
-    extent = max(float(np.ptp(gaussians.means.astype(np.float64), axis=0).max()), 1e-6)
-    finest, coarsest = extent / 2**20, extent * 2
-    labels, voxel = voxel_labels(gaussians.means, coarsest), coarsest
-    tried = extent / max_count**0.5
-    for _ in range(10):  # surfaces have as many voxels as the voxel size squared has room for
-        found = voxel_labels(gaussians.means, tried)
-        count = int(found.max()) + 1
-        if count <= max_count and tried < voxel:
-            labels, voxel = found, tried
-        if 0.7 * max_count <= count <= max_count:
-            break
-        tried = float(np.clip(tried * (count / (0.85 * max_count)) ** 0.5, finest, coarsest))
-    return merge_groups(gaussians, labels)[0], voxel
+    level, into = decimate(gaussians, max_count)
+    if len(level) == len(gaussians):
+        return level, 0.0
+    apart = np.linalg.norm(gaussians.means.astype(np.float64) - level.means[into], axis=1)
+    return level, float(np.quantile(apart, 0.95))
 
 
 def box_of(gaussians: Gaussians) -> np.ndarray:
@@ -168,7 +169,7 @@ def box_of(gaussians: Gaussians) -> np.ndarray:
 
 
 def _octree(
-    path: Path, gaussians: Gaussians, center: np.ndarray, side: float, max_per_tile: int, name: str
+    path: Path, gaussians: Gaussians, center: np.ndarray, side: float, max_per_tile: int, name: str, compressed: bool
 ) -> tuple[TileNode, Gaussians]:
     """The tile of a cube, written with all below it; and what it draws, from which its parent's level is made."""
     children, levels = [], []
@@ -176,25 +177,26 @@ def _octree(
         octant = ((gaussians.means >= center) @ [1, 2, 4]).astype(int)
         for i in np.unique(octant):
             sub_center = center + side / 4 * np.where([i & 1, i & 2, i & 4], 1, -1)
-            node, level = _octree(path, gaussians[octant == i], sub_center, side / 2, max_per_tile, f"{name}{i}")
+            inside, below = gaussians[octant == i], f"{name}{i}"
+            node, level = _octree(path, inside, sub_center, side / 2, max_per_tile, below, compressed)
             children.append(node)
             levels.append(level)
     if not children:
-        return TileNode(box_of(gaussians), 0.0, _place(path, gaussians, name)), gaussians
-    level, voxel = coarser(Gaussians.concatenate(levels), max(1, max_per_tile // 4))
-    below = max(child.error_m for child in children)
+        return TileNode(box_of(gaussians), 0.0, _place(path, gaussians, name, compressed)), gaussians
+    level, error_m = coarser(Gaussians.concatenate(levels), max(1, max_per_tile // 4))
+    coarsest = max(child.error_m for child in children)
     boxes = np.stack([box_of(level), *(child.box for child in children)])
     box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
-    return TileNode(box, max(voxel, below), _place(path, level, name), tuple(children)), level
+    return TileNode(box, max(error_m, 1.5 * coarsest), _place(path, level, name, compressed), tuple(children)), level
 
 
-def _place(path: Path, gaussians: Gaussians, name: str) -> str:
+def _place(path: Path, gaussians: Gaussians, name: str, compressed: bool) -> str:
     """Write one GLB into the content folder under a name with its digest; returns its uri."""
     folder = path.parent / CONTENT_FOLDER
     folder.mkdir(exist_ok=True)
     staged = folder / f".{os.getpid()}.{name}.glb"
     try:
-        write_content(staged, gaussians)
+        write_content(staged, gaussians, compressed=compressed)
         with open(staged, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         uri = f"{CONTENT_FOLDER}/{name}-{digest[:12]}.glb"

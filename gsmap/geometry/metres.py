@@ -13,6 +13,7 @@ from gsmap.types.metre import Metre
 # Devices' metres are off by 1 to 3 percent, all captures of one device alike: many of them are no better than one.
 _TOLD_SIGMA = 0.01  # of what a person measured: a tape is that good, and so is a look at where it was laid
 _MEASURED_SIGMA = 0.02  # of captures that are said to be in metres
+_SURVEYED_SIGMA = 0.02  # of a survey that goes before what people say
 _ASSUMED_SIGMA = 0.03  # of an own unit that nobody said is the metre, if it is
 _FACTOR = 2.0  # that a guess from the content is good to
 _AGREE = 5.0  # sigmas by which units may differ that are one
@@ -35,7 +36,7 @@ class SceneUnit:
     guess_m: float | None = None
 
 
-def metre_of(scenes: Sequence[tuple[SceneUnit, ScenePose]]) -> Metre:
+def metre_of(scenes: Sequence[tuple[SceneUnit, ScenePose]], surveyed: tuple[float, float] | None = None) -> Metre:
     """The metre of one component.
 
     What a person told of scenes goes before what captures are said to be in, that before what may be assumed, and that
@@ -46,7 +47,11 @@ def metre_of(scenes: Sequence[tuple[SceneUnit, ScenePose]]) -> Metre:
 
     Args:
         scenes: all of the component, each with its pose in it.
+        surveyed: metres per unit of the frame and the standard deviation of the logarithm, from control points,
+            positions or scale bars; goes before all else unless a person's word is better.
     """
+    if surveyed is not None and surveyed[1] <= _SURVEYED_SIGMA:
+        return _rounded(*surveyed)
     told = [(unit.told, pose) for unit, pose in scenes if unit.told is not None]
     if told:
         return _combined(told, _TOLD_SIGMA, "told")
@@ -67,6 +72,11 @@ def metre_of(scenes: Sequence[tuple[SceneUnit, ScenePose]]) -> Metre:
 
 
 _TELL = "gsmap edit MAP SCENE --metres-per-unit X tells"
+
+
+def _rounded(metres_per_unit: float, sigma: float) -> Metre:
+    """A surveyed metre: to four digits, so that what is made in metres stays as it is for what a solve adds."""
+    return Metre(float(f"{metres_per_unit:.4g}"), max(sigma, 5e-4), "surveyed", "")
 
 
 def _combined(units: Sequence[tuple[float, ScenePose]], own_sigma: float, known_by: str) -> Metre:

@@ -11,8 +11,9 @@ from gsmap.methods import RecipeKey
 from gsmap.retrieve import Voters
 from gsmap.store import Store
 from gsmap.store.indexes import Lookup, StoredSegment
+from gsmap.types import SceneGraph
 from gsmap.types.progress import StageProgress
-from gsmap.types.retrieval import Candidate
+from gsmap.types.retrieval import Candidate, Member
 
 _AT_ONCE = 64  # scenes whose nodes lie in memory: about 8 MB
 _PATIENCE = 8  # times that others may change the index while it is read, or that a damaged one is made anew
@@ -51,6 +52,33 @@ def ask(
                 raise
 
 
+def ask_once(
+    store: Store, graphs: Mapping[str, RecipeKey], graph: SceneGraph, params: retrieve.Params
+) -> list[Candidate]:
+    """What the index says of a graph that is none of the map's; nothing is kept, the index stays as it is.
+
+    Args:
+        graphs: the key of the graph of every scene that counts; those that the index lacks are read.
+        graph: made by the recipe of these.
+    """
+    for left in reversed(range(_PATIENCE)):
+        try:
+            segments: list[retrieve.Segment] = list(_segments(store, graphs, params))
+            present = {member.scene for segment in segments for member in segment.members if member is not None}
+            missing = sorted(set(graphs) - present)
+            for start in range(0, len(missing), _AT_ONCE):
+                new = [_voters(store, graphs[scene], params) for scene in missing[start : start + _AT_ONCE]]
+                segments.append(retrieve.new_segment(new))
+            asking = retrieve.voters_of(graph, "", params.nodes_per_scene)
+            return retrieve.look_up([asking], segments, params)[0]
+        except NotFoundError:  # another process made segments one while they were read
+            if not left:
+                raise
+        except CorruptError as error:
+            raise CorruptError(f"{error}: gsmap register {store.home} makes the index anew") from error
+    raise AssertionError("unreachable")
+
+
 def keys_of_lookups(graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> dict[str, str]:
     """The key (digest) under which each scene's lookup is kept."""
     recipe = retrieve.recipe_key(params)
@@ -85,16 +113,16 @@ def _bring_up_to_date(
 
 def _segments(store: Store, graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> list[StoredSegment]:
     """The index; of its scenes those count whose present graph it holds, each once."""
-    seen: set[str] = set()
+    present, seen = {scene: key.digest for scene, key in graphs.items()}, set[str]()
     found = []
     for segment in store.indexes.segments(retrieve.index_recipe(params)):
-        members = []
+        members: list[Member | None] = []
         for member in segment.members:
-            counts = member is not None and member.scene in graphs and member.scene not in seen
-            counts = counts and member is not None and graphs[member.scene].digest == member.graph
-            members.append(member if counts else None)
-            if counts and member is not None:
+            counts = None
+            if member is not None and member.scene not in seen and present.get(member.scene) == member.graph:
+                counts = member
                 seen.add(member.scene)
+            members.append(counts)
         found.append(replace(segment, members=members))
     return found
 

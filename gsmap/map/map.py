@@ -35,11 +35,13 @@ from gsmap.types.rows import (
     EdgeRow,
     EvaluationReport,
     ExportReport,
+    FindReport,
     GraphRow,
     HistoryReport,
     IngestRow,
     LocalizeReport,
     MapStatus,
+    MeasureReport,
     MergeReport,
     ModelRow,
     ObjectsReport,
@@ -51,6 +53,7 @@ from gsmap.types.rows import (
     PurgeReport,
     RestoreReport,
     RevisionRow,
+    ScanRow,
     SceneReport,
     SceneRow,
     SettingRow,
@@ -60,10 +63,12 @@ from gsmap.types.rows import (
     TileRow,
     UpdateReport,
     WhyReport,
+    WorldReport,
 )
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
+    from gsmap.map.stages.georeference import Localise, Request
     from gsmap.map.stages.register import Pairs
     from gsmap.view import ViewServer
 
@@ -354,8 +359,11 @@ class Map(AbstractContextManager["Map"]):
         return reports.prior_row(self.store, self.store.scenes.get(prior.scene))
 
     def remove_prior(self, scene: str) -> None:
-        """Take back what was told of where a scene lies."""
-        self.store.priors.remove(scene)
+        """Take back what was told of where a scene lies: in the world, where that was told last, else in the map."""
+        from gsmap.map.stages.georeference import forget_position
+
+        if not forget_position(self.store, scene):
+            self.store.priors.remove(scene)
 
     # --- changes -----------------------------------------------------------------------------------------------------
 
@@ -505,6 +513,70 @@ class Map(AbstractContextManager["Map"]):
                 progress=self._progress,
             )
 
+    def find(
+        self,
+        text: str | None = None,
+        *,
+        picture: str | os.PathLike[str] | None = None,
+        like: str | None = None,
+        at: Sequence[float] | None = None,
+        top: int = 10,
+        pictures: str | os.PathLike[str] | None = None,
+    ) -> FindReport:
+        """``gsmap find MAP``: places that are like what is asked for, best first; nothing is kept.
+
+        Args:
+            text: words; the map's image encoder needs a text tower.
+            picture: a file that shows such a thing.
+            like: an object's id, or ``SCENE:NODE``, a row of a scene's layer of objects.
+            at: (3,) a point of the frame of component 0.
+            top: how many hits at most.
+            pictures: a folder to draw each hit in; an empty or new one, or one of this map.
+
+        Raises:
+            NotFoundError: no poses yet, or no such scene, node, object, or thing at the point.
+            ConfigError: not one thing to look for, or words or a picture that the embedder cannot read.
+        """
+        from gsmap.map.finding import Request, find_places, with_pictures
+
+        request = Request(text, picture, like, at, top)
+        report, boxes = find_places(self.store, request, self.settings, self._progress)
+        if pictures is None:
+            return report
+        return with_pictures(self.store, report, boxes, Path(pictures), self.settings, self._progress)
+
+    # --- scans -------------------------------------------------------------------------------------------------------
+
+    def localize_scan(
+        self,
+        file: str | os.PathLike[str],
+        *,
+        intrinsics: Sequence[float] | None = None,
+        colour: str | os.PathLike[str] | None = None,
+        depth_scale: float = 1000.0,
+        scale: str | None = None,
+        near: str | None = None,
+    ) -> ScanRow:
+        """Where a point cloud, mesh, splat or depth picture lies in the map; nothing of it is kept.
+
+        Args:
+            file: ``.ply .pcd .xyz .las .laz .obj .stl .glb``, any splat, or (with ``intrinsics``) a depth picture.
+            intrinsics: ``fx, fy, cx, cy`` of a depth picture, pixels.
+            colour: a picture aligned with the depth picture.
+            depth_scale: values of the depth picture that make a metre.
+            scale: ``known`` (the file is in metres), ``unknown`` or ``auto``; by default ``known``, but for splats,
+                ``.obj`` and ``.stl``, whose unit nobody knows: ``auto``.
+            near: only scenes near one (its name), or near ``X,Y,Z,R``, a ball in the frame of component 0.
+
+        Raises:
+            NotFoundError: no such file, or the map has no poses yet.
+            InputError, ConfigError, MissingDependencyError: see `gsmap.formats.scans`.
+        """
+        from gsmap.map.stages.localize_scan import Request, localize_scan
+
+        request = Request(Path(file), intrinsics, colour, depth_scale, scale, near)
+        return localize_scan(self.store, request, self.settings, self._progress)
+
     # --- export ------------------------------------------------------------------------------------------------------
 
     def export(
@@ -520,6 +592,7 @@ class Map(AbstractContextManager["Map"]):
         steps: int | None = None,
         budget_s: float | None = None,
         provenance: bool = False,
+        uncompressed: bool = False,
         prefer: str | None = None,
         as_of: str | None = None,
         wait: bool = False,
@@ -537,6 +610,7 @@ class Map(AbstractContextManager["Map"]):
             steps: optimisation steps per tile; chosen from its size by default.
             budget_s: ceiling in wall seconds per tile; a tile that it cuts short is marked ``truncated``.
             provenance: add the property ``scene`` to ``.ply`` files.
+            uncompressed: the content of ``3dtiles`` as float32, for viewers that do not read SPZ in glTF.
             prefer: whom to believe where captures disagree: ``newest``, ``best`` (whoever saw it best) or ``both``; by
                 default what the merger's settings say.
             as_of: only captures dated at or before this (ISO 8601; of a day, its end) take part, those without a date
@@ -559,6 +633,7 @@ class Map(AbstractContextManager["Map"]):
             steps=steps,
             budget_s=budget_s,
             provenance=provenance,
+            uncompressed=uncompressed,
             prefer=prefer,
             as_of=as_of,
         )
@@ -640,9 +715,9 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap models list MAP``."""
         return reports.model_rows(self.store)
 
-    def pose_rows(self) -> list[PoseRow]:
-        """``gsmap poses MAP``: where every placed scene lies."""
-        return reports.pose_rows(self.store)
+    def pose_rows(self, crs: str | None = None) -> list[PoseRow]:
+        """``gsmap poses MAP``: where every placed scene lies, in the map and (``crs``, or the map's own) the world."""
+        return reports.pose_rows(self.store, crs)
 
     def status(self) -> MapStatus:
         """``gsmap status MAP``: what is missing, stale or wants a person, each with the verb that helps."""
@@ -767,11 +842,68 @@ class Map(AbstractContextManager["Map"]):
         except ValueError as error:  # a suffix that Pillow does not know
             raise ConfigError(f"cannot draw to {path} ({error}): name a file that ends with .png") from error
 
-    def write_poses(self, out: str | os.PathLike[str], format: str) -> list[Path]:
+    def write_poses(self, out: str | os.PathLike[str], format: str, crs: str | None = None) -> list[Path]:
         """``gsmap poses MAP OUT --format F``: poses for other programs (`gsmap.map.poses`); the files written."""
         from gsmap.map.poses import write_poses
 
-        return write_poses(self.store, Path(out), format)
+        return write_poses(self.store, Path(out), format, crs)
+
+    # --- the world ---------------------------------------------------------------------------------------------------
+
+    def georeference(
+        self,
+        request: Request | None = None,
+        *,
+        remove: Sequence[str] | None = None,
+        localise: Localise | None = None,
+    ) -> WorldReport:
+        """``gsmap georeference MAP``: note observations of the world, solve the poses with them, and say how they fit.
+
+        Args:
+            request: what to note (`gsmap.map.stages.georeference.Request`); None to look only.
+            remove: names of observations to take back; an empty sequence takes back all, with the CRS.
+            localise: places photos that are no scene's camera (`gsmap.map.placed_photos.localiser`).
+
+        Raises:
+            ConfigError, InputError, NotFoundError: see `gsmap.map.stages.georeference`; nothing is noted then.
+        """
+        from gsmap.map.stages.georeference import georeference, take_back
+        from gsmap.map.stages.optimize import is_solved, solve
+
+        notes: tuple[str, ...] = ()
+        if request is not None or remove is not None:
+            with at_work(self.store, "georeference"):
+                if remove is not None:
+                    notes = (f"{take_back(self.store, remove)} observations were taken back",)
+                if request is not None:
+                    notes += georeference(self.store, request, self.settings, localise)
+                solve(self.store, self.settings, self._progress)
+        return reports.world_report(self.store, stale=not is_solved(self.store, self.settings), notes=notes)
+
+    def set_world_position(
+        self, scene: str, position: Sequence[float], sigma_m: tuple[float, float], crs: str = "EPSG:4326"
+    ) -> None:
+        """``gsmap prior MAP SCENE --latitude ...``: where the origin of a scene's frame lies in the world.
+
+        Args:
+            position: (3,) longitude or easting first, then latitude or northing, then height.
+            sigma_m: horizontal and vertical standard deviations.
+        """
+        from gsmap.map.stages.georeference import survey_position
+
+        survey_position(self.store, scene, position, crs, sigma_m, self.settings)
+
+    def measure(self, a: str, b: str, *, component: int | None = None, crs: str | None = None) -> MeasureReport:
+        """``gsmap measure MAP A B``: how far two points are apart in metres, and how well that is known.
+
+        Args:
+            a, b: ``X,Y,Z`` (map), ``SCENE:X,Y,Z``, ``SCENE:CAMERA@COLUMN,ROW`` or ``world:X,Y,Z``.
+            component: of points given in the map, where it has several.
+            crs: of the world coordinates shown; the map's own by default.
+        """
+        from gsmap.map.measuring import measure
+
+        return measure(self.store, a, b, self.settings, component=component, crs=crs)
 
     # --- upkeep ------------------------------------------------------------------------------------------------------
 

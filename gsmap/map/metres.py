@@ -11,6 +11,7 @@ from gsmap.geometry.metres import SceneUnit, metre_of
 from gsmap.store import Store
 from gsmap.types import PoseGraph, ScenePose
 from gsmap.types.metre import Metre
+from gsmap.types.world import WorldTie
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
@@ -18,7 +19,11 @@ if TYPE_CHECKING:
 
 def metres_at(store: Store, settings: Settings, revision: int | None = None) -> dict[int, Metre]:
     """The metre of every component of a revision, by default the newest; of that no edge is read."""
-    graph = PoseGraph(store.revisions.poses()) if revision is None else store.revisions.get(revision)
+    graph = (
+        PoseGraph(store.revisions.poses(), world=store.revisions.world())
+        if revision is None
+        else store.revisions.get(revision)
+    )
     return map_metres(store, settings, graph)
 
 
@@ -49,7 +54,14 @@ def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dic
             guess_m=None if policy == "known" else guess,
         )
         components.setdefault(pose.component, []).append((unit, pose))
-    return {component: metre_of(components[component]) for component in sorted(components)}
+    ties = {tie.component: tie for tie in (graph.world if graph else ()) if tie.metres_per_unit is not None}
+    return {
+        component: metre_of(components[component], _surveyed(ties.get(component))) for component in sorted(components)
+    }
+
+
+def _surveyed(tie: WorldTie | None) -> tuple[float, float] | None:
+    return None if tie is None or tie.metres_per_unit is None else (tie.metres_per_unit, tie.scale_sigma)
 
 
 def metres_of_scenes(store: Store, settings: Settings, graph: PoseGraph) -> dict[str, float]:

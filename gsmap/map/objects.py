@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from gsmap.objects import (
 )
 from gsmap.objects.fuse import Node
 from gsmap.store import Store
-from gsmap.types import MapObject, Scene
+from gsmap.types import MapObject, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import SCHEMA, HistoryReport, ObjectRow, ObjectsReport, RelationRow, SightingRow
 
@@ -63,8 +63,14 @@ class Known:
 
 
 @of_one_state
-def known_objects(store: Store, settings: Settings, progress: StageProgress) -> Known:
+def known_objects(
+    store: Store, settings: Settings, progress: StageProgress, graphs: Mapping[str, SceneGraph] | None = None
+) -> Known:
     """The objects of every component by the newest poses; nothing is written.
+
+    Args:
+        graphs: by scene, what the captures are taken to show; no capture is then asked whether it looked where others
+            show something. By default the newest graph of each, and all are asked.
 
     Raises:
         NotFoundError: the map has no poses yet.
@@ -78,7 +84,10 @@ def known_objects(store: Store, settings: Settings, progress: StageProgress) -> 
     captures: dict[int, list[Capture]] = {}
     without = []
     for scene in sorted(scenes.values(), key=_when):
-        graph, pose = store.graphs.load(scene.id), placed.poses[scene.id]
+        graph = store.graphs.load(scene.id) if graphs is None else graphs.get(scene.id)
+        pose = placed.poses[scene.id]
+        if graph is None and graphs is not None:
+            continue  # whoever chose them says why
         if graph is None or graph.things is None:
             without.append(scene.name)
         else:
@@ -96,7 +105,7 @@ def known_objects(store: Store, settings: Settings, progress: StageProgress) -> 
         )
 
     def eyes(capture: Capture) -> Eyes:
-        if scenes[capture.scene].thinning is not None:
+        if graphs is not None or scenes[capture.scene].thinning is not None:
             return Eyes((), (), ())  # what is left of it does not show what it looked at
         gaussians, cameras = store.scenes.gaussians(capture.scene), store.scenes.cameras(capture.scene)
         return open_eyes(gaussians, cameras, settings.objects.look)

@@ -20,6 +20,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.changes import change_arrays, named
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
+from gsmap.methods import text_digest
 from gsmap.register.view_cache import Params as ViewParams
 from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
@@ -30,7 +31,7 @@ from gsmap.types.rows import ChangeRow
 _log = logging.getLogger("gsmap.map")
 FILE_NAME = "changes.json"
 _VERSION = 1
-_PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png")
+_PICTURE = re.compile(r"c\d+\.png|why-[0-9a-f]{8}-[0-9a-f]{8}\.png|find-[0-9a-f]{16}\.png")
 _LOOKS = 2  # cameras of each capture that a picture of a pair is drawn from
 _OWN = ViewParams(own_share=0.0)  # pictures are of what a capture's own cameras saw
 _MAX_BYTES = 1 << 26
@@ -130,6 +131,45 @@ def draw_pair(store: Store, folder: Path, a: Scene, b: Scene) -> str | None:
     drawn = _side_by_side(target, source, store.graphs.load(edge.target))
     write_whole(folder / name, partial(_save, drawn))
     return str(folder / name)
+
+
+def draw_places(
+    store: Store,
+    folder: Path,
+    scenes: Sequence[str],
+    boxes: Sequence[np.ndarray],
+    settings: Settings,
+    progress: StageProgress,
+) -> list[str]:
+    """Draw what a capture shows in each of some boxes; the files, in the order of these.
+
+    Args:
+        scenes: id of the capture of each.
+        boxes: (2, 3) each, map frame and unit.
+
+    Raises:
+        ConfigError, InputError: see `Pictures.load`.
+    """
+    from gsmap.view.change_picture import draw_place
+
+    known, poses = Pictures.load(folder, store.id), store.revisions.get()
+    assert poses is not None
+    metres = metres_of_scenes(store, settings, poses)
+    names = [
+        f"find-{text_digest(f'{scene} {box.tolist()}')[:16]}.png" for scene, box in zip(scenes, boxes, strict=True)
+    ]
+    make_folder(folder)
+    _note(store, folder)
+    known.scenes |= {name: [scene] for name, scene in zip(names, scenes, strict=True)}
+    known.save(folder)  # first: what an interrupted run leaves is known to a purge
+    for done, scene in enumerate(dict.fromkeys(scenes)):
+        progress("pictures", done / len(scenes), scene[:12])
+        placed = _placed(store, scene, in_metres(poses.poses[scene].S_map_scene, metres[scene]))
+        for name, one, box in zip(names, scenes, boxes, strict=True):
+            if one == scene:
+                write_whole(folder / name, partial(_save, draw_place(placed, box * metres[scene])))
+    progress("pictures", 1.0, f"{len(names)} pictures")
+    return [str(folder / name) for name in names]
 
 
 def _side_by_side(target: PlacedScene, source: PlacedScene, graph: SceneGraph | None) -> np.ndarray:

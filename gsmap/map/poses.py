@@ -23,7 +23,7 @@ FORMATS = ("tum", "g2o", "colmap", "nerfstudio", "json")
 
 
 @of_one_state
-def write_poses(store: Store, out: Path, format: str) -> list[Path]:
+def write_poses(store: Store, out: Path, format: str, crs: str | None = None) -> list[Path]:
     """Write the newest poses of all placed scenes; returns the files or folders written.
 
     - ``tum``: a line per scene, ``T_map_scene`` (a scale is left out: the format has none), at the time of capture in
@@ -46,8 +46,12 @@ def write_poses(store: Store, out: Path, format: str) -> list[Path]:
     placed = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in scenes]
     if graph is None or not placed:
         raise NotFoundError("no scene has a place in the map yet: run gsmap update first")
+    if crs is not None and format != "json":
+        raise ConfigError(
+            f"{format} holds poses in the map's frame; world coordinates go into json: leave out --format"
+        )
     if format == "json":
-        rows = [row.to_json() for row in reports.pose_rows(store)]
+        rows = [row.to_json() for row in reports.pose_rows(store, crs)]
         text = json.dumps({"schema": SCHEMA, "poses": rows}, indent=1)
         write_text_whole(out, text)
         return [out]

@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin
+from gsmap import change, describe, engine, export, localize, merge, objects, optimize, register, retrieve, thin, world
 from gsmap.errors import ConfigError
 from gsmap.evaluate import judge
+from gsmap.localize import scan
 from gsmap.map import visits
+from gsmap.register import by_shape
 from gsmap.settings import FILE_NAME, changed, load, save
 from gsmap.settings.file import PRESET
 
@@ -57,6 +59,7 @@ class Settings:
         retrieve: which pairs are tried.
         register: how a pair is registered and judged.
         optimize: how poses are solved.
+        world: how observations of the world are read.
         thin: when a capture is kept compact.
         merge: how captures become one.
         export: how tiles are planned and kept.
@@ -64,6 +67,8 @@ class Settings:
         change: how changes between two captures are found.
         objects: when things of several captures are one, and how they are looked for.
         localize: how photographs are found.
+        scan: how a scan is looked for.
+        by_shape: how a scan without colours is compared with a scene.
         evaluate: when an edge counts as wrong.
         engine: where jobs run.
     """
@@ -72,6 +77,7 @@ class Settings:
     retrieve: retrieve.Params = field(default_factory=retrieve.Params)
     register: register.Params = field(default_factory=register.Params)
     optimize: optimize.Params = field(default_factory=optimize.Params)
+    world: world.Params = field(default_factory=world.Params)
     thin: thin.Params = field(default_factory=thin.Params)
     merge: merge.Params = field(default_factory=merge.Params)
     export: export.Params = field(default_factory=export.Params)
@@ -79,6 +85,8 @@ class Settings:
     change: change.Params = field(default_factory=change.Params)
     objects: objects.Params = field(default_factory=objects.Params)
     localize: localize.Params = field(default_factory=localize.Params)
+    scan: scan.Params = field(default_factory=scan.Params)
+    by_shape: by_shape.Params = field(default_factory=by_shape.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 

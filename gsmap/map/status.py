@@ -67,6 +67,11 @@ def status(store: Store, settings: Settings) -> MapStatus:
     add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
     outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
+    ties = graph.world if graph else ()
+    contrary = sum(row.use == "outlier" for tie in ties for row in tie.residuals)
+    add("world_outliers", contrary, f"gsmap georeference {at}", "observations of the world that contradict the others")
+    untied = sum(bool(tie.problem) for tie in ties)
+    add("untied", untied, f"gsmap georeference {at}", "components whose place in the world is not determined yet")
     twice = [stored for stored in current if any(n.startswith(SAME_CAPTURE) for n in stored.registration.notes)]
     add("duplicates", len(twice), f"gsmap list {at} edges", "pairs that are the same capture twice: remove one of each")
     isolated = [pose for pose in poses if pose.status == "isolated"]
@@ -123,7 +128,7 @@ def _add_unsolved(store: Store, settings: Settings, add: Callable[[str, int, str
     if newest is not None and newest.recipe != given.key.recipe:
         add("stale_poses", 1, verb, "poses solved by other settings or another version")
     else:
-        add("unsolved", 1, verb, "scenes, edges, reviews or priors newer than the poses")
+        add("unsolved", 1, verb, "scenes, edges, reviews, priors or observations newer than the poses")
 
 
 def metre_row(component: int, metre: Metre) -> MetreRow:

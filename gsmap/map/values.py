@@ -49,6 +49,7 @@ def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
         num_reviews=merged.reviews,
         num_facts=merged.facts,
         num_priors=merged.priors,
+        num_observations=merged.observations,
         num_models=merged.models,
         num_comparisons=merged.comparisons,
         num_change_reviews=merged.change_reviews,

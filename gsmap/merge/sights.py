@@ -18,6 +18,7 @@ from tempfile import NamedTemporaryFile
 import numpy as np
 
 from gsmap.geometry.boxes import moved_box
+from gsmap.merge.placed import inside
 from gsmap.methods import text_digest
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, Sim3
@@ -174,7 +175,7 @@ class Sights:
             low = np.array(cell) * _CELL * self.around
             box = np.array([low - self.around, low + (1 + _CELL) * self.around])
             found = self.load(box)
-            found = found[((found.means >= box[0]) & (found.means < box[1])).all(1)]
+            found = found[inside(found.means, box)]
             self._near = cell, found, keys_of(found.means)
         return self._near[1:]
 

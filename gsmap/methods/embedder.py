@@ -35,6 +35,22 @@ class Embedder(Protocol):
         ...
 
 
+class PictureEmbedder(Embedder, Protocol):
+    """An embedder that can be shown a picture of one thing, to find it by; it need not be."""
+
+    def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Features of a picture that shows one thing and little else.
+
+        Args:
+            rgb: (H, W, 3) uint8.
+
+        Returns:
+            (F,) float32 features, comparable with those of masks; and (F,) bool, which of them a picture can tell:
+            the others do not count.
+        """
+        ...
+
+
 class EmbedderMethod(Protocol):
     """What a module (or object) offers to be an embedder.
 
@@ -44,6 +60,7 @@ class EmbedderMethod(Protocol):
         MODELS: kinds of the ONNX models that it needs, such as ``("clip",)``; empty where it needs none. ``auto`` takes
             the first embedder, in alphabetical order, that needs models and has them all.
         probe: only where ``MODELS`` names any.
+        embed_text: only where there is a text tower to its vectors: ``embed_text(text, models)`` gives (F,) float32.
     """
 
     Params: type[Any]

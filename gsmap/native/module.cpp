@@ -9,6 +9,7 @@ namespace gsmap {
 void bind_correspondences(nb::module_ &);
 void bind_fit(nb::module_ &);
 void bind_landmarks(nb::module_ &);
+void bind_merging(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_stopping(nb::module_ &);
 void bind_surroundings(nb::module_ &);
@@ -22,6 +23,7 @@ NB_MODULE(_native, m) {
     gsmap::bind_correspondences(m);
     gsmap::bind_fit(m);
     gsmap::bind_landmarks(m);
+    gsmap::bind_merging(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_stopping(m);
     gsmap::bind_surroundings(m);

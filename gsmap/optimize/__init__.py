@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from gsmap.optimize.changes import diff, motion, moved
 from gsmap.optimize.gravity import gravity_align
 from gsmap.optimize.measurements import check_priors
@@ -16,8 +18,20 @@ from gsmap.optimize.recipe import recipe_key
 from gsmap.optimize.stillness import kept_still
 from gsmap.types import Edge, PoseGraph, Prior
 from gsmap.types.progress import Progress, silent
+from gsmap.types.world import Survey
 
-__all__ = ["Params", "check_priors", "diff", "gravity_align", "kept_still", "motion", "moved", "optimize", "recipe_key"]
+__all__ = [
+    "Params",
+    "check_priors",
+    "diff",
+    "gravity_align",
+    "joint_covariance",
+    "kept_still",
+    "motion",
+    "moved",
+    "optimize",
+    "recipe_key",
+]
 
 
 def optimize(
@@ -27,6 +41,7 @@ def optimize(
     previous: PoseGraph | None = None,
     params: Params | None = None,
     progress: Progress = silent,
+    survey: Survey | None = None,
 ) -> PoseGraph:
     """Poses of all scenes from pairwise edges, some of which are wrong. Pure and deterministic.
 
@@ -44,6 +59,8 @@ def optimize(
             only few scenes are new, they are placed in it (``provenance.method == "incremental"``); see `Params`.
         params: see `Params`.
         progress: called with a fraction and a short text.
+        survey: observations of the world, positions in the world frame. They bend the components that they tie to the
+            world, and never move one as a whole: where it lies is in ``world`` of the answer.
 
     Raises:
         InputError: an edge or prior is unusable, or confirmed edges contradict each other; the message names it.
@@ -56,7 +73,32 @@ def optimize(
     edges = sorted(edges, key=lambda edge: (edge.target, edge.source))
     priors = sorted(priors, key=lambda prior: prior.scene)
     if previous is not None and params.growth > 0 and len(scene_ids) > params.limits.full_scenes:
-        placed = place_new(scene_ids, edges, priors, previous, params)
+        placed = place_new(scene_ids, edges, priors, previous, params, survey or Survey())
         if placed is not None:
             return placed
-    return solve_batch(scene_ids, edges, priors, previous, params, progress)
+    return solve_batch(scene_ids, edges, priors, previous, params, progress, survey or Survey())
+
+
+def joint_covariance(
+    answer: PoseGraph,
+    edges: Sequence[Edge],
+    priors: Sequence[Prior],
+    survey: Survey | None,
+    scenes: Sequence[str],
+    component: int,
+    params: Params | None = None,
+) -> np.ndarray | None:
+    """(7 + 7 S, 7 + 7 S) covariance of ``S_world_map`` and the poses of some scenes of a component, together.
+
+    Each over [rotation, translation, log scale] on its source side; zero for the world where the component is not tied.
+    Marginals do not tell how well two scenes are known to each other: next to each other they err alike.
+
+    Args:
+        answer: as `optimize` gave it, with the edges, priors and observations that it rests on.
+
+    Returns:
+        None where the scenes are alone, or the system cannot be solved.
+    """
+    from gsmap.optimize.survey import joint_of_answer
+
+    return joint_of_answer(answer, edges, priors, survey or Survey(), scenes, component, params or Params())

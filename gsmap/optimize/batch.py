@@ -26,6 +26,7 @@ from gsmap.optimize.state import State, initial_state, refine
 from gsmap.optimize.structure import component_labels, roots
 from gsmap.types import Edge, PoseGraph, Prior, Provenance
 from gsmap.types.progress import Progress
+from gsmap.types.world import Survey
 
 
 def solve_batch(
@@ -35,6 +36,7 @@ def solve_batch(
     previous: PoseGraph | None,
     params: Params,
     progress: Progress,
+    survey: Survey,
 ) -> PoseGraph:
     """See `gsmap.optimize.optimize`; edges and priors come sorted by id."""
     check_priors(scene_ids, priors)
@@ -57,14 +59,15 @@ def solve_batch(
     _check_confirmed(m, state, gate, params)
 
     solved = solve_components(
-        m, state, _ages(m, scene_ids), previous, params, lambda f, text: progress(0.75 + 0.25 * f, text)
+        m, state, _ages(m, scene_ids), previous, params, lambda f, text: progress(0.75 + 0.25 * f, text), survey
     )
     answer = pose_graph(m, solved.poses, solved.component, solved.covariances, state, votes, params)
     return replace(
         answer,
         poses={scene: answer.poses[scene] for scene in scene_ids},
-        provenance=_provenance(m, edges, priors, state, params),
+        provenance=_provenance(m, edges, priors, state, params, survey),
         notes=solved.notes,
+        world=solved.world,
     )
 
 
@@ -105,14 +108,19 @@ def _ages(m: Measurements, scene_ids: Sequence[str]) -> np.ndarray:
 
 
 def _provenance(
-    m: Measurements, edges: Sequence[Edge], priors: Sequence[Prior], state: State, params: Params
+    m: Measurements,
+    edges: Sequence[Edge],
+    priors: Sequence[Prior],
+    state: State,
+    params: Params,
+    survey: Survey,
 ) -> Provenance:
     believed = {m.scene_ids[k] for k in state.terms.scenes.tolist()}
     return Provenance(
         method="batch",
         recipe=recipe_key(params).recipe,
         batch_scenes=m.num_scenes,
-        measured=f"{fingerprint(edges, priors):016x}",
+        measured=f"{fingerprint(edges, priors, survey) % 2**64:016x}",
         contradicted_priors=tuple(p.scene for p in priors if p.scene not in believed),
     )
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.gauge import anchor_of, onto_anchor, onto_priors, open_gauge
-from gsmap.optimize.gtsam_solve import solve
+from gsmap.optimize.gtsam_solve import held_directions, solve
 from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import component_labels
+from gsmap.optimize.survey import Component, tie_component
 from gsmap.types import PoseGraph, Sim3
 from gsmap.types.progress import Progress
+from gsmap.types.world import Survey, WorldTie
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,16 +28,24 @@ class Solved:
         component: (N,) largest first; those that priors fix completely share the outside world's frame, as one.
         covariances: (N, 7, 7), zero where there is none.
         notes: on covariances that there are not.
+        world: where components lie in the world, of those of which anything was observed.
     """
 
     poses: Similarities
     component: np.ndarray
     covariances: np.ndarray
     notes: tuple[str, ...]
+    world: tuple[WorldTie, ...] = ()
 
 
 def solve_components(
-    m: Measurements, state: State, ages: np.ndarray, previous: PoseGraph | None, params: Params, progress: Progress
+    m: Measurements,
+    state: State,
+    ages: np.ndarray,
+    previous: PoseGraph | None,
+    params: Params,
+    progress: Progress,
+    survey: Survey,
 ) -> Solved:
     """Exact poses and covariances of every component from the edges that are taken in.
 
@@ -56,6 +66,7 @@ def solve_components(
     covariances = np.zeros((m.num_scenes, 7, 7))
     component = np.zeros(m.num_scenes, dtype=np.int64)
     missing: list[tuple[int, int, str]] = []
+    ties: list[tuple[int, WorldTie]] = []
     world: int | None = None
     most = params.limits.marginal_scenes if params.marginals else 0
     for index, label in enumerate(order):
@@ -71,7 +82,7 @@ def solve_components(
             if not len(open_gauge(poses, scenes, anchor, own, m.dim, params.gauge.loose)):
                 # Fully known to the outside: it shares the world's frame with every other such component.
                 component[scenes] = world = index if world is None else world
-        if not len(mine) and not len(own):
+        if not len(mine) and not len(own) and not survey:
             continue
         solution = solve(m[mine], poses, anchor, own, params.gauge, most)
         poses = solution.poses
@@ -80,8 +91,20 @@ def solve_components(
         elif params.marginals:
             why = solution.problem or f"more than limits.marginal_scenes, {most}"
             missing.append((int(scenes[0]), len(scenes), why))
+        if survey:
+            held = held_directions(m[mine], poses, scenes, anchor, own, params.gauge)
+            whole = Component(scenes, m[mine], own, anchor, held)
+            surveyed = tie_component(whole, poses, survey, index, params.survey, most)
+            if surveyed is not None:
+                poses = surveyed.poses
+                ties.append((int(scenes[0]), surveyed.tie))
+                if surveyed.covariances is not None:
+                    covariances[scenes] = surveyed.covariances
     _, component = np.unique(component, return_inverse=True)
     notes = tuple(
         f"no covariances in component {component[scene]} ({size} scenes): {why}" for scene, size, why in missing
     )
-    return Solved(poses, component, covariances, notes)
+    placed: dict[int, WorldTie] = {}
+    for scene, tie in ties:  # of components that priors put into one frame, the largest says where that is
+        placed.setdefault(int(component[scene]), replace(tie, component=int(component[scene])))
+    return Solved(poses, component, covariances, notes, tuple(placed.values()))

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from gsmap.geometry.directions import rotation_to_z
+from gsmap.geometry.similarities import Similarities
 from gsmap.optimize.params import Gravity
 from gsmap.types import PoseGraph, ScenePose, Sim3
+from gsmap.types.world import WorldTie
 
 
 def gravity_align(
@@ -29,7 +31,8 @@ def gravity_align(
     for pose in graph.poses.values():
         components.setdefault(pose.component, []).append(pose)
     poses = dict(graph.poses)
-    for members in components.values():
+    world = {tie.component: tie for tie in graph.world}
+    for component, members in components.items():
         votes = [p.S_map_scene.rotation @ ups[p.scene] for p in members if p.scene in ups]
         if not votes or any(p.scene in fixed for p in members):
             continue
@@ -42,4 +45,15 @@ def gravity_align(
         turn = Sim3(rotation_to_z(up / length), np.zeros(3))
         for pose in members:
             poses[pose.scene] = replace(pose, S_map_scene=turn @ pose.S_map_scene)
-    return replace(graph, poses=poses)
+        if component in world:
+            world[component] = _turned(world[component], turn)
+    return replace(graph, poses=poses, world=tuple(world.values()))
+
+
+def _turned(tie: WorldTie, turn: Sim3) -> WorldTie:
+    """Where a component lies in the world whose frame was turned."""
+    if tie.S_world_map is None or tie.covariance is None:
+        return tie
+    to_new = Similarities.stack([turn]).adjoint()[0]
+    covariance = to_new @ tie.covariance @ to_new.T
+    return replace(tie, S_world_map=tie.S_world_map @ turn.inverse(), covariance=(covariance + covariance.T) / 2)

@@ -46,9 +46,8 @@ def solve(
     scenes = np.unique(np.r_[edges.targets, edges.sources, anchor])
     factors = _factors(edges, dim)
     start = poses[np.array([anchor])]
-    held = open_gauge(poses, scenes, anchor, priors, dim, gauge.loose)
-    if len(held):
-        root = held / (gauge_sigmas(gauge)[:dim] if len(held) == dim else np.full(dim, gauge.rotation_sigma_rad))
+    root = held_directions(edges, poses, scenes, anchor, priors, gauge)
+    if len(root):
         factors.push_back(_gauge_factor(anchor, start, root, dim))
     for k in range(len(priors)):
         factors.push_back(_prior_factor(priors[np.array([k])], dim))
@@ -67,6 +66,18 @@ def solve(
     except RuntimeError as error:
         # So badly conditioned (scales or levers of many powers of ten) that no covariance means anything.
         return Solution(out, None, str(error).strip().splitlines()[0] if str(error).strip() else "singular")
+
+
+def held_directions(
+    edges: Measurements, poses: Similarities, scenes: np.ndarray, anchor: int, priors: PriorTerms, gauge: Gauge
+) -> np.ndarray:
+    """(K, D) whitened steps of the anchor's scene in which it is held: those that no prior decides."""
+    held = open_gauge(poses, scenes, anchor, priors, edges.dim, gauge.loose)
+    full = len(held) == edges.dim
+    out: np.ndarray = held / (
+        gauge_sigmas(gauge)[: edges.dim] if full else np.full(edges.dim, gauge.rotation_sigma_rad)
+    )
+    return out
 
 
 def gauge_sigmas(gauge: Gauge) -> np.ndarray:

@@ -22,6 +22,7 @@ from gsmap.optimize.robust import Descent, chi_squares
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import component_labels
 from gsmap.types import Edge, EdgeOutcome, PoseGraph, Prior, ScenePose, Sim3
+from gsmap.types.world import Survey
 
 
 def place_new(
@@ -30,6 +31,7 @@ def place_new(
     priors: Sequence[Prior],
     previous: PoseGraph,
     params: Params,
+    survey: Survey,
 ) -> PoseGraph | None:
     """The previous answer with the new scenes placed in it, or None where only a full solve will do.
 
@@ -46,10 +48,12 @@ def place_new(
         return None
     if len(scene_ids) > (1 + params.growth) * solved or any(p.scene not in known for p in priors):
         return None
+    if survey.scenes() - known:
+        return None
     fresh = set(new)
     old = [e for e in edges if e.target not in fresh and e.source not in fresh]
-    measured = fingerprint(old, priors)
-    if f"{measured:016x}" != previous.provenance.measured:
+    measured = fingerprint(old, priors, survey)
+    if f"{measured % 2**64:016x}" != previous.provenance.measured:
         return None
     measured += fingerprint([e for e in edges if e.target in fresh or e.source in fresh])
     answer = previous

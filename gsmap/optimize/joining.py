@@ -48,27 +48,23 @@ def find_joins(edges: Measurements, rows: np.ndarray, drift: DriftModel, probabi
     first, second = agreeing_pairs(edges, rows, drift, np.repeat(ends, ends - starts), probability)
     neighbours = sp.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(rows), len(rows))).tocsr()
     neighbours = neighbours + neighbours.T
-    count = np.diff(neighbours.indptr)
     # A pair of scenes tied twice is one piece of evidence when it comes to counting pairs; see `join_decision`.
     weight = -np.log(np.trace(edges.covariance[rows], axis1=1, axis2=2))
+    group = np.repeat(np.arange(len(starts)), ends - starts)
+    # The edge that most others agree with, but a confirmed one before any other.
+    best = np.lexsort((weight, np.diff(neighbours.indptr), edges.confirmed[rows], group))[ends - 1]
+    mine = np.zeros(len(rows), dtype=bool)
+    mine[best] = True
+    mine |= neighbours @ mine.astype(float) > 0
+    apart = ~mine & (neighbours @ mine.astype(float) == 0)
+    agreeing_apart = np.where(apart, 1 + neighbours @ apart.astype(float), 0).astype(np.int64)
+    rivals = np.maximum.reduceat(agreeing_apart, starts)
     out = []
-    for begin, end in zip(starts.tolist(), ends.tolist(), strict=True):
-        # A confirmed edge decides which group counts.
-        best = begin + int(np.lexsort((weight[begin:end], count[begin:end], edges.confirmed[rows[begin:end]]))[-1])
-        mine = np.zeros(end - begin, dtype=bool)
-        mine[np.r_[neighbours.indices[neighbours.indptr[best] : neighbours.indptr[best + 1]], best] - begin] = True
-        rival = _largest_apart(neighbours, begin, mine)
-        group = np.r_[best, begin + np.flatnonzero(mine)]
-        group = group[np.sort(np.unique(group, return_index=True)[1])]
-        out.append(Join(int(low[begin]), int(high[begin]), rows[group], rival, rows[begin:end]))
+    for k, (begin, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+        others = begin + np.flatnonzero(mine[begin:end])
+        chosen = np.r_[best[k], others[others != best[k]]]
+        out.append(Join(int(low[begin]), int(high[begin]), rows[chosen], int(rivals[k]), rows[begin:end]))
     return out
-
-
-def _largest_apart(neighbours: sp.csr_matrix, begin: int, mine: np.ndarray) -> int:
-    """Size of the largest agreeing group among edges that agree with none of ``mine``."""
-    block = neighbours[begin : begin + len(mine), begin : begin + len(mine)]
-    apart = ~mine & (block @ mine.astype(float) == 0)
-    return int((block[apart] @ apart.astype(float)).max()) + 1 if apart.any() else 0
 
 
 def join_decision(join: Join, edges: Measurements, sizes: np.ndarray, params: Joining) -> str:

@@ -156,6 +156,37 @@ class Gravity:
 
 
 @dataclass(frozen=True)
+class SurveyParams:
+    """How observations of the world are weighed against each other and against the edges.
+
+    Args:
+        gate_probability: an observation is an outlier if its chi-square against all others is beyond this quantile.
+        drift_share: before the edges give way, a map may be bent by this share of its extent.
+        draws: triples of places that are tried as the first guess, where there are too many to try all.
+        max_rounds: of leaving out the worst observation and solving again.
+        max_rotation_sigma_deg: a component whose rotation is known no better than this is not tied.
+        max_log_scale_sigma: the same of its scale.
+        min_redundancy: directions of an observation that others check by no more than this share are not tested.
+        min_checks: where points, fixes and bars have fewer checks among them all, a remark says so.
+    """
+
+    gate_probability: float = 0.999
+    drift_share: float = 0.03
+    draws: int = 500
+    max_rounds: int = 50
+    max_rotation_sigma_deg: float = 5.0
+    max_log_scale_sigma: float = 0.1
+    min_redundancy: float = 1e-3
+    min_checks: float = 2.5
+
+    def __post_init__(self) -> None:
+        _probability(self, "gate_probability", "min_redundancy")
+        _positive(self, "drift_share", "max_rotation_sigma_deg", "max_log_scale_sigma")
+        _at_least(self, 1, "draws", "max_rounds")
+        _at_least(self, 0, "min_checks")
+
+
+@dataclass(frozen=True)
 class Limits:
     """Sizes beyond which something cheaper is done.
 
@@ -201,6 +232,7 @@ class Params:
         aliasing: what is done about places that look alike.
         gauge: how frames are held, and which priors are believed.
         gravity: how components are turned upright.
+        survey: how observations of the world are weighed.
         limits: sizes beyond which something cheaper is done.
         still_sigmas: a scene keeps its last pose where the new one is no further from it than this share of what its
             edges leave open; 0 keeps a pose only where rounding moved it.
@@ -221,6 +253,7 @@ class Params:
     aliasing: Aliasing = field(default_factory=Aliasing)
     gauge: Gauge = field(default_factory=Gauge)
     gravity: Gravity = field(default_factory=Gravity)
+    survey: SurveyParams = field(default_factory=SurveyParams)
     limits: Limits = field(default_factory=Limits)
     still_sigmas: float = 1e-3
     still_variance: float = 1e-2

@@ -8,7 +8,14 @@ from gsmap.methods import RecipeKey
 from gsmap.optimize.params import Params
 from gsmap.types.plain import plain
 
-VERSIONS = {"optimize": 3, "optimize.incremental": 3, "perceptual_aliasing": 1, "gravity_align": 1, "kept_still": 1}
+VERSIONS = {
+    "optimize": 3,
+    "optimize.incremental": 3,
+    "perceptual_aliasing": 1,
+    "gravity_align": 1,
+    "kept_still": 1,
+    "survey": 1,
+}
 """By piece: raised whenever its answer changes for the same input. They stand here, and not in the modules, because
 those load solvers."""
 

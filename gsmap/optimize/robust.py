@@ -61,6 +61,18 @@ def residuals(edges: Measurements, poses: Similarities) -> np.ndarray:
     return (edges.measured.inverse() @ predicted).log()[:, : edges.dim]
 
 
+def linearised(edges: Measurements, poses: Similarities, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(E, D, D) derivatives of the residuals ``r`` by a step of the target and of the source, on their source sides."""
+    d = edges.dim
+    full = np.zeros((len(edges), 7))
+    full[:, :d] = r
+    ad = commutator(full)
+    # Inverse right Jacobian of the exponential, to second order (exact up to the fourth).
+    inverse_right = np.eye(7) + ad / 2 + ad @ ad / 12
+    back = (poses[edges.sources].inverse() @ poses[edges.targets]).adjoint()
+    return -(inverse_right @ back)[:, :d, :d], inverse_right[:, :d, :d]
+
+
 def chi_squares(edges: Measurements, poses: Similarities) -> np.ndarray:
     """(E,) chi-square of every edge under ``poses``, with D degrees of freedom."""
     r = residuals(edges, poses)
@@ -130,15 +142,8 @@ class Descent:
 
     def step(self, poses: Similarities, weights: np.ndarray, r: np.ndarray) -> np.ndarray:
         """(N, D) Gauss-Newton step from residuals ``r`` and a weight per edge."""
-        edges, d = self.edges, self.edges.dim
-        full = np.zeros((len(edges), 7))
-        full[:, :d] = r
-        ad = commutator(full)
-        # Inverse right Jacobian of the exponential, to second order (exact up to the fourth).
-        inverse_right = np.eye(7) + ad / 2 + ad @ ad / 12
-        B = inverse_right[:, :d, :d]
-        back = (poses[edges.sources].inverse() @ poses[edges.targets]).adjoint()
-        A = -(inverse_right @ back)[:, :d, :d]
+        edges = self.edges
+        A, B = linearised(edges, poses, r)
         W = edges.information * weights[:, None, None]
         return self.system.solve(A, B, W, r[:, :, None])[:, :, 0]
 

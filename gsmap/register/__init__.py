@@ -1,8 +1,9 @@
 """Pairwise registration: where one scene lies in another, and how sure that is."""
 
+from gsmap.register.by_shape import register_by_shape
 from gsmap.register.pair import check_pose, register_pair
 from gsmap.register.params import Params
 from gsmap.register.recipe import VERSION, recipe_key
 from gsmap.register.scene_view import SceneView
 
-__all__ = ["VERSION", "Params", "SceneView", "check_pose", "recipe_key", "register_pair"]
+__all__ = ["VERSION", "Params", "SceneView", "check_pose", "recipe_key", "register_by_shape", "register_pair"]

@@ -60,7 +60,7 @@ def _laid_exactly(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.nda
 def _coinciding_cameras(target: SceneView, source: SceneView, S_target_source: Sim3) -> tuple[int, int]:
     """How many cameras of the scene with fewer stand and look as one of the other's, and how many those are."""
     ours, theirs = target.cameras, source.cameras
-    if not ours or not theirs or ours.synthesised or theirs.synthesised:
+    if not ours or not theirs or ours.synthesised or theirs.synthesised or min(len(ours), len(theirs)) < _MIN_CAMERAS:
         return 0, 0
     poses = ours.T_frame_camera, theirs.T_frame_camera
     centres = poses[0][:, :3, 3], S_target_source.apply(poses[1][:, :3, 3])

@@ -267,6 +267,13 @@ def a_pose(value: Any) -> bool:
     )
 
 
+def ties(value: Any) -> bool:
+    """Where components lie in the world; `gsmap.store.ties` looks further."""
+    return isinstance(value, list) and all(
+        isinstance(one, dict) and isinstance(one.get("component"), int) for one in value
+    )
+
+
 def poses_by_scene(value: Any) -> bool:
     return isinstance(value, dict) and all(is_digest(scene) and a_pose(pose) for scene, pose in value.items())
 

@@ -18,7 +18,7 @@ from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import cache, trust
 from gsmap.store.explained import call
-from gsmap.store.places import ObjectPlace, place_of
+from gsmap.store.places import ObjectPlace, chunks_of, place_of
 
 _MAX_BYTES = 1 << 20  # of what is brought to a desk; longer ones are not read
 _FILES = (trust.URL_FILE, SETTINGS)
@@ -105,7 +105,7 @@ class Home:
     def send(self, name: str, path: Path) -> None:
         """Send a file that is named by its content."""
         if self.place.size_bytes(name) != path.stat().st_size:
-            self.place.put(name, _chunks(path), path.stat().st_size)
+            self.place.put(name, chunks_of(path), path.stat().st_size)
 
     def bring(self, name: str) -> None:
         """Bring a file that is named by its content to the desk, unless it is there.
@@ -133,12 +133,6 @@ class Home:
 
 def _write(content: bytes, path: Path) -> None:
     path.write_bytes(content)
-
-
-def _chunks(path: Path) -> Iterator[bytes]:
-    with open(path, "rb") as file:
-        while chunk := file.read(1 << 20):
-            yield chunk
 
 
 def _fill(path: Path, chunks: Iterator[bytes]) -> None:

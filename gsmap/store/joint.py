@@ -13,6 +13,7 @@ from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.similarities import Similarities
 from gsmap.geometry.umeyama import umeyama
 from gsmap.types import PoseGraph, ScenePose, Sim3
+from gsmap.types.world import WorldTie
 
 # Scenes in both maps agree where their poses differ by no more than what both solutions leave open. The covariance of
 # the scene that holds a component's frame is next to nothing, so that this much is always allowed: [rad, scene units,
@@ -59,14 +60,45 @@ def joined(ours: PoseGraph, theirs: PoseGraph, living: Collection[str], bounds: 
         for pair, outcome in theirs.outcomes.items()
         if set(pair) <= set(poses) and frozenset(pair) not in known
     }
-    return PoseGraph(_largest_first(poses), outcomes, settings=ours.settings, notes=tuple(notes))
+    placed = _largest_first(poses)
+    world = _ties(ours, placed, {scene: pose.component for scene, pose in ours.poses.items()})
+    known_in_world = {tie.component for tie in world}
+    apart = {pose.scene: pose.component for pose in theirs.poses.values() if pose.scene not in ours.poses}
+    # A component of theirs that came into a frame of ours left its own, and its tie with it.
+    left = {pose.component for pose in theirs.poses.values() if pose.scene in ours.poses}
+    world += tuple(
+        tie
+        for tie in _ties(theirs, placed, {s: c for s, c in apart.items() if c not in left})
+        if tie.component not in known_in_world
+    )
+    return PoseGraph(placed, outcomes, settings=ours.settings, notes=tuple(notes), world=world)
 
 
 def restricted(graph: PoseGraph, scenes: Collection[str]) -> PoseGraph:
     """The poses of some scenes, and what became of the edges among them."""
     poses = {scene: pose for scene, pose in graph.poses.items() if scene in scenes}
     outcomes = {pair: outcome for pair, outcome in graph.outcomes.items() if set(pair) <= set(poses)}
-    return PoseGraph(_largest_first(poses), outcomes, settings=graph.settings, notes=graph.notes)
+    placed = _largest_first(poses)
+    world = _ties(graph, placed, {scene: pose.component for scene, pose in poses.items()})
+    return PoseGraph(placed, outcomes, settings=graph.settings, notes=graph.notes, world=world)
+
+
+def _ties(graph: PoseGraph, placed: Mapping[str, ScenePose], before: Mapping[str, int]) -> tuple[WorldTie, ...]:
+    """Where components lie in the world, under their new numbers; of what was observed, that of scenes that are here.
+
+    Args:
+        before: component of scenes in ``graph``, of those whose frame is what it was.
+    """
+    now = {component: placed[scene].component for scene, component in before.items() if scene in placed}
+    return tuple(
+        replace(
+            tie,
+            component=now[tie.component],
+            residuals=tuple(row for row in tie.residuals if not row.scene or row.scene in placed),
+        )
+        for tie in graph.world
+        if tie.component in now
+    )
 
 
 def _components(graph: PoseGraph) -> list[int]:

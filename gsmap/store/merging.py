@@ -29,8 +29,8 @@ class Merged:
 
     Args:
         scenes, removed, known: scenes that are new here and live, that are new or now removed, and that both maps had.
-        graphs, registrations, reviews, facts, priors, models, recipes, revisions, comparisons, change_reviews: rows
-            that are new here.
+        graphs, registrations, reviews, facts, priors, observations, models, recipes, revisions, comparisons,
+            change_reviews: rows that are new here.
         renamed: (old, new) names of scenes whose name was taken.
         revision: number of the joint revision; None where none was needed.
         num_bytes: of the arrays that are new here, linked or copied.
@@ -45,6 +45,7 @@ class Merged:
     reviews: int = 0
     facts: int = 0
     priors: int = 0
+    observations: int = 0
     models: int = 0
     recipes: int = 0
     revisions: int = 0
@@ -73,6 +74,7 @@ def merge(into: Store, source: Store) -> Merged:
         transfer.pairs()
         comparisons_of(transfer)
         transfer.priors()
+        transfer.observations()
         transfer.models()
         number = _revisions(transfer)
         transfer.notes += _other_settings(into, source)
@@ -93,6 +95,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
         transfer.pairs()
         comparisons_of(transfer)
         transfer.priors()
+        transfer.observations()
         transfer.models()
         number = None
         newest = newest_poses(transfer.theirs)
@@ -128,6 +131,7 @@ def bring_scene(into: Store, source: Store, scene: str) -> Merged:
         transfer.pairs()
         comparisons_of(transfer)
         transfer.priors()
+        transfer.observations()
         return replace(_merged(transfer, None), notes=())
 
 

@@ -26,7 +26,7 @@ from gsmap.store.arrays import Arrays, Staged, StoredFile, stored_file
 from gsmap.store.columns import KINDS, is_digest
 from gsmap.store.homes import Home
 from gsmap.store.layout import CHUNK_ROWS
-from gsmap.store.places import CHUNK_BYTES, SINGLE_PUT_BYTES
+from gsmap.store.places import SINGLE_PUT_BYTES, chunks_of
 
 _ROOT = "arrays"
 _MAX_REQUESTS = 5  # for the parts of a group that are read, beside the one for its table of contents
@@ -98,7 +98,7 @@ class ObjectArrays(Arrays):
                     if self._home.size_bytes(key) != file.size_bytes:  # else only the answer was lost
                         raise
             elif self._home.size_bytes(key) != file.size_bytes:  # S3 has no condition for objects of several parts
-                self._home.put(key, _chunks(path), file.size_bytes)
+                self._home.put(key, chunks_of(path), file.size_bytes)
                 self._sent.add(key)
 
     def publish(self, staged: Staged, kind: str, name: str) -> None:
@@ -108,7 +108,7 @@ class ObjectArrays(Arrays):
             if key not in self._sent:  # another one sent it, some time
                 whole = whole and self._sha256(key) == file.sha256
             if not whole:
-                self._home.put(key, _chunks(staged.folder / file.path), file.size_bytes)
+                self._home.put(key, chunks_of(staged.folder / file.path), file.size_bytes)
             self._sent.discard(key)
 
     def read(
@@ -296,9 +296,3 @@ def joined(ranges: Sequence[layout.Range], at_most: int) -> list[layout.Range]:
         else:
             few.append((start, stop))
     return few
-
-
-def _chunks(path: Path) -> Iterator[bytes]:
-    with open(path, "rb") as file:
-        while chunk := file.read(CHUNK_BYTES):
-            yield chunk

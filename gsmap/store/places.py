@@ -17,7 +17,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any, Protocol
 
-from gsmap.durable import make_folder, sync_folder
+from gsmap.durable import make_folder, open_file, sync_folder
 from gsmap.errors import (
     ConfigError,
     DiskError,
@@ -31,6 +31,15 @@ from gsmap.errors import (
 )
 
 CHUNK_BYTES = 1 << 20  # read, hashed and written at a time
+
+
+def chunks_of(path: Path) -> Iterator[bytes]:
+    """The bytes of a file; a link is not followed."""
+    with open(open_file(path), "rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            yield chunk
+
+
 SINGLE_PUT_BYTES = 64 << 20  # up to this size an object is one request; above, its parts appear as one at the end
 _PART_BYTES = 16 << 20  # S3 allows 10,000 parts: objects of up to 160 GB
 _STAGING = "staging"

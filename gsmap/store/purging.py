@@ -37,6 +37,7 @@ from gsmap.store.schema import (
     index_segments,
     leases,
     lookups,
+    observations,
     poses,
     priors,
     purges,
@@ -57,7 +58,7 @@ _GONE = "a scene that was purged"
 _REMARKS: tuple[tuple[Table, tuple[str, ...]], ...] = (
     (scenes, ("notes",)),
     (registrations, ("reason", "notes")),
-    (revisions, ("notes", "provenance")),
+    (revisions, ("notes", "provenance", "world")),
     (edges, ("reason",)),
     (comparisons, ("notes",)),
     (tiles, ("notes",)),
@@ -246,6 +247,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     drop("edges", edges, (edges.c.target == scene) | (edges.c.source == scene))
     drop("poses", poses, poses.c.scene == scene)
     drop("priors", priors, priors.c.scene == scene)
+    drop("observations", observations, (observations.c.scene == scene) | (observations.c.other == scene))
     drop("facts", scene_facts, scene_facts.c.scene == scene)
     drop("leases", leases, leases.c.what.contains(scene))
     drop("set_aside", set_aside, set_aside.c.about.contains(scene))
@@ -274,6 +276,10 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
         said = f"the pose of {_GONE} is no longer part of this revision"
         connection.execute(update(revisions).where(mine).values(notes=[*notes, said]))
     counts["revisions"] = len(affected)
+    for line in connection.execute(select(revisions.c.number, revisions.c.world)).all():
+        left = [tie | {"residuals": [row for row in tie["residuals"] if row["scene"] != scene]} for tie in line.world]
+        if left != line.world:
+            connection.execute(update(revisions).where(revisions.c.number == line.number).values(world=left))
     return counts, bodies
 
 

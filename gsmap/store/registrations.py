@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -79,8 +79,6 @@ class Standing:
 
     Args:
         usable: as `StoredRegistration.is_usable`.
-        keys: of all that was computed for the pair.
-        disagreement: of what both scenes saw; NaN where that is not known.
     """
 
     number: int
@@ -91,8 +89,6 @@ class Standing:
     recipe: str | None
     review: str | None
     usable: bool
-    keys: frozenset[str]
-    disagreement: float
 
     @property
     def manual(self) -> bool:
@@ -103,6 +99,19 @@ class Standing:
     def is_told(self) -> bool:
         """Whether a person measured or confirmed it."""
         return self.manual or self.review == "confirm"
+
+
+@dataclass(frozen=True)
+class Tried(Standing):
+    """What counts of a pair, and what else was computed for it.
+
+    Args:
+        keys: of all that was computed.
+        disagreement: of what both scenes saw, by what counts; NaN where that is not known.
+    """
+
+    keys: frozenset[str]
+    disagreement: float
 
 
 @dataclass(frozen=True)
@@ -181,7 +190,7 @@ class Registrations:
             newest = [r for r in pair if r.proposer != MANUAL][-1]
             original = row.number if row.adopts is None else row.adopts
             if original in (newest.number, newest.adopts):
-                return _stored_one(newest, _decide(pair, _reviews_of(connection, row.pair)).word)
+                return _stored_one(newest, _decide(pair, _reviews_of(connection, row.pair))[1])
             copied = {name: value for name, value in row._mapping.items() if name != "number"}
             return self._insert(connection, copied | {"adopts": original, "created_at": now()})
 
@@ -213,20 +222,29 @@ class Registrations:
             usable: only those that are (`Standing.usable`).
         """
         accepted = registrations.c.status == "accepted" if usable else None
-        repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
         with self._catalog.read() as connection:
-            alive = living_ids(connection)
-            chosen = _choose(connection, _LEAN, silent_if=accepted)
-            keys: dict[str, set[str]] = {}
-            again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
+            rows = _choose(connection, _LEAN, silent_if=accepted)
+            made = [Standing(**_stands(choice)) for choice in _living(connection, rows)]
+        return sorted((one for one in made if one.usable or not usable), key=lambda one: (one.target, one.source))
+
+    def tried(self) -> list[Tried]:
+        """The same of every pair, with what else was computed for it: what registering asks."""
+        repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
+        again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
+        keys: dict[str, set[str]] = {}
+        with self._catalog.read() as connection:
+            chosen = _living(connection, _choose(connection, (*_LEAN, _EVIDENCE)))
             for row in connection.execute(again):
                 keys.setdefault(row.pair, set()).add(row.key)
         made = [
-            _standing(choice, keys.get(choice.row.pair, {choice.row.key}))
+            Tried(
+                **_stands(choice),
+                keys=frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
+                disagreement=float((choice.row.evidence or {}).get("disagreement", np.nan)),
+            )
             for choice in chosen
-            if choice.row.target in alive and choice.row.source in alive
         ]
-        return sorted((one for one in made if one.usable or not usable), key=lambda one: (one.target, one.source))
+        return sorted(made, key=lambda one: (one.target, one.source))
 
     def usable(self) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source)."""
@@ -239,8 +257,8 @@ class Registrations:
         """The current registration of a pair (scene refs, either direction); None where there is none."""
         with self._catalog.read() as connection:
             pair = _pair(connection, a, b)
-            choice = _decide(_rows_of(connection, pair), _reviews_of(connection, pair))
-        return None if choice.row is None else _stored_one(choice.row, choice.word)
+            row, word = _decide(_rows_of(connection, pair), _reviews_of(connection, pair))
+        return None if row is None else _stored_one(row, word)
 
     def find(self, key: RecipeKey | str) -> StoredRegistration | None:
         """The newest registration that is kept under a key (or its digest); None where there is none."""
@@ -252,8 +270,8 @@ class Registrations:
             row = connection.execute(query.limit(1)).first()
             if row is None:
                 return None
-            choice = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
-        return _stored_one(row, choice.word)
+            _, word = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
+        return _stored_one(row, word)
 
     def kept(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
         """Those of the keys (as digests) that a registration is kept under, made later than the one of a number."""
@@ -270,8 +288,8 @@ class Registrations:
         with self._catalog.read() as connection:
             pair = _pair(connection, a, b)
             rows = _rows_of(connection, pair)
-            choice = _decide(rows, _reviews_of(connection, pair))
-        return [_stored_one(row, choice.word) for row in rows]
+            _, word = _decide(rows, _reviews_of(connection, pair))
+        return [_stored_one(row, word) for row in rows]
 
     def review(self, a: str, b: str, review: str, note: str = "") -> StoredRegistration | None:
         """Write down a person's word on a pair: ``confirm`` its current pose, ``reject`` it, or ``withdraw`` the last.
@@ -311,20 +329,20 @@ class Registrations:
     def _insert(self, connection: Connection, row: dict[str, Any]) -> StoredRegistration:
         number = connection.execute(insert(registrations).returning(registrations.c.number), row).scalar_one()
         stored = connection.execute(select(registrations).where(registrations.c.number == number)).one()
-        choice = _decide(_rows_of(connection, stored.pair), _reviews_of(connection, stored.pair))
-        return _stored_one(stored, choice.word)
+        _, word = _decide(_rows_of(connection, stored.pair), _reviews_of(connection, stored.pair))
+        return _stored_one(stored, word)
 
 
 @dataclass(frozen=True)
 class _Choice:
     """A pair's current row, and the review that stands on it."""
 
-    row: Row[Any] | None
+    row: Row[Any]
     word: Review | None
 
 
-def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> _Choice:
-    """What counts of a pair: its rows and reviews, both oldest first. See `Registrations`."""
+def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> tuple[Row[Any] | None, Review | None]:
+    """What counts of a pair, and the word that stands: its rows and reviews, both oldest first. See `Registrations`."""
     measured = {row.number for row in rows if row.proposer == MANUAL}
     word: Review | None = None
     withdrawn: set[int] = set()
@@ -344,7 +362,7 @@ def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> _Choice:
         chosen = word.registration
     else:
         chosen = max((row.number for row in rows if row.proposer != MANUAL), default=None)
-    return _Choice(next((row for row in rows if row.number == chosen), None), word)
+    return next((row for row in rows if row.number == chosen), None), word
 
 
 def _pair(connection: Connection, a: str, b: str) -> str:
@@ -378,24 +396,19 @@ _PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "st
 _LEAN = (
     *(registrations.c[name] for name in _PARTS),
     (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed"),
-    case((registrations.c.status == "accepted", registrations.c.evidence)).label("evidence"),
 )
-
-
-@dataclass(frozen=True)
-class _Chosen:
-    """The current row of a pair, and the word that stands on it."""
-
-    row: Row[Any]
-    word: Review | None
+_EVIDENCE = case((registrations.c.status == "accepted", registrations.c.evidence)).label("evidence")
 
 
 def _current(
     connection: Connection, of: ColumnElement[bool] | None = None, silent_if: ColumnElement[bool] | None = None
 ) -> list[StoredRegistration]:
+    return _stored_all(_living(connection, _choose(connection, _FULL, of, silent_if)))
+
+
+def _living(connection: Connection, chosen: Iterable[_Choice]) -> list[_Choice]:
     alive = living_ids(connection)
-    chosen = _choose(connection, _FULL, of, silent_if)
-    return _stored_all([one for one in chosen if one.row.target in alive and one.row.source in alive])
+    return [one for one in chosen if one.row.target in alive and one.row.source in alive]
 
 
 def _choose(
@@ -403,7 +416,7 @@ def _choose(
     columns: Sequence[ColumnElement[Any]],
     of: ColumnElement[bool] | None = None,
     silent_if: ColumnElement[bool] | None = None,
-) -> list[_Chosen]:
+) -> list[_Choice]:
     """The current row of every pair, by the pair's first row.
 
     Of a pair on which nobody ever spoke it is the newest, which the index of pairs tells without reading the others.
@@ -418,7 +431,7 @@ def _choose(
     silent = ends.where(wanted, registrations.c.pair.not_in(spoken)).group_by(registrations.c.pair).subquery()
     query: Select[Any] = select(*columns, silent.c.first).join(silent, silent.c.newest == registrations.c.number)
     rows = connection.execute(query if silent_if is None else query.where(silent_if)).all()
-    found = [(row.first, _Chosen(row, None)) for row in rows]
+    found = [(row.first, _Choice(row, None)) for row in rows]
 
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
     every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(spoken))).all()
@@ -426,9 +439,9 @@ def _choose(
     words = {pair: [_review(row) for row in of_pair] for pair, of_pair in groupby(said, lambda row: str(row.pair))}
     for pair, of_pair in groupby(every, lambda row: str(row.pair)):
         history = list(of_pair)
-        choice = _decide(history, words.get(pair, []))
-        if choice.row is not None:
-            found.append((history[0].number, _Chosen(choice.row, choice.word)))
+        current, word = _decide(history, words.get(pair, []))
+        if current is not None:
+            found.append((history[0].number, _Choice(current, word)))
     return [chosen for _, chosen in sorted(found, key=lambda item: item[0])]
 
 
@@ -436,23 +449,15 @@ def _may_be_used(status: str, review: str | None) -> bool:
     return review == "confirm" or (status == "accepted" and review != "reject")
 
 
-def _standing(chosen: _Chosen, keys: Collection[str]) -> Standing:
+def _stands(chosen: _Choice) -> dict[str, Any]:
+    """The fields of `Standing`."""
     row, review = chosen.row, None if chosen.word is None else chosen.word.review
-    return Standing(
-        number=row.number,
-        target=row.target,
-        source=row.source,
-        status=row.status,
-        key=row.key,
-        recipe=row.recipe,
-        review=review,
-        usable=bool(row.posed) and _may_be_used(row.status, review),
-        keys=frozenset(keys) - {""},
-        disagreement=float((row.evidence or {}).get("disagreement", np.nan)),
-    )
+    usable = bool(row.posed) and _may_be_used(row.status, review)
+    own = {name: getattr(row, name) for name in ("number", "target", "source", "status", "key", "recipe")}
+    return own | {"review": review, "usable": usable}
 
 
-def _stored_all(chosen: Sequence[_Chosen]) -> list[StoredRegistration]:
+def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:
     """As `_stored`; poses and matrices are taken from their bytes all at once."""
     rows = [one.row for one in chosen]
     with not_ours("registrations.S_target_source"):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from sqlalchemy import (
@@ -37,8 +37,10 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import Numbers, not_ours
 from gsmap.store.matrices import covariance_bytes, covariances_of_bytes, pose_bytes, poses_of_bytes
 from gsmap.store.schema import REVISION_COUNTS, edges, poses, revisions
+from gsmap.store.ties import tie_value, ties_of
 from gsmap.types import EdgeOutcome, PoseGraph, Provenance, ScenePose
 from gsmap.types.plain import plain
+from gsmap.types.world import WorldTie
 
 PairsByRevision = dict[int, list[tuple[str, str]]]
 
@@ -101,6 +103,7 @@ class Revisions:
                 "settings": plain(graph.settings),
                 "provenance": plain(graph.provenance),
                 "notes": list(graph.notes),
+                "world": [tie_value(tie) for tie in graph.world],
                 "note": note,
                 "created_at": now(),
             }
@@ -131,12 +134,6 @@ class Revisions:
                 )
             return _pose_graph(connection, row)
 
-    def find(self, key: RecipeKey | str) -> int | None:
-        """Number of the newest revision that was solved from exactly this; None where there is none."""
-        same = revisions.c.key == recipes.digest_of(key)
-        with self._catalog.read() as connection:
-            return connection.execute(select(func.max(revisions.c.number)).where(same)).scalar()
-
     def list(self) -> list[Revision]:
         """All revisions, oldest first."""
         with self._catalog.read() as connection:
@@ -165,6 +162,12 @@ class Revisions:
         newest = poses.c.until.is_(None)
         with self._catalog.read() as connection:
             return _poses(connection, newest & poses.c.scene.in_(scenes) if scenes else newest)
+
+    def world(self) -> tuple[WorldTie, ...]:
+        """Where the components of the newest revision lie in the world, of those of which anything was observed."""
+        with self._catalog.read() as connection:
+            row = connection.execute(_NEWEST).first()
+        return () if row is None else ties_of(row.world)
 
     def outcomes(self, *scenes: str) -> dict[tuple[str, str], EdgeOutcome]:
         """What the newest revision made of the edges of some scenes (ids), or of all where none is named."""
@@ -364,10 +367,13 @@ def _revision(row: Row[Any]) -> Revision:
 
 
 def _pose_graph(connection: Connection, row: Row[Any]) -> PoseGraph:
-    return replace(
-        PoseGraph({}, {}, row.settings, _provenance(row.provenance), tuple(row.notes)),
+    return PoseGraph(
         poses=_poses(connection, _where(connection, poses, row.number)),
         outcomes=_outcomes(connection, _where(connection, edges, row.number)),
+        settings=row.settings,
+        provenance=_provenance(row.provenance),
+        notes=tuple(row.notes),
+        world=ties_of(row.world),
     )
 
 

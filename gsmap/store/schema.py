@@ -44,6 +44,7 @@ from gsmap.store.columns import (
     poses_by_scene,
     sigmas,
     texts,
+    ties,
 )
 from gsmap.store.matrices import (
     covariance_bytes,
@@ -54,6 +55,7 @@ from gsmap.store.matrices import (
     pose_of_bytes,
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
+from gsmap.types.world import OBSERVATION_KINDS
 
 HEAD = "0008"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
@@ -310,6 +312,7 @@ revisions = _table(
     Column("settings", Json(an_object), nullable=False, server_default="{}"),
     Column("provenance", Json(an_object), nullable=False, server_default="{}"),
     Column("notes", Json(texts), nullable=False, server_default="[]"),
+    Column("world", Json(ties), nullable=False, server_default="[]"),  # where its components lie in the world
     Column("note", Lines, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("dropped_at", Text),  # prune may reclaim what only this revision names
@@ -353,6 +356,20 @@ priors = _table(
     Column("up_sigma_rad", Real, nullable=False),
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
+)
+
+# What was observed of the world; nothing is overwritten.
+observations = _table(
+    "observations",
+    Column("number", Integer, primary_key=True),
+    Column("kind", Word(OBSERVATION_KINDS), nullable=False),
+    Column("name", Line, nullable=False),
+    Column("scene", Digest, ForeignKey("scenes.id"), index=True),  # whose frame it speaks of; null of points
+    Column("other", Digest, ForeignKey("scenes.id")),  # of a scale bar's other end
+    Column("value", Json(an_object), nullable=False),  # as of `gsmap.types.world`
+    Column("created_at", Text, nullable=False),
+    Column("removed_at", Text),
+    CheckConstraint("kind in ('frame', 'point', 'image', 'fix', 'bar')", name="kind"),
 )
 
 models = _table(

@@ -39,6 +39,7 @@ from gsmap.store.revisions import Revisions
 from gsmap.store.scenes import Scenes
 from gsmap.store.set_aside import SetAsides
 from gsmap.store.view_features import ViewFeatures
+from gsmap.store.world import World
 from gsmap.types.progress import Progress
 from gsmap.version import __version__
 
@@ -47,9 +48,10 @@ class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
     One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``indexes``, ``view_features``, ``registrations``,
-    ``changes``, ``revisions``, ``priors``, ``models``, ``exports``, ``branches``, ``backups``, ``leases`` and
-    ``set_aside``. Every method that changes something is one transaction, durable when it returns; `transaction` makes
-    several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes open their own.
+    ``changes``, ``revisions``, ``priors``, ``world``, ``models``, ``exports``, ``branches``, ``backups``, ``leases``
+    and ``set_aside``. Every method that changes something is one transaction, durable when it returns; `transaction`
+    makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes open their
+    own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -84,6 +86,7 @@ class Store:
         self.changes = Changes(catalog, self.arrays)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
+        self.world = World(catalog)
         self.models = Models(catalog, self.arrays)
         self.exports = Exports(catalog)
         self.branches = Branches(place, catalog, self.arrays)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from sqlalchemy import Connection, delete, insert, select, update
 
-from gsmap.store import facts
+from gsmap.store import facts, world
 from gsmap.store.change_rows import pair_of
 from gsmap.store.schema import comparisons, priors, scene_facts
 from gsmap.store.store import Store
@@ -29,6 +29,7 @@ def inherit(store: Store, old: str, new: str) -> None:
             content = {column: value for column, value in row.items() if column != "number"}
             connection.execute(insert(priors), content | {"scene": new})
         _inherit_comparisons(connection, old, new)
+        world.inherit(connection, old, new)
         graph = store.revisions.get()
         if graph is not None and old in graph.poses:
             name = store.scenes.get(old).name

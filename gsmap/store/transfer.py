@@ -26,6 +26,7 @@ from gsmap.store.schema import (
     graphs,
     groups,
     models,
+    observations,
     priors,
     purges,
     recipes,
@@ -99,6 +100,7 @@ class Transfer:
         self.notes: list[str] = []
         self.renamed: list[tuple[str, str]] = []
         self._staged = staged
+        self._whole = only is None
         rows = theirs.execute(select(scenes).order_by(scenes.c.number)).all()
         self._rows = [row for row in rows if only is None or row.id in only]
         self._forgotten = _forgotten(ours) & {row.id for row in self._rows}
@@ -323,6 +325,45 @@ class Transfer:
             for row in rows[:-1]:
                 earlier = priors.c.number == row.number
                 self.ours.execute(update(priors).where(earlier).values(removed_at=rows[-1].created_at))
+
+    def observations(self) -> None:
+        """What was observed of the world by these scenes, and the control points that their photos show.
+
+        Of two that stand under a name the later one holds; the world frame of this map stays where it has one.
+        """
+        theirs = self.theirs.execute(select(observations).order_by(observations.c.number)).all()
+        here = set(self.ours.execute(select(scenes.c.id)).scalars())
+        shown = {row.value.get("point") for row in theirs if row.kind == "image" and row.scene in self.wanted}
+        everything = self._whole
+
+        def comes(row: Row[Any]) -> bool:
+            ends = {end for end in (row.scene, row.other) if end is not None}
+            if ends:
+                return ends <= here and bool(ends & self.wanted)
+            return everything or row.kind == "frame" or row.name in shown
+
+        mine = {_identity(row, "removed_at"): row for row in self.ours.execute(select(observations))}
+        has_frame = any(row.kind == "frame" and row.removed_at is None for row in mine.values())
+        for row in filter(comes, theirs):
+            known = mine.get(_identity(row, "removed_at"))
+            if known is None and row.kind == "frame" and has_frame:
+                if row.removed_at is None:
+                    self.notes.append("both maps are tied to the world: this one's frame stays")
+                continue
+            if known is None:
+                self.ours.execute(insert(observations), _content(row))
+                self.counts["observations"] += 1
+            elif row.removed_at is not None and known.removed_at is None:
+                taken_back = observations.c.number == known.number
+                self.ours.execute(update(observations).where(taken_back).values(removed_at=row.removed_at))
+        standing: dict[tuple[Any, ...], list[Row[Any]]] = {}
+        query = select(observations).where(observations.c.removed_at.is_(None)).order_by(observations.c.created_at)
+        for row in self.ours.execute(query):
+            standing.setdefault((row.kind, row.name, row.scene), []).append(row)
+        for rows in standing.values():
+            for row in rows[:-1]:
+                earlier = observations.c.number == row.number
+                self.ours.execute(update(observations).where(earlier).values(removed_at=rows[-1].created_at))
 
     def models(self) -> None:
         """Models of kinds that this map lacks; where both have one under a name, this map's stays."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 
-KNOWN_BY = ("measured", "told", "assumed", "guessed", "unknown")
+KNOWN_BY = ("surveyed", "measured", "told", "assumed", "guessed", "unknown")
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,10 @@ class Metre:
     Args:
         metres_per_unit: metres in a unit of the component's frame.
         sigma: standard deviation of its logarithm: 0.01 is one percent; infinite where it is unknown.
-        known_by: ``measured`` (by captures that are said to be in metres), ``told`` (a person gave metres per unit of a
-            capture), ``assumed`` (nobody said so, but the captures' own unit may well be the metre), ``guessed`` (from
-            how far cameras stand from what they see: good to a factor of about two), ``unknown`` (1 is taken).
+        known_by: ``surveyed`` (by control points, positions or scale bars), ``measured`` (by captures that are
+            said to be in metres), ``told`` (a person gave metres per unit of a capture), ``assumed`` (nobody
+            said so, but the captures' own unit may well be the metre), ``guessed`` (from how far cameras stand
+            from what they see: good to a factor of about two), ``unknown`` (1 is taken).
         note: what a person should know of it; empty where nothing.
     """
 

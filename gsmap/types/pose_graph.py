@@ -9,6 +9,7 @@ import numpy as np
 
 from gsmap.errors import InputError
 from gsmap.types.sim3 import Sim3
+from gsmap.types.world import WorldTie
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +133,7 @@ class PoseGraph:
         settings: the parameters it was computed with, as plain values.
         provenance: how it came about.
         notes: what a person should know (covariances that could not be computed, ...).
+        world: where components lie in the world, of those of which anything was observed.
     """
 
     poses: dict[str, ScenePose]
@@ -139,6 +141,11 @@ class PoseGraph:
     settings: dict[str, Any] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
     notes: tuple[str, ...] = ()
+    world: tuple[WorldTie, ...] = ()
+
+    def tie(self, component: int) -> WorldTie | None:
+        """Where a component lies in the world; None where nothing was observed of it."""
+        return next((tie for tie in self.world if tie.component == component), None)
 
     def use(self, target: str, source: str) -> str:
         """How an edge was used; ``unused`` where it was not given."""

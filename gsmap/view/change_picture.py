@@ -18,6 +18,7 @@ _NEAR = 0.15  # metres within which a surface is the one that changed
 _MARGIN = 1.0  # around the box, as a share of it
 _LEAST_SHARE = 0.15  # of the camera's picture: a small thing is shown with what is around it
 _GAP_PX = 4
+_POINTS = 500  # of what lies in a box, by which a camera is chosen
 _FRAME = (255, 64, 64)
 
 
@@ -44,6 +45,19 @@ def draw_change(
     halves = [_picture(scene, camera, box) for scene in (older, newer)]
     gap = np.full((halves[0].shape[0], _GAP_PX, 3), 255, np.uint8)
     return np.concatenate([halves[0], gap, halves[1]], axis=1)
+
+
+def draw_place(scene: PlacedScene, box: np.ndarray, side_px: int = 320) -> np.ndarray:
+    """What a capture shows in a box, (H, W, 3) uint8, from the camera that sees most of it; the box is outlined.
+
+    Args:
+        scene: in a metric frame.
+        box: (2, 3) in that frame.
+        side_px: the longer side.
+    """
+    points = scene.gaussians.means[((scene.gaussians.means >= box[0]) & (scene.gaussians.means <= box[1])).all(1)]
+    points = points[:: max(1, len(points) // _POINTS)] if len(points) else box
+    return _picture(scene, _sized(_best(scene, scene, box, points), side_px), box)
 
 
 def _picture(scene: PlacedScene, camera: Cameras, box: np.ndarray) -> np.ndarray:

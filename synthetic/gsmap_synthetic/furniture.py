@@ -174,6 +174,10 @@ def chair(s: Surfaces, rng, tone=None, seat=None) -> None:
     s.box(0, -0.19, 0.62, 0.34, 0.025, 0.28, legs, front=seat)
 
 
+def lone_chair(s: Surfaces, rng, w, d) -> None:
+    chair(s.at(0, d / 2), rng)
+
+
 def sofa(s: Surfaces, rng, w, d) -> None:
     cloth = _cloth(rng)
     s.box(0, d / 2, 0.08, w, d, 0.32, cloth)
@@ -368,6 +372,7 @@ PIECES = {
     "bathtub": Piece(bathtub, (1.5, 1.7), (0.7, 0.8)),
     "bed": Piece(bed, (1.2, 1.7), (2.0, 2.1)),
     "bookshelf": Piece(bookshelf, (0.8, 1.4), (0.3, 0.34), tall=True, covers_wall=True),
+    "chair": Piece(lone_chair, (0.42, 0.42), (0.42, 0.42), against_wall=False),
     "coffee table": Piece(coffee_table, (0.8, 1.1), (0.5, 0.6), against_wall=False, symmetry="half"),
     "desk": Piece(desk, (1.2, 1.5), (0.6, 0.7), covers_wall=True),
     "dining table": Piece(dining_table, (1.6, 2.1), (1.7, 1.8), against_wall=False, symmetry="half"),

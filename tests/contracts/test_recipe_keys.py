@@ -58,11 +58,14 @@ JUDGING = tuple(
 NAMES_NOTHING = (
     "objects.",  # made whenever they are asked for, and not kept
     "retrieve.",
+    "by_shape.",  # nothing of it is kept
+    "scan.",  # nothing of it is kept
     "visits.",
     "thin.",
     "export.",
     "evaluate.",
     "engine.",
+    "world.",  # is in what was observed once it was read
     "merge.method",
     "describe.object.model_",
     *(f"localize.{part}" for part in JUDGING),

@@ -151,13 +151,17 @@ def test_another_scale_of_a_scene_makes_its_tiles_again_and_no_others(row):
     assert of_scene(first, FAR) & set(row.made) == set()
 
 
-def test_format_provenance_and_budget_are_part_of_what_a_tile_is(row):
+def test_format_packed_provenance_and_budget_are_part_of_what_a_tile_is(row):
     count = len(row.export().tiles)
-    for options in ({"provenance": True}, {"budget_s": 60.0}, {"format": "glb"}, {"format": "3dtiles"}):
+    tileset = {"format": "3dtiles"}
+    plain = tileset | {"uncompressed": True}
+    for options in ({"provenance": True}, {"budget_s": 60.0}, {"format": "glb"}, plain, tileset):
         assert row.export(**options).recomputed == count
         assert row.export(**options).recomputed == 0
     with pytest.raises(ConfigError, match="provenance"):
         TileRecipe(recipe_key("voxel"), "spz", provenance=True)
+    with pytest.raises(ConfigError, match="uncompressed"):
+        TileRecipe(recipe_key("voxel"), "spz", uncompressed=True)
 
 
 def test_notes_recipe_and_key_are_in_the_manifest_and_in_the_answer(row):

@@ -46,17 +46,24 @@ def test_two_formats_of_one_object_look_the_same(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("name", "decibels"),
-    [("a.glb", 90), ("tileset.json", 90), ("a.compressed.ply", 48), ("a.spz", 44), ("a.splat", 30)],
+    ("name", "decibels", "options"),
+    [
+        ("a.glb", 90, {}),
+        ("tileset.json", 45, {}),
+        ("tileset.json", 90, {"compressed": False}),
+        ("a.compressed.ply", 48, {}),
+        ("a.spz", 44, {}),
+        ("a.splat", 30, {}),
+    ],
 )
-def test_a_real_capture_looks_the_same(shared_data, tmp_path, name, decibels):
+def test_a_real_capture_looks_the_same(shared_data, tmp_path, name, decibels, options):
     g = formats.read(shared_data / "house" / "c0.ply")
     cameras = formats.read_cameras(shared_data / "house" / "c0.cameras.json")
     some = [10, 50]
     cameras = Cameras(
         cameras.T_frame_camera[some], cameras.intrinsics_px[some] / 3, np.asarray(cameras.sizes_px)[some] // 3
     )
-    formats.write(tmp_path / name, g)
+    formats.write(tmp_path / name, g, **options)
     assert psnr(picture(g, cameras), picture(formats.read(tmp_path / name), cameras)) > decibels
 
 

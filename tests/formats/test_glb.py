@@ -206,6 +206,34 @@ def test_damage_is_named(tmp_path, damage, says):
         formats.read(path)
 
 
+def packing(d):
+    return prim(d)["extensions"]["KHR_gaussian_splatting"]["extensions"]["KHR_gaussian_splatting_compression_spz_2"]
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda d: packing(d).update(bufferView=3), "not valid glTF"),
+        (lambda d: packing(d).pop("bufferView"), "not valid glTF"),
+        (lambda d: d["bufferViews"][0].update(byteLength=10**9), "damaged"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "damaged"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=40), "not an SPZ"),
+        (lambda d: d["bufferViews"][0].update(buffer=1), "outside the file"),
+        (lambda d: d["buffers"][0].update(uri="other.bin"), "outside the file"),
+        (lambda d: [a.update(count=11) for a in d["accessors"]], "accessors do not"),
+        (lambda d: [a.update(count=2**60) for a in d["accessors"]], "hostile"),
+    ],
+)
+def test_damage_of_what_is_packed_is_named(tmp_path, damage, says):
+    path = tmp_path / "a.glb"
+    formats.write(path, random_gaussians(10, degree=1), compressed=True)
+    gltf, binary = container(path)
+    damage(gltf)
+    put(path, gltf, binary)
+    with pytest.raises(InputError, match=says):
+        formats.read(path)
+
+
 def test_a_draft_with_logarithmic_scales_is_recognised(tmp_path):
     path = tmp_path / "a.glb"
     g = random_gaussians(10)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from formats_cases import colours_along, covariances, directions, random_gaussians
+from scipy.spatial import cKDTree
 
 from gsmap import formats
 from gsmap.errors import ConfigError, InputError
@@ -36,13 +37,57 @@ def tiles_of(tile, above=None):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_the_finest_level_is_the_originals_bit_by_bit(tmp_path, degree):
     g = random_gaussians(3000, degree=degree)
-    formats.write(tmp_path / "tileset.json", g, max_per_tile=400)
+    formats.write(tmp_path / "tileset.json", g, max_per_tile=400, compressed=False)
     back = formats.read(tmp_path / "tileset.json")
     a, b = by_position(g), by_position(back)
     np.testing.assert_array_equal(a.means, b.means)
     np.testing.assert_array_equal(a.sh, b.sh)
     np.testing.assert_allclose(a.log_scales, b.log_scales, atol=2e-6)
     np.testing.assert_allclose(a.opacities, b.opacities, atol=1e-7)
+
+
+def json_of(glb_file):
+    data = glb_file.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+def test_content_is_packed_where_viewers_look_for_it(tmp_path):
+    """CesiumJS draws splats where the tileset requires both extensions, and takes the SPZ as the node's own numbers."""
+    g = random_gaussians(3000, degree=2)
+    g.means[:] += [300, 0, -200]
+    formats.write(tmp_path / "packed" / "tileset.json", g, max_per_tile=400)
+    tileset = json.loads((tmp_path / "packed" / "tileset.json").read_text())
+    both = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+    assert tileset["extensions"]["3DTILES_content_gltf"] == {"extensionsUsed": both, "extensionsRequired": both}
+    for tile, _ in tiles_of(tileset["root"]):
+        gltf = json_of(tmp_path / "packed" / tile["content"]["uri"])
+        assert gltf["extensionsRequired"] == both
+        assert all("bufferView" not in accessor for accessor in gltf["accessors"])
+    back = formats.read(tmp_path / "packed" / "tileset.json")
+    apart, same = cKDTree(back.means).query(g.means)
+    assert len(back) == len(g) == len(set(same.tolist()))
+    assert apart.max() < 8e-5  # 18 bits from the middle of tiles of 5 m, and float32 of 300 m
+    np.testing.assert_allclose(back.log_scales[same], g.log_scales, atol=1 / 32 + 1e-5)
+    np.testing.assert_allclose(back.opacities[same], g.opacities, atol=1 / 255)
+    np.testing.assert_allclose(colours_along(back[same], directions()), colours_along(g, directions()), atol=0.3)
+    formats.write(tmp_path / "plain" / "tileset.json", g, max_per_tile=400, compressed=False)
+    packed, plain = (sum(f.stat().st_size for f in (tmp_path / n / "tiles").iterdir()) for n in ("packed", "plain"))
+    assert packed < plain / 3
+
+
+def test_packed_numbers_are_those_of_the_node(tmp_path):
+    """As an independent reader of SPZ finds them, without turning axes: what CesiumJS and cesium-native do."""
+    gsply = pytest.importorskip("gsply")
+    g = random_gaussians(200, degree=1)
+    tiles3d.write_content(tmp_path / "a.glb", g)
+    data = (tmp_path / "a.glb").read_bytes()
+    gltf = json_of(tmp_path / "a.glb")
+    (tmp_path / "a.spz").write_bytes(data[-gltf["buffers"][0]["byteLength"] :].rstrip(b"\0") + b"\0" * 4)
+    theirs = gsply.read_spz(str(tmp_path / "a.spz"))
+    node = np.array(gltf["nodes"][0]["matrix"]).reshape(4, 4).T
+    turn = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of the 3D Tiles specification
+    placed = np.c_[theirs.means, np.ones(len(g))] @ (turn @ node).T
+    np.testing.assert_allclose(placed[:, :3], g.means, atol=5e-5)
 
 
 def test_tree_is_well_formed_and_coarser_upwards(tmp_path):
@@ -105,7 +150,7 @@ def test_few_gaussians_are_one_tile_and_equal_points_do_not_recurse_for_ever(tmp
 def test_content_is_in_the_frame_of_the_root_tile_in_every_reading_of_sh(tmp_path):
     """3D Tiles turns y up to z up; node and turn cancel, so stored SH are right with or without turning them."""
     g = random_gaussians(20)
-    tiles3d.write_content(tmp_path / "a.glb", g)
+    tiles3d.write_content(tmp_path / "a.glb", g, compressed=False)
     data = (tmp_path / "a.glb").read_bytes()
     gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     node = np.array(gltf["nodes"][0]["matrix"]).reshape(4, 4).T
@@ -125,7 +170,7 @@ def test_the_root_stands_upright_or_where_it_is_put(tmp_path):
     np.testing.assert_array_equal(transform @ [0, -1, 0, 0], [0, 0, 1, 0])  # up of a ply is up
     placed = np.eye(4)
     placed[:3, 3] = 4e6, 1e6, 4e6
-    formats.write(tmp_path / "tileset.json", g, transform=placed)
+    formats.write(tmp_path / "tileset.json", g, transform=placed, compressed=False)
     back = formats.read(tmp_path / "tileset.json")
     np.testing.assert_array_equal(back.means, g.means)
 
@@ -133,7 +178,10 @@ def test_the_root_stands_upright_or_where_it_is_put(tmp_path):
 def test_tiles_written_one_by_one_with_transforms_and_both_refinements(tmp_path):
     """The way of a large map; and a foreign tileset with placed tiles, several contents and ADD."""
     near, far = random_gaussians(30, degree=1), random_gaussians(20, degree=0, seed=1)
-    boxes = [tiles3d.write_content(tmp_path / name, g) for name, g in (("near.glb", near), ("far.glb", far))]
+    boxes = [
+        tiles3d.write_content(tmp_path / name, g, compressed=False)
+        for name, g in (("near.glb", near), ("far.glb", far))
+    ]
     box = np.stack([np.minimum(*[b[0] for b in boxes]), np.maximum(*[b[1] for b in boxes])])
     leaves = (TileNode(boxes[0], 0.0, "near.glb"), TileNode(boxes[1], 0.0, "far.glb"))
     tiles3d.write_tileset(tmp_path / "tileset.json", TileNode(box, 1.0, None, leaves))
@@ -228,8 +276,9 @@ def test_published_validators_find_no_fault(tmp_path):
         pytest.skip("needs node and the npm package gltf-validator: see tools/validate_3dtiles.sh")
     formats.write(tmp_path / "tileset.json", random_gaussians(3000), max_per_tile=500)
     formats.write(tmp_path / "a.glb", random_gaussians(30, degree=1))
+    formats.write(tmp_path / "packed.glb", random_gaussians(30, degree=1), compressed=True)
     done = subprocess.run(
-        ["bash", TOOL, "--no-install", tmp_path / "tileset.json", tmp_path / "a.glb"],
+        ["bash", TOOL, "--no-install", tmp_path / "tileset.json", tmp_path / "a.glb", tmp_path / "packed.glb"],
         capture_output=True,
         text=True,
         timeout=300,

@@ -18,6 +18,7 @@ from gsmap.map import Map
 from gsmap.map.stages import register as register_stage
 from gsmap.map.stages.describe import graph_keys
 from gsmap.types import Cameras, Gaussians, Sim3
+from gsmap_synthetic import make_captures
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,15 @@ class Described:
                     m.update()
             m.update()
             return Outcome.of(m)
+
+
+@contextmanager
+def walked_room(path: Path, visits: int) -> Iterator[Described]:
+    """A map of one room walked through several times, its captures described: capture_a, capture_b, ..."""
+    made = make_captures(0, visits, steps=0, num_frames=6, num_gaussians=4_000, size_px=(80, 60), routes=[[0]] * visits)
+    found = Described.of(path, {one.name: (one.gaussians, one.cameras) for one in made})
+    yield found
+    found.map.close()
 
 
 @contextmanager

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from map_orders import Described, Outcome, pairs_remembered
+from map_orders import Described, Outcome, pairs_remembered, walked_room
 
 import gsmap.map
 from gsmap import register as registering
 from gsmap.map.stages.describe import graph_keys
-from gsmap_synthetic import make_captures
 
 NAMES = ["capture_a", "capture_b", "capture_c"]
 
@@ -25,12 +24,8 @@ def quick() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Described]:
-    """One room walked through three times."""
-    captures = make_captures(0, 3, steps=0, num_frames=6, num_gaussians=4_000, size_px=(80, 60), routes=[[0]] * 3)
-    path = tmp_path_factory.mktemp("maps") / "described.gsmap"
-    found = Described.of(path, {c.name: (c.gaussians, c.cameras) for c in captures})
-    yield found
-    found.map.close()
+    with walked_room(tmp_path_factory.mktemp("maps") / "described.gsmap", 3) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from map_orders import Described, pairs_remembered
+from map_orders import Described, pairs_remembered, walked_room
 
 import gsmap.map
 from gsmap.map import Map
 from gsmap.store.graphs import Graphs
 from gsmap.store.indexes import StoredSegment
-from gsmap_synthetic import make_captures
 
 NAMES = [f"capture_{letter}" for letter in "abcd"]
 
@@ -29,12 +28,8 @@ def quick() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Described]:
-    """One room walked through four times."""
-    captures = make_captures(0, 4, steps=0, num_frames=6, num_gaussians=4_000, size_px=(80, 60), routes=[[0]] * 4)
-    path = tmp_path_factory.mktemp("maps") / "described.gsmap"
-    found = Described.of(path, {c.name: (c.gaussians, c.cameras) for c in captures})
-    yield found
-    found.map.close()
+    with walked_room(tmp_path_factory.mktemp("maps") / "described.gsmap", 4) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

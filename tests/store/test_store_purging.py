@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from gsmap.map.stages import purge
 from gsmap.store import Store, purging
 from gsmap.store.merging import merge
 from gsmap.types import EdgeOutcome, PoseGraph, Prior, Provenance, Registration, SceneGraph, ScenePose, Sim3
+from gsmap.types.world import Fix, Residual, WorldTie
 
 NAME, NOTE, SOURCE = "secret-garden", "the key is under the mat", "/home/ann/private/garden.ply"
 
@@ -44,6 +46,8 @@ def make(path):
         store.scenes.edit(secret, name=f"{NAME}-2")
         store.scenes.edit(secret, name=NAME)
         store.priors.set(Prior(secret, Sim3.identity(), np.full(7, 0.1)))
+        store.world.add([Fix("f.jpg", secret, np.zeros(3), "EPSG:4979", np.array([11.0, 48, 500]), (1.0, 1.0))])
+        left_out = Residual("fix", "f.jpg", secret, "outlier", (1.0, 0.0, 0.0), (1.0, 1.0, 1.0), reason=f"{NAME} lies")
         outcomes = {
             (ids[0], secret): EdgeOutcome("used", 1.0),
             (ids[0], ids[2]): EdgeOutcome("unused", 9.0, f"{secret} contradicts"),
@@ -51,6 +55,7 @@ def make(path):
         placed = {s: ScenePose(s, Sim3.identity(), 0, "placed") for s in ids}
         told = Provenance(contradicted_priors=(secret, ids[0]))
         graph = PoseGraph(placed, outcomes, provenance=told, notes=(f"{NAME} lies far out", "all is well"))
+        graph = replace(graph, world=(WorldTie(0, residuals=(left_out,), problem=f"{NAME} is alone"),))
         store.revisions.save(graph)
         store.revisions.save(graph)
     return secret
@@ -111,6 +116,7 @@ def test_nothing_of_it_is_left(place):
             "view_features": 0,
         },
         "set_aside": 0,
+        "observations": 1,
     }
     assert report.num_groups == 2
     assert report.num_bytes > 1000
@@ -368,7 +374,7 @@ def test_levels_of_an_export_that_was_killed_go(place, tmp_path):
         m.remove(secret)
         m.optimize()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("gsmap.map.stages.export.write_tilesets", lambda *a: None)
+            patch.setattr("gsmap.map.stages.export.write_tilesets", lambda *a, **options: None)
             m.export(out, tile_size_m=2, merge="union", format="3dtiles")
         tiles = set(folder.glob("*.glb"))
         assert {p.name for p in (folder / "levels").iterdir()} == before

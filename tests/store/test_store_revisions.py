@@ -188,6 +188,13 @@ def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
         )
         assert one.usable == stored.is_usable
     assert store.registrations.standing(usable=True) == [one for one in standing if one.usable]
+    tried = store.registrations.tried()
+    assert [(one.number, one.review, one.usable) for one in tried] == [
+        (one.number, one.review, one.usable) for one in standing
+    ]
+    for one in tried:
+        history = store.registrations.history(one.target, one.source)
+        assert one.keys == {stored.key for stored in history} - {""}
     usable = store.registrations.usable()
     assert [one.number for one in usable] == [one.number for one in standing if one.usable]
     of_one = {one.number for one in store.registrations.current_of(ids[1])}

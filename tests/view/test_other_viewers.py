@@ -1,7 +1,7 @@
 """What gsmap writes, opened by viewers that others wrote, against what gsmap renders from the same camera.
 
 They come from npm: ``npm install --prefix ~/.cache/gsmap/validators @sparkjsdev/spark three playcanvas babylonjs
-babylonjs-loaders``.
+babylonjs-loaders cesium``.
 """
 
 from __future__ import annotations
@@ -84,14 +84,27 @@ def truth(g: Gaussians) -> np.ndarray:
 
 def shown(viewer: str, url: str, name: str, axes: str, profile: Path) -> np.ndarray:
     """The picture that a viewer makes of a file whose own axes are ``axes``, from the one camera of this module."""
-    package = {"spark": "@sparkjsdev/spark", "playcanvas": "playcanvas", "babylon": "babylonjs-loaders"}[viewer]
+    package = {"spark": "@sparkjsdev/spark", "babylon": "babylonjs-loaders"}.get(viewer, viewer)
     if not (NPM / package).is_dir():
         pytest.skip(f"needs {package} in {NPM.parent}: see the top of this file")
     M = axes_matrix(axes, "RDF")
-    query = {"file": f"/file/{name}", "fov": FOV_DEG}
-    query |= {k: ",".join(map(str, M @ v)) for k, v in (("eye", EYE), ("target", TARGET), ("up", UP))}
-    with Page(f"{url}/page/{viewer}.html?{urlencode(query)}", profile, SIZE, SIZE) as page:
-        page.wait("window.done === true || window.failure !== undefined")
+    seen = {"eye": M @ EYE, "target": M @ TARGET, "up": M @ UP}
+    return drawn(viewer, url, name, seen, FOV_DEG, (SIZE, SIZE), profile)
+
+
+def drawn(
+    viewer: str, url: str, name: str, seen: dict[str, np.ndarray], fov_deg: float, size: tuple[int, int], profile: Path
+) -> np.ndarray:
+    """The picture that a viewer makes of a file.
+
+    Args:
+        seen: ``eye``, ``target`` and ``up`` (3,) in the viewer's world.
+        fov_deg: of the picture's height.
+        size: width and height.
+    """
+    query = {"file": f"/file/{name}", "fov": fov_deg} | {k: ",".join(map(repr, v.tolist())) for k, v in seen.items()}
+    with Page(f"{url}/page/{viewer}.html?{urlencode(query)}", profile, *size) as page:
+        page.wait("window.done === true || window.failure !== undefined", timeout_s=240)
         assert page.value("window.failure || null") is None
         return page.picture()
 
@@ -101,6 +114,7 @@ def shown(viewer: str, url: str, name: str, axes: str, profile: Path) -> np.ndar
     [
         ("playcanvas", "a.glb", "LUF", 3),
         ("babylon", "a.glb", "LUF", 3),
+        ("three", "a.glb", "LUF", 3),
         ("playcanvas", "a.compressed.ply", "RDF", 3),
         ("playcanvas", "a.ply", "RDF", 3),
         ("spark", "a.ply", "RDF", 3),
@@ -123,7 +137,55 @@ def test_same_picture(viewer, name, axes, degree, served, tmp_path):
 def test_same_picture_of_a_3d_tiles_content(viewer, served, tmp_path):
     """Its node lays right-down-front on its side: what 3D Tiles stands up again, the camera does here."""
     g = thing(0)
-    tiles3d.write_content(tmp_path / "a.glb", g)
+    tiles3d.write_content(tmp_path / "a.glb", g, compressed=False)
     # y up from the z up that is stored: (x, z, -y).
     picture = shown(viewer, served, "a.glb", "RFU", tmp_path / "profile")
     assert psnr(picture, truth(g)) > 25
+
+
+def on_earth() -> np.ndarray:
+    """(4, 4) from right-down-front to earth-centred axes, upright on the ellipsoid (WGS 84) at 9 E 48 N."""
+    longitude, latitude = np.radians([9.0, 48.0])
+    e2 = 6.69437999014e-3
+    up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([east, -up, np.cross(up, east)], axis=1)
+    T[:3, 3] = 6378137.0 / np.sqrt(1 - e2 * np.sin(latitude) ** 2) * up * [1, 1, 1 - e2]
+    return T
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_cesium_draws_a_tileset_on_the_earth(degree, served, tmp_path):
+    """Packed, in several tiles, and turned by the root: degree 3 shows whether SH are turned with it."""
+    g, T = thing(degree), on_earth()
+    formats.write(tmp_path / "site" / "tileset.json", g, transform=T, max_per_tile=100)
+    seen = {"eye": T[:3, :3] @ EYE + T[:3, 3], "target": T[:3, :3] @ TARGET + T[:3, 3], "up": T[:3, :3] @ UP}
+    picture = drawn("cesium", served, "site/tileset.json", seen, FOV_DEG, (SIZE, SIZE), tmp_path / "profile")
+    decibels = psnr(picture, truth(g))
+    assert decibels > 25
+    if degree:
+        assert decibels > psnr(picture, truth(replace(g, sh=g.sh[:, :1]))) + 5
+
+
+@pytest.mark.parametrize(("viewer", "least"), [("cesium", 35), ("three", 28)])
+def test_a_real_capture(viewer, least, served, tmp_path, shared_data):
+    """What a 3D Tiles export looks like; three.js lowers opacities as if every capture were trained antialiased."""
+    from gsmap.render import render
+
+    g = formats.read(shared_data / "house" / "c0.ply")
+    cameras = formats.read_cameras(shared_data / "house" / "c0.cameras.json")
+    if viewer == "cesium":
+        name, T = "site/tileset.json", on_earth()
+        formats.write(tmp_path / name, g, transform=T, max_per_tile=len(g))
+    else:
+        name, T = "a.glb", np.eye(4)
+        T[:3, :3] = axes_matrix("LUF", "RDF")
+        formats.write(tmp_path / name, g)
+    for k in (30, 60):
+        pose, (width, height) = T @ cameras.T_frame_camera[k], cameras.sizes_px[k].tolist()
+        seen = {"eye": pose[:3, 3], "target": pose[:3, 3] + pose[:3, 2], "up": -pose[:3, 1]}
+        fov_deg = 2 * np.degrees(np.arctan(height / 2 / cameras.intrinsics_px[k, 1]))
+        picture = drawn(viewer, served, name, seen, fov_deg, (width, height), tmp_path / f"profile{k}")
+        ours = np.clip(render(g, cameras[k], depth=False, dominant_id=False).colour[0], 0, 1)
+        assert psnr(picture, ours) > least

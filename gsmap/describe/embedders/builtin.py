@@ -87,6 +87,22 @@ class BuiltinEmbedder:
             rows.append(np.concatenate([np.sqrt(p / max(p.sum(), 1e-12)) for p in parts]) * self.weights)
         return np.stack(rows).astype(np.float32)
 
+    def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours alone: a picture by itself has no size in metres, no shape in space, and no known resolution.
+
+        Args:
+            rgb: (H, W, 3) uint8.
+
+        Returns:
+            (F,) features, and (F,) bool which of them are told.
+        """
+        lab = srgb_to_lab(rgb / 255.0)
+        told = np.repeat([True, False, False, False], _PARTS)
+        hue = _hues(lab, self.grey_chroma).of(slice(None))
+        out = np.zeros(sum(_PARTS))
+        out[: _PARTS[0]] = np.sqrt(hue / max(hue.sum(), 1e-12))
+        return (out * self.weights).astype(np.float32), told
+
     def _shape(self, points: np.ndarray) -> np.ndarray:
         values, axes = np.linalg.eigh(np.cov((points * self.unit_m).T) + 1e-8 * np.eye(3))
         spread = np.sqrt(values)

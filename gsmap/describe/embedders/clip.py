@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from PIL import Image
@@ -37,6 +37,13 @@ class Params:
 def make(context: SceneContext, params: Params) -> ClipEmbedder:
     """Open the encoder; see `gsmap.methods.embedder`."""
     return ClipEmbedder(params, context.models["clip"])
+
+
+def embed_text(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
+    """The vector (F,) of words, by the text tower of the same pack; see `gsmap.describe.onnx.text`."""
+    from gsmap.describe.onnx import text as tower
+
+    return tower.embed(text, models)
 
 
 def probe(spec: ModelSpec) -> None:
@@ -78,6 +85,13 @@ class ClipEmbedder:
         crops = np.stack([crop(view.rgb, m.pixels, self.size, self.params) for m in masks])
         features = self._run(normalise(crops, self.spec))
         return (features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+
+    def embed_picture(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `embed`, of one whole picture (H, W, 3) uint8; and (F,) bool: all of it is told."""
+        crops = crop(rgb, np.ones(rgb.shape[:2], bool), self.size, replace(self.params, margin=0.0))[None]
+        feature = self._run(normalise(crops, self.spec))[0]
+        unit = (feature / max(float(np.linalg.norm(feature)), 1e-12)).astype(np.float32)
+        return unit, np.ones(len(unit), bool)
 
     def _run(self, pictures: np.ndarray) -> np.ndarray:
         """(R, F) features of normalised pictures (R, H, W, 3)."""

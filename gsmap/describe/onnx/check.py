@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from gsmap.describe.onnx import text
 from gsmap.errors import ConfigError, NotFoundError
 from gsmap.methods import family
 from gsmap.networks import refuse_external_data
@@ -21,7 +22,7 @@ PRESETS = {  # mean and standard deviation of rgb in [0, 1]
 
 
 def kinds() -> dict[str, list[Any]]:
-    """Every kind of model that a segmenter, embedder or extractor names, and the methods that name it.
+    """Every kind of model that a segmenter, embedder or extractor names, and those methods; and what reads words.
 
     Raises:
         ConfigError: a method that names models and has no ``probe`` for them.
@@ -36,7 +37,7 @@ def kinds() -> dict[str, list[Any]]:
                 )
             for kind in method.MODELS:
                 found.setdefault(kind, []).append(method)
-    return found
+    return found | {kind: [] for kind in text.KINDS}
 
 
 def parse_preset(preset: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -82,10 +83,14 @@ def check_model(
     path = Path(path)
     if not path.is_file():
         raise NotFoundError(f"no model file at {path}")
+    if kind == text.TOKENIZER:
+        return text.check_tokenizer(path)
     refuse_external_data(path)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     limits = limits or ModelLimits()
     spec = ModelSpec(kind, str(path), sha256, preset, mean, std, *declared(path, sha256, limits), limits)
     for method in known[kind]:
         method.probe(spec)
+    if kind == text.TEXT:
+        text.probe_text(spec)
     return spec

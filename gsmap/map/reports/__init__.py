@@ -6,6 +6,7 @@ from gsmap.map.reports.pairs import EDGE_STATUSES, edge_row, edge_rows, pair_rep
 from gsmap.map.reports.revisions import made_after, pose_change_rows, revision_row, revision_rows, update_report
 from gsmap.map.reports.scenes import SCENE_STATUSES, ingest_row, pose_rows, scene_row, scene_rows
 from gsmap.map.reports.upkeep import check_report, export_report, model_rows, prune_report, setting_rows, tile_rows
+from gsmap.map.reports.world import world_report
 
 __all__ = [
     "EDGE_STATUSES",
@@ -34,4 +35,5 @@ __all__ = [
     "setting_rows",
     "tile_rows",
     "update_report",
+    "world_report",
 ]

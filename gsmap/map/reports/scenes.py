@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from gsmap.map.dates import is_after, is_until, last_of, parsed
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import one_of
+from gsmap.map.reports.world import world_positions
 from gsmap.store import Store
-from gsmap.types import Scene, ScenePose
+from gsmap.types import Scene, ScenePose, Sim3
 from gsmap.types.metre import Metre
 from gsmap.types.rows import IngestRow, PoseRow, SceneRow
 
@@ -44,8 +47,9 @@ def scene_rows(
     until = None if as_of is None else last_of(as_of)
     placed, nodes = store.revisions.poses(), store.graphs.node_counts()
     said = store.scenes.latest_notes()
+    _, found = world_positions(store, placed)
     rows = [
-        row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres)
+        row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres, found)
         for scene in store.scenes.list()
     ]
     return [
@@ -63,7 +67,8 @@ def scene_rows(
 def scene_row(store: Store, scene: Scene, metres: Mapping[int, Metre]) -> SceneRow:
     """The row of one scene."""
     placed, nodes = store.revisions.poses(scene.id), store.graphs.node_counts()
-    return row_of_scene(scene, placed, nodes.get(scene.id), store.scenes.latest_notes().get(scene.id, ""), metres)
+    note, (_, found) = store.scenes.latest_notes().get(scene.id, ""), world_positions(store, placed)
+    return row_of_scene(scene, placed, nodes.get(scene.id), note, metres, found)
 
 
 def row_of_scene(
@@ -72,9 +77,11 @@ def row_of_scene(
     num_nodes: int | None,
     note: str,
     metres: Mapping[int, Metre] | None = None,
+    in_world: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> SceneRow:
     pose = placed.get(scene.id)
     metre = metres.get(pose.component) if metres and pose else None
+    at = (in_world or {}).get(scene.id)
     return SceneRow(
         name=scene.name,
         id=scene.id,
@@ -89,13 +96,21 @@ def row_of_scene(
         tags=scene.tags,
         note=note,
         metres_per_unit=metre.metres_per_unit if metre and metre.is_known else None,
+        metric=None if at is None else at[0],
+        world=None if at is None else at[1],
     )
 
 
 @of_one_state
-def pose_rows(store: Store) -> list[PoseRow]:
-    """Where every placed living scene lies, oldest scene first."""
-    poses = store.revisions.poses()
+def pose_rows(store: Store, crs: str | None = None) -> list[PoseRow]:
+    """Where every placed living scene lies, oldest scene first.
+
+    Args:
+        crs: of the world coordinates; None for the map's own.
+    """
+    poses, ties = store.revisions.poses(), store.revisions.world()
+    tied = {tie.component: tie.S_world_map for tie in ties if tie.S_world_map is not None}
+    named, found = world_positions(store, poses, crs)
     return [
         PoseRow(
             scene=scene.id,
@@ -103,11 +118,18 @@ def pose_rows(store: Store) -> list[PoseRow]:
             component=poses[scene.id].component,
             status=poses[scene.id].status,
             S_map_scene=poses[scene.id].S_map_scene,
+            S_world_scene=_in_world(tied, poses[scene.id]),
+            world=found[scene.id][1] if scene.id in found else None,
+            crs=named if scene.id in found else None,
             covariance=poses[scene.id].covariance,
         )
         for scene in store.scenes.list()
         if scene.id in poses
     ]
+
+
+def _in_world(tied: Mapping[int, Sim3], pose: ScenePose) -> Sim3 | None:
+    return tied[pose.component] @ pose.S_map_scene if pose.component in tied else None
 
 
 def ingest_row(scene: Scene, *, new: bool, dated: bool, notes: Sequence[str]) -> IngestRow:

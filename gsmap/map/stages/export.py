@@ -23,6 +23,7 @@ from gsmap.map.jobs import TileMaker
 from gsmap.map.metres import map_metres, metre_notes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
+from gsmap.map.world import InWorld, in_world, world_notes
 from gsmap.merge import reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.sights import SightStore
 from gsmap.store import Store
@@ -55,6 +56,7 @@ class Request:
     steps: int | None = None
     budget_s: float | None = None
     provenance: bool = False
+    uncompressed: bool = False
     prefer: str | None = None
     as_of: str | None = None
 
@@ -80,6 +82,7 @@ _OPTIONS = {
     "steps": "--steps",
     "budget_s": "--budget",
     "provenance": "--provenance",
+    "uncompressed": "--uncompressed",
     "prefer": "--prefer",
     "as_of": "--as-of",
 }
@@ -97,6 +100,7 @@ class Planned:
         tiles: what the folder is to hold.
         notes: what a person should know of what takes part.
         metres: how long a metre is in the frame of each component of the poses.
+        world: where those lie that are tied to the world.
     """
 
     revision: int | None
@@ -107,6 +111,7 @@ class Planned:
     tiles: list[PlannedTile]
     notes: tuple[str, ...] = ()
     metres: Mapping[int, Metre] = field(default_factory=dict)
+    world: Mapping[int, InWorld] = field(default_factory=dict)
 
 
 def plan(store: Store, request: Request, settings: Settings) -> Planned:
@@ -117,7 +122,9 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         params = with_steps(method, params, request.steps)
     if request.prefer is not None:
         params = with_prefer(method, params, request.prefer)
-    recipe = TileRecipe(recipe_key(method, params), request.format, request.provenance, request.budget_s)
+    recipe = TileRecipe(
+        recipe_key(method, params), request.format, request.provenance, request.budget_s, request.uncompressed
+    )
     _check(request, recipe)
     revision = store.revisions.current() if request.revision is None else request.revision
     graph, placed = _placed(store, revision, request.component)
@@ -132,6 +139,8 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
     exported = {pose.component for pose in placed.values()}
     metres = {component: metre for component, metre in metres.items() if component in exported}
     notes += metre_notes(metres)
+    world = in_world(graph, exported)
+    notes += world_notes(world, request.format)
     tiles = plan_tiles(
         {scene: pose.S_map_scene for scene, pose in placed.items()},
         {scene: found.bounds for scene, found in scenes.items()},
@@ -142,7 +151,7 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         max_tiles=settings.export.max_tiles,
     )
-    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres)
+    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres, world)
 
 
 def export(
@@ -208,6 +217,7 @@ def _export(
             map_id=store.id,
             recipe=planned.recipe,
             metres=planned.metres,
+            world={component: one.told() for component, one in planned.world.items()},
             params=settings.export,
             run=lambda job, arguments: run_jobs(job, arguments, settings.engine),
             made=noted,
@@ -216,7 +226,11 @@ def _export(
     _put_aside(store, out, planned, result)
     if planned.recipe.is_tileset and is_stale(out, result.tiles):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
-        write_tilesets(out, result.tiles, request.tile_size_m, in_metres_of)
+        S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}
+        compressed = not request.uncompressed
+        write_tilesets(
+            out, result.tiles, request.tile_size_m, in_metres_of, S_ecef_map=S_ecef_map, compressed=compressed
+        )
     if store.catalog.writable:
         refused = ""
         try:  # what an interrupted export, or one that could not be noted, left untold is told now

@@ -20,6 +20,8 @@ from gsmap.store import Store
 from gsmap.types import Edge, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
 from gsmap.types.progress import StageProgress
+from gsmap.types.world import Survey
+from gsmap.world.survey import in_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,7 @@ class PoseBasis:
         same_visits: (target, source) of the edges between captures that are known to be of about one time.
         priors: outside knowledge.
         ups: (3,) direction against gravity in the scene's frame, by scene id, where it is known.
+        observed: what was observed of the world, as it was told.
         key: the recipe with all of these, and the edges that may be used, as its inputs.
     """
 
@@ -38,6 +41,7 @@ class PoseBasis:
     same_visits: set[tuple[str, str]]
     priors: list[Prior]
     ups: dict[str, np.ndarray]
+    observed: Survey
     key: RecipeKey
 
 
@@ -57,8 +61,10 @@ def pose_basis(store: Store, settings: Settings) -> PoseBasis:
     ups = _ups(store, living, {key.digest for key in graph_keys(store, living, settings).values()})
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
     recipe = solver.recipe_key(settings.optimize)
-    key = recipe.of(*(scene.id for scene in living), *named, canonical(told), canonical(ups))
-    return PoseBasis([scene.id for scene in living], same_visits, priors, ups, key)
+    observed = store.world.survey()
+    seen = [canonical(observed)] if observed else []  # as it was told: the same key wherever PROJ is another
+    key = recipe.of(*(scene.id for scene in living), *named, canonical(told), canonical(ups), *seen)
+    return PoseBasis([scene.id for scene in living], same_visits, priors, ups, observed, key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +73,11 @@ class PoseInputs(PoseBasis):
 
     Args:
         edges: those that may be used, by (target, source).
+        survey: what was observed of the world, in its frame.
     """
 
     edges: list[Edge]
+    survey: Survey
 
 
 @of_one_state
@@ -89,7 +97,7 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
         for stored in store.registrations.usable()
         if stored.registration.S_target_source is not None and stored.registration.information is not None
     ]
-    return PoseInputs(**vars(basis), edges=edges)
+    return PoseInputs(**vars(basis), edges=edges, survey=in_frame(basis.observed))
 
 
 def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool:
@@ -107,11 +115,14 @@ def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dic
 
 def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
     """Solve for all poses and keep the answer as a new revision; returns its number."""
-    given = pose_inputs(store, settings)
+    return _optimize(store, pose_inputs(store, settings), settings, progress)
+
+
+def _optimize(store: Store, given: PoseInputs, settings: Settings, progress: StageProgress) -> int:
     progress("optimize", 0.0, "poses")
     previous: PoseGraph | None = store.revisions.get()
     fixed = {prior.scene for prior in given.priors}
-    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, settings.optimize)
+    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, settings.optimize, survey=given.survey)
     answer = solver.gravity_align(answer, given.ups, fixed=fixed, params=settings.optimize.gravity)
     number = store.revisions.save(solver.kept_still(answer, previous, given.edges, settings.optimize), given.key)
     progress("optimize", 1.0, f"revision {number}")
@@ -124,11 +135,12 @@ def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
     One process does it at a time: others wait, and then need not.
     """
     told = False
-    while not is_solved(store, settings):
+    while not _is_of(store, pose_basis(store, settings)):
         if store.leases.try_hold("poses", "optimize"):
             try:
-                if not is_solved(store, settings):
-                    optimize(store, settings, progress)
+                given = pose_inputs(store, settings)
+                if not _is_of(store, given):
+                    _optimize(store, given, settings, progress)
             finally:
                 store.leases.release(["poses"])
             return True
@@ -142,5 +154,10 @@ def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
 
 def is_solved(store: Store, settings: Settings) -> bool:
     """Whether the newest revision is what this recipe makes of what the map knows now."""
+    return _is_of(store, pose_basis(store, settings))
+
+
+def _is_of(store: Store, basis: PoseBasis) -> bool:
+    """Whether the newest revision is what was solved from this."""
     newest = store.revisions.newest()
-    return newest is not None and newest.key == pose_basis(store, settings).key.digest
+    return newest is not None and newest.key == basis.key.digest

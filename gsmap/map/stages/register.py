@@ -22,8 +22,8 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import Standing, StoredRegistration
-from gsmap.types import PoseGraph, Registration, Scene, Sim3
+from gsmap.store.registrations import StoredRegistration, Tried
+from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
 
 Pair = tuple[str, str]
@@ -114,9 +114,9 @@ class _Known:
         self._work = work
         self._graphs = {scene: key.digest for scene, key in work.graphs.items()}
         self._digests: dict[Pair, str] = {}  # of registrations, by (target, source)
-        self._standing = {directed(one.target, one.source): one for one in work.store.registrations.standing()}
+        self._standing = {directed(one.target, one.source): one for one in work.store.registrations.tried()}
         if adopted := [pair for pair, one in self._standing.items() if self._adopt(one)]:
-            changed = {directed(one.target, one.source): one for one in work.store.registrations.standing()}
+            changed = {directed(one.target, one.source): one for one in work.store.registrations.tried()}
             self._standing |= {pair: changed[pair] for pair in adopted}
         bar = work.settings.optimize.aliasing.max_disagreement
         current = {pair: one for pair, one in self._standing.items() if one.is_told or one.key in self._keys(one)}
@@ -138,10 +138,10 @@ class _Known:
         """All that it has registered."""
         return {pair for pair, one in self._standing.items() if self._has(one)}
 
-    def _has(self, one: Standing) -> bool:
+    def _has(self, one: Tried) -> bool:
         return any(key in one.keys for key in self._keys(one))
 
-    def _keys(self, one: Standing) -> Iterator[str]:
+    def _keys(self, one: Tried) -> Iterator[str]:
         """What the pair's registration would be kept under, in its own direction and in the other."""
         if one.target in self._graphs and one.source in self._graphs:
             yield self._digest(one.target, one.source)
@@ -154,7 +154,7 @@ class _Known:
             self._digests[target, source] = known
         return known
 
-    def _adopt(self, one: Standing) -> bool:
+    def _adopt(self, one: Tried) -> bool:
         if one.is_told or one.key in self._keys(one) or not self._has(one):
             return False
         known = [self._work.store.registrations.find(key) for key in self._keys(one)]
@@ -212,7 +212,7 @@ def stale(current: Iterable[StoredRegistration], graphs: Mapping[str, RecipeKey]
     return [
         (a, b)
         for a, b, key in ends
-        if {a, b} <= set(graphs) and key != recipe.of(graphs[a].digest, graphs[b].digest).digest
+        if {a, b} <= set(graphs) and key != recipe.digest_of(graphs[a].digest, graphs[b].digest)
     ]
 
 
@@ -321,9 +321,8 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
 def placed_scenes(store: Store) -> dict[str, Placed]:
     """Where scenes lie by the newest poses, for finding neighbours."""
     bounds = {scene.id: scene.bounds for scene in store.scenes.list()}
-    graph: PoseGraph | None = store.revisions.get()
     placed = {}
-    for scene, pose in (graph.poses if graph else {}).items():
+    for scene, pose in store.revisions.poses().items():
         if scene in bounds:
             S = pose.S_map_scene
             radius = S.scale * float(np.linalg.norm(np.diff(bounds[scene], axis=0))) / 2

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from gsmap.durable import open_file
 from gsmap.errors import CorruptError, NotFoundError, StoreError
 from gsmap.settings import FILE_NAME as SETTINGS
 from gsmap.store import catalog as _catalog
@@ -26,7 +25,7 @@ from gsmap.store.copying import copy_catalog, empty_catalog
 from gsmap.store.explained import explained
 from gsmap.store.layout import mend
 from gsmap.store.models import FOLDER as MODELS
-from gsmap.store.places import CHUNK_BYTES
+from gsmap.store.places import chunks_of
 
 if TYPE_CHECKING:
     from gsmap.store.store import Store
@@ -200,7 +199,7 @@ def _bytes_of(store: Store, file: StoredFile, path: Path) -> Iterator[bytes]:
     if top == MODELS:
         store.arrays.bring_model(file.path)
     if top != ARRAYS:
-        return _chunks(path)
+        return chunks_of(path)
     kind, group, *within = rest
     return store.arrays.chunks(kind, group, replace(file, path="/".join(within)))
 
@@ -227,12 +226,6 @@ def checked(chunks: Iterator[bytes], file: StoredFile, what: str) -> Iterator[by
         raise CorruptError(f"{what} does not have the {file.size_bytes} bytes that were written")
     if digest.hexdigest() != file.sha256:
         raise CorruptError(f"{what} differs from what was written")
-
-
-def _chunks(path: Path) -> Iterator[bytes]:
-    with open(open_file(path), "rb") as opened:
-        while chunk := opened.read(CHUNK_BYTES):
-            yield chunk
 
 
 def _capture_catalog(source: Catalog, folder: Path) -> State:

@@ -12,9 +12,11 @@ from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, S
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
 from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.find import FindHit, FindReport
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
 from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
+from gsmap.types.rows.localize_scan import ScanRow, ScanSupport
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -56,8 +58,10 @@ from gsmap.types.rows.truth import (
     PoseErrorRow,
 )
 from gsmap.types.rows.values import BranchRow, MergeReport, PurgeReport, SplitReport
+from gsmap.types.rows.world import MeasureReport, PlaceRow, ResidualRow, TieRow, WorldReport
 
 __all__ = [
+    "SCHEMA",
     "AtWorkRow",
     "BackupReport",
     "BandRow",
@@ -76,6 +80,8 @@ __all__ = [
     "EvaluationReport",
     "ExportReport",
     "FactRow",
+    "FindHit",
+    "FindReport",
     "GraphRow",
     "HistoryReport",
     "ImageErrorRow",
@@ -85,8 +91,9 @@ __all__ = [
     "LocalizeReport",
     "LocalizeRow",
     "MapStatus",
-    "MetreRow",
+    "MeasureReport",
     "MergeReport",
+    "MetreRow",
     "MigrateReport",
     "ModelRow",
     "NeesRow",
@@ -96,6 +103,7 @@ __all__ = [
     "PairEventRow",
     "PairRef",
     "PairReport",
+    "PlaceRow",
     "PoseChangeRow",
     "PoseErrorRow",
     "PoseRow",
@@ -103,10 +111,12 @@ __all__ = [
     "PruneReport",
     "PurgeReport",
     "RelationRow",
+    "ResidualRow",
     "RestoreReport",
     "RevisionRow",
     "Row",
-    "SCHEMA",
+    "ScanRow",
+    "ScanSupport",
     "SceneEdgeRow",
     "SceneRef",
     "SceneReport",
@@ -117,6 +127,7 @@ __all__ = [
     "SplitReport",
     "ThinReport",
     "ThinRow",
+    "TieRow",
     "TileRow",
     "TodoRow",
     "TrustReport",
@@ -124,4 +135,5 @@ __all__ = [
     "ViewReport",
     "WhyReport",
     "WhyStep",
+    "WorldReport",
 ]

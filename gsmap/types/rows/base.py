@@ -36,6 +36,14 @@ class Row:
     __hash__ = None  # type: ignore[assignment]
 
 
+def coordinates(world: np.ndarray | None) -> str | None:
+    """World coordinates as a table shows them: to a tenth of a millimetre, whatever their size."""
+    if world is None:
+        return None
+    degrees = abs(world[0]) <= 360 and abs(world[1]) <= 90
+    return " ".join(f"{value:.{9 if degrees and k < 2 else 4}f}" for k, value in enumerate(np.asarray(world).tolist()))
+
+
 def _json(value: Any) -> Any:
     if isinstance(value, Row):
         return value.to_json()

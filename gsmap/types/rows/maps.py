@@ -20,11 +20,12 @@ class TodoRow(Row):
 
     Args:
         what: ``undescribed`` scenes; ``stale_graphs``, made by other settings or another version; ``unregistered``
-            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews or priors are
-            newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes; ``undecided``
-            edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``; ``duplicates``, pairs that
-            are one capture twice; ``isolated`` scenes; ``set_aside``, work that twice ended the process it ran in and
-            is left out until it is asked for by name.
+            scenes, never tried with another one; ``stale_edges``; ``unsolved`` (scenes, edges, reviews, priors or
+            observations are newer than the poses); ``stale_poses``; ``dirty_tiles`` of an export; ``tentative`` scenes;
+            ``undecided`` edges; ``changes`` that nobody confirmed or rejected; ``contradicted_priors``;
+            ``world_outliers``, observations of the world that contradict the others; ``untied`` components, whose place
+            in the world is not determined; ``duplicates``, pairs that are one capture twice; ``isolated`` scenes;
+            ``set_aside``, work that twice ended the process it ran in and is left out until it is asked for by name.
         count: how many; 1 for ``unsolved``, ``stale_poses`` and ``set_aside``.
         verb: the command that helps.
         meaning: the same in words.
@@ -46,9 +47,10 @@ class MetreRow(Row):
         component: its index.
         metres_per_unit: metres in a unit of its frame: of its poses and of its tiles.
         metre_sigma: standard deviation of its logarithm (0.01 is one percent); null where it is unknown.
-        metre_known_by: ``measured`` (by captures that are said to be in metres), ``told`` (a person gave metres per
-            unit of a capture), ``assumed`` (nobody said so, but the captures' own unit may well be the metre),
-            ``guessed`` (from how far cameras stand from what they see), ``unknown`` (1 is taken).
+        metre_known_by: ``surveyed`` (by control points, positions or scale bars), ``measured`` (by captures
+            that are said to be in metres), ``told`` (a person gave metres per unit of a capture), ``assumed``
+            (nobody said so, but the captures' own unit may well be the metre), ``guessed`` (from how far
+            cameras stand from what they see), ``unknown`` (1 is taken).
         metre_note: what a person should know of it; empty where nothing.
     """
 

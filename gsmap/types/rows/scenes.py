@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from gsmap.types.rows.base import Row
+from gsmap.types.rows.base import Row, coordinates
 from gsmap.types.sim3 import Sim3
 
 
@@ -46,6 +46,9 @@ class SceneRow(Row):
         tags: labels that people gave it.
         note: what people noted of it.
         metres_per_unit: metres in a unit of the frame it is placed in, see ``gsmap status``; null where nothing tells.
+        metric: (3,) where its origin lies, metres east, north, up of the world frame; null where the map is not tied to
+            the world (``gsmap georeference``).
+        world: (3,) the same in the map's CRS; null as above.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -58,6 +61,7 @@ class SceneRow(Row):
         "captured_at": "captured",
         "tags": "tags",
         "metres_per_unit": "m a unit",
+        "in_world": "world",
     }
 
     name: str
@@ -73,6 +77,13 @@ class SceneRow(Row):
     tags: tuple[str, ...] = ()
     note: str = ""
     metres_per_unit: float | None = None
+    metric: np.ndarray | None = None
+    world: np.ndarray | None = None
+
+    @property
+    def in_world(self) -> str | None:
+        """World coordinates of its origin, for people."""
+        return coordinates(self.world)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -348,7 +359,10 @@ class PoseRow(Row):
         component: index of its connected component, largest first; components share no frame.
         status: ``placed``, ``tentative`` or ``isolated``, as in `SceneRow`.
         S_map_scene: its pose in the frame of its component.
-        S_world_scene: its pose in the world; null where the map does not know the world's frame.
+        S_world_scene: its pose in the world frame (metres east, north, up); null where the map is not tied to the
+            world.
+        world: (3,) where its origin lies in the CRS; null as above.
+        crs: of that; null as above.
         covariance: (7, 7) over [rotation (3, rad), translation (3), log scale] on the scene side; null where it is not
             known.
     """
@@ -359,6 +373,7 @@ class PoseRow(Row):
         "status": "status",
         "position": "position",
         "scale": "scale",
+        "in_world": "world",
     }
 
     scene: str
@@ -368,6 +383,8 @@ class PoseRow(Row):
     S_map_scene: Sim3
     S_world_scene: Sim3 | None = None
     covariance: np.ndarray | None = None
+    world: np.ndarray | None = None
+    crs: str | None = None
 
     @property
     def position(self) -> np.ndarray:
@@ -378,3 +395,8 @@ class PoseRow(Row):
     def scale(self) -> float:
         """Map units per unit of the scene."""
         return self.S_map_scene.scale
+
+    @property
+    def in_world(self) -> str | None:
+        """World coordinates of its origin, for people."""
+        return coordinates(self.world)

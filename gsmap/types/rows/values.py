@@ -58,6 +58,7 @@ class MergeReport(Row):
         num_reviews: reviews of pairs.
         num_facts: names, dates, notes and tags.
         num_priors: priors.
+        num_observations: observations of the world.
         num_models: models.
         num_comparisons: pairs that were looked at for changes.
         num_change_reviews: reviews of changes.
@@ -88,6 +89,7 @@ class MergeReport(Row):
     num_reviews: int
     num_facts: int
     num_priors: int
+    num_observations: int
     num_models: int
     num_comparisons: int
     num_change_reviews: int

@@ -1,0 +1,59 @@
+"""gsmap find: places that are like what is asked for."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
+from gsmap.errors import ConfigError
+
+
+def command(
+    map: MapPath,
+    text: Annotated[
+        str | None, typer.Argument(metavar="[TEXT]", help="Words; the map's image encoder needs its text tower.")
+    ] = None,
+    picture: Annotated[
+        str | None, typer.Option("--picture", metavar="FILE", help="A picture that shows such a thing.")
+    ] = None,
+    like: Annotated[
+        str | None,
+        typer.Option("--like", metavar="SCENE:NODE", help="An object of a scene (`show --picture`), or of `graph`."),
+    ] = None,
+    at: Annotated[str | None, typer.Option("--at", metavar="X,Y,Z", help="What stands at a point of the map.")] = None,
+    top: Annotated[int, typer.Option("--top", help="How many hits at most.")] = 10,
+    pictures: Annotated[
+        str | None, typer.Option("--pictures", metavar="DIR", help="Draw each hit in this folder.")
+    ] = None,
+    sets: Sets = None,
+    preset: Preset = None,
+    json: AsJson = False,
+) -> None:
+    """Find things in all captures: by one of them, a point, a picture, or words. Ranked, with place, object and dates.
+
+    Example: `gsmap find site.gsmap --like monday:12 --pictures found`
+    """
+    from gsmap.types.rows import FindHit
+
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
+        report = m.find(text, picture=picture, like=like, at=_point(at), top=top, pictures=pictures)
+    for note in report.notes:
+        say(note)
+    if json:
+        print_rows("find", report, json)
+        return
+    known = f"{report.described} of {report.placed} captures"
+    say(f"{report.query}: by {report.by} of things, embedder {report.embedder}, {known}")
+    columns = dict(FindHit.columns)
+    if pictures is None:
+        del columns["picture"]
+    print_table("hits", columns, report.hits)
+
+
+def _point(text: str | None) -> list[float] | None:
+    try:
+        return None if text is None else [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {text!r}") from error

@@ -1,0 +1,139 @@
+"""gsmap georeference: tie a map to the world."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, Sets, opened, print_facts, print_rows, print_table, say
+
+if TYPE_CHECKING:
+    from gsmap.map import Map
+    from gsmap.map.stages.georeference import Localise
+    from gsmap.types.rows import WorldReport
+
+
+def command(
+    map: MapPath,
+    crs: Annotated[
+        str | None,
+        typer.Option("--crs", metavar="EPSG:N", help="The coordinate reference system that the map speaks in."),
+    ] = None,
+    gcp: Annotated[
+        str | None,
+        typer.Option("--gcp", metavar="FILE", help="Control points in photos, as OpenDroneMap has them: gcp_list.txt."),
+    ] = None,
+    photos: Annotated[
+        str | None,
+        typer.Option(
+            "--photos", metavar="DIR", help="Where photos of --gcp lie that are of no capture; localised first."
+        ),
+    ] = None,
+    exif: Annotated[
+        str | None,
+        typer.Option("--exif", metavar="DIR", help="Photos of the captures whose EXIF says where they were taken."),
+    ] = None,
+    scale_bar: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(
+            "--scale-bar", metavar="A B METRES", help="A distance between SCENE:X,Y,Z or SCENE:CAMERA@COLUMN,ROW."
+        ),
+    ] = None,
+    check: Annotated[
+        str | None,
+        typer.Option("--check", metavar="NAME,...", help="Control points to hold out and compare with; '' for none."),
+    ] = None,
+    sigma: Annotated[
+        float | None, typer.Option("--sigma", metavar="M", help="Of control points or the scale bar; .01, or .2 %.")
+    ] = None,
+    height_sigma: Annotated[
+        float | None, typer.Option("--height-sigma", metavar="M", help="Of heights of control points; as --sigma.")
+    ] = None,
+    photo_size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(
+            "--photo-size", metavar="WIDTH HEIGHT", help="Of the photos that pixels of --gcp are of, if larger."
+        ),
+    ] = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Take back what was observed: all, or --name.")] = False,
+    name: Annotated[
+        list[str] | None, typer.Option("--name", help="With --remove: a control point, photo, or scale bar.")
+    ] = None,
+    sets: Sets = None,
+    json: AsJson = False,
+) -> None:
+    """Tie a map to the world by control points, positions of photos and lengths; alone, show how well they fit.
+
+    Example: `gsmap georeference site.gsmap --crs EPSG:25832 --gcp gcp_list.txt --check P4,P7`
+    """
+    from gsmap.errors import ConfigError
+    from gsmap.map.stages.georeference import Request
+
+    said = any(one is not None for one in (crs, gcp, exif, scale_bar, check))
+    if remove and said:
+        raise ConfigError("--remove takes back what was observed: leave out the other options, but --name")
+    if name and not remove:
+        raise ConfigError("--name goes with --remove")
+    if not said and (sigma is not None or height_sigma is not None or photo_size is not None):
+        raise ConfigError("--sigma, --height-sigma and --photo-size go with --gcp or --scale-bar")
+    for value in (sigma, height_sigma, *(photo_size or ())):
+        if value is not None and not value > 0:
+            raise ConfigError("--sigma, --height-sigma and --photo-size must be positive")
+    sigmas = None if sigma is None and height_sigma is None else (sigma or 0.01, height_sigma or sigma or 0.01)
+    request = Request(
+        crs=crs,
+        gcp=gcp,
+        exif=exif,
+        bars=() if scale_bar is None else (scale_bar,),
+        check=None if check is None else tuple(one.strip() for one in check.split(",") if one.strip()),
+        sigma_m=sigmas,
+        bar_sigma_m=sigma if scale_bar is not None else None,
+        photo_size_px=photo_size,
+    )
+    if photos is not None and gcp is None:
+        raise ConfigError("--photos goes with --gcp")
+    with opened(map, bars=True, sets=sets) as m:
+        localise = None if photos is None else _localiser(m, photos)
+        taken_back = tuple(name or ()) if remove else None
+        report = m.georeference(request if said else None, remove=taken_back, localise=localise)
+    for note in report.notes:
+        say(note)
+    if json:
+        print_rows("georeference", report, json)
+    else:
+        _print(map, report)
+
+
+def _localiser(m: Map, folder: str) -> Localise:
+    from gsmap.errors import ConfigError
+    from gsmap.map.placed_photos import localiser
+
+    localize = getattr(m, "localize", None)
+    if localize is None:
+        raise ConfigError("this gsmap cannot localise photos: leave out --photos, and use photos of captures")
+    return localiser(m.store, localize, folder)
+
+
+def _print(map: str, report: WorldReport) -> None:
+    from gsmap.types.rows import ResidualRow, TieRow
+
+    heights = "of the CRS" if report.own_heights else "above the ellipsoid"
+    origin = (
+        None if report.origin is None else f"{report.origin[0]:.4f} N, {report.origin[1]:.4f} E, {report.origin[2]:g} m"
+    )
+    facts = {
+        "CRS": None if report.crs is None else f"{report.crs} ({report.crs_name})",
+        "heights": None if report.crs is None else heights,
+        "frame": None if origin is None else f"metres east, north, up at {origin}",
+        "unseen points": ", ".join(report.unseen),
+        "stale": f"observations have changed: run gsmap optimize {map}" if report.stale else None,
+    }
+    print_facts("world", facts)
+    for tie in report.components:
+        print_table(f"component {tie.component}", TieRow.columns, [tie])
+        print_table("residuals", ResidualRow.columns, tie.residuals)
+        for note in tie.notes:
+            say(f"component {tie.component}: {note}")
+        if tie.problem:
+            say(f"component {tie.component} is not tied to the world: {tie.problem}")

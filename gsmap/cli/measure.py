@@ -1,0 +1,40 @@
+"""gsmap measure: a distance in metres."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table, say
+
+_POINT = "X,Y,Z in the map; SCENE:X,Y,Z; SCENE:CAMERA@COLUMN,ROW; world:X,Y,Z or EPSG:N:X,Y,Z."
+
+
+def command(
+    map: MapPath,
+    a: Annotated[str, typer.Argument(metavar="A", help=_POINT)],
+    b: Annotated[str, typer.Argument(metavar="B", help="Another one.")],
+    component: Annotated[
+        int | None, typer.Option("--component", "--island", help="Of points given in the map, where it has several.")
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option("--crs", metavar="EPSG:N", help="Of the world coordinates shown; else the map's own.")
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Measure how far two points are apart, in metres, with the standard deviation of that.
+
+    Example: `gsmap measure site.gsmap monday:1.2,0.4,2.0 monday:0007.jpg@812,410`
+    """
+    from gsmap.types.rows import PlaceRow
+
+    with opened(map) as m:
+        report = m.measure(a, b, component=component, crs=crs)
+    for note in report.notes:
+        say(note)
+    if json:
+        print_rows("measure", report, json)
+        return
+    print(f"{report.distance_m:.4f} m +- {report.sigma_m:.2g} m ({report.known_by})")
+    print_table("points", PlaceRow.columns, [report.a, report.b])

@@ -1,0 +1,149 @@
+"""Words as an embedder's vectors: a text tower (``clip-text``, ONNX) and its tokenizer (``clip-tokenizer``, the
+``tokenizer.json`` that is published beside it), both of the pack that the image encoder ``clip`` is of."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import ConfigError, InputError, MissingDependencyError, NotFoundError
+from gsmap.networks.session import misfit, open_session, run
+from gsmap.types.model import ModelSpec, Tensor
+
+TEXT, TOKENIZER = "clip-text", "clip-tokenizer"
+KINDS = (TEXT, TOKENIZER)
+
+_MAX_CHARACTERS = 1000
+_MAX_BYTES = 64 << 20  # of a tokenizer: those that are published have two to twenty
+_CONTEXT = 77  # tokens that CLIP was trained on; for towers that leave it free
+_OUTPUTS = ("text_embeds", "text_embedding", "embedding", "embeddings", "sentence_embedding", "pooler_output")
+_IMAGE_DIMS = 4
+
+
+def embed(text: str, models: Mapping[str, ModelSpec]) -> np.ndarray:
+    """The unit vector (F,) float32 of some words.
+
+    Raises:
+        ConfigError: the map lacks the tower or its tokenizer; what to add is said.
+        InputError: words that are too long, or a tower that does not run on them.
+        MissingDependencyError: the package tokenizers is not installed.
+    """
+    missing = [kind for kind in KINDS if kind not in models]
+    if missing:
+        files = {TEXT: "TEXT.onnx", TOKENIZER: "tokenizer.json"}
+        verbs = " and ".join(f"gsmap models add MAP {kind} {files[kind]}" for kind in missing)
+        raise ConfigError(
+            f"words are looked for by the text tower of the map's image encoder, which the map lacks: {verbs}; or show "
+            "a thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z"
+        )
+    if len(text) > _MAX_CHARACTERS:
+        raise InputError(f"{len(text)} characters are more than a text tower reads: use a few words")
+    spec = models[TEXT]
+    fixed = _ids_of(spec).shape[1]
+    ids, mask = _tokens(text, models[TOKENIZER], fixed or _CONTEXT, pad=fixed is not None)
+    found = _run(spec, ids, mask)
+    norm = float(np.linalg.norm(found))
+    if not np.isfinite(norm) or norm <= 0:
+        raise InputError(f"model {TEXT} ({spec.path}) says nothing of {text!r}: its vector has no direction")
+    return (found / norm).astype(np.float32)
+
+
+def probe_text(spec: ModelSpec) -> None:
+    """Refuse a model that is no text tower; it is run once.
+
+    Raises:
+        InputError: its inputs and outputs do not fit, or it does not run.
+    """
+    if any(len(tensor.shape) == _IMAGE_DIMS for tensor in spec.inputs):
+        raise misfit(spec, "it takes pictures as well: export the text tower by itself")
+    if not spec.outputs:
+        raise misfit(spec, "it gives nothing")
+    length = _ids_of(spec).shape[1] or _CONTEXT
+    ids = np.zeros((1, length), np.int64)
+    _run(spec, ids, np.ones_like(ids))
+
+
+def check_tokenizer(path: Path) -> ModelSpec:
+    """Check that a file is a ``tokenizer.json``; it is kept beside the models, and is none.
+
+    Raises:
+        InputError: it is not.
+        MissingDependencyError: the package tokenizers is not installed.
+    """
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f"{path} is larger than any tokenizer: give the tokenizer.json of the model pack")
+    _tokenizer(path)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    return ModelSpec(TOKENIZER, str(path), sha256, "unit", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (), ())
+
+
+def _tokens(text: str, spec: ModelSpec, length: int, *, pad: bool) -> tuple[np.ndarray, np.ndarray]:
+    """(1, L) ids of the tokens of a text, and (1, L) 1 where there is one.
+
+    Args:
+        length: tokens at most.
+        pad: to that many: by the tokenizer's own token for it, else by the one that ends a text, as CLIP does.
+    """
+    path = Path(spec.path)
+    if not path.is_file():
+        raise NotFoundError(f"the tokenizer is missing: {path}; add it again with gsmap models add")
+    if hashlib.sha256(path.read_bytes()).hexdigest() != spec.sha256:
+        raise InputError(f"the tokenizer has changed since it was added: {path}; add it again")
+    tokenizer = _tokenizer(path)
+    own = tokenizer.padding
+    tokenizer.no_padding()
+    tokenizer.enable_truncation(max_length=length)
+    ids = list(tokenizer.encode(text).ids)
+    if not ids:
+        raise InputError(f"the tokenizer {path} makes nothing of {text!r}")
+    empty = int(own["pad_id"]) if own else ids[-1]
+    rest = length - len(ids) if pad else 0
+    found = np.array([ids + [empty] * rest], np.int64)
+    return found, np.array([[1] * len(ids) + [0] * rest], np.int64)
+
+
+def _tokenizer(path: Path) -> Any:
+    try:
+        from tokenizers import Tokenizer
+    except ImportError as error:
+        raise MissingDependencyError(
+            "words are read by tokenizers, which is not installed: pip install 'gsmap[text]'"
+        ) from error
+    try:
+        return Tokenizer.from_file(str(path))
+    except Exception as error:  # it raises plain exceptions, whatever is wrong
+        raise InputError(f"{path} is not a tokenizer.json that can be read: {error}") from error
+
+
+def _ids_of(spec: ModelSpec) -> Tensor:
+    """The input that takes the tokens."""
+    takes = [t for t in spec.inputs if len(t.shape) == 2 and not any(w in t.name for w in ("mask", "type", "position"))]
+    if len(takes) != 1:
+        raise misfit(spec, "a text tower takes tokens of shape (N, L), and perhaps a mask of that shape")
+    return takes[0]
+
+
+def _run(spec: ModelSpec, ids: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(F,) what the tower gives for the tokens of one text."""
+    feed = {}
+    for tensor in spec.inputs:
+        value = ids
+        if "mask" in tensor.name:
+            value = mask
+        elif "type" in tensor.name:
+            value = np.zeros_like(ids)
+        elif "position" in tensor.name:
+            value = np.arange(ids.shape[1])[None]
+        rows = tensor.shape[0] or 1
+        feed[tensor.name] = np.repeat(value, rows, axis=0).astype(np.int32 if tensor.dtype == "int32" else np.int64)
+    named = [tensor.name for tensor in spec.outputs if tensor.name in _OUTPUTS]
+    flat = [tensor.name for tensor in spec.outputs if len(tensor.shape) == 2]
+    output = (named or flat or [spec.outputs[0].name])[0]
+    found = np.asarray(run(spec, open_session(spec), [output], feed)[0], np.float32)
+    if found.ndim != 2 or not found.shape[1]:
+        raise misfit(spec, f"its output {output} has shape {list(found.shape)}: one vector a text is needed")
+    return found[0]

@@ -1,0 +1,84 @@
+"""What a person shows or says, as the vectors that nodes have."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from gsmap.describe.objects.layer import Params, resolved
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.methods import family
+from gsmap.types.model import ModelSpec
+from gsmap.types.views import Cloud, SceneContext
+
+_LEAST_PX, _MOST_PX = 8, 512  # sides: fewer show nothing, more say no more
+
+
+def embedded_picture(
+    path: str | os.PathLike[str], params: Params, models: Mapping[str, ModelSpec]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the embedder of nodes makes of a picture of one thing: features (F,), and (F,) bool which it can tell.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: no picture, or one too small to show anything.
+        ConfigError: the embedder reads no pictures by themselves, or its model is missing.
+    """
+    rgb = _picture(Path(path))
+    chosen = resolved(params, models)
+    name = chosen.params.embedder
+    method = family("embedder").get(name)
+    lacking = [kind for kind in method.MODELS if kind not in models]
+    if lacking:
+        raise ConfigError(f"embedder {name} needs a model: gsmap models add MAP {lacking[0]} FILE.onnx")
+    limited = {kind: replace(model, limits=params.limits) for kind, model in models.items()}
+    nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0), np.zeros(0, np.int64))
+    embedder = method.make(SceneContext(nothing, 0, None, 1.0, limited), chosen.params.embedders[name])
+    if not hasattr(embedder, "embed_picture"):
+        raise ConfigError(f"embedder {name} describes parts of captures alone: show one with --like SCENE:NODE")
+    vector, told = embedder.embed_picture(rgb)
+    return np.asarray(vector, np.float32), np.asarray(told, bool)
+
+
+def embedded_text(text: str, params: Params, models: Mapping[str, ModelSpec]) -> np.ndarray:
+    """What the text tower beside the embedder of nodes makes of words: a unit vector (F,).
+
+    Raises:
+        ConfigError: the embedder has none, or the map lacks it; what to add is said.
+        InputError, MissingDependencyError: see `gsmap.describe.onnx.text`.
+    """
+    name = resolved(params, models).params.embedder
+    method = family("embedder").get(name)
+    if not hasattr(method, "embed_text"):
+        raise ConfigError(
+            f"the embedder {name} knows no words: add an image encoder with a text tower (gsmap models add MAP clip "
+            "IMAGE.onnx, then clip-text TEXT.onnx and clip-tokenizer tokenizer.json) and run gsmap update; or show a "
+            "thing: --picture FILE, --like SCENE:NODE, --at X,Y,Z"
+        )
+    limited = {kind: replace(model, limits=params.limits) for kind, model in models.items()}
+    found: np.ndarray = method.embed_text(text, limited)
+    return found
+
+
+def _picture(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8, no larger than is of use."""
+    if not path.exists():
+        raise NotFoundError(f"cannot read {path}: no such file")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                picture = image.convert("RGB")
+                picture.thumbnail((_MOST_PX, _MOST_PX))
+                rgb = np.asarray(picture)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise InputError(f"{path} is not a picture that can be read: {error}") from error
+    if min(rgb.shape[:2]) < _LEAST_PX:
+        raise InputError(f"{path} has {rgb.shape[1]} x {rgb.shape[0]} pixels: too few to show a thing")
+    return rgb

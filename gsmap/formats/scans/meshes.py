@@ -1,0 +1,171 @@
+"""Meshes (``.obj .stl .glb``, ``.ply`` with faces) and ``.pcd`` clouds, read by open3d in a process of its own.
+
+A mesh becomes points spread evenly over its area, coloured by its textures, else by its vertices.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.formats.scans import child
+from gsmap.formats.scans.params import Params
+from gsmap.formats.scans.points import scan_of
+from gsmap.types.scan import Scan
+
+_MIB = 1 << 20
+_SEED = 0
+
+
+def read(path: Path, params: Params) -> Scan:
+    """The points of a cloud, or points of a mesh.
+
+    Raises:
+        InputError: not what its suffix says, damaged, or beyond the limits of time and memory.
+    """
+    kind = "cloud" if path.suffix.lower() == ".pcd" else "mesh"
+    found = _asked(path, kind, params)
+    vertices, colours = _checked(found, "vertices", 3, path), found.get("colours")
+    if colours is not None:
+        colours = _checked(found, "colours", 3, path) if len(colours) == len(vertices) else None
+    if colours is not None and not colours.any():
+        colours = None  # what a library fills in where a file has none
+    triangles = found.get("triangles", np.zeros((0, 3), np.int64))
+    if not len(vertices):
+        raise InputError(f"{path} holds no {'points' if kind == 'cloud' else 'mesh'} that open3d can read")
+    if not len(triangles):
+        total = len(vertices)
+        rows = slice(None, None, -(-total // params.max_points))
+        return scan_of(vertices[rows], None if colours is None else np.clip(colours[rows], 0, 1), path, total)
+    return _sampled(path, found, vertices, colours, params.max_points)
+
+
+def _sampled(path: Path, found: dict[str, Any], vertices: np.ndarray, colours: np.ndarray | None, count: int) -> Scan:
+    """Points spread evenly over a mesh's area (Osada et al. 2002, eq. 1), the same for the same file."""
+    triangles = _checked(found, "triangles", 3, path).astype(np.int64)
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise InputError(f"{path}: its triangles name vertices that it does not have: it is damaged")
+    corners = vertices[triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    areas = np.where(np.isfinite(areas), areas, 0.0)
+    if not areas.sum() > 0:
+        raise InputError(f"{path}: its triangles have no area: there is no surface to look for")
+    rng = np.random.default_rng(_SEED)
+    # Strata of equal area: each point from its own, so that no patch is missed by chance.
+    at = (np.arange(count) + rng.uniform(size=count)) / count
+    total = np.cumsum(areas)
+    rows = np.minimum(np.searchsorted(total, at * total[-1]), len(areas) - 1)
+    r1, r2 = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
+    shares = np.stack([1 - r1, r1 * (1 - r2), r1 * r2], axis=1)
+    points = np.einsum("nk,nkj->nj", shares, corners[rows])
+    seen = _textured(found, rows, shares, path)
+    if seen is None and colours is not None:
+        seen = np.einsum("nk,nkj->nj", shares, colours[triangles[rows]])
+    note = f"{count:,} points spread over the {areas.sum():,.0f} square units of its {len(triangles):,} triangles"
+    return scan_of(points, None if seen is None else np.clip(seen, 0, 1), path, count, kind="mesh", notes=(note,))
+
+
+def _textured(found: dict[str, Any], rows: np.ndarray, shares: np.ndarray, path: Path) -> np.ndarray | None:
+    """(N, 3) colours of the samples from the mesh's pictures; None where it has none, or where they do not fit."""
+    pictures = [found[name] for name in sorted(n for n in found if n.startswith("texture"))]
+    pictures = [found[f"texture{number}"] for number in range(len(pictures))]
+    uvs, materials = found.get("uvs"), found.get("materials")
+    count = len(found["triangles"])
+    if not any(picture.size for picture in pictures) or uvs is None or uvs.shape != (3 * count, 2):
+        return None
+    which = np.zeros(count, np.int64) if materials is None or materials.shape != (count,) else materials
+    at = np.einsum("nk,nkj->nj", shares, uvs.reshape(count, 3, 2)[rows])
+    at = at - np.floor(at)  # textures repeat
+    out = np.full((len(rows), 3), 0.5)
+    for number, picture in enumerate(pictures):
+        mine = which[rows] == number
+        if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or not picture.size or not mine.any():
+            continue
+        picture = picture.reshape(*picture.shape[:2], -1)
+        tall, wide, channels = picture.shape
+        column = np.minimum((at[mine, 0] * wide).astype(np.int64), wide - 1)
+        row = np.minimum((at[mine, 1] * tall).astype(np.int64), tall - 1)
+        pixels = picture[row, column].astype(np.float64) / 255
+        out[mine] = pixels[:, :3] if channels >= 3 else pixels[:, :1]
+    return out
+
+
+def _asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
+    """What open3d reads of a file."""
+    if path.suffix.lower() == ".ply":
+        _require_vertices(path)
+    end, out = os.pipe()
+    command = [sys.executable, "-P", child.__file__, str(out), str(path.resolve()), kind]
+    with os.fdopen(end, "rb") as pipe:
+        process = subprocess.Popen(
+            [*command, str(params.memory_mb * _MIB)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=(out,),
+            start_new_session=True,
+        )
+        os.close(out)
+        try:
+            said = _until_end(pipe, process, params, path)
+        finally:
+            process.kill()
+            process.wait()
+    try:
+        with np.load(io.BytesIO(said), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(
+            f"{path} cannot be read: open3d gave it up, or it needs more than {params.memory_mb} MB: it is damaged, or "
+            "too large; convert it to a .ply point cloud"
+        ) from error
+
+
+def _until_end(pipe: Any, process: subprocess.Popen[bytes], params: Params, path: Path) -> bytes:
+    """All that the process writes, before its time is up."""
+    import threading
+
+    timer = threading.Timer(params.time_s, process.kill)
+    timer.start()
+    parts, size = [], 0
+    try:
+        while part := pipe.read(_MIB):
+            parts.append(part)
+            size += len(part)
+            if size > params.memory_mb * _MIB:
+                raise InputError(f"{path} is larger than {params.memory_mb} MB in memory: thin it first")
+        if not timer.is_alive():
+            raise InputError(f"{path} takes longer than {params.time_s:g} s to read: thin it first")
+    finally:
+        timer.cancel()
+    return b"".join(parts)
+
+
+def _checked(found: dict[str, np.ndarray], name: str, width: int, path: Path) -> np.ndarray:
+    array = found.get(name, np.zeros((0, width)))
+    if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: its {name} cannot be read: it is damaged")
+    return array
+
+
+def _require_vertices(path: Path) -> None:
+    """Refuse a PLY header that promises more than the file holds, before a library allocates it."""
+    from gsmap.formats import ply
+
+    header = ply.read_header(path)
+    size = path.stat().st_size - header.data_offset
+    for element in header.elements.values():
+        least = 2 if header.encoding == "ascii" or element.has_list else element.dtype.itemsize
+        if element.count * least > size + 1:
+            raise InputError(
+                f"{path} is truncated: its header promises {element.count:,} rows of {element.name}, "
+                f"but {size:,} bytes follow"
+            )

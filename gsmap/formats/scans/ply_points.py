@@ -1,0 +1,46 @@
+"""Point clouds in a ``.ply``: any numeric type, float64 kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.formats import ply
+from gsmap.formats.scans.params import Params
+from gsmap.formats.scans.points import scan_of
+from gsmap.types.scan import Scan
+
+_COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+
+
+def is_mesh(path: Path) -> bool:
+    """Whether its header names faces."""
+    elements = ply.read_header(path).elements
+    return any(name in elements and elements[name].count for name in ("face", "tristrips"))
+
+
+def read(path: Path, params: Params) -> Scan:
+    """The points of the element ``vertex``, with ``red green blue`` where they have them.
+
+    Raises:
+        InputError: damaged, truncated, or vertices without ``x y z``.
+    """
+    header = ply.read_header(path)
+    rows = ply.read_element(path, header, "vertex")
+    names = set(rows.dtype.names or ())
+    if not {"x", "y", "z"} <= names:
+        raise InputError(f"{path}: its vertices lack x, y or z: it is no point cloud")
+    total = len(rows)
+    rows = rows[:: -(-total // params.max_points)]
+    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    colours = None
+    for channels in _COLOURS:
+        if names.issuperset(channels):
+            kind = rows.dtype[channels[0]]
+            most = float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
+            colours = np.stack([rows[channel].astype(np.float64) / most for channel in channels], axis=1)
+            colours = np.clip(np.nan_to_num(colours), 0.0, 1.0)
+            break
+    return scan_of(points, colours, path, total)

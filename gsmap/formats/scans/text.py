@@ -1,0 +1,74 @@
+"""Point clouds as text (``.xyz``): a point a line, ``x y z`` and perhaps ``r g b`` behind it."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.formats.scans.params import Params
+from gsmap.formats.scans.points import scan_of
+from gsmap.types.scan import Scan
+
+_MAX_HEAD_LINES = 20
+_MOST_BYTES = 4 << 30  # beyond it a text takes longer to read than anybody waits
+_BYTE = 255.0
+
+
+def read(path: Path, params: Params) -> Scan:
+    """Three columns are a point; three more that are whole numbers from 0 to 255, behind it or behind an intensity, are
+    its colour. Columns are parted by spaces, commas or semicolons; lines before the first point are left out, and so
+    are those that begin with ``#`` or ``//``.
+
+    Raises:
+        InputError: no numbers, fewer than three in a line, or lines of different lengths.
+    """
+    if path.stat().st_size > _MOST_BYTES:
+        raise InputError(f"{path} is larger than {_MOST_BYTES >> 30} GiB of text: convert it to .ply or .laz first")
+    skip, split, width = _layout(path)
+    with open(path, encoding="utf-8", errors="replace") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lines = (split.sub(" ", line.replace("//", "#")) for line in file)
+        try:
+            rows = np.loadtxt(lines, np.float64, comments="#", skiprows=skip, ndmin=2)
+        except ValueError as error:
+            raise InputError(f"{path}: its rows cannot be read as {width} numbers each: {error}") from error
+    total = len(rows)
+    rows = rows[:: -(-total // params.max_points)] if total else rows
+    points, rest = rows[:, :3], rows[:, 3:]
+    notes: tuple[str, ...] = ()
+    colours = next((c for c in (rest[:, :3], rest[:, 1:4]) if _are_bytes(c)), None)
+    if colours is None and rest.shape[1]:
+        notes = (f"columns 4 to {3 + rest.shape[1]} hold no colours from 0 to 255: they are not used",)
+    return scan_of(points, None if colours is None else colours / _BYTE, path, total, notes=notes)
+
+
+def _layout(path: Path) -> tuple[int, re.Pattern[str], int]:
+    """Lines before the first point, what parts columns, and how many there are."""
+    split = re.compile(r"[,;\t]")
+    with open(path, encoding="utf-8", errors="replace") as file:
+        for number in range(_MAX_HEAD_LINES):
+            line = file.readline(4096)
+            if not line:
+                break
+            words = split.sub(" ", line.partition("#")[0].partition("//")[0]).split()
+            try:
+                numbers = [float(word) for word in words]
+            except ValueError:
+                continue
+            if len(numbers) >= 3:
+                return number, split, len(numbers)
+            if len(numbers) not in (0, 1):  # a count in the first line is common
+                raise InputError(f"{path}: line {number + 1} has {len(numbers)} numbers: a point has x, y and z")
+    raise InputError(f"{path} begins with no point: a .xyz has x y z in every line, and perhaps r g b behind them")
+
+
+def _are_bytes(values: np.ndarray) -> bool:
+    """Whether they are colours from 0 to 255: whole numbers, and not all 0 or 1, as normals would be."""
+    if values.shape[1] < 3 or not len(values):
+        return False
+    whole = np.isfinite(values).all() and (values == np.round(values)).all()
+    return bool(whole and values.min() >= 0 and 1 < values.max() <= _BYTE)

@@ -1,0 +1,424 @@
+"""Find things in a map: asked by one of its things, a point, a picture or words; answered by graphs of one recipe."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsmap import find
+from gsmap.describe.objects.layer import descriptor_id
+from gsmap.describe.seeing import embedded_picture, embedded_text
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.map import models
+from gsmap.map.objects import Known, known_objects
+from gsmap.map.settings import Settings
+from gsmap.map.stages.describe import graph_keys
+from gsmap.store import Store
+from gsmap.types import MapObject, PoseGraph, Scene, SceneGraph, Sighting
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows import FindHit, FindReport
+
+_NEAR_M = 0.3  # a node, or a point that was picked, lies in the thing whose nearest sample is so near
+_SAME_PLACE_M = 0.5  # nodes of no object that are nearer than this are one place
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is looked for; exactly one of the first four.
+
+    Args:
+        text: words, for an embedder that has a tower for them.
+        picture: a file that shows such a thing.
+        like: an object's id, or ``SCENE:NODE``, a row of the layer of objects of a scene.
+        at: (3,) a point of the frame of component 0, in its unit.
+        top: how many hits at most.
+    """
+
+    text: str | None = None
+    picture: str | os.PathLike[str] | None = None
+    like: str | None = None
+    at: Sequence[float] | None = None
+    top: int = 10
+
+    def __post_init__(self) -> None:
+        given = [value for value in (self.text, self.picture, self.like, self.at) if value is not None]
+        if len(given) != 1:
+            raise ConfigError("say one thing to look for: words, --picture FILE, --like SCENE:NODE or --at X,Y,Z")
+        if self.text is not None and not self.text.strip():
+            raise ConfigError("the words to look for are empty")
+        if self.at is not None and (len(self.at) != 3 or not np.isfinite(self.at).all()):
+            raise ConfigError(f"a point is three numbers such as 1.5,0,2, got {list(self.at)}")
+        if self.top < 1:
+            raise ConfigError(f"at least one hit is shown, got {self.top}")
+
+    @property
+    def words(self) -> str:
+        """What is asked for, for people."""
+        if self.at is not None:
+            return "what stands at " + ",".join(f"{value:g}" for value in self.at)
+        if self.like is not None:
+            return f"what is like {self.like}"
+        return f"what {os.fspath(self.picture)} shows" if self.picture is not None else str(self.text)
+
+
+@dataclass(frozen=True, eq=False)
+class _Index:
+    """What one recipe's graphs know of the map.
+
+    Args:
+        recipe: its digest.
+        embedder: its name.
+        graphs: by scene id, of the placed captures that it has described.
+        poses, scenes: of all placed captures.
+        known: objects of these graphs.
+        notes: what a person should know of the choice.
+    """
+
+    recipe: str
+    embedder: str
+    graphs: Mapping[str, SceneGraph]
+    poses: PoseGraph
+    scenes: Mapping[str, Scene]
+    known: Known
+    notes: tuple[str, ...]
+
+    @property
+    def objects(self) -> list[MapObject]:
+        return self.known.objects
+
+    def name(self, scene: str) -> str:
+        return self.scenes[scene].name
+
+
+@dataclass(frozen=True, eq=False)
+class _Vector:
+    """What nodes are compared with: features (F,), and (F,) bool which of them are told."""
+
+    features: np.ndarray
+    told: np.ndarray
+
+
+def find_places(
+    store: Store, request: Request, settings: Settings, progress: StageProgress
+) -> tuple[FindReport, list[np.ndarray]]:
+    """Places of the map that are like what is asked for, best first, and a box (2, 3) around each, map frame and unit.
+
+    Nothing is written. Every capture that answers was described by one recipe: while a map moves to another embedder,
+    the old one answers until it has been described anew as a whole; words and pictures are asked of the present one.
+
+    Raises:
+        NotFoundError: no poses yet, no such scene, node or object, or nothing stands at a point.
+        ConfigError: words or a picture that the map's embedder cannot read; what to add is said.
+    """
+    shown = _shown(store, request, settings)
+    index = _index(store, settings, progress, present=shown is not None)
+    if shown is not None:
+        _require_same_meaning(index, descriptor_id(settings.describe.object, models.specs(store)))
+    asked = _asked(store, request, index) if shown is None else shown
+    hits, things = (
+        _by_embedding(index, asked, request.top)
+        if isinstance(asked, _Vector)
+        else _by_likeness(index, asked, request.top)
+    )
+    notes = [*index.notes, *index.known.notes]
+    if not hits:
+        notes.append("nothing in the map can be compared with it")
+    report = FindReport(
+        query=request.words,
+        by="embedding" if isinstance(asked, _Vector) else "likeness",
+        recipe=index.recipe,
+        embedder=index.embedder,
+        described=len(index.graphs),
+        placed=len(index.scenes),
+        hits=tuple(hits),
+        notes=tuple(notes),
+    )
+    return report, [_box(index, hit, thing) for hit, thing in zip(hits, things, strict=True)]
+
+
+# --- one recipe -------------------------------------------------------------------------------------------------------
+
+
+def _index(store: Store, settings: Settings, progress: StageProgress, *, present: bool) -> _Index:
+    """The graphs of the one recipe that answers, and the objects of these.
+
+    Args:
+        present: by the present recipe alone; else by that which has described most captures.
+    """
+    poses = store.revisions.get()
+    if poses is None:
+        raise NotFoundError("the map has no poses yet: run gsmap update first")
+    scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in poses.poses}
+    keys = graph_keys(store, list(scenes.values()), settings)
+    now = next(iter(keys.values())).recipe if keys else ""
+    made: dict[str, dict[str, str]] = {}
+    for stored in store.graphs.list():  # oldest first
+        if stored.scene in scenes and stored.recipe is not None:
+            made.setdefault(stored.recipe, {})[stored.scene] = stored.key
+    # What a scene is described under names its scale, too: of the present recipe only what is of use now counts.
+    mine = {scene: key for scene, key in made.get(now, {}).items() if keys[scene].digest == key}
+    made = {recipe: graphs for recipe, graphs in made.items() if recipe != now} | ({now: mine} if mine else {})
+    if not made or (present and not mine):
+        raise NotFoundError(
+            "no placed capture is described by the present recipe yet: run gsmap update first"
+            if made
+            else "no placed capture is described: run gsmap update first"
+        )
+    recipe = now if present else max(made, key=lambda r: (len(made[r]), r == now, list(made).index(r)))
+    notes = []
+    if recipe != now:
+        notes.append(
+            f"answered by the graphs of an earlier recipe, which knows {len(made[recipe])} of {len(scenes)} captures; "
+            f"the present one knows {len(mine)}: gsmap update describes the rest"
+        )
+    elif len(mine) < len(scenes):
+        notes.append(
+            f"{len(scenes) - len(mine)} of {len(scenes)} captures are not described by the present recipe and take no "
+            "part: gsmap update describes them"
+        )
+    keys_of = made[recipe]
+    graphs = {scene: store.graphs.load(scene, key) for scene, key in keys_of.items()}
+    there = {scene: graph for scene, graph in graphs.items() if graph is not None}
+    known = known_objects(store, settings, progress, there)
+    return _Index(recipe, _embedder(store, recipe), there, poses, scenes, known, tuple(notes))
+
+
+def _embedder(store: Store, recipe: str) -> str:
+    """Its name, as the recipe says."""
+    about = store.recipes.get(recipe).settings.get("object") or {}
+    named = about.get("embedders") if isinstance(about, Mapping) else None
+    return ", ".join(sorted(map(str, named))) if isinstance(named, Mapping) else ""
+
+
+def _require_same_meaning(index: _Index, descriptor: str) -> None:
+    """Refuse graphs whose embeddings another embedder made than what is asked for."""
+    layers = [graph.layers["objects"] for graph in index.graphs.values() if "objects" in graph.layers]
+    if not layers:
+        raise NotFoundError("the map's graphs hold no embeddings, since describe.objects is off: show a thing instead")
+    if any(layer.descriptor_id != descriptor for layer in layers):
+        raise NotFoundError("the map's graphs were made by another embedder: run gsmap update first")
+
+
+# --- what is asked for ------------------------------------------------------------------------------------------------
+
+
+def _shown(store: Store, request: Request, settings: Settings) -> _Vector | None:
+    """The vector of words or of a picture; None where a thing of the map is asked for."""
+    params, specs = settings.describe.object, models.specs(store)
+    if request.text is not None:
+        features = embedded_text(request.text, params, specs)
+        return _Vector(features, np.ones(len(features), bool))
+    return None if request.picture is None else _Vector(*embedded_picture(request.picture, params, specs))
+
+
+def _asked(store: Store, request: Request, index: _Index) -> Sequence[Sighting] | _Vector:
+    """The sightings of the object that is asked for, or the embedding of a node that is of no object."""
+    if request.at is not None:
+        point = np.asarray(request.at, np.float64)
+        thing = _thing_at(point, 0, index)
+        if thing is None:
+            raise NotFoundError(
+                f"nothing stands within {_NEAR_M:g} m of {','.join(f'{v:g}' for v in request.at)}: gsmap graph "
+                f"{store.home} lists where things are"
+            )
+        return thing.sightings
+    assert request.like is not None
+    named = next((thing for thing in index.objects if thing.id == request.like), None)
+    if named is not None:
+        return named.sightings
+    ref, _, number = request.like.rpartition(":")
+    if not ref or not number.isdecimal():
+        raise NotFoundError(f"{request.like!r} is neither an object of the map (gsmap graph lists them) nor SCENE:NODE")
+    scene = store.scenes.get(ref)
+    graph, row = index.graphs.get(scene.id), int(number)
+    if graph is None:
+        raise NotFoundError(f"scene {scene.name} has no graph of the recipe that answers: run gsmap update first")
+    layer = graph.layers.get("objects")
+    if layer is None or row >= len(layer):
+        raise NotFoundError(
+            f"scene {scene.name} has {0 if layer is None else len(layer)} objects, counted from 0: "
+            f"gsmap show {store.home} {scene.name!r} --picture FILE draws them"
+        )
+    pose = index.poses.poses[scene.id]
+    thing = _thing_at(pose.S_map_scene.apply(layer.positions[row]), pose.component, index, scene.id)
+    if thing is not None:
+        return thing.sightings
+    return _Vector(layer.embeddings[row], np.ones(layer.embeddings.shape[1], bool))
+
+
+def _thing_at(point: np.ndarray, component: int, index: _Index, scene: str | None = None) -> MapObject | None:
+    """The object that a point (3,) of the map lies in; None where none does.
+
+    Args:
+        scene: only as this capture shows it.
+    """
+    metres = index.known.metres.get(component, 1.0)
+    nearest, best = _NEAR_M, None
+    for thing in index.objects:
+        for sighting in thing.sightings if thing.component == component else ():
+            if sighting.thing < 0 or scene not in (None, sighting.scene):
+                continue
+            samples = _samples(index, sighting)
+            distance = float(np.linalg.norm(samples - point, axis=1).min(initial=np.inf)) * metres
+            if distance < nearest:
+                nearest, best = distance, thing
+    return best
+
+
+def _samples(index: _Index, sighting: Sighting) -> np.ndarray:
+    """(K, 3) of a thing, map frame and unit."""
+    things = index.graphs[sighting.scene].things
+    assert things is not None
+    end = int(things.sample_counts[: sighting.thing + 1].sum())
+    own = things.samples[end - int(things.sample_counts[sighting.thing]) : end]
+    return index.poses.poses[sighting.scene].S_map_scene.apply(own)
+
+
+# --- ranking ----------------------------------------------------------------------------------------------------------
+
+
+def _by_likeness(index: _Index, query: Sequence[Sighting], top: int) -> tuple[list[FindHit], list[MapObject | None]]:
+    """Objects by how like they are to one, itself first."""
+    looks: dict[str, list[find.Look]] = {}
+    for scene, graph in index.graphs.items():
+        if graph.things is not None and graph.up is not None:
+            looks[scene] = find.looks_of(graph.things, graph.up)
+
+    def shown(sightings: Sequence[Sighting]) -> list[tuple[Sighting, find.Look]]:
+        return [(s, looks[s.scene][s.thing]) for s in sightings if s.thing >= 0 and s.scene in looks]
+
+    theirs = [shown(thing.sightings) for thing in index.objects]
+    asked = [look for _, look in shown(query)]
+    scores, which = find.by_likeness(asked, [[look for _, look in one] for one in theirs])
+    order = [int(i) for i in np.argsort(-scores, kind="stable")[:top] if which[i] >= 0]
+    hits = [
+        _hit(index, rank, float(scores[i]), index.objects[i], theirs[i][int(which[i])][0].scene)
+        for rank, i in enumerate(order, 1)
+    ]
+    return hits, [index.objects[i] for i in order]
+
+
+def _by_embedding(index: _Index, asked: _Vector, top: int) -> tuple[list[FindHit], list[MapObject | None]]:
+    """Objects, and places of the building, by the node in them that is likest."""
+    scenes, rows, owners, points, scores = [], [], [], [], []
+    places: list[MapObject | None] = list(index.objects)
+    number = {thing.id: i for i, thing in enumerate(index.objects)}
+    for scene, graph in sorted(index.graphs.items()):
+        layer = graph.layers.get("objects")
+        if layer is None or not len(layer):
+            continue
+        at = index.poses.poses[scene].S_map_scene.apply(layer.positions)
+        inside = _thing_of(index, scene, layer.positions)
+        mine = {s.thing: number[thing.id] for thing in index.objects for s in thing.sightings if s.scene == scene}
+        if layer.embeddings.shape[1] != len(asked.features):
+            raise ConfigError(
+                f"what is asked for is a vector of {len(asked.features)} numbers, those of the map have "
+                f"{layer.embeddings.shape[1]}: the text tower and the image encoder are not of one pack"
+            )
+        scores.append(find.cosines(asked.features, asked.told, layer.embeddings))
+        for row in range(len(layer)):
+            scenes.append(scene)
+            rows.append(row)
+            points.append(at[row])
+            owners.append(mine.get(int(inside[row]), -1) if inside[row] >= 0 else -1)
+    if not scores:
+        return [], []
+    every, owner = np.concatenate(scores), np.array(owners)
+    # What is of no object: the likest first, and what lies near it in the same component is the same place.
+    component = np.array([index.poses.poses[scene].component for scene in scenes])
+    where = np.array(points)
+    for row in np.argsort(-every, kind="stable"):
+        if owner[row] >= 0:
+            continue
+        metres = index.known.metres.get(int(component[row]), 1.0)
+        near = np.linalg.norm(where - where[row], axis=1) * metres < _SAME_PLACE_M
+        owner[(owner < 0) & near & (component == component[row])] = len(places)
+        places.append(None)
+        if len(places) - len(index.objects) > top:
+            break
+    told_of = owner >= 0
+    best, which = find.best_of(every[told_of], owner[told_of], len(places))
+    of = np.flatnonzero(told_of)
+    hits: list[FindHit] = []
+    things: list[MapObject | None] = []
+    for i in np.argsort(-best, kind="stable")[:top]:
+        if which[i] < 0:
+            break
+        row = int(of[which[i]])
+        hits.append(_hit(index, len(hits) + 1, float(best[i]), places[i], scenes[row], rows[row], where[row]))
+        things.append(places[i])
+    return hits, things
+
+
+def _thing_of(index: _Index, scene: str, positions: np.ndarray) -> np.ndarray:
+    """(M,) the thing of a capture that each point (M, 3) of its frame lies in, -1 for none."""
+    from scipy.spatial import cKDTree
+
+    things = index.graphs[scene].things
+    if things is None or not len(things.samples):
+        return np.full(len(positions), -1)
+    distance, row = cKDTree(things.samples).query(positions)
+    owner = np.repeat(np.arange(len(things)), things.sample_counts)
+    return np.where(distance * things.unit_m < _NEAR_M, owner[row], -1)
+
+
+def _box(index: _Index, hit: FindHit, thing: MapObject | None) -> np.ndarray:
+    """(2, 3) around a hit, as the capture shows it that matched best."""
+    half = _SAME_PLACE_M / 2 / index.known.metres.get(hit.component, 1.0)
+    if thing is None:
+        return np.array([hit.position - half, hit.position + half])
+    mine = next((s.box for s in thing.sightings if s.scene == hit.scene and s.box is not None), None)
+    return thing.box if mine is None else mine
+
+
+def _hit(
+    index: _Index,
+    rank: int,
+    score: float,
+    thing: MapObject | None,
+    scene: str,
+    node: int | None = None,
+    position: np.ndarray | None = None,
+) -> FindHit:
+    component = index.poses.poses[scene].component
+    metres = index.known.metres.get(component, 1.0)
+    seen = [s.scene for s in thing.sightings if s.state == "seen"] if thing is not None else [scene]
+    at = position if thing is None else thing.position
+    assert at is not None
+    return FindHit(
+        rank=rank,
+        score=round(score, 4),
+        object=None if thing is None else thing.id,
+        scene=scene,
+        scene_name=index.name(scene),
+        node=node,
+        component=component,
+        position=at,
+        position_m=at * metres,
+        size_m=None if thing is None else (thing.box[1] - thing.box[0]) * metres,
+        dates=tuple(index.scenes[one].captured_at for one in seen),
+    )
+
+
+def with_pictures(
+    store: Store,
+    report: FindReport,
+    boxes: Sequence[np.ndarray],
+    folder: Path,
+    settings: Settings,
+    progress: StageProgress,
+) -> FindReport:
+    """The report, with a picture of every hit in a folder; see `gsmap.map.pictures`.
+
+    Args:
+        boxes: (2, 3) around each hit, map frame and unit.
+    """
+    from gsmap.map.pictures import draw_places
+
+    files = draw_places(store, folder, [hit.scene for hit in report.hits], boxes, settings, progress)
+    hits = tuple(replace(hit, picture=file) for hit, file in zip(report.hits, files, strict=True))
+    return replace(report, hits=hits)

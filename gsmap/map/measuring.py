@@ -1,0 +1,224 @@
+"""How far two points of a map are apart, and how well that is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap import optimize
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.map.metres import map_metres
+from gsmap.map.places import Place, place
+from gsmap.map.settings import Settings
+from gsmap.map.stages.optimize import pose_inputs
+from gsmap.store import Store
+from gsmap.types import PoseGraph
+from gsmap.types.rows.world import MeasureReport, PlaceRow
+from gsmap.types.world import WorldFrame, WorldTie
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A point where it lies.
+
+    Args:
+        component: whose frame ``map`` is in; None of a point of the world.
+        map, metric: (3,) in the map and in the world frame; None where it is not known.
+    """
+
+    place: Place
+    component: int | None
+    map: np.ndarray | None
+    metric: np.ndarray | None
+
+
+def measure(
+    store: Store, a: str, b: str, settings: Settings, *, component: int | None = None, crs: str | None = None
+) -> MeasureReport:
+    """The distance of two points in metres, with its standard deviation; see `gsmap.map.places` for how to give them.
+
+    Points of one component are measured in its frame, by its metre; those of two in the world, if both are tied to it.
+
+    Args:
+        component: of points given in the map, where it has several.
+        crs: of the world coordinates that are shown; the map's own by default.
+
+    Raises:
+        ConfigError: a point that is none, or a map of several components of which none was named.
+        NotFoundError: a scene without a pose, or points that no frame joins.
+    """
+    graph = store.revisions.get()
+    if graph is None:
+        raise NotFoundError("no scene has a place in the map yet: run gsmap update first")
+    said = [place(store, text, settings) for text in (a, b)]
+    placed = [_where(store, one, graph, component) for one in said]
+    frame = next((tie.frame for tie in graph.world if tie.S_world_map is not None), None)
+    notes = []
+    if any(one.scene is None for one in said):
+        notes.append("points given in the map or the world count as exact: sigma is of the map alone")
+    one, two = placed
+    if one.component is not None and one.component == two.component and one.map is not None and two.map is not None:
+        tie = graph.tie(one.component)
+        metres, sigma_log, known_by = _metre(store, settings, graph, one.component, tie)
+        span = float(np.linalg.norm(one.map - two.map))
+        variance = _pose_variance(store, settings, graph, placed) * metres**2 + (span * metres * sigma_log) ** 2
+        distance = span * metres
+        if known_by in ("assumed", "guessed", "unknown"):
+            notes.append(f"its metre is {known_by}: gsmap georeference MAP --scale-bar A B METRES measures it")
+    elif one.metric is not None and two.metric is not None:
+        distance, known_by = float(np.linalg.norm(one.metric - two.metric)), "world"
+        variance = _world_variance(store, settings, graph, placed)
+    else:
+        raise NotFoundError(
+            "the two points lie in different components, and not both of them are tied to the world: gsmap "
+            "georeference does so"
+        )
+    rows = [_row(store, one, frame, crs) for one in placed]
+    named = crs or (frame.crs if frame else None)
+    sigma = float(np.sqrt(max(0.0, variance)))
+    return MeasureReport(
+        distance_m=distance, sigma_m=sigma, known_by=known_by, a=rows[0], b=rows[1], crs=named, notes=tuple(notes)
+    )
+
+
+def _where(store: Store, one: Place, graph: PoseGraph, component: int | None) -> _Placed:
+    if one.crs is not None:
+        tied = [tie for tie in graph.world if tie.S_world_map is not None and tie.frame is not None]
+        if not tied:
+            raise NotFoundError("the map is not tied to the world: gsmap georeference does so")
+        from gsmap.world.frame import to_frame
+
+        frame = tied[0].frame
+        assert frame is not None
+        metric = to_frame(frame, one.point[None], None if one.crs == "world" else one.crs)[0]
+        tie = tied[0] if len(tied) == 1 else next((t for t in tied if t.component == component), None)
+        if tie is None or tie.S_world_map is None:
+            return _Placed(one, None, None, metric)
+        return _Placed(one, tie.component, tie.S_world_map.inverse().apply(metric), metric)
+    if one.scene is not None:
+        pose = graph.poses.get(one.scene)
+        if pose is None or pose.S_map_scene is None:
+            raise NotFoundError(f"scene {store.scenes.get(one.scene).name} has no place in the map: run gsmap update")
+        at, of = pose.S_map_scene.apply(one.point), pose.component
+    else:
+        components = sorted({pose.component for pose in graph.poses.values()})
+        if component is None and len(components) > 1:
+            raise ConfigError(
+                f"{one.said} is in the map's frame, of which there are {len(components)}: name one with --component"
+            )
+        of, at = components[0] if component is None else component, one.point
+    tie = graph.tie(of)
+    metric = None if tie is None or tie.S_world_map is None else tie.S_world_map.apply(at)
+    return _Placed(one, of, at, metric)
+
+
+def _metre(
+    store: Store, settings: Settings, graph: PoseGraph, component: int, tie: WorldTie | None
+) -> tuple[float, float, str]:
+    """Metres per unit of a component, the standard deviation of its logarithm, and how it is known."""
+    if tie is not None and tie.metres_per_unit is not None:
+        return tie.metres_per_unit, tie.scale_sigma, "world" if tie.S_world_map is not None else "measured"
+    metre = map_metres(store, settings, graph)[component]
+    sigma = metre.sigma if np.isfinite(metre.sigma) else float("inf")
+    return metre.metres_per_unit, sigma, metre.known_by
+
+
+def _pose_variance(store: Store, settings: Settings, graph: PoseGraph, placed: list[_Placed]) -> float:
+    """Of the distance in the map's frame, by poses and picking."""
+    one, two = placed
+    assert one.map is not None
+    assert two.map is not None
+    span = one.map - two.map
+    along = span / max(float(np.linalg.norm(span)), 1e-300)
+    variance = 0.0
+    for end in placed:
+        turn = _turn(graph, end)
+        variance += float(along @ turn @ end.place.covariance @ turn.T @ along)
+    scenes = [end.place.scene for end in placed]
+    if scenes[0] == scenes[1] or None in scenes:
+        return variance
+    joint = _joint(store, settings, graph, one.component, [str(scene) for scene in scenes])
+    if joint is None:
+        return float("inf")
+    J = np.zeros(joint.shape[0])
+    for k, (end, sign) in enumerate(zip(placed, (1.0, -1.0), strict=True)):
+        J[7 + 7 * k : 14 + 7 * k] = sign * along @ _turn(graph, end) @ _moves(end.place.point)
+    return variance + float(J @ joint @ J)
+
+
+def _world_variance(store: Store, settings: Settings, graph: PoseGraph, placed: list[_Placed]) -> float:
+    """Of the distance between points of two components, or of the world and a component: these err apart."""
+    one, two = placed
+    assert one.metric is not None
+    assert two.metric is not None
+    span = one.metric - two.metric
+    along = span / max(float(np.linalg.norm(span)), 1e-300)
+    variance = 0.0
+    for end in placed:
+        covariance = _world_covariance(store, settings, graph, end)
+        variance += 0.0 if covariance is None else float(along @ covariance @ along)
+    return variance
+
+
+def _world_covariance(store: Store, settings: Settings, graph: PoseGraph, end: _Placed) -> np.ndarray | None:
+    """(3, 3) of a point in the world frame; None of one that was given there, or whose component is not tied."""
+    tie = None if end.component is None else graph.tie(end.component)
+    if tie is None or tie.S_world_map is None or end.map is None or end.place.crs is not None:
+        return None
+    W = tie.S_world_map
+    big = W.scale * W.rotation
+    if end.place.scene is None:
+        J = big @ _moves(end.map)
+        out: np.ndarray = J @ tie.covariance @ J.T
+        return out
+    turn = _turn(graph, end)
+    joint = _joint(store, settings, graph, end.component, [end.place.scene])
+    picked = big @ turn @ end.place.covariance @ turn.T @ big.T
+    if joint is None:
+        return None
+    J = np.concatenate([big @ _moves(end.map), big @ turn @ _moves(end.place.point)], axis=1)
+    found: np.ndarray = J @ joint @ J.T + picked
+    return found
+
+
+def _turn(graph: PoseGraph, end: _Placed) -> np.ndarray:
+    """(3, 3) scale and rotation of the frame that a point was given in."""
+    if end.place.scene is None:
+        return np.eye(3)
+    S = graph.poses[end.place.scene].S_map_scene
+    return S.scale * S.rotation
+
+
+def _moves(point: np.ndarray) -> np.ndarray:
+    """(3, 7) how a point moves by a step of the frame that it is given in."""
+    from gsmap.geometry.rotations import skew
+
+    return np.concatenate([-skew(point[None])[0], np.eye(3), point[:, None]], axis=1)
+
+
+def _joint(
+    store: Store, settings: Settings, graph: PoseGraph, component: int | None, scenes: list[str]
+) -> np.ndarray | None:
+    """Covariance of the world and these scenes together; None where it cannot be computed."""
+    given = pose_inputs(store, settings)
+    return optimize.joint_covariance(
+        graph, given.edges, given.priors, given.survey, scenes, component or 0, settings.optimize
+    )
+
+
+def _row(store: Store, end: _Placed, frame: WorldFrame | None, crs: str | None) -> PlaceRow:
+    from gsmap.world.frame import of_frame
+
+    scene = end.place.scene
+    world = None if end.metric is None or frame is None else of_frame(frame, end.metric[None], crs)[0]
+    return PlaceRow(
+        said=end.place.said,
+        scene=scene,
+        scene_name=None if scene is None else store.scenes.get(scene).name,
+        component=end.component,
+        map=end.map,
+        metric=end.metric,
+        world=world,
+        sigma_m=None,
+    )

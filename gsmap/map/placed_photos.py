@@ -1,0 +1,101 @@
+"""Photos that are no scene's camera, as control points are seen in them: localised, and put into a scene's frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from gsmap.errors import NotFoundError
+from gsmap.map.stages.georeference import Localise, PlacedPhoto
+from gsmap.store import Store
+from gsmap.types import ScenePose
+
+
+class Localised(Protocol):
+    """What is used of where one photo was taken; a row of ``gsmap localize``."""
+
+    @property
+    def file(self) -> str: ...
+    @property
+    def T_map_camera(self) -> np.ndarray | None: ...
+    @property
+    def covariance(self) -> np.ndarray | None: ...
+    @property
+    def component(self) -> int | None: ...
+    @property
+    def scenes(self) -> Sequence[str]: ...
+    @property
+    def intrinsics_px(self) -> np.ndarray | None: ...
+
+
+def localiser(store: Store, localize: Callable[..., Any], folder: str | os.PathLike[str]) -> Localise:
+    """Finds photos of a folder in the map.
+
+    Args:
+        localize: as ``Map.localize``: files in, a report with a row for each (``results``) out.
+
+    Raises:
+        NotFoundError: no such folder.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise NotFoundError(f"no folder of photos at {root}")
+
+    def localise(names: Sequence[str]) -> dict[str, PlacedPhoto]:
+        files = {name: root / name for name in names if _inside(root, name)}
+        if not files:
+            return {}
+        rows: Sequence[Localised] = localize(*files.values()).results
+        poses, ids = store.revisions.poses(), {scene.name: scene.id for scene in store.scenes.list()}
+        found = {}
+        for (name, path), row in zip(files.items(), rows, strict=True):
+            placed = placed_photo(row, _size(path), poses, ids)
+            if placed is not None:
+                found[name] = placed
+        return found
+
+    return localise
+
+
+def placed_photo(
+    row: Localised, size_px: tuple[int, int], poses: Mapping[str, ScenePose], ids: Mapping[str, str]
+) -> PlacedPhoto | None:
+    """Where a photo was taken, in the frame of the scene that supports it most; None where it was refused.
+
+    A photo is tied to what it was found by: when the map is bent, it moves with that scene.
+
+    Args:
+        poses: by scene id. ids: by scene name.
+    """
+    if row.T_map_camera is None or row.covariance is None or row.intrinsics_px is None:
+        return None
+    known = [ids[name] for name in row.scenes if name in ids and ids[name] in poses]
+    scene = next((one for one in known if poses[one].component == row.component), None)
+    if scene is None:
+        return None
+    S_scene_map = poses[scene].S_map_scene.inverse()
+    pose = np.eye(4)
+    pose[:3, :3] = S_scene_map.rotation @ row.T_map_camera[:3, :3]
+    pose[:3, 3] = S_scene_map.apply(row.T_map_camera[:3, 3])
+    # Both covariances are on the camera's side; lengths become the scene's.
+    unit = np.diag([1.0] * 3 + [S_scene_map.scale] * 3)
+    return PlacedPhoto(scene, pose, np.asarray(row.intrinsics_px), size_px, unit @ row.covariance @ unit)
+
+
+def _inside(root: Path, name: str) -> bool:
+    """Whether a name from a file leads to a photo below the folder, and nowhere else."""
+    path = root / name
+    return path.is_file() and path.resolve().is_relative_to(root.resolve())
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """Width and height of the upright picture."""
+    from PIL import Image, ImageOps
+
+    with Image.open(path) as picture:
+        width, height = ImageOps.exif_transpose(picture).size
+    return width, height

@@ -1,0 +1,83 @@
+"""Points as people give them: in the map, in a scene, at a pixel of a camera, in the world."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import ConfigError
+from gsmap.map.seeing import picked_point
+from gsmap.map.settings import Settings
+from gsmap.store import Store
+
+HOW = (
+    "X,Y,Z (in the map), SCENE:X,Y,Z, SCENE:CAMERA@COLUMN,ROW (a pixel), or world:X,Y,Z (in the map's CRS; "
+    "EPSG:N:X,Y,Z in another)"
+)
+_CRS = re.compile(r"(?i)(world|[a-z]+:\d+(?:\+\d+)?):([^:]*)")
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A point that was given.
+
+    Args:
+        said: how.
+        point: (3,) in the frame of ``scene``; where there is none in that of the map, or of ``crs``.
+        covariance: (3, 3) of it in that frame.
+        scene: id; None where it is not a scene's.
+        crs: of a point in the world, ``world`` for the map's own; None for others.
+    """
+
+    said: str
+    point: np.ndarray
+    covariance: np.ndarray
+    scene: str | None = None
+    crs: str | None = None
+
+
+def place(store: Store, text: str, settings: Settings) -> Place:
+    """A point from what a person wrote.
+
+    Raises:
+        ConfigError: it is none of the ways to give one.
+        NotFoundError: no such scene or camera, or nothing is to be seen at the pixel.
+    """
+    if (numbers := _numbers(text, 3)) is not None:
+        return Place(text, numbers, np.zeros((3, 3)))
+    scene_name, colon, rest = text.rpartition(":")
+    if (world := _CRS.fullmatch(text)) is not None and (numbers := _numbers(world[2], 3)) is not None:
+        if world[1].lower() == "world" and any(scene.name == world[1] for scene in store.scenes.list()):
+            raise ConfigError(f"a scene is called {world[1]}: name it by its id, or the world by its CRS, EPSG:N:X,Y,Z")
+        return Place(text, numbers, np.zeros((3, 3)), crs="world" if world[1].lower() == "world" else world[1])
+    if colon and (numbers := _numbers(rest, 3)) is not None:
+        return Place(text, numbers, np.zeros((3, 3)), scene=store.scenes.get(scene_name).id)
+    scene_name, colon, rest = text.partition(":")
+    camera, at, pixel = rest.rpartition("@")
+    if colon and at and (numbers := _numbers(pixel, 2)) is not None:
+        scene = store.scenes.get(scene_name).id
+        params = settings.world
+        found = picked_point(store, scene, camera, numbers, params.depth_sigma_share, params.pixel_sigma_px)
+        return Place(text, *found, scene=scene)
+    raise ConfigError(f"{text!r} is no point: give {HOW}")
+
+
+def place_in_scene(store: Store, text: str, settings: Settings) -> Place:
+    """A point that stays with a scene, whatever the next solve does to the map."""
+    found = place(store, text, settings)
+    if found.scene is None:
+        raise ConfigError(
+            f"{text!r} is a point of the {'world' if found.crs else 'map'}, whose frame the solve moves: pick it in a "
+            "scene, SCENE:X,Y,Z or SCENE:CAMERA@COLUMN,ROW"
+        )
+    return found
+
+
+def _numbers(text: str, count: int) -> np.ndarray | None:
+    try:
+        found = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        return None
+    return found if len(found) == count and np.isfinite(found).all() else None

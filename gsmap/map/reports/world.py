@@ -1,0 +1,115 @@
+"""How a map is tied to the world."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from gsmap.map.one_state import of_one_state
+from gsmap.map.reports.common import names
+from gsmap.store import Store
+from gsmap.types import ScenePose
+from gsmap.types.rows.world import ResidualRow, TieRow, WorldReport
+from gsmap.types.world import Residual, WorldTie
+
+
+@of_one_state
+def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> WorldReport:
+    """The newest answer, and what it was solved from.
+
+    Args:
+        stale: whether observations, or anything else, came or went since.
+    """
+    survey, ties, placed = store.world.survey(), store.revisions.world(), store.revisions.poses()
+    name_of = names(store)
+    sizes = Counter(pose.component for pose in placed.values())
+    shown = {image.point for image in survey.images}
+    frame = survey.frame
+    system = None
+    if frame is not None:
+        from gsmap.world.crs import crs
+
+        system = crs(frame.crs)
+    return WorldReport(
+        crs=None if frame is None else frame.crs,
+        crs_name="" if system is None else system.name,
+        axes=() if system is None else system.axes,
+        own_heights=False if system is None else system.has_own_heights,
+        origin=None if frame is None else (frame.latitude_deg, frame.longitude_deg, frame.height_m),
+        components=tuple(_tie_row(tie, sizes[tie.component], name_of) for tie in ties),
+        unseen=tuple(point.name for point in survey.points if point.name not in shown),
+        revision=store.revisions.current(),
+        stale=stale,
+        notes=tuple(notes),
+    )
+
+
+def _tie_row(tie: WorldTie, num_scenes: int, name_of: Mapping[str, str]) -> TieRow:
+    controls = [row.error_m for row in tie.residuals if row.use == "used" and row.kind != "image"]
+    checks = [row.error_m for row in tie.residuals if row.use == "check" and row.kind == "point"]
+    return TieRow(
+        component=tie.component,
+        num_scenes=num_scenes,
+        S_world_map=tie.S_world_map,
+        covariance=tie.covariance,
+        metres_per_unit=tie.metres_per_unit,
+        scale_sigma=tie.scale_sigma if np.isfinite(tie.scale_sigma) else None,
+        rms_m=_rms(controls),
+        rms_check_m=_rms(checks),
+        num_outliers=sum(row.use == "outlier" for row in tie.residuals),
+        residuals=tuple(residual_row(row, name_of) for row in tie.residuals),
+        problem=tie.problem,
+        notes=tie.notes,
+    )
+
+
+def residual_row(row: Residual, name_of: Mapping[str, str]) -> ResidualRow:
+    """One line of the residual table."""
+    return ResidualRow(
+        kind=row.kind,
+        name=row.name,
+        scene=row.scene,
+        scene_name=name_of.get(row.scene, ""),
+        use=row.use,
+        error_m=row.error_m,
+        size_m=float(np.linalg.norm(row.error_m)) if row.error_m else None,
+        sigma_m=row.sigma_m,
+        error_px=row.error_px,
+        statistic=row.statistic,
+        dof=row.dof,
+        reason=row.reason,
+    )
+
+
+def _rms(errors: Sequence[tuple[float, ...]]) -> float | None:
+    told = [float(np.sum(np.square(error))) for error in errors if error]
+    return float(np.sqrt(np.mean(told))) if told else None
+
+
+def world_positions(
+    store: Store, poses: Mapping[str, ScenePose], crs_text: str | None = None
+) -> tuple[str | None, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """The CRS, and by scene where its origin lies: metres of the world frame, and coordinates in the CRS.
+
+    Args:
+        crs_text: another CRS than the map's.
+    """
+    ties = {tie.component: tie for tie in store.revisions.world() if tie.S_world_map is not None and tie.frame}
+    if not ties:
+        return None, {}
+    from gsmap.world.frame import of_frame
+
+    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    named = None
+    for component, tie in ties.items():
+        assert tie.frame is not None
+        assert tie.S_world_map is not None
+        mine = [pose for pose in poses.values() if pose.component == component]
+        named = crs_text or tie.frame.crs
+        if mine:
+            metric = tie.S_world_map.apply(np.array([pose.S_map_scene.translation for pose in mine]))
+            world = of_frame(tie.frame, metric, named)
+            found |= {pose.scene: (metric[k], world[k]) for k, pose in enumerate(mine)}
+    return named, found

@@ -1,0 +1,311 @@
+"""Localise a scan: looked for in the map as a capture would be, and nothing of it is kept."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsmap import describe, register
+from gsmap.describe.unit import estimate_unit_m
+from gsmap.errors import ConfigError, NotFoundError
+from gsmap.formats import scans
+from gsmap.geometry.vantage import synthesise_cameras
+from gsmap.ingest import read_captures
+from gsmap.localize.scan import as_gaussians
+from gsmap.localize.scan_joining import Joined, OnePlace, Support, join
+from gsmap.map import models
+from gsmap.map.looking_up import ask_once
+from gsmap.map.metres import metres_of_scenes
+from gsmap.map.settings import Settings
+from gsmap.map.stages.describe import graph_keys, without_graph
+from gsmap.map.stages.register import placed_scenes
+from gsmap.methods import RecipeKey
+from gsmap.register import SceneView
+from gsmap.store import Store
+from gsmap.types import Cameras, Gaussians, PoseGraph, Registration, Scene
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows import ScanRow, ScanSupport
+from gsmap.types.scan import Scan
+from gsmap.types.scene import SCALE_POLICIES
+
+_ID = "scan"
+_OF_NO_UNIT = (".obj", ".stl")  # formats whose files are in whatever unit their program likes
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is looked for.
+
+    Args:
+        file: a cloud, a mesh, a splat, or a depth picture.
+        intrinsics_px: ``fx fy cx cy``, which make a depth picture of the file.
+        colour: picture of the same view as a depth picture.
+        units_per_m: values of a depth picture that make a metre.
+        scale: ``known`` (the scan is in metres), ``unknown`` or ``auto``; None for what its kind of file is in.
+        near: only scenes near one (its name), or near ``X,Y,Z,R``, a ball in the frame and unit of component 0.
+    """
+
+    file: Path
+    intrinsics_px: Sequence[float] | None = None
+    colour: str | os.PathLike[str] | None = None
+    units_per_m: float = 1000.0
+    scale: str | None = None
+    near: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.scale is not None and self.scale not in SCALE_POLICIES:
+            raise ConfigError(f"scale must be one of {', '.join(SCALE_POLICIES)}, got {self.scale!r}")
+        if self.colour is not None and self.intrinsics_px is None:
+            raise ConfigError("colours belong to a depth picture: give its intrinsics fx,fy,cx,cy, too")
+
+
+@dataclass(frozen=True, eq=False)
+class _Sought:
+    """A scan as captures are: Gaussians and cameras in one frame."""
+
+    gaussians: Gaussians
+    cameras: Cameras
+    kind: str
+    policy: str
+    coloured: bool
+    origin: np.ndarray
+    notes: tuple[str, ...]
+
+
+def localize_scan(store: Store, request: Request, settings: Settings, progress: StageProgress) -> ScanRow:
+    """Where a scan lies in the map, by the scenes that show it; nothing is written.
+
+    It is described by the recipe of the map's graphs, the index tells the likeliest scenes, and it is registered with
+    each of these in turn as any pair is, until enough of them put it at one place.
+
+    Raises:
+        NotFoundError: no such file, or no scene of the map is described and placed.
+        InputError: see `gsmap.formats.scans` and `gsmap.ingest`.
+    """
+    began = time.process_time()
+
+    def told(fraction: float, text: str) -> None:
+        progress("localize", fraction, text)
+
+    told(0.0, f"reading {request.file.name}")
+    sought = _read(request, settings)
+    poses = store.revisions.get()
+    scenes = {scene.id: scene for scene in store.scenes.list()}
+    known = _asked(store, scenes, poses, settings)
+    if request.near is not None:
+        known = {scene: key for scene, key in known.items() if scene in _near(store, request.near)}
+    told(0.1, "describing the scan")
+    params = replace(settings.describe, objects=False, things=False)
+    graph = describe.describe(
+        _ID, sought.gaussians, sought.cameras, params, models.specs(store), scale_policy=sought.policy
+    )
+    source = SceneView(_ID, sought.gaussians, sought.cameras, graph, sought.policy)
+    told(0.3, "asking the index")
+    candidates = [one.scene for one in ask_once(store, known, graph, settings.retrieve)[: settings.retrieve.top_k]]
+    notes: list[str] = []
+    if not sought.coloured:
+        # The index knows scenes by their colours, and shapes repeat: all are asked, and all have a say.
+        rest = sorted(set(known) - set(candidates))
+        candidates = [*candidates, *rest][: settings.scan.most_by_shape]
+        if len(candidates) < len(known):
+            notes.append(
+                f"{len(candidates)} of {len(known)} scenes were compared: without colours nothing tells which are the "
+                "likeliest; say where it may lie with near"
+            )
+    assert poses is not None
+    found: list[Registration] = []
+    supports: list[Support] = []
+    for number, scene in enumerate(candidates):
+        told(0.3 + 0.7 * number / len(candidates), f"comparing with {scenes[scene].name}")
+        target = _view(store, scenes[scene], known[scene].digest)
+        if sought.coloured:
+            found.append(register.register_pair(target, source, settings.register))
+        else:
+            found.append(register.register_by_shape(target, source, settings.by_shape, settings.register))
+        if found[-1].status == "accepted":
+            supports.append(Support.of(poses.poses[scene], found[-1]))
+        if sought.coloured and len(supports) >= settings.scan.enough:
+            break
+    told(1.0, "done")
+    joined = None
+    if supports:
+        names = {scene.id: scene.name for scene in scenes.values()}
+        metres = metres_of_scenes(store, settings, poses)[supports[0].scene]
+        same = settings.register.same_pose
+        one = OnePlace(same.rotation_deg, same.distance_m / metres, same.log_scale, settings.scan.agree_sigmas)
+        joined = join(supports, source.centre, one, names)
+    seconds = time.process_time() - began
+    remarks = (*graph.notes, *notes) if sought.coloured else tuple(notes)
+    return _row(request, sought, remarks, found, supports, joined, poses, scenes, source.centre, seconds)
+
+
+def _read(request: Request, settings: Settings) -> _Sought:
+    """The scan, from whatever it is."""
+    reading = settings.scan.reading
+    if request.intrinsics_px is not None:
+        scan = scans.read_depth(
+            request.file,
+            request.intrinsics_px,
+            colour=request.colour,
+            units_per_m=request.units_per_m,
+            params=reading,
+        )
+        return _of_scan(scan, request.scale or "known", settings)
+    if scans.holds_splat(request.file):
+        captures = read_captures(request.file, scale_policy=request.scale or "auto")
+        if len(captures) != 1:
+            raise ConfigError(f"{request.file} holds {len(captures)} captures: name one of them")
+        capture = captures[0]
+        notes = capture.notes
+        return _Sought(capture.gaussians, capture.cameras, "splat", capture.scale_policy, True, np.zeros(3), notes)
+    policy = "auto" if request.file.suffix.lower() in _OF_NO_UNIT else "known"
+    return _of_scan(scans.read(request.file, reading), request.scale or policy, settings)
+
+
+def _of_scan(scan: Scan, policy: str, settings: Settings) -> _Sought:
+    few = scan.points[:: max(1, len(scan) // 20_000)]
+    unit_m = 1.0 if policy == "known" else estimate_unit_m(few, None, None, settings.describe.unit)
+    gaussians = as_gaussians(scan, unit_m, settings.scan)
+    cameras = synthesise_cameras(gaussians) if scan.camera is None else scan.camera
+    notes = list(scan.notes)
+    if scan.colours is None:
+        notes.append("the scan has no colours: it is told by its shape alone, which says less")
+    return _Sought(gaussians, cameras, scan.kind, policy, scan.colours is not None, scan.origin, tuple(notes))
+
+
+def _asked(store: Store, scenes: dict[str, Scene], poses: PoseGraph | None, settings: Settings) -> dict[str, RecipeKey]:
+    """The key of the graph of every scene that can be asked: described by the present recipe, and with a place."""
+    placed = [scene for scene in scenes.values() if poses is not None and scene.id in poses.poses]
+    keys = graph_keys(store, placed, settings)
+    lacking = set(without_graph(store, keys))
+    known = {scene: key for scene, key in keys.items() if scene not in lacking}
+    if not known:
+        raise NotFoundError(
+            f"no scene of {store.home} is described and has a place: run gsmap update {store.home} first"
+        )
+    return known
+
+
+def _near(store: Store, near: str) -> set[str]:
+    """Ids of the scenes near a scene, or near a ball ``X,Y,Z,R`` in the frame of component 0.
+
+    Raises:
+        NotFoundError: no such scene, or none is there.
+        ConfigError: four numbers that make no ball.
+    """
+    placed = placed_scenes(store)
+    parts = near.split(",")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        scene = store.scenes.get(near).id
+        if scene not in placed:
+            raise NotFoundError(f"scene {near} has no place in the map yet: run gsmap update first") from None
+        at, radius, component = placed[scene].centre, placed[scene].radius, placed[scene].component
+    else:
+        if len(numbers) != 4 or not np.isfinite(numbers).all() or not numbers[3] > 0:
+            raise ConfigError(f"near is a scene, or X,Y,Z,R with a positive radius, got {near!r}")
+        at, radius, component = np.array(numbers[:3]), numbers[3], 0
+    found = {
+        scene
+        for scene, one in placed.items()
+        if one.component == component and np.linalg.norm(one.centre - at) < radius + one.radius
+    }
+    if not found:
+        raise NotFoundError(f"no scene of the map lies near {near}")
+    return found
+
+
+def _view(store: Store, scene: Scene, graph_key: str) -> SceneView:
+    graph = store.graphs.load(scene.id, graph_key)
+    assert graph is not None
+    gaussians, cameras = store.scenes.gaussians(scene.id), store.scenes.cameras(scene.id)
+    return SceneView(scene.id, gaussians, cameras, graph, scene.scale_policy)
+
+
+def _row(
+    request: Request,
+    sought: _Sought,
+    remarks: Sequence[str],
+    found: Sequence[Registration],
+    supports: Sequence[Support],
+    joined: Joined | None,
+    poses: PoseGraph,
+    scenes: dict[str, Scene],
+    middle: np.ndarray,
+    seconds: float,
+) -> ScanRow:
+    notes = [*sought.notes, *remarks]
+    if any(support.tentative for support in supports):
+        notes.append("a scene that shows it is itself placed by edges that no cycle confirms")
+    S = None if joined is None else joined.S_map_scan
+    probabilities = [one.evidence.get("probability", np.nan) for one in found]
+    best = float(np.nanmax(probabilities)) if np.isfinite(probabilities).any() else 0.0
+    camera = None
+    if S is not None and sought.kind == "depth":
+        camera = np.eye(4)
+        camera[:3, :3], camera[:3, 3] = S.rotation, S.translation
+    sigma_deg, sigma = (None, None) if S is None or joined is None else _sigmas(joined.covariance, middle)
+    return ScanRow(
+        file=str(request.file),
+        kind=sought.kind,
+        status="refused" if S is None else "placed",
+        reason="" if S is not None else _why_not(found, joined, scenes),
+        S_map_scan=S,
+        T_map_camera=camera,
+        origin=sought.origin,
+        covariance=None if joined is None else joined.covariance,
+        sigma_deg=sigma_deg,
+        sigma_m=sigma,
+        component=None if S is None else supports[0].component,
+        scenes=() if S is None else tuple(scenes[s.scene].name for s in supports),
+        probability=best if joined is None else joined.probability,
+        coloured=sought.coloured,
+        num_points=len(sought.gaussians),
+        supports=tuple(
+            ScanSupport(
+                scene=one.target,
+                scene_name=scenes[one.target].name,
+                status=one.status,
+                reason=one.reason,
+                probability=one.evidence.get("probability", float("nan")),
+                overlap=one.overlap,
+                component=poses.poses[one.target].component,
+                S_map_scan=None
+                if one.S_target_source is None
+                else poses.poses[one.target].S_map_scene @ one.S_target_source,
+            )
+            for one in found
+        ),
+        seconds=seconds,
+        notes=tuple(notes),
+    )
+
+
+def _why_not(found: Sequence[Registration], joined: Joined | None, scenes: dict[str, Scene]) -> str:
+    if joined is not None:
+        return joined.reason
+    if not found:
+        return "no scene of the map has anything in common with it"
+    best = max(found, key=lambda one: (one.evidence.get("probability", 0.0) or 0.0, one.overlap))
+    return f"{len(found)} scenes were compared and none shows it; nearest {scenes[best.target].name}: {best.reason}"
+
+
+def _sigmas(covariance: np.ndarray | None, middle: np.ndarray) -> tuple[float | None, float | None]:
+    """Degrees about the least known axis, and the unit of the scan in the least known direction at its middle."""
+    if covariance is None:
+        return None, None
+    x, y, z = middle
+    moved = np.zeros((3, 7))
+    moved[:, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    moved[:, 3:6], moved[:, 6] = np.eye(3), middle
+    at = moved @ covariance @ moved.T
+    return (
+        float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))),
+        float(np.sqrt(np.linalg.eigvalsh(at)[-1])),
+    )

@@ -1,0 +1,476 @@
+"""Observations of the world as least-squares terms over scene poses, and the unknowns that only they have.
+
+Unknowns are scene poses ``S_map_scene``, the component's ``S_world_map``, the control points (world frame), cameras of
+photos that were localised, and what the fixes of a scene are off by together. Steps are on the source side, as
+everywhere; a point ``x`` in the source frame moves by ``G(x) step`` with ``G(x) = [-skew(x), I, x]``.
+
+Sums of few terms with many unknowns are what a survey is, so that everything here is arrays by kind of term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from gsmap.geometry.rotations import skew
+from gsmap.geometry.similarities import Similarities, commutator, exp
+from gsmap.types import Sim3
+from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey
+
+_FAR = 1e6  # m: how little is known of a point that no term holds; keeps the system regular and pulls at nothing
+_BEHIND = 1e3  # standard deviations of a photo that has the point behind it
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """An estimate of everything.
+
+    Args:
+        scenes: N poses. world: ``S_world_map``, as one row. points: (K, 3). cameras: M poses, scene frame.
+        offsets: (B, 3) common errors of fixes, m.
+    """
+
+    scenes: Similarities
+    world: Similarities
+    points: np.ndarray
+    cameras: Similarities
+    offsets: np.ndarray
+
+    def moved(self, step: np.ndarray, dim: int) -> Unknowns:
+        """After a step over all columns, see `Columns`."""
+        n, k, m = len(self.scenes), len(self.points), len(self.cameras)
+        ends = np.cumsum([n * dim, 7, 3 * k, 6 * m])
+        scenes, world, points, cameras, offsets = np.split(step, ends)
+        return Unknowns(
+            (self.scenes @ exp(scenes.reshape(n, dim))).orthonormalised(),
+            (self.world @ exp(world.reshape(1, 7))).orthonormalised(),
+            self.points + points.reshape(k, 3),
+            (self.cameras @ exp(cameras.reshape(m, 6))).orthonormalised(),
+            self.offsets + offsets.reshape(-1, 3),
+        )
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where the unknowns lie in a step: scenes (``dim`` each), world (7), points (3), cameras (6), offsets (3)."""
+
+    num_scenes: int
+    dim: int
+    num_points: int
+    num_cameras: int
+    num_offsets: int
+
+    @property
+    def world(self) -> int:
+        return self.num_scenes * self.dim
+
+    @property
+    def points(self) -> int:
+        return self.world + 7
+
+    @property
+    def cameras(self) -> int:
+        return self.points + 3 * self.num_points
+
+    @property
+    def offsets(self) -> int:
+        return self.cameras + 6 * self.num_cameras
+
+    @property
+    def size(self) -> int:
+        return self.offsets + 3 * self.num_offsets
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """G whitened terms of one kind, each of m rows.
+
+    Args:
+        kind: of observation, as in `Residual`; empty for what is no observation (edges, priors, cameras, offsets).
+        residuals: (G, m).
+        parts: (first column (G,), derivative (G, m, width)) by unknown; a first column of -1 is none.
+        valid: (G,) bool, False where the term means nothing at this estimate (behind the camera).
+    """
+
+    kind: str
+    residuals: np.ndarray
+    parts: tuple[tuple[np.ndarray, np.ndarray], ...]
+    valid: np.ndarray
+
+    @cached_property
+    def squares(self) -> np.ndarray:
+        """(G,) chi-square of each term by itself."""
+        out: np.ndarray = (self.residuals**2).sum(1)
+        return out
+
+    def rows(self, size: int) -> np.ndarray:
+        """(G, m, size) dense derivatives by all columns; of few terms only."""
+        g, m = self.residuals.shape
+        out = np.zeros((g, m, size))
+        for first, J in self.parts:
+            for k in np.flatnonzero(first >= 0).tolist():
+                out[k, :, first[k] : first[k] + J.shape[2]] += J[k]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyTerms:
+    """The observations of one component as arrays.
+
+    Args:
+        scene_ids: N, in the order of the scenes of `Unknowns`.
+        dim: unknowns of a scene's pose, 6 or 7.
+        points, images, fixes, bars: positions in the world frame.
+    """
+
+    scene_ids: tuple[str, ...]
+    dim: int
+    points: tuple[ControlPoint, ...]
+    images: tuple[ImagePoint, ...]
+    fixes: tuple[Fix, ...]
+    bars: tuple[ScaleBar, ...]
+
+    @classmethod
+    def of(cls, survey: Survey, scene_ids: Sequence[str], dim: int) -> SurveyTerms:
+        """Those of the scenes of one component; points that none of their photos shows are left out."""
+        mine = set(scene_ids)
+        known = {point.name for point in survey.points}
+        images = tuple(i for i in survey.images if i.scene in mine and i.point in known)
+        seen = {image.point for image in images}
+        return cls(
+            tuple(scene_ids),
+            dim,
+            tuple(point for point in survey.points if point.name in seen),
+            images,
+            tuple(fix for fix in survey.fixes if fix.scene in mine),
+            tuple(bar for bar in survey.bars if set(bar.scenes) <= mine),
+        )
+
+    def __bool__(self) -> bool:
+        return bool(self.points or self.fixes or self.bars)
+
+    @property
+    def columns(self) -> Columns:
+        return Columns(
+            len(self.scene_ids), self.dim, len(self.points), len(self._camera_rows), len(self._offset_scenes)
+        )
+
+    @cached_property
+    def _row(self) -> dict[str, int]:
+        return {scene: k for k, scene in enumerate(self.scene_ids)}
+
+    @cached_property
+    def _point_row(self) -> dict[str, int]:
+        return {point.name: k for k, point in enumerate(self.points)}
+
+    @cached_property
+    def image_points(self) -> np.ndarray:
+        """(I,) the point that each image shows."""
+        return np.array([self._point_row[i.point] for i in self.images], dtype=np.int64)
+
+    @cached_property
+    def image_scenes(self) -> np.ndarray:
+        """(I,) the scene that each image's camera is in."""
+        return np.array([self._row[i.scene] for i in self.images], dtype=np.int64)
+
+    @cached_property
+    def _uncertain(self) -> dict[tuple[str, str], ImagePoint]:
+        """By (scene, photo), the first image of each photo whose camera is not exact."""
+        out: dict[tuple[str, str], ImagePoint] = {}
+        for image in self.images:
+            if image.camera_covariance is not None:
+                out.setdefault((image.scene, image.image), image)
+        return out
+
+    @cached_property
+    def _camera_rows(self) -> dict[tuple[str, str], int]:
+        return {photo: k for k, photo in enumerate(self._uncertain)}
+
+    @cached_property
+    def _image_cameras(self) -> np.ndarray:
+        """(I,) the camera of each image, -1 where it is exact."""
+        return np.array([self._camera_rows.get((i.scene, i.image), -1) for i in self.images], dtype=np.int64)
+
+    @cached_property
+    def _offset_scenes(self) -> list[str]:
+        return sorted({fix.scene for fix in self.fixes if max(fix.common_sigma_m) > 0})
+
+    def start(self, scenes: Similarities, world: Sim3) -> Unknowns:
+        """Points where they were surveyed, cameras where they were localised, no common errors."""
+        cameras = [Sim3.from_matrix(image.T_scene_camera) for image in self._uncertain.values()]
+        return Unknowns(
+            scenes,
+            Similarities.stack([world]),
+            np.array([point.position for point in self.points], dtype=np.float64).reshape(-1, 3),
+            Similarities.stack(cameras),
+            np.zeros((len(self._offset_scenes), 3)),
+        )
+
+    # --- terms -------------------------------------------------------------------------------------------------------
+
+    def observations(self, x: Unknowns) -> tuple[Terms, Terms, Terms, Terms]:
+        """Of points, images, fixes and bars."""
+        return self._points(x), self._images(x), self._fixes(x), self._bars(x)
+
+    def others(self, x: Unknowns, at: Unknowns) -> tuple[Terms, ...]:
+        """What is known of localised cameras and common errors, and next to nothing of the points.
+
+        Args:
+            at: where the steps of points are counted from.
+        """
+        columns, k = self.columns, len(self.points)
+        points = Terms(
+            "",
+            (x.points - at.points) / _FAR,
+            ((columns.points + 3 * np.arange(k), np.tile(np.eye(3) / _FAR, (k, 1, 1))),),
+            np.ones(k, dtype=bool),
+        )
+        start = Similarities.stack([Sim3.from_matrix(i.T_scene_camera) for i in self._uncertain.values()])
+        m = len(start)
+        roots = np.array([_whitener(np.asarray(i.camera_covariance)) for i in self._uncertain.values()])
+        roots = roots.reshape(m, 6, 6)
+        off = (start.inverse() @ x.cameras).log()
+        ad = commutator(off)
+        back = (np.eye(7) + ad / 2 + ad @ ad / 12)[:, :6, :6]  # as of edges
+        cameras = Terms(
+            "",
+            np.einsum("kij,kj->ki", roots, off[:, :6]),
+            ((columns.cameras + 6 * np.arange(m), roots @ back),),
+            np.ones(m, dtype=bool),
+        )
+        b = len(self._offset_scenes)
+        weights = 1 / self._offset_sigmas
+        offsets = Terms(
+            "",
+            x.offsets * weights,
+            ((columns.offsets + 3 * np.arange(b), weights[:, :, None] * np.eye(3)),),
+            np.ones(b, dtype=bool),
+        )
+        return points, cameras, offsets
+
+    @cached_property
+    def _offset_sigmas(self) -> np.ndarray:
+        """(B, 3); the largest that any fix of the scene has."""
+        out = np.full((len(self._offset_scenes), 3), 1e-6)
+        for k, scene in enumerate(self._offset_scenes):
+            for fix in self.fixes:
+                if fix.scene == scene:
+                    out[k] = np.maximum(out[k], _per_axis(fix.common_sigma_m))
+        return out
+
+    def _points(self, x: Unknowns) -> Terms:
+        weights = np.array([1 / _per_axis(point.sigma_m) for point in self.points]).reshape(-1, 3)
+        surveyed = np.array([point.position for point in self.points], dtype=np.float64).reshape(-1, 3)
+        first = self.columns.points + 3 * np.arange(len(self.points))
+        J = weights[:, :, None] * np.eye(3)
+        return Terms("point", (x.points - surveyed) * weights, ((first, J),), np.ones(len(self.points), dtype=bool))
+
+    def _images(self, x: Unknowns) -> Terms:
+        columns, scenes, cams = self.columns, self.image_scenes, self._image_cameras
+        count = len(self.images)
+        if not count:
+            return Terms("image", np.zeros((0, 3)), (), np.zeros(0, dtype=bool))
+        world, P = x.world[np.zeros(count, dtype=np.int64)], x.points[self.image_points]
+        in_map = world.inverse().apply(P)
+        pose = x.scenes[scenes]
+        in_scene = pose.inverse().apply(in_map)
+        camera = self.cameras_at(x)
+        in_camera = camera.inverse().apply(in_scene)
+        # Each frame's own step, then the chain towards the camera.
+        to_scene = _linear(pose.inverse())
+        to_camera = _linear(camera.inverse())
+        by_world = to_camera @ to_scene @ -_moves(in_map)
+        by_point = to_camera @ to_scene @ _linear(world.inverse())
+        by_pose = to_camera @ -_moves(in_scene)[:, :, : self.dim]
+        by_camera = -_moves(in_camera)[:, :, :6]
+        fx, fy, cx, cy = np.array([i.intrinsics_px for i in self.images], dtype=np.float64).T
+        picked = np.array([i.pixel for i in self.images], dtype=np.float64)
+        size = np.linalg.norm(in_camera, axis=1)
+        valid = in_camera[:, 2] > 1e-3 * size
+        z = np.where(valid, in_camera[:, 2], np.maximum(size, 1e-9))
+        u, v = fx * in_camera[:, 0] / z + cx, fy * in_camera[:, 1] / z + cy
+        weight = np.array([1 / i.sigma_px for i in self.images])
+        depth = np.array([np.nan if i.depth is None else i.depth for i in self.images], dtype=np.float64)
+        far = np.array([0.0 if i.depth is None else 1 / i.depth_sigma for i in self.images])
+        r = np.stack([(u - picked[:, 0]) * weight, (v - picked[:, 1]) * weight, np.zeros(count)], axis=1)
+        r[:, 2] = np.where(far > 0, (in_camera[:, 2] - np.nan_to_num(depth)) * far, 0.0)
+        D = np.zeros((count, 3, 3))
+        D[:, 0, 0], D[:, 0, 2] = fx / z * weight, -fx * in_camera[:, 0] / z**2 * weight
+        D[:, 1, 1], D[:, 1, 2] = fy / z * weight, -fy * in_camera[:, 1] / z**2 * weight
+        D[:, 2, 2] = far
+        D[~valid] = 0.0
+        r[~valid] = _BEHIND
+        none = np.full(count, -1)
+        parts = (
+            (scenes * self.dim, D @ by_pose),
+            (np.full(count, columns.world), D @ by_world),
+            (columns.points + 3 * self.image_points, D @ by_point),
+            (np.where(cams >= 0, columns.cameras + 6 * cams, none), D @ by_camera),
+        )
+        return Terms("image", r, parts, valid)
+
+    def cameras_at(self, x: Unknowns) -> Similarities:
+        """(I) the camera of each image in its scene."""
+        exact = Similarities.stack([Sim3.from_matrix(image.T_scene_camera) for image in self.images])
+        rows = np.flatnonzero(self._image_cameras >= 0)
+        return exact.replaced(rows, x.cameras[self._image_cameras[rows]]) if len(rows) else exact
+
+    def image_errors_px(self, x: Unknowns) -> np.ndarray:
+        """(I, 2) from where points were picked to where they fall."""
+        terms = self._images(x)
+        sigmas = np.array([image.sigma_px for image in self.images])
+        out: np.ndarray = terms.residuals[:, :2] * sigmas[:, None]
+        return out
+
+    def _fixes(self, x: Unknowns) -> Terms:
+        count, columns = len(self.fixes), self.columns
+        if not count:
+            return Terms("fix", np.zeros((0, 3)), (), np.zeros(0, dtype=bool))
+        scenes = np.array([self._row[fix.scene] for fix in self.fixes], dtype=np.int64)
+        points = np.array([fix.point for fix in self.fixes], dtype=np.float64)
+        measured = np.array([fix.position for fix in self.fixes], dtype=np.float64)
+        weights = np.array([1 / _per_axis(fix.sigma_m) for fix in self.fixes])
+        pose, world = x.scenes[scenes], x.world[np.zeros(count, dtype=np.int64)]
+        in_map = pose.apply(points)
+        of_scene = {scene: k for k, scene in enumerate(self._offset_scenes)}
+        common = np.array([of_scene.get(f.scene, -1) if max(f.common_sigma_m) > 0 else -1 for f in self.fixes])
+        off = np.where(common[:, None] >= 0, x.offsets[common] if len(x.offsets) else 0.0, 0.0)
+        residual = (world.apply(in_map) + off - measured) * weights
+        turn = _linear(world)
+        parts = (
+            (scenes * self.dim, weights[:, :, None] * (turn @ _linear(pose) @ _moves(points)[:, :, : self.dim])),
+            (np.full(count, columns.world), weights[:, :, None] * (turn @ _moves(in_map))),
+            (np.where(common >= 0, columns.offsets + 3 * common, -1), weights[:, :, None] * np.eye(3)),
+        )
+        return Terms("fix", residual, parts, np.ones(count, dtype=bool))
+
+    def fix_points(self, scenes: Similarities) -> np.ndarray:
+        """(F, 3) where they lie in the map."""
+        rows = np.array([self._row[fix.scene] for fix in self.fixes], dtype=np.int64)
+        return scenes[rows].apply(np.array([fix.point for fix in self.fixes], dtype=np.float64).reshape(-1, 3))
+
+    def _bars(self, x: Unknowns) -> Terms:
+        count, columns = len(self.bars), self.columns
+        if not count:
+            return Terms("bar", np.zeros((0, 1)), (), np.zeros(0, dtype=bool))
+        rows = np.array([[self._row[scene] for scene in bar.scenes] for bar in self.bars], dtype=np.int64)
+        ends = np.array([bar.points for bar in self.bars], dtype=np.float64)
+        poses = [x.scenes[rows[:, k]] for k in (0, 1)]
+        in_map = [pose.apply(ends[:, k]) for k, pose in enumerate(poses)]
+        span = in_map[0] - in_map[1]
+        across = np.linalg.norm(span, axis=1)
+        along = span / np.maximum(across, 1e-300)[:, None]
+        scale = float(np.exp(x.world.log_scales[0]))
+        length = scale * across
+        sigma = np.array([bar.sigma_m for bar in self.bars])
+        sizes = np.stack([np.exp(pose.log_scales) for pose in poses], axis=1)
+        measured = np.array([bar.length_m for bar in self.bars])
+        # In metres by the bar itself: by the estimate, a larger world would make its own errors count for less.
+        metres = (measured / np.maximum(across, 1e-300))[:, None]
+        picked = np.array([bar.point_sigmas for bar in self.bars]) * sizes * metres
+        weight = 1 / np.sqrt(sigma**2 + (picked**2).sum(1))
+        by_end = [
+            (scale * weight)[:, None, None] * along[:, None, :] @ _linear(pose) @ _moves(ends[:, k])[:, :, : self.dim]
+            for k, pose in enumerate(poses)
+        ]
+        by_world = np.zeros((count, 1, 7))
+        by_world[:, 0, 6] = length * weight
+        parts = (
+            (rows[:, 0] * self.dim, by_end[0]),
+            (rows[:, 1] * self.dim, -by_end[1]),
+            (np.full(count, columns.world), by_world),
+        )
+        return Terms("bar", ((length - measured) * weight)[:, None], parts, np.ones(count, dtype=bool))
+
+    # --- points from photos alone ------------------------------------------------------------------------------------
+
+    def triangulated(self, x: Unknowns, use: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where photos alone have the points, all poses held.
+
+        Two rays or more are met where their least-squares point lies; a single one where the rendered surface is.
+
+        Args:
+            use: (I,) bool, images to take.
+
+        Returns:
+            (K, 3) world frame, (K, 3, 3) covariance of picking alone, (K,) bool whether the photos tell.
+        """
+        world = x.world[np.zeros(len(self.images), dtype=np.int64)]
+        full = world @ x.scenes[self.image_scenes] @ self.cameras_at(x) if len(self.images) else world
+        points, covariances, told = x.points.copy(), np.zeros((len(self.points), 3, 3)), []
+        for k in range(len(self.points)):
+            mine = np.flatnonzero((self.image_points == k) & use)
+            found = self._meeting(full[mine], [self.images[i] for i in mine.tolist()])
+            told.append(found is not None)
+            if found is not None:
+                points[k] = found
+        told_ = np.array(told, dtype=bool)
+        at = replace(x, points=points)
+        for _ in range(10):
+            terms = self._images(at)
+            J = terms.parts[2][1] if len(self.images) else np.zeros((0, 3, 3))
+            live = use & terms.valid
+            H, g = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+            np.add.at(H, self.image_points[live], np.einsum("iab,iac->ibc", J[live], J[live]))
+            np.add.at(g, self.image_points[live], np.einsum("iab,ia->ib", J[live], terms.residuals[live]))
+            told_ &= np.array([np.linalg.cond(h) < 1e12 if h.any() else False for h in H], dtype=bool)
+            step = np.zeros_like(points)
+            step[told_] = -np.linalg.solve(H[told_], g[told_][:, :, None])[:, :, 0]
+            at = replace(at, points=at.points + step)
+            if np.abs(step).max(initial=0) < 1e-9:
+                break
+        covariances[told_] = np.linalg.inv(H[told_]) if len(points) else covariances[told_]
+        return at.points, covariances, told_
+
+    def _meeting(self, cameras: Similarities, images: Sequence[ImagePoint]) -> np.ndarray | None:
+        """A first guess of where rays meet; None where they are too few or parallel and no surface is known."""
+        if not images:
+            return None
+        centres = cameras.translations
+        rays = np.array([_ray(image) for image in images])
+        turned = np.einsum("nij,nj->ni", cameras.rotations, rays)
+        unit = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        away = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+        H = away.sum(0)
+        if len(images) >= 2 and np.linalg.eigvalsh(H)[0] > 1e-5 * len(images):
+            met: np.ndarray = np.linalg.solve(H, np.einsum("nij,nj->i", away, centres))
+            if ((met - centres) * unit).sum(1).min() > 0:
+                return met
+        for k, image in enumerate(images):
+            if image.depth is not None:
+                seen: np.ndarray = centres[k] + turned[k] * image.depth * float(np.exp(cameras.log_scales[k]))
+                return seen
+        return None
+
+
+def _ray(image: ImagePoint) -> np.ndarray:
+    fx, fy, cx, cy = np.asarray(image.intrinsics_px, dtype=np.float64)
+    return np.array([(image.pixel[0] - cx) / fx, (image.pixel[1] - cy) / fy, 1.0])
+
+
+def _per_axis(sigma_m: tuple[float, float]) -> np.ndarray:
+    return np.array([sigma_m[0], sigma_m[0], sigma_m[1]], dtype=np.float64)
+
+
+def _linear(poses: Similarities) -> np.ndarray:
+    """(N, 3, 3) ``s R``."""
+    out: np.ndarray = poses.rotations * np.exp(poses.log_scales)[:, None, None]
+    return out
+
+
+def _moves(points: np.ndarray) -> np.ndarray:
+    """(N, 3, 7) how points of a frame move by a step of it: ``[-skew(x), I, x]``."""
+    out = np.zeros((len(points), 3, 7))
+    out[:, :, :3] = -skew(points)
+    out[:, :, 3:6] = np.eye(3)
+    out[:, :, 6] = points
+    return out
+
+
+def _whitener(covariance: np.ndarray) -> np.ndarray:
+    """(6, 6) ``L^-1`` of a covariance ``L L^T``."""
+    out: np.ndarray = np.linalg.inv(np.linalg.cholesky((covariance + covariance.T) / 2))
+    return out

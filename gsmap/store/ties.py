@@ -1,0 +1,71 @@
+"""Where components lie in the world, as a revision's row holds it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import CorruptError, GsmapError
+from gsmap.store.matrices import from_array, from_pose, to_array, to_pose
+from gsmap.types.plain import plain
+from gsmap.types.world import Residual, WorldFrame, WorldTie
+
+_PAIRS = ("error_m", "sigma_m", "error_px")
+
+
+def tie_value(tie: WorldTie) -> dict[str, Any]:
+    """As JSON holds it, to the last bit."""
+    return {
+        "component": int(tie.component),
+        "S_world_map": from_pose(tie.S_world_map),
+        "covariance": from_array(tie.covariance),
+        "metres_per_unit": tie.metres_per_unit,
+        "scale_sigma": tie.scale_sigma,
+        "frame": plain(tie.frame),
+        "residuals": [plain(row) for row in tie.residuals],
+        "problem": tie.problem,
+        "notes": list(tie.notes),
+    }
+
+
+def ties_of(values: list[dict[str, Any]]) -> tuple[WorldTie, ...]:
+    """The reverse.
+
+    Raises:
+        CorruptError: gsmap did not write that.
+    """
+    try:
+        return tuple(_tie(value) for value in values)
+    except (GsmapError, TypeError, ValueError, KeyError, AttributeError) as error:
+        raise CorruptError(
+            f"the catalog holds a place in the world, in revisions.world, that makes no sense ({error!r}): gsmap did "
+            "not write that; restore the catalog from a backup"
+        ) from error
+
+
+def _tie(value: dict[str, Any]) -> WorldTie:
+    covariance, metres = to_array(value["covariance"]), value["metres_per_unit"]
+    if covariance is not None and (covariance.shape != (7, 7) or not np.isfinite(covariance).all()):
+        raise ValueError("no covariance")
+    if metres is not None and not (np.isfinite(metres) and metres > 0):
+        raise ValueError("no metre")
+    rows = []
+    for row in value["residuals"]:
+        values: dict[str, Any] = {k: tuple(map(float, v)) if k in _PAIRS else v for k, v in row.items()}
+        if not all(isinstance(values[k], str) for k in ("kind", "name", "scene", "use", "reason")):
+            raise ValueError("names that are no texts")
+        if not isinstance(values["dof"], int) or not isinstance(values["statistic"], float | int | None):
+            raise ValueError("no statistic")
+        rows.append(Residual(**values))
+    return WorldTie(
+        int(value["component"]),
+        to_pose(value["S_world_map"]),
+        covariance,
+        metres,
+        float(value["scale_sigma"]),
+        None if value["frame"] is None else WorldFrame(**value["frame"]),
+        tuple(rows),
+        str(value["problem"]),
+        tuple(map(str, value["notes"])),
+    )

@@ -1,0 +1,185 @@
+"""What was observed of the world: control points, photos of them, positions, scale bars, and the frame they are in.
+
+Observations are kept as they were made, each in its own coordinate reference system, and none is overwritten: one that
+is told again retires the earlier one. A row's ``scene`` is the one whose frame it speaks of; a bar may name another,
+``other``. Photos of a point hold their camera, so that nothing else is needed to solve from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Row, insert, select, update
+
+from gsmap.errors import CorruptError, GsmapError, NotFoundError
+from gsmap.store.catalog import Catalog, now
+from gsmap.store.scene_refs import living_ids
+from gsmap.store.schema import observations
+from gsmap.types.plain import plain
+from gsmap.types.world import ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame
+
+Observation = WorldFrame | ControlPoint | ImagePoint | Fix | ScaleBar
+_TYPES: Mapping[str, type[Observation]] = {
+    "frame": WorldFrame,
+    "point": ControlPoint,
+    "image": ImagePoint,
+    "fix": Fix,
+    "bar": ScaleBar,
+}
+_ARRAYS = {"position", "pixel", "T_scene_camera", "intrinsics_px", "camera_covariance", "point", "points"}
+_TEXTS = {"name", "crs", "image", "scene"}
+_TUPLES = {"sigma_m", "common_sigma_m", "scenes", "point_sigmas"}
+
+
+class World:
+    """The observations of a map."""
+
+    def __init__(self, catalog: Catalog) -> None:
+        self._catalog = catalog
+
+    def add(self, items: Iterable[Observation]) -> int:
+        """Note observations, each in place of one of its name that stands; returns how many are new or differ."""
+        count = 0
+        with self._catalog.write() as connection:
+            standing = {_key(row): row for row in connection.execute(_standing())}
+            for item in items:
+                made = _row(item)
+                before = standing.get(_key_of(made))
+                if before is not None and before.value == made["value"]:
+                    continue
+                if before is not None:
+                    mine = observations.c.number == before.number
+                    connection.execute(update(observations).where(mine).values(removed_at=now()))
+                connection.execute(insert(observations), made | {"created_at": now()})
+                count += 1
+        return count
+
+    def survey(self) -> Survey:
+        """All that stands, of living scenes, in the order of names."""
+        with self._catalog.read() as connection:
+            alive = living_ids(connection)
+            rows = [row for row in connection.execute(_standing()) if _lives(row, alive)]
+        by_kind: dict[str, list[Any]] = {kind: [] for kind in _TYPES}
+        for row in sorted(rows, key=_key):
+            by_kind[row.kind].append(_item(row))
+        return Survey(
+            by_kind["frame"][0] if by_kind["frame"] else None,
+            tuple(by_kind["point"]),
+            tuple(by_kind["image"]),
+            tuple(by_kind["fix"]),
+            tuple(by_kind["bar"]),
+        )
+
+    def remove(self, names: Sequence[str] = (), *, kinds: Sequence[str] = (), scene: str | None = None) -> int:
+        """Take observations back; returns how many.
+
+        Args:
+            names: of points (with their photos), photos, fixes or bars; all where none is named.
+            kinds: only of these kinds; of all but the frame where none is named, with it where nothing else is chosen.
+            scene: only those of this one (id).
+
+        Raises:
+            NotFoundError: one of the names is none.
+        """
+        chosen = tuple(kinds) or (tuple(_TYPES) if not names and scene is None else ("point", "image", "fix", "bar"))
+        wanted, found = set(names), set()
+        with self._catalog.write() as connection:
+            gone = []
+            for row in connection.execute(_standing()).all():
+                said = {row.name, row.value.get("point")} if row.kind == "image" else {row.name}
+                if row.kind not in chosen or (scene is not None and row.scene != scene):
+                    continue
+                if not wanted or said & wanted:
+                    gone.append(row.number)
+                    found |= said & wanted
+            missing = sorted(wanted - found)
+            if missing:
+                raise NotFoundError(f"no observation is called {missing[0]!r}: gsmap georeference MAP shows them")
+            for number in gone:
+                mine = observations.c.number == number
+                connection.execute(update(observations).where(mine).values(removed_at=now()))
+        return len(gone)
+
+
+def inherit(connection: Connection, old: str, new: str) -> None:
+    """Let a scene have the observations of another, in whose frame it is."""
+    for row in connection.execute(_standing()).all():
+        if old not in (row.scene, row.other):
+            continue
+        values = _renamed(dict(row._mapping), old, new)
+        connection.execute(insert(observations), {k: v for k, v in values.items() if k != "number"})
+
+
+def _renamed(row: dict[str, Any], old: str, new: str) -> dict[str, Any]:
+    value = dict(row["value"])
+    if value.get("scene") == old:
+        value["scene"] = new
+    if "scenes" in value:
+        value["scenes"] = [new if scene == old else scene for scene in value["scenes"]]
+    ends = {name: new if row[name] == old else row[name] for name in ("scene", "other")}
+    return row | ends | {"value": value}
+
+
+def _standing() -> Any:
+    return select(observations).where(observations.c.removed_at.is_(None)).order_by(observations.c.number)
+
+
+def _lives(row: Row[Any], alive: set[str]) -> bool:
+    return all(scene is None or scene in alive for scene in (row.scene, row.other))
+
+
+def _key(row: Row[Any]) -> tuple[str, str, str]:
+    return row.kind, row.name, row.scene or ""
+
+
+def _key_of(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    # Of a bar the name alone: it may be picked again in other scenes.
+    return row["kind"], row["name"], row["scene"] or ""
+
+
+def _row(item: Observation) -> dict[str, Any]:
+    kind = next(kind for kind, type_ in _TYPES.items() if type(item) is type_)
+    scene, other = getattr(item, "scene", None), None
+    name = {"frame": "frame"}.get(kind) or str(getattr(item, "name", ""))
+    if isinstance(item, ImagePoint):
+        name = f"{item.point} in {item.image}"
+    if isinstance(item, ScaleBar):
+        scene, other = item.scenes
+    value = plain(item)
+    return {"kind": kind, "name": name, "scene": scene, "other": other, "value": value, "removed_at": None}
+
+
+def _item(row: Row[Any]) -> Any:
+    try:
+        values: dict[str, Any] = {
+            name: _tuple(value)
+            if name in _TUPLES and isinstance(value, list)
+            else np.array(value)
+            if _is_array(name, value)
+            else value
+            for name, value in row.value.items()
+        }
+        texts = [value for name, value in values.items() if name in _TEXTS]
+        if not all(isinstance(text, str) for text in [*texts, *values.get("scenes", ())]):
+            raise ValueError("names that are no texts")
+        made = _TYPES[row.kind](**values)
+        if _row(made)["scene"] != row.scene or _row(made)["other"] != row.other or _row(made)["name"] != row.name:
+            raise ValueError("of another name or scene than its row")
+    except (GsmapError, TypeError, ValueError, KeyError) as error:
+        raise CorruptError(
+            f"the catalog holds an observation ({row.kind} {row.name!r}) that makes no sense: {error}; gsmap did not "
+            "write that: restore the catalog from a backup"
+        ) from error
+    return made
+
+
+def _is_array(name: str, value: Any) -> bool:
+    return name in _ARRAYS and isinstance(value, list)
+
+
+def _tuple(value: list[Any]) -> tuple[Any, ...]:
+    if len(value) != 2:
+        raise ValueError("not a pair")
+    return tuple(value)

@@ -1,0 +1,274 @@
+"""What ties a map to the world: a coordinate reference system, observations of where things lie in it, and the answer.
+
+World coordinates are in a *CRS*: longitude or easting first, then latitude or northing, then height (what PROJ calls
+``always_xy``), with the height in the CRS's own vertical axis, ellipsoidal where it has none. No graph is solved in
+them: a projection bends and stretches lengths, and eight digits before the point cost the last of float64. The *world
+frame* is Euclidean, metres along east, north and up at an origin near the data (`WorldFrame`); ``S_world_map`` maps a
+component of the map into it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.types.sim3 import Sim3
+
+LOCAL = "local"
+"""In place of a CRS: east, north, up in metres of the world frame."""
+
+
+@dataclass(frozen=True)
+class WorldFrame:
+    """The Euclidean frame that the map is solved in: metres along east, north and up at an origin.
+
+    Args:
+        crs: that the map speaks to people in, ``EPSG:N`` or WKT.
+        latitude_deg, longitude_deg, height_m: the origin, on the ellipsoid of that CRS's datum.
+    """
+
+    crs: str
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+    def __post_init__(self) -> None:
+        if not np.isfinite([self.latitude_deg, self.longitude_deg, self.height_m]).all():
+            raise InputError("the origin of a world frame must be finite")
+
+
+OBSERVATION_KINDS = ("frame", "point", "image", "fix", "bar")
+
+
+# --- what was observed ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoint:
+    """A ground control point: a mark whose world coordinates were surveyed.
+
+    Args:
+        name: unique in the map.
+        crs: of ``position``; ``local`` once it is in the world frame.
+        position: (3,) x y z in it.
+        sigma_m: (2,) standard deviations of the survey, horizontal (per axis) and vertical.
+        check: held out, to be compared with and not to be solved from.
+    """
+
+    name: str
+    crs: str
+    position: np.ndarray
+    sigma_m: tuple[float, float] = (0.01, 0.01)
+    check: bool = False
+
+    def __post_init__(self) -> None:
+        _finite(f"control point {self.name}", self.position, 3)
+        _positive(f"control point {self.name}", *self.sigma_m)
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePoint:
+    """A control point as a photo shows it. It holds its camera, so that it outlives whatever named the photo.
+
+    Args:
+        point: name of the control point.
+        image: name of the photo.
+        scene: id of the scene whose frame the camera is in.
+        pixel: (2,) column, row; the first pixel's centre is .5 .5.
+        sigma_px: standard deviation per axis, of the picking and of the camera that it was picked in.
+        T_scene_camera: (4, 4).
+        intrinsics_px: (4,) ``fx fy cx cy``.
+        camera_covariance: (6, 6) of the camera over [rotation (3, rad), translation (3, scene unit)] on the camera's
+            side; None where the camera is a scene's own.
+        depth: of the surface seen there, along the camera's z, in the scene's unit; None where nothing was rendered.
+        depth_sigma: its standard deviation.
+    """
+
+    point: str
+    image: str
+    scene: str
+    pixel: np.ndarray
+    sigma_px: float
+    T_scene_camera: np.ndarray
+    intrinsics_px: np.ndarray
+    camera_covariance: np.ndarray | None = None
+    depth: float | None = None
+    depth_sigma: float = float("inf")
+
+    def __post_init__(self) -> None:
+        where = f"control point {self.point} in {self.image}"
+        _finite(where, self.pixel, 2)
+        _finite(where, self.T_scene_camera, 4, 4)
+        _finite(where, self.intrinsics_px, 4)
+        _positive(where, self.sigma_px, *np.asarray(self.intrinsics_px, dtype=float)[:2])
+        if self.camera_covariance is not None:
+            _finite(where, self.camera_covariance, 6, 6)
+        if self.depth is not None:
+            _positive(where, self.depth, self.depth_sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """A point of a scene whose world coordinates were measured: a camera's GNSS position, a survey of its origin.
+
+    Args:
+        name: unique within its scene: of the photo, or ``survey``.
+        scene: id.
+        point: (3,) in the scene's frame.
+        crs: of ``position``; ``local`` once it is in the world frame.
+        position: (3,) x y z in it.
+        sigma_m: (2,) standard deviations, horizontal (per axis) and vertical, each fix by itself.
+        common_sigma_m: (2,) the same of what all fixes of a scene are off by together: satellites, antenna, datum.
+    """
+
+    name: str
+    scene: str
+    point: np.ndarray
+    crs: str
+    position: np.ndarray
+    sigma_m: tuple[float, float]
+    common_sigma_m: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        where = f"the position of {self.name} in scene {self.scene}"
+        _finite(where, self.point, 3)
+        _finite(where, self.position, 3)
+        _positive(where, *self.sigma_m)
+        if not (np.isfinite(self.common_sigma_m).all() and min(self.common_sigma_m) >= 0):
+            raise InputError(f"{where} needs a common sigma of at least 0, got {self.common_sigma_m}")
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleBar:
+    """A distance that was measured between two picked points.
+
+    Args:
+        name: unique in the map.
+        scenes: ids of the scenes that the ends were picked in.
+        points: (2, 3) the ends, each in the frame of its scene.
+        point_sigmas: (2,) standard deviations of the picking, per axis, in the scenes' units.
+        length_m, sigma_m: the distance.
+    """
+
+    name: str
+    scenes: tuple[str, str]
+    points: np.ndarray
+    point_sigmas: tuple[float, float]
+    length_m: float
+    sigma_m: float
+
+    def __post_init__(self) -> None:
+        _finite(f"scale bar {self.name}", self.points, 2, 3)
+        _positive(f"scale bar {self.name}", self.length_m, self.sigma_m, *self.point_sigmas)
+        if self.scenes[0] == self.scenes[1] and np.allclose(self.points[0], self.points[1], rtol=0, atol=1e-12):
+            raise InputError(f"the ends of scale bar {self.name} are one point: pick two")
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """All observations of a map. Where they are solved from, positions are in the world frame (``crs`` is ``local``).
+
+    Args:
+        frame: the world frame; None as long as no CRS was named.
+    """
+
+    frame: WorldFrame | None = None
+    points: tuple[ControlPoint, ...] = ()
+    images: tuple[ImagePoint, ...] = ()
+    fixes: tuple[Fix, ...] = ()
+    bars: tuple[ScaleBar, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.points or self.fixes or self.bars)
+
+    def scenes(self) -> set[str]:
+        """Ids of all scenes that anything was observed of."""
+        found = {image.scene for image in self.images} | {fix.scene for fix in self.fixes}
+        return found.union(*(bar.scenes for bar in self.bars))
+
+
+# --- what was solved --------------------------------------------------------------------------------------------------
+
+RESIDUAL_KINDS = ("point", "image", "fix", "bar")
+RESIDUAL_USES = ("used", "outlier", "check", "unused")
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How one observation fits.
+
+    Args:
+        kind: ``point``, ``image`` (a point in one photo), ``fix`` or ``bar``.
+        name: of the point, photo or bar.
+        scene: id of the scene; empty for a point, which may be seen from several.
+        use: ``used``, ``outlier`` (it contradicts the others, and was left out), ``check`` (held out) or ``unused``.
+        error_m: east, north, up from where the survey has it to where the map has it; of a bar the map's length less
+            the measured one; empty where the map cannot tell.
+        sigma_m: standard deviations of these by what the solve knows.
+        error_px: of an image: column, row from where it was picked to where the map has it.
+        statistic: chi-square of the observation against all others, by Baarda's data snooping; None where nothing else
+            checks it.
+        dof: its degrees of freedom.
+        reason: why it is an outlier or unused; empty where it is neither.
+    """
+
+    kind: str
+    name: str
+    scene: str
+    use: str
+    error_m: tuple[float, ...] = ()
+    sigma_m: tuple[float, ...] = ()
+    error_px: tuple[float, ...] = ()
+    statistic: float | None = None
+    dof: int = 0
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in RESIDUAL_KINDS or self.use not in RESIDUAL_USES:
+            raise InputError(f"no such residual: {self.kind!r}, {self.use!r}")
+
+
+@dataclass(frozen=True, eq=False)
+class WorldTie:
+    """Where a component of the map lies in the world.
+
+    Args:
+        component: its index in the pose graph.
+        S_world_map: takes the component's frame to the world frame; None where the observations do not determine it.
+        covariance: (7, 7) of it over [rotation (3, rad), translation (3, map unit), log scale] on the map's side, with
+            the scene that holds the component's frame taken as exact; None as above.
+        metres_per_unit: metres in a unit of the component's frame; None where nothing tells.
+        scale_sigma: standard deviation of its logarithm.
+        frame: the world frame; None where only lengths were observed.
+        residuals: of all observations of this component.
+        problem: what is missing for ``S_world_map``; empty where it is there.
+        notes: what a person should know.
+    """
+
+    component: int
+    S_world_map: Sim3 | None = None
+    covariance: np.ndarray | None = None
+    metres_per_unit: float | None = None
+    scale_sigma: float = float("inf")
+    frame: WorldFrame | None = None
+    residuals: tuple[Residual, ...] = field(default=())
+    problem: str = ""
+    notes: tuple[str, ...] = ()
+
+    def left_out(self) -> set[tuple[str, str, str]]:
+        """(kind, name, scene) of the observations that were not solved from."""
+        return {(r.kind, r.name, r.scene) for r in self.residuals if r.use != "used"}
+
+
+def _finite(where: str, values: np.ndarray, *shape: int) -> None:
+    found = np.asarray(values, dtype=np.float64)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise InputError(f"{where} needs finite numbers of shape {shape}, got {found.shape}")
+
+
+def _positive(where: str, *values: float) -> None:
+    for value in values:
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"{where} needs finite positive sigmas and lengths, got {value}")

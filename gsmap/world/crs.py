@@ -1,0 +1,192 @@
+"""Coordinate reference systems by PROJ: named, checked, and turned into Earth-centred metres and back."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import ConfigError, InputError
+
+ECEF = "EPSG:4978"
+WGS84 = "EPSG:4979"
+
+
+@dataclass(frozen=True)
+class Crs:
+    """A coordinate reference system as people give coordinates in it.
+
+    Args:
+        text: ``EPSG:N``, ``EPSG:N+M`` (with a height system), a PROJ string or WKT, as told.
+    """
+
+    text: str
+
+    @cached_property
+    def named(self) -> Any:
+        """As PROJ has it, as it was named."""
+        from pyproj import CRS
+        from pyproj.exceptions import CRSError
+
+        try:
+            found = CRS.from_user_input(self.text)
+        except CRSError as error:
+            raise ConfigError(
+                f"no coordinate reference system is called {_short(self.text)}: name one such as EPSG:25832, "
+                "EPSG:25832+7837 (with its height system) or EPSG:4326"
+            ) from error
+        horizontal = found.sub_crs_list[0] if found.is_compound else found
+        if not (horizontal.is_projected or horizontal.is_geographic or horizontal.is_geocentric):
+            raise ConfigError(
+                f"{_short(self.text)} is no system of places on the Earth ({found.type_name}): a height alone, or a "
+                "site's own grid, cannot tie a map to the world"
+            )
+        if horizontal.geodetic_crs is None:
+            raise ConfigError(f"{_short(self.text)} does not say which datum it is on")
+        return found
+
+    @cached_property
+    def full(self) -> Any:
+        """With a height: ellipsoidal where the system has none of its own."""
+        return self.named.to_3d()
+
+    @cached_property
+    def geodetic(self) -> Any:
+        """Longitude, latitude and ellipsoidal height on the system's own datum."""
+        from pyproj import CRS
+
+        if self.named.is_geocentric:  # of whose datum PROJ gives no geographic system, so the ellipsoid alone
+            return CRS.from_user_input(WGS84) if self.named.to_epsg() == 4978 else self._bare
+        return self.named.geodetic_crs.to_3d()
+
+    @cached_property
+    def _bare(self) -> Any:
+        raise ConfigError(f"{_short(self.text)} is Earth-centred on a datum of its own: use {ECEF} or a projected one")
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return str(self.named.name)
+
+    @property
+    def has_own_heights(self) -> bool:
+        """Whether heights are in a system of the CRS (a geoid, a tide), not on the ellipsoid."""
+        return bool(self.named.is_compound or self.named.is_vertical)
+
+    @property
+    def axes(self) -> tuple[str, str, str]:
+        """Of a coordinate, in the order in which gsmap gives and takes it."""
+        if self.named.is_geocentric:
+            return "X", "Y", "Z"
+        horizontal = self.named.sub_crs_list[0] if self.named.is_compound else self.named
+        return ("longitude", "latitude", "height") if horizontal.is_geographic else ("easting", "northing", "height")
+
+    def to_geodetic(self, points: np.ndarray) -> np.ndarray:
+        """Longitude and latitude (deg) and ellipsoidal height (m) on the system's own datum, of (N, 3) coordinates.
+
+        Raises:
+            InputError: a coordinate outside the projection's domain.
+            ConfigError: the height system needs a grid that PROJ does not have here.
+        """
+        return _through(self.full, self.geodetic, points, self.text)
+
+    def of_geodetic(self, points: np.ndarray) -> np.ndarray:
+        """The reverse of `to_geodetic`."""
+        return _through(self.geodetic, self.full, points, self.text)
+
+    def check_area(self, points: np.ndarray, names: list[str], margin_deg: float) -> None:
+        """Raise `InputError` naming the first of (N, 3) coordinates outside the area that the system is meant for."""
+        area = self.named.area_of_use
+        if self.named.is_compound and self.named.sub_crs_list[0].area_of_use is not None:
+            area = self.named.sub_crs_list[0].area_of_use
+        lonlat = self.to_geodetic(points)[:, :2]
+        if area is None:
+            return
+        beyond_lat = np.maximum(area.south - lonlat[:, 1], lonlat[:, 1] - area.north)
+        width = (area.east - area.west) % 360 or 360.0
+        along = (lonlat[:, 0] - area.west) % 360
+        beyond_lon = np.where(along <= width, 0.0, np.minimum(along - width, 360 - along))
+        off = np.flatnonzero((beyond_lat > margin_deg) | (beyond_lon > margin_deg))
+        if len(off):
+            lon, lat = lonlat[off[0]]
+            raise InputError(
+                f"{names[off[0]]} lies at {lat:.4f} N {lon:.4f} E, outside of where {_short(self.text)} ({self.name}) "
+                f"is meant for ({area.name.split(':')[0]}): are the axes swapped, or is it another system?"
+            )
+
+
+@lru_cache(maxsize=64)
+def crs(text: str) -> Crs:
+    """A coordinate reference system by its name.
+
+    Raises:
+        ConfigError: PROJ knows none of that name, or it is none that places lie in.
+    """
+    if not isinstance(text, str) or not text.strip() or len(text) > 20_000:
+        raise ConfigError("a coordinate reference system is EPSG:N, a PROJ string or WKT")
+    found = Crs(text.strip())
+    found.named  # noqa: B018  # refuse here
+    return found
+
+
+def between(source: Crs, target: Crs, points: np.ndarray) -> np.ndarray:
+    """(N, 3) geodetic coordinates (`Crs.to_geodetic`) on the datum of one system as those on the datum of another.
+
+    Raises:
+        ConfigError: PROJ knows no way, or lacks its grid: one that is off by metres is never taken in its place.
+    """
+    if source.geodetic == target.geodetic:
+        return np.array(points, dtype=np.float64)
+    return _through(source.geodetic, target.geodetic, points, f"{source.text} to {target.text}")
+
+
+@lru_cache(maxsize=64)
+def _transformer(source: str, target: str, text: str) -> Any:
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is not best is refused below
+            return Transformer.from_crs(
+                CRS.from_wkt(source), CRS.from_wkt(target), always_xy=True, allow_ballpark=False, only_best=True
+            )
+    except ProjError as error:
+        raise _no_way(text, error) from error
+
+
+def _through(source: Any, target: Any, points: np.ndarray, text: str) -> np.ndarray:
+    from pyproj.exceptions import ProjError
+
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if not len(points):
+        return points
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = np.stack(_transformer(source.to_wkt(), target.to_wkt(), text).transform(*points.T), axis=1)
+    except ProjError as error:
+        raise _no_way(text, error) from error
+    bad = ~np.isfinite(found).all(1)
+    if bad.any():
+        where = ", ".join(f"{x:.10g}" for x in points[int(np.argmax(bad))])
+        raise InputError(f"{where} is no place in {_short(text)}: are the axes swapped, or is it another system?")
+    return found
+
+
+def _no_way(text: str, error: Exception) -> ConfigError:
+    said = str(error)
+    if "Grid " in said:
+        grid = said.split("Grid ", 1)[1].split(" ", 1)[0]
+        return ConfigError(
+            f"{_short(text)} needs the grid {grid}, which PROJ does not have here: run projsync --file {grid}, or name "
+            "the system without its heights if they are ellipsoidal"
+        )
+    return ConfigError(f"PROJ knows no exact way from {_short(text)}: {said}")
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,109 @@
+"""Positions of photos from their EXIF, read by Pillow."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsmap.errors import InputError
+from gsmap.world.params import Params
+
+_GPS = 0x8825
+_LATITUDE, _LONGITUDE, _ALTITUDE, _ERROR, _DATUM = 2, 4, 6, 31, 18
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+
+
+@dataclass(frozen=True)
+class PhotoPosition:
+    """Where a photo says that it was taken.
+
+    Args:
+        image: its file name.
+        longitude_deg, latitude_deg: on WGS 84.
+        height_m: as EXIF has it; None where it has none.
+        above_ellipsoid: whether that is above the ellipsoid (EXIF 3), not above sea level.
+        sigma_m: horizontal positioning error as the receiver says; None where it does not.
+    """
+
+    image: str
+    longitude_deg: float
+    latitude_deg: float
+    height_m: float | None
+    above_ellipsoid: bool
+    sigma_m: float | None
+
+    def sigmas(self, params: Params) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Standard deviations, horizontal and vertical, of this photo by itself and common to a capture's photos."""
+        own = self.sigma_m or params.gnss_sigma_m
+        common = max(params.gnss_common_sigma_m, self.sigma_m or 0.0)
+        if self.sigma_m is not None and self.sigma_m < 0.5:  # a receiver with corrections: what it says covers both
+            common = self.sigma_m
+        up = common * params.gnss_height_factor
+        if not self.above_ellipsoid:
+            up = (up**2 + params.sea_level_sigma_m**2) ** 0.5
+        return (own, own * params.gnss_height_factor), (common, up)
+
+
+def read_folder(folder: str | os.PathLike[str]) -> list[PhotoPosition]:
+    """The positions of all photos below a folder that have one, by path.
+
+    Raises:
+        InputError: no folder, or no photo in it has a position.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder of photos")
+    photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    found = [position for path in photos if (position := read(path)) is not None]
+    if not found:
+        raise InputError(f"none of the {len(photos)} photos in {folder} says where it was taken (EXIF GPS)")
+    return found
+
+
+def read(path: str | os.PathLike[str]) -> PhotoPosition | None:
+    """Where a photo was taken; None where it does not say, or says what cannot be."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as picture:
+            gps = picture.getexif().get_ifd(_GPS)
+    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+    datum = str(gps.get(_DATUM, "WGS-84")).strip("\0 ").upper().replace(" ", "").replace("-", "")
+    latitude = _degrees(gps.get(_LATITUDE), gps.get(_LATITUDE - 1), "NS")
+    longitude = _degrees(gps.get(_LONGITUDE), gps.get(_LONGITUDE - 1), "EW")
+    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
+        return None
+    if (latitude == 0 and longitude == 0) or datum not in ("", "WGS84"):
+        return None
+    height, reference = _number(gps.get(_ALTITUDE)), gps.get(_ALTITUDE - 1, b"\0")
+    code = reference[0] if isinstance(reference, bytes) and reference else int(reference or 0)
+    if height is not None and code in (1, 3):
+        height = -height
+    error = _number(gps.get(_ERROR))
+    return PhotoPosition(
+        Path(path).name, longitude, latitude, height, code in (2, 3), error if error and error > 0 else None
+    )
+
+
+def _degrees(value: Any, reference: Any, letters: str) -> float | None:
+    """Of degrees, minutes and seconds and their letter."""
+    try:
+        parts = [float(part) for part in value]
+        letter = str(reference).strip("\0 ").upper()[:1]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    if len(parts) != 3 or letter not in letters or letter == "" or any(part != part for part in parts):
+        return None
+    size = parts[0] + parts[1] / 60 + parts[2] / 3600
+    return -size if letter == letters[1] else size
+
+
+def _number(value: Any) -> float | None:
+    try:
+        found = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return found if abs(found) < 1e6 else None

@@ -1,0 +1,74 @@
+"""Observations of a map, brought into its world frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from gsmap.errors import InputError
+from gsmap.types.world import LOCAL, ControlPoint, Fix, Survey, WorldFrame
+from gsmap.world.crs import crs
+from gsmap.world.frame import frame_at, to_frame
+
+_T = TypeVar("_T", ControlPoint, Fix)
+
+
+def in_frame(survey: Survey) -> Survey:
+    """The same observations with all positions as east, north, up of the world frame, for the solver.
+
+    Raises:
+        ConfigError, InputError: a coordinate reference system, or a coordinate in it, that PROJ has no way for.
+    """
+    if survey.frame is None:
+        return replace(survey, points=(), images=(), fixes=())
+    points = _moved(survey.frame, survey.points)
+    fixes = _moved(survey.frame, survey.fixes)
+    return replace(survey, points=tuple(points), fixes=tuple(fixes))
+
+
+def frame_for(crs_text: str, survey: Survey) -> WorldFrame:
+    """A world frame near what was observed.
+
+    Raises:
+        InputError: nothing was observed that has a place.
+    """
+    system, found = crs(crs_text), []
+    for group in _by_crs([*survey.points, *survey.fixes]).values():
+        own = crs(group[0].crs)
+        found.append(own.to_geodetic(np.array([one.position for one in group])))
+    if not found:
+        raise InputError(f"nothing lies in {system.text} yet: give control points, photos with GNSS, or a position")
+    # To four digits of a degree: a shift between datums is next to nothing here.
+    near = system.of_geodetic(np.median(np.concatenate(found), axis=0)[None])
+    return frame_at(system.text, near)
+
+
+def check_area(items: Sequence[ControlPoint | Fix], margin_deg: float) -> None:
+    """Raise `InputError` for the first of observations outside of where its system is meant for."""
+    for group in _by_crs(items).values():
+        names = [f"control point {one.name}" if isinstance(one, ControlPoint) else one.name for one in group]
+        crs(group[0].crs).check_area(np.array([one.position for one in group]), names, margin_deg)
+
+
+def _by_crs(items: Sequence[ControlPoint | Fix]) -> dict[str, list[ControlPoint | Fix]]:
+    found: dict[str, list[ControlPoint | Fix]] = {}
+    for one in items:
+        found.setdefault(one.crs, []).append(one)
+    return found
+
+
+def _moved(frame: WorldFrame, items: Sequence[_T]) -> list[_T]:
+    out = list(items)
+    places: dict[str, list[int]] = {}
+    for k, one in enumerate(items):
+        places.setdefault(one.crs, []).append(k)
+    for text, rows in places.items():
+        if text == LOCAL:
+            continue
+        metres = to_frame(frame, np.array([items[k].position for k in rows]), text)
+        for k, position in zip(rows, metres, strict=True):
+            out[k] = replace(items[k], crs=LOCAL, position=position)
+    return out

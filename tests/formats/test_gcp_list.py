@@ -1,0 +1,74 @@
+"""Lists of control points as OpenDroneMap has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsmap.errors import InputError, NotFoundError
+from gsmap.formats import gcp_list
+from gsmap.formats.gcp_list import GcpLine
+
+GOOD = """EPSG:25832
+# x y z column row photo name
+691234.1234 5334567.7654 519.321 812.5 410 IMG_1.JPG P1
+691234.1234\t5334567.7654\t519.321\t12\t40.25\tIMG 2.JPG\tP1\tmore
+
+691254.0 5334560.0 518 5 6 IMG_1.JPG
+"""
+
+
+def test_a_list_is_read() -> None:
+    found = gcp_list.parse(GOOD)
+    assert found.crs == "EPSG:25832"
+    assert [(one.line, one.name, one.image, one.pixel) for one in found.lines] == [
+        (3, "P1", "IMG_1.JPG", (812.5, 410.0)),
+        (4, "P1", "IMG 2.JPG", (12.0, 40.25)),
+        (6, "691254.0_5334560.0_518", "IMG_1.JPG", (5.0, 6.0)),
+    ]
+    assert found.lines[0].position == (691234.1234, 5334567.7654, 519.321)
+
+
+@pytest.mark.parametrize(
+    ("line", "crs"),
+    [
+        ("WGS84 UTM 32N", "EPSG:32632"),
+        ("wgs84 utm 7s", "EPSG:32707"),
+        ("+proj=utm +zone=32 +datum=WGS84 +units=m", "+proj=utm +zone=32 +datum=WGS84 +units=m"),
+        ("EPSG:25832+7837", "EPSG:25832+7837"),
+    ],
+)
+def test_the_first_line_names_the_system(line: str, crs: str) -> None:
+    assert gcp_list.parse(f"{line}\n1 2 3 4 5 a.jpg\n").crs == crs
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is empty"),
+        ("EPSG:25832\n", "names no control point"),
+        ("1 2 3 4 5 a.jpg\n", "line 1: the first line names the coordinate system"),
+        ("UTM somewhere\n1 2 3 4 5 a.jpg", "line 1: 'UTM somewhere' is no coordinate system"),
+        ("WGS84 UTM 61N\n1 2 3 4 5 a.jpg", "line 1: there is no UTM zone 61"),
+        ("EPSG:1\n\n1 2 4 5 a.jpg", "line 3 has 5 of the fields .*height is missing"),
+        ("EPSG:1\n1 2 3 4 five a.jpg", "line 2: im_y is 'five'"),
+        ("EPSG:1\n1 nan 3 4 5 a.jpg", "line 2: geo_y is 'nan'"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 4 4 5 b.jpg P", "line 3: point P has other coordinates than on line 2"),
+        ("EPSG:1\n1 2 3 4 5 a.jpg P\n1 2 3 6 7 a.jpg P", "line 3: point P in a.jpg again, as on line 2"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        gcp_list.parse(text, "g.txt")
+
+
+def test_a_list_round_trips(tmp_path: Path) -> None:
+    line = GcpLine(2, "P1", (691234.12345678, 5334567.765432109, 519.3), (0.1, 2.0), "a b.jpg")
+    gcp_list.write(tmp_path / "g.txt", "EPSG:25832", [line])
+    assert gcp_list.read(tmp_path / "g.txt").lines == (line,)
+    with pytest.raises(NotFoundError):
+        gcp_list.read(tmp_path / "none.txt")
+    (tmp_path / "b.txt").write_bytes(b"EPSG:25832\n\xff\xfe")
+    with pytest.raises(InputError, match="no text"):
+        gcp_list.read(tmp_path / "b.txt")

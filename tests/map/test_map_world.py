@@ -1,0 +1,332 @@
+"""A map tied to the world, through every verb that carries it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsmap
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.map.stages.georeference import PlacedPhoto, Request
+from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
+from made_sites import made_map, write_gcps
+
+SITE = SiteParams(rows=3, columns=3, num_check=2, survey_m=0.005)
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return surveyed_site(1, SITE)
+
+
+@pytest.fixture(scope="module")
+def tied(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map that is tied; copy or branch it before it is changed."""
+    folder = tmp_path_factory.mktemp("world")
+    with made_map(folder / "site.gsmap", site) as m:
+        report = m.georeference(Request(gcp=write_gcps(folder / "gcp_list.txt", site), check=site.checks()))
+        assert report.components[0].problem == ""
+        assert not report.stale
+    return folder / "site.gsmap"
+
+
+def world_of(path: Path) -> dict[str, np.ndarray]:
+    with gsmap.map.open(path) as m:
+        return {row.scene_name: row.world for row in m.pose_rows() if row.world is not None}
+
+
+def test_world_coordinates_are_right_and_last(tied: Path, site: Site, tmp_path: Path) -> None:
+    """Eight digits before the point, to a centimetre by the survey and to a thousandth through store and export."""
+    from gsmap.world.frame import of_frame
+
+    found = world_of(tied)
+    truth = dict(zip(site.names, of_frame(site.frame, np.array([S.translation for S in site.truth])), strict=True))
+    off = np.array([found[name] - truth[name] for name in site.names])
+    assert np.sqrt((off**2).sum(1).mean()) < 0.02
+    with gsmap.map.open(tied) as m:
+        m.write_poses(tmp_path / "poses.json", "json")
+        rows = json.loads((tmp_path / "poses.json").read_text())["poses"]
+        here = m.pose_rows("EPSG:4326")
+    assert max(np.abs(np.array(row["world"]) - found[row["scene_name"]]).max() for row in rows) < 1e-9
+    back = np.array([row.world for row in here])
+    from gsmap.world.frame import to_frame
+
+    again = of_frame(site.frame, to_frame(site.frame, back, "EPSG:4326"))
+    assert np.abs(again - np.array([found[row.scene_name] for row in here])).max() < 1e-3
+
+
+def test_the_metre_is_the_survey_s(tied: Path) -> None:
+    with gsmap.map.open(tied) as m:
+        (metre,) = m.metres().values()
+        assert metre.known_by == "surveyed"
+        assert metre.metres_per_unit == pytest.approx(0.5, rel=1e-3)
+
+
+def test_measuring(tied: Path, site: Site) -> None:
+    true = float(np.linalg.norm(site.truth[0].translation - site.truth[8].translation))
+    with gsmap.map.open(tied) as m:
+        found = m.measure("site-000:0,0,0", "site-008:0,0,0")
+        assert found.known_by == "world"
+        assert abs(found.distance_m - true) < 4 * found.sigma_m
+        assert 1e-4 < found.sigma_m < 0.02
+        # A pixel shows the ground: opposite cameras see one point.
+        a, b = "site-000:site-000_0.jpg@700,600", "site-000:site-000_0@700.5,600"
+        near = m.measure(a, b)
+        assert near.distance_m < 0.01
+        pixel = m.measure("site-000:site-000_0.jpg@800,600", "site-000:site-000_4.jpg@800,600")
+        assert pixel.distance_m < 0.005
+        world = m.measure("site-000:0,0,0", f"world:{','.join(map(repr, found.a.world.tolist()))}")
+        assert world.distance_m < 1e-6
+        for text, said in (("nonsense", "is no point"), ("a:1,2", "is no point")):
+            with pytest.raises(ConfigError, match=said):
+                m.measure(text, "0,0,0")
+        for text in ("nobody:1,2,3", "site-000:none.jpg@1,2"):
+            with pytest.raises(NotFoundError):
+                m.measure(text, "0,0,0")
+        with pytest.raises(InputError, match="outside"):
+            m.measure("site-000:site-000_0.jpg@5000,2", "0,0,0")
+
+
+def test_observations_live_through_branch_backup_clone_and_merge(tied: Path, site: Site, tmp_path: Path) -> None:
+    before = world_of(tied)
+    with gsmap.map.open(tied) as m:
+        m.branch("other")
+        m.backup(tmp_path / "saved")
+        m.clone(tmp_path / "clone.gsmap")
+    gsmap.map.restore(tmp_path / "saved", tmp_path / "back.gsmap")
+    with gsmap.map.create(tmp_path / "merged.gsmap") as m:
+        m.merge(tied)
+    for path in (f"{tied}@other", tmp_path / "back.gsmap", tmp_path / "clone.gsmap", tmp_path / "merged.gsmap"):
+        with gsmap.map.open(path) as m:
+            assert len(m.store.world.survey().points) == len(site.marks), path
+            assert m.check().ok, path
+            m.optimize()
+        after = world_of(Path(path))
+        assert max(np.abs(after[name] - before[name]).max() for name in site.names) < 1e-3, path
+    with gsmap.map.open(tmp_path / "merged.gsmap") as m:
+        assert m.merge(tied).num_observations == 0, "again it adds nothing"
+
+
+def test_a_part_takes_what_was_seen_in_it(tied: Path, site: Site, tmp_path: Path) -> None:
+    chosen = [mark.scene for mark in site.marks if mark.name in ("G0", "G1", "G2")]
+    with gsmap.map.open(tied) as m:
+        m.split(tmp_path / "part.gsmap", scenes=chosen)
+    with gsmap.map.open(tmp_path / "part.gsmap") as m:
+        names = {point.name for point in m.store.world.survey().points}
+        assert {"G0", "G1", "G2"} <= names
+        shown = {mark.name for mark in site.marks if mark.scene in chosen}
+        assert names == shown
+        assert m.store.revisions.world()[0].S_world_map is not None
+
+
+def test_a_purged_scene_takes_its_photos_with_it(tied: Path, site: Site, tmp_path: Path) -> None:
+    gone = next(mark.scene for mark in site.marks if mark.name == "G0")
+    with gsmap.map.open(tied) as m:
+        scene = m.store.scenes.get(gone).id
+        m.clone(tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        m.remove(gone)
+        m.purge(scene)
+        assert all(image.scene != scene for image in m.store.world.survey().images)
+        assert scene not in json.dumps([row.to_json() for row in m.georeference().components])
+
+
+def test_taking_back(tied: Path, tmp_path: Path) -> None:
+    with gsmap.map.open(tied) as m:
+        m.clone(tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        report = m.georeference(remove=["G0"])
+        assert "G0" not in {row.name for row in report.components[0].residuals}
+        with pytest.raises(NotFoundError, match="no observation is called"):
+            m.georeference(remove=["G0"])
+        report = m.georeference(remove=[])
+        assert report.crs is None
+        assert report.components == ()
+        assert all(row.world is None for row in m.pose_rows())
+
+
+def test_bad_input_changes_nothing(site: Site, tmp_path: Path) -> None:
+    lines = write_gcps(tmp_path / "g.txt", site).read_text().splitlines()
+
+    def file(*rows: str) -> Request:
+        path = tmp_path / f"{abs(hash(rows))}.txt"
+        path.write_text("\n".join(rows))
+        return Request(gcp=path)
+
+    first = lines[1].split("\t")
+    swapped = "\t".join([first[1], first[0], *first[2:]])
+    outside = "\t".join([*first[:3], "4000", "20", *first[5:]])
+    unknown = "\t".join([*first[:5], "nobody.jpg", first[6]])
+    with made_map(tmp_path / "m.gsmap", replace(site)) as m:
+        for request, error, said in (
+            (file("EPSG:25832", swapped), InputError, "control point G0 .* axes swapped"),
+            (file("EPSG:25832", outside), InputError, r"line 2: pixel 4000 20 lies outside .*--photo-size"),
+            (file("EPSG:25832", unknown), NotFoundError, "none of the 1 photos"),
+            (file("EPSG:999999", lines[1]), ConfigError, "no coordinate reference system"),
+            (Request(crs="EPSG:25832"), InputError, "nothing of this map lies in"),
+            (Request(), ConfigError, "say what ties"),
+            (Request(check=["P9"]), NotFoundError, "no control point is called 'P9'"),
+            (Request(bars=[("0,0,0", "site-000:0,0,0", 2.0)]), ConfigError, "pick it in a scene"),
+            (Request(bars=[("site-000:0,0,0", "site-000:1,0,0", -2.0)]), ConfigError, "so many metres"),
+        ):
+            with pytest.raises(error, match=said):
+                m.georeference(request)
+            assert not m.store.world.survey()
+            assert m.store.world.survey().frame is None
+
+
+def test_a_photo_that_was_localised_counts_with_its_covariance(site: Site, tmp_path: Path) -> None:
+    """Marks of one scene's photos under other names, as a localiser places them."""
+    lines, photos = site.gcp_lines(), {}
+    for k, name in enumerate(site.names):
+        for j, photo in enumerate(site.cameras[k].names):
+            photos[f"walk_{photo}"] = (name, site.cameras[k][[j]])
+    lines = [replace(line, image=f"walk_{line.image}") for line in lines]
+    from gsmap.formats import gcp_list
+
+    gcp_list.write(tmp_path / "g.txt", site.frame.crs, lines)
+    with made_map(tmp_path / "m.gsmap", site) as m:
+        ids = {scene.name: scene.id for scene in m.scenes()}
+
+        def localise(names: list[str]) -> dict[str, PlacedPhoto]:
+            sigma = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
+            return {
+                name: PlacedPhoto(
+                    ids[photos[name][0]],
+                    photos[name][1].T_frame_camera[0],
+                    photos[name][1].intrinsics_px[0],
+                    tuple(photos[name][1].sizes_px[0].tolist()),
+                    sigma,
+                )
+                for name in names
+            }
+
+        report = m.georeference(Request(gcp=tmp_path / "g.txt", check=site.checks()), localise=localise)
+        (tie,) = report.components
+        assert tie.problem == ""
+        assert tie.rms_check_m is not None
+        assert tie.rms_check_m < 0.03
+        exact = m.georeference(Request(gcp=write_gcps(tmp_path / "e.txt", site), check=site.checks()))
+        assert exact.components[0].scale_sigma < tie.scale_sigma
+
+
+def test_a_point_in_one_photo_lies_on_the_surface(tmp_path: Path) -> None:
+    one = surveyed_site(2, replace(SITE, num_views=1))
+    with made_map(tmp_path / "m.gsmap", one) as m:
+        report = m.georeference(Request(gcp=write_gcps(tmp_path / "g.txt", one), check=one.checks()))
+        images = m.store.world.survey().images
+    assert all(image.depth is not None for image in images)
+    (tie,) = report.components
+    assert tie.problem == ""
+    assert tie.rms_check_m is not None
+    assert tie.rms_check_m < 0.06
+    sigmas = [row.sigma_m for row in tie.residuals if row.kind == "point"]
+    assert min(min(sigma) for sigma in sigmas) > 0.003
+
+
+def test_surveyed_positions_of_scenes(site: Site, tmp_path: Path) -> None:
+    from gsmap.world.frame import of_frame
+
+    with made_map(tmp_path / "m.gsmap", site) as m:
+        for k in (0, 2, 6, 8):
+            at = of_frame(site.frame, site.truth[k].translation[None], "EPSG:4326")[0]
+            m.set_world_position(site.names[k], at, (0.01, 0.01))
+        assert m.georeference().stale
+        m.optimize()
+        (tie,) = m.georeference().components
+        assert tie.problem == ""
+        assert [row.kind for row in tie.residuals] == ["fix"] * 4
+        m.remove_prior(site.names[0])
+        assert len(m.store.world.survey().fixes) == 3
+
+
+def test_what_is_exported_says_where_it_lies(tied: Path, site: Site, tmp_path: Path) -> None:
+    """3D Tiles lie on the globe; other formats, whose numbers are too short for it, have it beside them."""
+    from gsmap.formats import tiles3d
+    from gsmap.world.crs import ECEF
+    from gsmap.world.frame import of_frame
+
+    with gsmap.map.open(tied) as m:
+        m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
+        report = m.export(tmp_path / "plain", tile_size_m=0, format="ply", merge="union")
+        tie = m.store.revisions.world()[0]
+    assert any("tiles.json has S_world_map" in note for note in report.notes)
+    (tileset,) = (tmp_path / "globe").glob("component_0/tileset.json")
+    root = json.loads(tileset.read_text())["root"]
+    transform = np.reshape(root["transform"], (4, 4)).T
+    points = tiles3d.read(tileset).means[::97].astype(np.float64)
+    there = points @ transform[:3, :3].T + transform[:3, 3]
+    want = of_frame(tie.frame, tie.S_world_map.apply(points), ECEF)
+    assert np.abs(there - want).max() < 1e-3
+    sidecar = json.loads((tmp_path / "plain" / "tiles.json").read_text())["components"][0]["world"]
+    assert sidecar["crs"] == "EPSG:25832"
+    assert np.abs(np.array(sidecar["S_world_map"]) - tie.S_world_map.matrix()).max() == 0
+    assert np.abs(np.array(sidecar["S_ecef_map"]) - transform).max() == 0
+
+
+def test_tiles_move_on_the_globe_when_the_tie_does(tied: Path, tmp_path: Path) -> None:
+    with gsmap.map.open(tied) as m:
+        m.clone(tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+
+        def root() -> list[float]:
+            m.export(tmp_path / "globe", tile_size_m=20, format="3dtiles", merge="union")
+            found: list[float] = json.loads((tmp_path / "globe/component_0/tileset.json").read_text())["root"][
+                "transform"
+            ]
+            return found
+
+        before = root()
+        m.georeference(Request(check=["G3"]))
+        assert root() != before
+        m.georeference(remove=[])
+        assert abs(root()[12]) < 100, "in the map's own frame again"
+
+
+def test_a_localised_photo_is_put_into_its_scene_s_frame(site: Site, tied: Path, tmp_path: Path) -> None:
+    """By rows as ``gsmap localize`` gives them: map frame and unit in, scene frame and unit out."""
+    from types import SimpleNamespace
+
+    from PIL import Image
+
+    from gsmap.geometry.rotations import exp_so3
+    from gsmap.map.placed_photos import localiser, placed_photo
+    from gsmap.types import ScenePose, Sim3
+
+    S = Sim3(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2, 3]), 4.0)
+    T = np.eye(4)
+    T[:3, 3] = S.apply(np.array([0.5, 0.6, 0.7]))
+    sigma = np.diag([1.0] * 3 + [16.0] * 3)
+    row = SimpleNamespace(
+        file="a.jpg", T_map_camera=T, covariance=sigma, component=1, scenes=("gone", "far", "near"),
+        intrinsics_px=np.array([100.0, 100, 32, 24]),
+    )  # fmt: skip
+    poses = {"1": ScenePose("1", S, 0, "placed"), "2": ScenePose("2", S, 1, "placed")}
+    found = placed_photo(row, (64, 48), poses, {"far": "1", "near": "2"})
+    assert found is not None
+    assert found.scene == "2", "of its own component"
+    assert found.T_scene_camera[:3, 3] == pytest.approx([0.5, 0.6, 0.7])
+    assert np.diag(found.covariance) == pytest.approx([1.0] * 6)
+    row.T_map_camera = None
+    assert placed_photo(row, (64, 48), poses, {"near": "2"}) is None
+
+    Image.new("RGB", (64, 48)).save(tmp_path / "in.jpg")
+    (tmp_path / "below").mkdir()
+    asked = []
+
+    def localize(*files: Path) -> SimpleNamespace:
+        asked.extend(files)
+        return SimpleNamespace(results=[row for _ in files])
+
+    with gsmap.map.open(tied) as m:
+        localise = localiser(m.store, localize, tmp_path / "below")
+        assert localise(["../in.jpg", "none.jpg"]) == {}, "a list of points leads to no file elsewhere"
+        assert localiser(m.store, localize, tmp_path)(["in.jpg"]) == {}
+    assert asked == [tmp_path / "in.jpg"]

@@ -1,0 +1,59 @@
+"""Positions of photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from gsmap.errors import InputError
+from gsmap.world import Params, exif
+
+
+def photo(path: Path, **gps: object) -> Path:
+    """A small picture with GPS tags (by number, ``t1=...``)."""
+    picture = Image.new("RGB", (8, 8))
+    tags = picture.getexif()
+    ifd = tags.get_ifd(0x8825)
+    for tag, value in gps.items():
+        ifd[int(tag[1:])] = value
+    picture.save(path, exif=tags)
+    return path
+
+
+def test_a_position_is_read(tmp_path: Path) -> None:
+    one = photo(tmp_path / "a.jpg", t1="S", t2=(48.0, 8.0, 13.2), t3="E", t4=(11.0, 34.0, 30.0), t6=520.5, t31=4.0)
+    found = exif.read(one)
+    assert found is not None
+    assert (found.latitude_deg, found.longitude_deg) == pytest.approx((-48.137, 11.575))
+    assert found.height_m == pytest.approx(520.5)
+    assert found.sigma_m == pytest.approx(4.0)
+    assert not found.above_ellipsoid
+    own, common = found.sigmas(Params())
+    assert own == pytest.approx((4.0, 8.0))
+    assert common[1] > 40, "sea level is not the ellipsoid"
+
+
+@pytest.mark.parametrize(
+    "gps",
+    [
+        {},
+        {"t1": "N", "t2": (48.0, 8.0, 13.2)},
+        {"t1": "N", "t2": (0.0, 0.0, 0.0), "t3": "E", "t4": (0.0, 0.0, 0.0)},
+        {"t1": "N", "t2": (98.0, 0.0, 0.0), "t3": "E", "t4": (11.0, 0.0, 0.0)},
+        {"t1": "?", "t2": (48.0, 0.0, 0.0), "t3": "E", "t4": (11.0, 0.0, 0.0)},
+        {"t1": "N", "t2": (48.0, 0.0, 0.0), "t3": "E", "t4": (11.0, 0.0, 0.0), "t18": "TOKYO"},
+    ],
+)
+def test_what_is_no_position_is_none(tmp_path: Path, gps: dict[str, object]) -> None:
+    assert exif.read(photo(tmp_path / "a.jpg", **gps)) is None
+
+
+def test_a_folder_without_positions_is_refused(tmp_path: Path) -> None:
+    photo(tmp_path / "a.jpg")
+    (tmp_path / "b.jpg").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="none of the 2 photos"):
+        exif.read_folder(tmp_path)
+    with pytest.raises(InputError, match="no folder"):
+        exif.read_folder(tmp_path / "a.jpg")
