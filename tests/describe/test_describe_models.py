@@ -168,6 +168,8 @@ def test_kinds_are_those_that_methods_name():
         "sam-decoder": ["sam"],
         "clip": ["clip"],
         "extractor": ["onnx"],
+        "clip-text": [],
+        "clip-tokenizer": [],
     }
 
 
