@@ -65,7 +65,8 @@ VERBS = (
     "view",
     "demo",
 )
-"""In the order a newcomer meets them. ``gsmap/cli/<verb>.py`` holds ``command`` (or ``app`` where it has sub-verbs)."""
+"""In the order a newcomer meets them. ``gsmap/cli/<verb>.py`` holds ``command`` (or ``app`` where it has sub-verbs),
+and ``TAKES_POINTS`` where an argument may be ``X,Y,Z``."""
 
 
 def _version(value: bool) -> None:
@@ -102,7 +103,9 @@ def build() -> typer.Typer:
         if hasattr(module, "app"):
             app.add_typer(module.app, name=verb)
         else:
-            app.command(name=verb)(module.command)
+            # A point may begin with a minus: what is no option of the verb is one of its arguments.
+            points = {"ignore_unknown_options": True} if getattr(module, "TAKES_POINTS", False) else None
+            app.command(name=verb, context_settings=points)(module.command)
     return app
 
 

@@ -8,6 +8,8 @@ import typer
 
 from gsmap.cli.console import AsJson, MapPath, Preset, Sets, opened, print_rows, print_table, say
 
+TAKES_POINTS = True
+
 
 def command(
     map: MapPath,

@@ -8,6 +8,7 @@ import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, print_table, say
 
+TAKES_POINTS = True
 _POINT = "X,Y,Z in the map; SCENE:X,Y,Z; SCENE:CAMERA@COLUMN,ROW; world:X,Y,Z or EPSG:N:X,Y,Z."
 
 

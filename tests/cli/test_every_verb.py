@@ -304,6 +304,13 @@ def test_evaluate_says_plainly_that_a_map_failed(site: Path, captures: Path, cli
         assert f"{option} compares images: give --images too" in refused.stderr
 
 
+def test_a_point_may_begin_with_a_minus(site: Path, cli: Run) -> None:
+    """What is no option is an argument of the verbs that take points; a wrong option is still refused."""
+    assert cli("measure", site, "-1,0,0", "-1,2.5,0", "--component", 0, "--json").json["distance_m"] > 0
+    assert cli("history", site, "-0.5,0.5,0.5").code == 0
+    assert cli("measure", site, "-1,0,0", "1,0,0", "--wrong").code == 2
+
+
 def test_a_measurement_of_ones_own_places_a_scene(site: Path, cli: Run, tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = [20, 0, 0]
