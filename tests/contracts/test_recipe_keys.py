@@ -60,6 +60,7 @@ NAMES_NOTHING = (
     "retrieve.",
     "by_shape.",  # nothing of it is kept
     "scan.",  # nothing of it is kept
+    "report.",  # a page, made whenever it is asked for
     "visits.",
     "thin.",
     "export.",
