@@ -53,7 +53,6 @@ from gsmap.types.rows import (
     PurgeReport,
     RestoreReport,
     RevisionRow,
-    ScanRow,
     SceneReport,
     SceneRow,
     SettingRow,
@@ -66,6 +65,7 @@ from gsmap.types.rows import (
     WorldReport,
     WrittenReport,
 )
+from gsmap.types.rows.localize_scan import ScanRow
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings

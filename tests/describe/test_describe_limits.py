@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 
 from gsmap.describe.objects.layer import Params, object_layer
-from gsmap.describe.onnx import session
 from gsmap.describe.onnx.check import check_model
 from gsmap.errors import ConfigError, InputError
 from gsmap.map import create
-from gsmap.networks import ModelProcess
+from gsmap.networks import ModelProcess, session
 from gsmap.networks.session import open_session, run
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.model import ModelLimits, ModelSpec, Tensor

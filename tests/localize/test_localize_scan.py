@@ -14,7 +14,7 @@ from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.rotations import angle_between
 from gsmap.map.stages.localize_scan import _near
-from gsmap.types.rows import ScanRow
+from gsmap.types.rows.localize_scan import ScanRow
 
 
 def ply(path: Path, points: np.ndarray, colours: np.ndarray | None) -> Path:

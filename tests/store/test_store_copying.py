@@ -15,6 +15,7 @@ from gsmap.store.catalog import now
 from gsmap.store.copying import copy_catalog, copy_rows, empty_catalog, one_state, tables
 from gsmap.store.indexes import Lookup
 from gsmap.types import Prior, SceneGraph, Sim3
+from gsmap.types.localization import SceneFeatures
 from gsmap.types.retrieval import Candidate, IndexArrays, Member
 from gsmap.types.world import ControlPoint
 
@@ -36,6 +37,12 @@ def fill(store):
     nodes = IndexArrays(np.zeros(1, np.int64), np.arange(2, dtype=np.int64), np.zeros((1, 58), np.uint8))
     store.indexes.put("0" * 32, [Member(a.id, "1" * 32, True, False, 1.5)], nodes, ())
     store.indexes.note([Lookup(a.id, "0" * 32, (Candidate(b.id, 1.0, 2.0),))])
+    cameras = make_cameras()
+    starts = np.zeros(len(cameras) + 1, np.int64)
+    shown, angles = np.zeros((0, 128), np.int8), np.zeros(0, np.uint8)
+    summaries = np.zeros((len(cameras), 8), np.int8)
+    views = SceneFeatures(a.id, cameras, starts, np.zeros((0, 3), np.float32), shown, angles, summaries)
+    store.view_features.save(views, key("localize", a.id))
     with store.transaction(), store.catalog.read() as connection:
         blank = {"name": "m", "kind": "clip", "path": "/m.onnx", "copied": 0, "sha256": "0" * 64, "size_bytes": 2**40}
         connection.execute(insert(schema.models), blank | {"options": {"x": 0.1}, "created_at": now()})

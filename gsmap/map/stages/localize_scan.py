@@ -30,7 +30,7 @@ from gsmap.register import SceneView
 from gsmap.store import Store
 from gsmap.types import Cameras, Gaussians, PoseGraph, Registration, Scene
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import ScanRow, ScanSupport
+from gsmap.types.rows.localize_scan import ScanRow, ScanSupport
 from gsmap.types.scan import Scan
 from gsmap.types.scene import SCALE_POLICIES
 

@@ -16,7 +16,6 @@ from gsmap.types.rows.find import FindHit, FindReport
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
 from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
-from gsmap.types.rows.localize_scan import ScanRow, ScanSupport
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -116,8 +115,6 @@ __all__ = [
     "RestoreReport",
     "RevisionRow",
     "Row",
-    "ScanRow",
-    "ScanSupport",
     "SceneEdgeRow",
     "SceneRef",
     "SceneReport",
