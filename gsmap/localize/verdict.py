@@ -23,7 +23,7 @@ class Params:
         max_translation_sigma_m: ... nor one whose place is.
     """
 
-    min_probability: float = 0.9
+    min_probability: float = 0.95
     prior: float = 0.3
     min_inliers: int = 12
     max_rival: float = 0.2
