@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.localize import covariance, matching, resection, tying
-from gsmap.localize.candidates import Candidate
+from gsmap.localize.candidates import Candidate, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.localizing import Judged, judged_pose, judged_poses, photo_features, placement, prepared, rival_of
 from gsmap.localize.looks import look
@@ -210,12 +210,8 @@ def _carried(helper: Judged, T_metric_camera: np.ndarray) -> np.ndarray:
 
 def _same(judged: Judged, candidate: Candidate, params: Params) -> bool:
     """Whether a pose that was looked into is the one that another photo says."""
-    if judged.candidate.component != candidate.component:
-        return False
-    one, two = judged.settled.T_metric_camera, candidate.T_metric_camera
-    far = float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
-    chord = float(np.linalg.norm(one[:3, :3] - two[:3, :3])) / np.sqrt(8.0)
-    return far < params.resection.same_m and np.degrees(2 * np.arcsin(min(1.0, chord))) < params.resection.same_deg
+    settled = replace(judged.candidate, T_metric_camera=judged.settled.T_metric_camera)
+    return near_to(settled, candidate, params.resection)
 
 
 def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool], params: tying.Params) -> list[float]:

@@ -124,13 +124,19 @@ def _metre(
     return metre.metres_per_unit, sigma, metre.known_by
 
 
+def _direction(to: np.ndarray | None, of: np.ndarray | None) -> np.ndarray:
+    """(3,) from one point to another, of length 1; zeros where they are one."""
+    assert to is not None
+    assert of is not None
+    span = to - of
+    out: np.ndarray = span / max(float(np.linalg.norm(span)), 1e-300)
+    return out
+
+
 def _pose_variance(store: Store, settings: Settings, graph: PoseGraph, placed: list[_Placed]) -> float:
     """Of the distance in the map's frame, by poses and picking."""
     one, two = placed
-    assert one.map is not None
-    assert two.map is not None
-    span = one.map - two.map
-    along = span / max(float(np.linalg.norm(span)), 1e-300)
+    along = _direction(one.map, two.map)
     variance = 0.0
     for end in placed:
         turn = _turn(graph, end)
@@ -150,10 +156,7 @@ def _pose_variance(store: Store, settings: Settings, graph: PoseGraph, placed: l
 def _world_variance(store: Store, settings: Settings, graph: PoseGraph, placed: list[_Placed]) -> float:
     """Of the distance between points of two components, or of the world and a component: these err apart."""
     one, two = placed
-    assert one.metric is not None
-    assert two.metric is not None
-    span = one.metric - two.metric
-    along = span / max(float(np.linalg.norm(span)), 1e-300)
+    along = _direction(one.metric, two.metric)
     variance = 0.0
     for end in placed:
         covariance = _world_covariance(store, settings, graph, end)

@@ -100,7 +100,8 @@ def localize_scan(store: Store, request: Request, settings: Settings, progress: 
     scenes = {scene.id: scene for scene in store.scenes.list()}
     known = _asked(store, scenes, poses, settings)
     if request.near is not None:
-        known = {scene: key for scene, key in known.items() if scene in _near(store, request.near)}
+        wanted = _near(store, request.near)
+        known = {scene: key for scene, key in known.items() if scene in wanted}
     told(0.1, "describing the scan")
     params = replace(settings.describe, objects=False, things=False)
     graph = describe.describe(
