@@ -1,0 +1,2 @@
+// The page's beginning.
+console.log("gsmap");

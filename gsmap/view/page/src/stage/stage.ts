@@ -1,0 +1,63 @@
+// What the panels ask of the 3D view. The stage knows nothing of panels.
+import type { Box, ChangeEntry, EdgeDetail, MapSummary, Matrix, ObjectEntry, RevisionPoses, Vector } from "../contract";
+
+export type Source = "scenes" | "merged";
+
+/** Where the viewer stands: part of the page's address. */
+export interface Standpoint {
+  position: Vector;
+  target: Vector;
+}
+
+/** What is picked: the nearest surface under the pointer. */
+export interface Pick {
+  point: Vector; // map frame
+  scene: number | null;
+  thing: { kind: "edge" | "change" | "object" | "photo" | "camera"; index: number } | null;
+}
+
+export interface StageOptions {
+  canvas: HTMLCanvasElement;
+  onPick: (pick: Pick) => void;
+  onMove: (standpoint: Standpoint) => void; // after the viewer has come to rest
+  onError: (message: string) => void;
+}
+
+/** Numbers that tests and the curious look at; `window.gsmap` is one. */
+export interface StageState {
+  phase: "loading" | "ready" | "failed";
+  frames: number;
+  splats: number; // drawn
+  bytesReceived: number; // of splats
+  bytesUploaded: number;
+  pending: number; // tiles on their way
+  settled: boolean; // nothing more to load, sort or draw for this standpoint
+  error: string | null;
+}
+
+export interface Stage {
+  readonly state: StageState;
+  /** Shows a map; again after an action, keeping what is loaded. */
+  show(map: MapSummary, component: number): void;
+  setVisible(scenes: ReadonlySet<number>): void;
+  setSource(source: Source): void;
+  /** Right of `at` (0..1 of the width) other scenes, or merged instead of scenes; null ends it. */
+  setSplit(split: { at: number; scenes: ReadonlySet<number>; source: Source } | null): void;
+  setClip(box: Box | null): void; // drawn with handles to drag; what lies outside is not drawn
+  setCeiling(shown: boolean): void; // doll's house
+  setOverlay(name: "cameras" | "nodes" | "boxes" | "edges" | "ellipsoids" | "objects" | "photos", shown: boolean): void;
+  setObjects(objects: ObjectEntry[], relations: { a: string; b: string; kind: string }[]): void;
+  setChanges(changes: ChangeEntry[]): void; // boxes coloured by kind
+  setCorrespondences(detail: EdgeDetail | null): void;
+  /** Poses of an old revision in place of the newest ones; null goes back. */
+  setPoses(revision: RevisionPoses | null): void;
+  /** Lets a person drag a scene; `onDrag` gives S_map_scene as it is dragged; null ends it. */
+  drag(scene: number | null, onDrag?: (S_map_scene: Matrix) => void): void;
+  stand(at: Standpoint, fly?: boolean): void;
+  fit(box?: Box, fly?: boolean): void; // all that is visible, or one box
+  standpoint(): Standpoint;
+  setTheme(dark: boolean): void;
+  /** Renders once with the camera of a capture: for tests of fidelity. */
+  standAtCamera(T_map_camera: Matrix, intrinsics: [number, number, number, number], size: [number, number]): void;
+  dispose(): void;
+}
