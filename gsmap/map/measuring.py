@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map.metres import map_metres
 from gsmap.map.places import Place, place
 from gsmap.map.settings import Settings
-from gsmap.map.stages.optimize import pose_inputs
+from gsmap.map.stages.optimize import PoseInputs, pose_inputs
 from gsmap.store import Store
 from gsmap.types import PoseGraph
 from gsmap.types.rows.world import MeasureReport, PlaceRow
@@ -51,6 +52,7 @@ def measure(
     graph = store.revisions.get()
     if graph is None:
         raise NotFoundError("no scene has a place in the map yet: run gsmap update first")
+    solved = _Solved(store, settings, graph)
     said = [place(store, text, settings) for text in (a, b)]
     placed = [_where(store, one, graph, component) for one in said]
     frame = next((tie.frame for tie in graph.world if tie.S_world_map is not None), None)
@@ -58,23 +60,24 @@ def measure(
     if any(one.scene is None for one in said):
         notes.append("points given in the map or the world count as exact: sigma is of the map alone")
     one, two = placed
-    if one.component is not None and one.component == two.component and one.map is not None and two.map is not None:
+    in_world = any(end.place.crs is not None for end in placed)
+    if one.component is not None and one.component == two.component and not in_world:
         tie = graph.tie(one.component)
         metres, sigma_log, known_by = _metre(store, settings, graph, one.component, tie)
-        span = float(np.linalg.norm(one.map - two.map))
-        variance = _pose_variance(store, settings, graph, placed) * metres**2 + (span * metres * sigma_log) ** 2
+        span = _apart(one.map, two.map)
+        variance = _pose_variance(solved, placed) * metres**2 + (span * metres * sigma_log) ** 2
         distance = span * metres
         if known_by in ("assumed", "guessed", "unknown"):
             notes.append(f"its metre is {known_by}: gsmap georeference MAP --scale-bar A B METRES measures it")
     elif one.metric is not None and two.metric is not None:
-        distance, known_by = float(np.linalg.norm(one.metric - two.metric)), "world"
-        variance = _world_variance(store, settings, graph, placed)
+        distance, known_by = _apart(one.metric, two.metric), "world"
+        variance = _world_variance(solved, placed)
     else:
         raise NotFoundError(
             "the two points lie in different components, and not both of them are tied to the world: gsmap "
             "georeference does so"
         )
-    rows = [_row(store, one, frame, crs) for one in placed]
+    rows = [_row(solved, one, frame, crs) for one in placed]
     named = crs or (frame.crs if frame else None)
     sigma = float(np.sqrt(max(0.0, variance)))
     return MeasureReport(
@@ -124,6 +127,12 @@ def _metre(
     return metre.metres_per_unit, sigma, metre.known_by
 
 
+def _apart(a: np.ndarray | None, b: np.ndarray | None) -> float:
+    assert a is not None
+    assert b is not None
+    return float(np.linalg.norm(a - b))
+
+
 def _direction(to: np.ndarray | None, of: np.ndarray | None) -> np.ndarray:
     """(3,) from one point to another, of length 1; zeros where they are one."""
     assert to is not None
@@ -133,41 +142,60 @@ def _direction(to: np.ndarray | None, of: np.ndarray | None) -> np.ndarray:
     return out
 
 
-def _pose_variance(store: Store, settings: Settings, graph: PoseGraph, placed: list[_Placed]) -> float:
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """The newest poses, and how they err together."""
+
+    store: Store
+    settings: Settings
+    graph: PoseGraph
+
+    @cached_property
+    def _given(self) -> PoseInputs:
+        return pose_inputs(self.store, self.settings)
+
+    def joint(self, component: int | None, scenes: list[str]) -> np.ndarray | None:
+        """Covariance of the world and these scenes together; None where it cannot be computed."""
+        given, params = self._given, self.settings.optimize
+        return optimize.joint_covariance(
+            self.graph, given.edges, given.priors, given.survey, scenes, component or 0, params
+        )
+
+
+def _pose_variance(solved: _Solved, placed: list[_Placed]) -> float:
     """Of the distance in the map's frame, by poses and picking."""
     one, two = placed
     along = _direction(one.map, two.map)
     variance = 0.0
     for end in placed:
-        turn = _turn(graph, end)
+        turn = _turn(solved.graph, end)
         variance += float(along @ turn @ end.place.covariance @ turn.T @ along)
-    scenes = [end.place.scene for end in placed]
-    if scenes[0] == scenes[1] or None in scenes:
-        return variance
-    joint = _joint(store, settings, graph, one.component, [str(scene) for scene in scenes])
+    if one.place.scene == two.place.scene:
+        return variance  # both move with it
+    moved = [(end, sign) for end, sign in zip(placed, (1.0, -1.0), strict=True) if end.place.scene is not None]
+    joint = solved.joint(one.component, [str(end.place.scene) for end, _ in moved])
     if joint is None:
         return float("inf")
     J = np.zeros(joint.shape[0])
-    for k, (end, sign) in enumerate(zip(placed, (1.0, -1.0), strict=True)):
-        J[7 + 7 * k : 14 + 7 * k] = sign * along @ _turn(graph, end) @ _moves(end.place.point)
+    for k, (end, sign) in enumerate(moved):
+        J[7 + 7 * k : 14 + 7 * k] = sign * along @ _turn(solved.graph, end) @ _moves(end.place.point)
     return variance + float(J @ joint @ J)
 
 
-def _world_variance(store: Store, settings: Settings, graph: PoseGraph, placed: list[_Placed]) -> float:
+def _world_variance(solved: _Solved, placed: list[_Placed]) -> float:
     """Of the distance between points of two components, or of the world and a component: these err apart."""
     one, two = placed
     along = _direction(one.metric, two.metric)
-    variance = 0.0
-    for end in placed:
-        covariance = _world_covariance(store, settings, graph, end)
-        variance += 0.0 if covariance is None else float(along @ covariance @ along)
-    return variance
+    covariances = [_world_covariance(solved, end) for end in placed]
+    return sum(float("inf") if found is None else float(along @ found @ along) for found in covariances)
 
 
-def _world_covariance(store: Store, settings: Settings, graph: PoseGraph, end: _Placed) -> np.ndarray | None:
-    """(3, 3) of a point in the world frame; None of one that was given there, or whose component is not tied."""
-    tie = None if end.component is None else graph.tie(end.component)
-    if tie is None or tie.S_world_map is None or end.map is None or end.place.crs is not None:
+def _world_covariance(solved: _Solved, end: _Placed) -> np.ndarray | None:
+    """(3, 3) of a point in the world frame, zeros of one that was given there; None where it is not known."""
+    if end.place.crs is not None:
+        return np.zeros((3, 3))
+    tie = None if end.component is None else solved.graph.tie(end.component)
+    if tie is None or tie.S_world_map is None or end.map is None:
         return None
     W = tie.S_world_map
     big = W.scale * W.rotation
@@ -175,11 +203,11 @@ def _world_covariance(store: Store, settings: Settings, graph: PoseGraph, end: _
         J = big @ _moves(end.map)
         out: np.ndarray = J @ tie.covariance @ J.T
         return out
-    turn = _turn(graph, end)
-    joint = _joint(store, settings, graph, end.component, [end.place.scene])
-    picked = big @ turn @ end.place.covariance @ turn.T @ big.T
+    turn = _turn(solved.graph, end)
+    joint = solved.joint(end.component, [end.place.scene])
     if joint is None:
         return None
+    picked = big @ turn @ end.place.covariance @ turn.T @ big.T
     J = np.concatenate([big @ _moves(end.map), big @ turn @ _moves(end.place.point)], axis=1)
     found: np.ndarray = J @ joint @ J.T + picked
     return found
@@ -200,28 +228,19 @@ def _moves(point: np.ndarray) -> np.ndarray:
     return np.concatenate([-skew(point[None])[0], np.eye(3), point[:, None]], axis=1)
 
 
-def _joint(
-    store: Store, settings: Settings, graph: PoseGraph, component: int | None, scenes: list[str]
-) -> np.ndarray | None:
-    """Covariance of the world and these scenes together; None where it cannot be computed."""
-    given = pose_inputs(store, settings)
-    return optimize.joint_covariance(
-        graph, given.edges, given.priors, given.survey, scenes, component or 0, settings.optimize
-    )
-
-
-def _row(store: Store, end: _Placed, frame: WorldFrame | None, crs: str | None) -> PlaceRow:
+def _row(solved: _Solved, end: _Placed, frame: WorldFrame | None, crs: str | None) -> PlaceRow:
     from gsmap.world.frame import of_frame
 
     scene = end.place.scene
+    covariance = None if end.metric is None else _world_covariance(solved, end)
     world = None if end.metric is None or frame is None else of_frame(frame, end.metric[None], crs)[0]
     return PlaceRow(
         said=end.place.said,
         scene=scene,
-        scene_name=None if scene is None else store.scenes.get(scene).name,
+        scene_name=None if scene is None else solved.store.scenes.get(scene).name,
         component=end.component,
         map=end.map,
         metric=end.metric,
         world=world,
-        sigma_m=None,
+        sigma_m=None if covariance is None else np.sqrt(np.diag(covariance)),
     )

@@ -70,6 +70,8 @@ def test_the_metre_is_the_survey_s(tied: Path) -> None:
 
 
 def test_measuring(tied: Path, site: Site) -> None:
+    from gsmap.world.frame import of_frame
+
     true = float(np.linalg.norm(site.truth[0].translation - site.truth[8].translation))
     with gsmap.map.open(tied) as m:
         found = m.measure("site-000:0,0,0", "site-008:0,0,0")
@@ -84,6 +86,17 @@ def test_measuring(tied: Path, site: Site) -> None:
         assert pixel.distance_m < 0.005
         world = m.measure("site-000:0,0,0", f"world:{','.join(map(repr, found.a.world.tolist()))}")
         assert world.distance_m < 1e-6
+        # Of a point that was told exactly, only the other end's error is left: that of where its scene lies.
+        lone = m.measure("site-008:0,0,0", f"world:{','.join(map(repr, found.a.world.tolist()))}")
+        assert lone.distance_m == pytest.approx(found.distance_m, abs=1e-6)
+        assert 1e-4 < lone.sigma_m < 0.05
+        assert lone.sigma_m <= 1.01 * np.linalg.norm(lone.a.sigma_m)
+        assert lone.b.sigma_m.tolist() == [0, 0, 0]
+        truth = of_frame(site.frame, site.truth[8].translation[None])[0]
+        assert np.linalg.norm(found.b.world - truth) < 3 * np.linalg.norm(found.b.sigma_m)
+        assert (found.b.sigma_m < 0.05).all()
+        in_map = m.measure("site-008:0,0,0", ",".join(map(repr, found.a.map.tolist())))
+        assert 1e-4 < in_map.sigma_m < 0.05
         for text, said in (("nonsense", "is no point"), ("a:1,2", "is no point")):
             with pytest.raises(ConfigError, match=said):
                 m.measure(text, "0,0,0")
