@@ -25,6 +25,7 @@ FILE_NAME = "tileset.json"
 LEVELS_FOLDER = "levels"
 _MAX_PER_LEVEL = 100_000
 _COARSENING = 4  # a level draws at most this fraction of what replaces it: half the detail on surfaces
+_MEASURED = "measured_error_m"  # of a level alone; its geometric error is not less than those of finer ones
 _Cell = tuple[int, int, int]
 
 
@@ -140,21 +141,32 @@ class _Maker:
         digest = hashlib.sha256("\n".join(made_of).encode()).hexdigest()
         uri = f"{LEVELS_FOLDER}/{digest[:24]}.glb"
         path = self.folder / uri
-        below = tuple(child.node for child in children)
         if uri in self.known and is_file(path):
-            return _Drawn(replace(self.known[uri], children=below), path, digest)
+            known = self.known[uri]
+            return _Drawn(replace(known, children=_needed(children, known.extras[_MEASURED])), path, digest)
         finer = Gaussians.concatenate([child.gaussians() for child in children])
         level = make_level(finer, min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING)), self.cameras(), self.levels)
         make_folder(path.parent)
         written: list[np.ndarray] = []
         content = partial(tiles3d.write_content, gaussians=level.gaussians, compressed=self.compressed)
         write_whole(path, lambda staged: written.append(content(staged)))
+        below = _needed(children, level.error_m)
         boxes = np.stack([*written, *(node.box for node in below)])
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level must never be finer than what replaces it, or viewers would stop at it too early.
         error_m = max(level.error_m, 1.5 * max(node.error_m for node in below), 1e-3)
         said = {} if level.psnr_db is None else dict(zip(("psnr_worst_db", "psnr_db"), level.psnr_db, strict=True))
-        return _Drawn(TileNode(box, error_m, uri, below, {n: round(v, 2) for n, v in said.items()}), path, digest)
+        extras = {name: round(value, 2) for name, value in said.items()} | {_MEASURED: level.error_m}
+        return _Drawn(TileNode(box, error_m, uri, below, extras), path, digest)
+
+
+def _needed(children: list[_Drawn], error_m: float) -> tuple[TileNode, ...]:
+    """What replaces a level of this measured error: finer ones, and of those that are no better what replaces them."""
+    nodes: list[TileNode] = []
+    for child in children:
+        is_level = bool(child.node.children)  # the tiles themselves stay, whatever
+        nodes += child.node.children if is_level and error_m <= child.node.error_m else [child.node]
+    return tuple(nodes)
 
 
 def _one_level_up(cells: dict[_Cell, _Drawn], maker: _Maker) -> dict[_Cell, _Drawn]:
