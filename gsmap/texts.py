@@ -1,8 +1,10 @@
-"""Texts that people read on a terminal: what must never reach it as it is."""
+"""Texts that people read: values as tables show them, and what must never reach a terminal as it is."""
 
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Mapping
+from typing import Any
 
 # Cc, Cs: escape sequences, line breaks, halves of characters. Zl, Zp: line breaks of another kind.
 _CATEGORIES = ("Cc", "Cs", "Zl", "Zp")
@@ -28,8 +30,29 @@ def escaped(text: str, *, lines: bool = False) -> str:
     """
     if not control_characters(text, lines=lines):
         return text
-    shown = (c.encode("unicode_escape").decode() if _steers(c) and not (lines and c == "\n") else c for c in text)
-    return "".join(shown)
+    parts = (c.encode("unicode_escape").decode() if _steers(c) and not (lines and c == "\n") else c for c in text)
+    return "".join(parts)
+
+
+def shown(value: Any, *, lines: bool = False) -> str:
+    """A value as people read it in a table; control characters are escaped, whoever wrote them.
+
+    Args:
+        lines: line breaks stay.
+    """
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{escaped(str(name))} {shown(item, lines=lines)}" for name, item in value.items())
+    if hasattr(value, "tolist"):  # numpy arrays
+        return " ".join(shown(item) for item in value.tolist())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(shown(item, lines=lines) for item in value)
+    return escaped(str(value), lines=lines)
 
 
 def _steers(c: str) -> bool:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+
+if TYPE_CHECKING:
+    from gsmap.types.rows import BranchRow
 
 
 def command(
@@ -36,7 +39,7 @@ def make_or_list(
         raise ConfigError(f"name the {kind} to make or to delete, or give --list alone")
     with opened(map) as m:
         if name is None:
-            rows = m.branches(kind)
+            rows: list[BranchRow] = m.branches(kind)
         elif delete:
             rows = [m.delete_branch(name, kind)]
             say(f"deleted {kind} {name}; gsmap prune {map} reclaims what only it named")

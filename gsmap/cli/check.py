@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say, text
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
+from gsmap.texts import shown
 
 
 def command(
@@ -29,9 +30,9 @@ def command(
         print_rows("check", report, json)
     else:
         for problem in report.problems:
-            print(text(problem))
+            print(shown(problem))
         for why in report.unverified:
-            print(f"cannot verify the catalog: {text(why)}")
+            print(f"cannot verify the catalog: {shown(why)}")
     if not report.ok:
         count = len(report.problems)
         again = "restore files from a backup, or ingest (of graphs: describe) their scenes again"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json as _json
 import logging
-import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gsmap.texts import escaped
+from gsmap.texts import escaped, shown
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -51,9 +50,6 @@ Scheduler = Annotated[
     typer.Option("--scheduler", metavar="URL", help="Of a Dask cluster, tcp://HOST:8786; GSMAP_SCHEDULER else."),
 ]
 
-_DIGESTS = {"id", "scene", "target", "source", "sha256", "key", "descriptor_id"}
-_DIGEST = re.compile(r"[0-9a-f]{32,64}")
-_SHORT = 12  # digits of a digest that tell a map's things apart
 
 # --- remarks and logs ------------------------------------------------------------------------------------------------
 
@@ -132,6 +128,8 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
     from rich.table import Table
     from rich.text import Text
 
+    from gsmap.types.notebook import cell_text
+
     table = Table(title=Text(escaped(title), "table.title"), title_justify="left", box=box.SIMPLE_HEAD)
     values = [[getattr(row, name) for name in columns] for row in rows]
     for i, heading in enumerate(columns.values()):
@@ -139,7 +137,7 @@ def print_table(title: str, columns: Mapping[str, str], rows: Sequence[Row]) -> 
         table.add_column(heading, justify="right" if numeric else "left", overflow="fold")
     for line in values:
         cells = zip(columns, line, strict=True)
-        table.add_row(*[Text(short(value) if name in _DIGESTS else text(value)) for name, value in cells])
+        table.add_row(*[Text(cell_text(name, value)) for name, value in cells])
     _print(table)
 
 
@@ -148,13 +146,13 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    shown = Text(escaped(title), "table.title")
-    table = Table(title=shown, title_justify="left", box=None, show_header=False, padding=(0, 2, 0, 0))
+    heading = Text(escaped(title), "table.title")
+    table = Table(title=heading, title_justify="left", box=None, show_header=False, padding=(0, 2, 0, 0))
     table.add_column(overflow="fold")
     table.add_column(overflow="fold")
     for name, value in facts.items():
-        if value is not None and text(value) != "":
-            table.add_row(Text(escaped(name)), Text(text(value, lines=True)))
+        if value is not None and shown(value) != "":
+            table.add_row(Text(escaped(name)), Text(shown(value, lines=True)))
     _print(table)
 
 
@@ -162,32 +160,6 @@ def _print(table: Any) -> None:
     from rich.console import Console
 
     Console(width=None if sys.stdout.isatty() else 200, highlight=False).print(table)
-
-
-def text(value: Any, *, lines: bool = False) -> str:
-    """A value as people read it in a table; control characters are escaped, whoever wrote them.
-
-    Args:
-        lines: line breaks stay.
-    """
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{escaped(str(name))} {text(item, lines=lines)}" for name, item in value.items())
-    if hasattr(value, "tolist"):  # numpy arrays
-        return " ".join(text(item) for item in value.tolist())
-    if isinstance(value, (list, tuple)):
-        return ", ".join(text(item, lines=lines) for item in value)
-    return escaped(str(value), lines=lines)
-
-
-def short(value: Any) -> str:
-    """As `text`, but of a content digest the first dozen digits."""
-    return value[:_SHORT] if isinstance(value, str) and _DIGEST.fullmatch(value) else text(value)
 
 
 # --- maps ------------------------------------------------------------------------------------------------------------

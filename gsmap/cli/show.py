@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table, say, text
+from gsmap.cli.console import AsJson, MapPath, opened, print_facts, print_rows, print_table, say
+from gsmap.texts import shown
 
 if TYPE_CHECKING:
     from gsmap.map import Map
@@ -78,7 +79,7 @@ def _print_scene(scene: SceneReport, nodes: bool) -> None:
     size, prior, sigmas = scene.bounds[1] - scene.bounds[0], scene.prior, None
     metre = _metre(scene)
     if scene.rotation_sigma_deg is not None:
-        sigmas = f"{text(scene.rotation_sigma_deg)} deg, {text(scene.translation_sigma_m)} m"
+        sigmas = f"{shown(scene.rotation_sigma_deg)} deg, {shown(scene.translation_sigma_m)} m"
     facts = {
         "id": scene.id,
         "status": scene.status,
@@ -93,8 +94,8 @@ def _print_scene(scene: SceneReport, nodes: bool) -> None:
         "note": scene.note,
         "Gaussians": f"{scene.num_gaussians}, SH degree {scene.sh_degree}" + ", antialiased" * scene.antialiased,
         "cameras": f"{scene.num_cameras}" + ", synthesised" * scene.cameras_synthesised,
-        "size": f"{text(size)} units",
-        "scale": scene.scale_policy + ("" if scene.unit_m is None else f", about {text(scene.unit_m)} m a unit"),
+        "size": f"{shown(size)} units",
+        "scale": scene.scale_policy + ("" if scene.unit_m is None else f", about {shown(scene.unit_m)} m a unit"),
         "map": None if metre is None else metre.text(),
         "note on the metre": scene.metre_note or None,
         "up": scene.up,
@@ -168,9 +169,9 @@ def _pose(pose: Sim3 | None) -> str | None:
     w, *xyz = matrices_to_quats(pose.rotation[None])[0]
     sine = float(np.linalg.norm(xyz))
     angle = 2.0 * float(np.degrees(np.arctan2(sine, abs(w))))
-    axis = f" about {text(np.round(np.copysign(1.0, w) * np.array(xyz) / sine, 3))}" if sine > 1e-9 else ""
+    axis = f" about {shown(np.round(np.copysign(1.0, w) * np.array(xyz) / sine, 3))}" if sine > 1e-9 else ""
     scale = "" if pose.is_rigid else f", scale {pose.scale:.5g}"
-    return f"at {text(np.round(pose.translation, 4))}, turned {angle:.2f} deg{axis}{scale}"
+    return f"at {shown(np.round(pose.translation, 4))}, turned {angle:.2f} deg{axis}{scale}"
 
 
 def _captured(scene: SceneReport) -> str | None:

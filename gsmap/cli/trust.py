@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, print_rows, say, text
+from gsmap.cli.console import AsJson, MapPath, print_rows, say
+from gsmap.texts import shown
 
 
 def command(
@@ -27,7 +28,7 @@ def command(
     if not report.trusted:
         if not yes and sys.stdin.isatty():
             question = f"connect to {report.server} as {report.user or 'yourself'}, from now on?"
-            yes = typer.confirm(text(question), err=True)
+            yes = typer.confirm(shown(question), err=True)
         if yes:
             report = gsmap.map.trust(map)
         else:

@@ -58,6 +58,7 @@ from gsmap.types.rows import (
     SettingRow,
     SnapshotRow,
     SplitReport,
+    Table,
     ThinReport,
     TileRow,
     UpdateReport,
@@ -124,11 +125,11 @@ def restore(
     )
 
 
-def snapshots(target: str | os.PathLike[str]) -> list[SnapshotRow]:
+def snapshots(target: str | os.PathLike[str]) -> Table[SnapshotRow]:
     """``gsmap backup MAP DEST --list``: the states in a backup, oldest first."""
     from gsmap.map import backing
 
-    return backing.snapshots(target)
+    return Table(backing.snapshots(target))
 
 
 def accept_catalog(path: str | os.PathLike[str]) -> list[str]:
@@ -206,9 +207,9 @@ class Map(AbstractContextManager["Map"]):
             self.store.send_settings()
         self.__dict__.pop("settings", None)
 
-    def setting_rows(self) -> list[SettingRow]:
+    def setting_rows(self) -> Table[SettingRow]:
         """``gsmap settings MAP``: every setting with value, default, unit and meaning."""
-        return reports.setting_rows(self.settings)
+        return Table(reports.setting_rows(self.settings))
 
     # --- ingest, describe, register, optimize ------------------------------------------------------------------------
 
@@ -220,7 +221,7 @@ class Map(AbstractContextManager["Map"]):
         captured_at: str | None = None,
         scale: str = "auto",
         supersedes: str | None = None,
-    ) -> list[IngestRow]:
+    ) -> Table[IngestRow]:
         """Add captures: those found at files and folders, or one in memory. Each is checked whole before it is written.
 
         Args:
@@ -248,12 +249,12 @@ class Map(AbstractContextManager["Map"]):
             with at_work(self.store, "ingest"):
                 capture = found[0][1]()
                 done = supersede(self.store, capture, supersedes, self.settings, self._progress, named=name is not None)
-            return [reports.ingest_row(done.scene, new=True, dated=False, notes=(*capture.notes, *done.notes))]
+            return Table([reports.ingest_row(done.scene, new=True, dated=False, notes=(*capture.notes, *done.notes))])
 
         added = ingest(self.store, captures, progress=self._progress, **options)
-        return [reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added]
+        return Table(reports.ingest_row(one.scene, new=one.new, dated=one.dated, notes=one.notes) for one in added)
 
-    def describe(self, *scenes: str) -> list[GraphRow]:
+    def describe(self, *scenes: str) -> Table[GraphRow]:
         """The scene graph of every scene, made where the present recipe has not made it yet.
 
         Args:
@@ -264,9 +265,9 @@ class Map(AbstractContextManager["Map"]):
         wanted = [self.store.scenes.get(ref) for ref in scenes] or unthinned(self.scenes())
         with at_work(self.store, "describe"):
             keys = describe(self.store, wanted, self.settings, self._progress, verify=bool(scenes))
-        return [reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted if scene.id in keys]
+        return Table(reports.graph_row(self.store, scene, keys[scene.id]) for scene in wanted if scene.id in keys)
 
-    def register(self, pairs: Pairs = "auto") -> list[EdgeRow]:
+    def register(self, pairs: Pairs = "auto") -> Table[EdgeRow]:
         """Register pairs of described scenes.
 
         Args:
@@ -277,7 +278,7 @@ class Map(AbstractContextManager["Map"]):
 
         with at_work(self.store, "register"):
             made = register(self.store, pairs, self.settings, self._progress)
-        return reports.rows_of_edges(self.store, made)
+        return Table(reports.rows_of_edges(self.store, made))
 
     def add_edge(self, pair: str, S_target_source: Sim3, sigmas: np.ndarray, note: str = "") -> EdgeRow:
         """Keep a measurement of your own of how scene B lies in scene A of ``A:B``; the next optimize uses it.
@@ -650,6 +651,9 @@ class Map(AbstractContextManager["Map"]):
         made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait)
         return reports.export_report(self.store, Path(out), made, notes)
 
+    def _repr_html_(self) -> str:
+        return reports.map_html(self.store, self.status(), self.scene_rows())
+
     # --- look --------------------------------------------------------------------------------------------------------
 
     def scenes(self) -> list[Scene]:
@@ -691,11 +695,11 @@ class Map(AbstractContextManager["Map"]):
         after: str | None = None,
         tag: str | None = None,
         as_of: str | None = None,
-    ) -> list[SceneRow]:
+    ) -> Table[SceneRow]:
         """``gsmap list MAP scenes``: all, or those of one component or status, captured after a date or at or before
         one, or with a tag."""
         chosen: dict[str, Any] = {"component": component, "status": status, "after": after, "tag": tag, "as_of": as_of}
-        return reports.scene_rows(self.store, **chosen, metres=self.metres())
+        return Table(reports.scene_rows(self.store, **chosen, metres=self.metres()))
 
     def edge_rows(
         self,
@@ -705,25 +709,26 @@ class Map(AbstractContextManager["Map"]):
         after: str | None = None,
         tag: str | None = None,
         as_of: str | None = None,
-    ) -> list[EdgeRow]:
+    ) -> Table[EdgeRow]:
         """``gsmap list MAP edges``: all, or those of one status, registered after a date, between scenes as asked."""
-        return reports.edge_rows(self.store, component=component, status=status, after=after, tag=tag, as_of=as_of)
+        chosen: dict[str, Any] = {"component": component, "status": status, "after": after, "tag": tag, "as_of": as_of}
+        return Table(reports.edge_rows(self.store, **chosen))
 
-    def revision_rows(self) -> list[RevisionRow]:
+    def revision_rows(self) -> Table[RevisionRow]:
         """``gsmap list MAP revisions``."""
-        return reports.revision_rows(self.store)
+        return Table(reports.revision_rows(self.store))
 
-    def tile_rows(self) -> list[TileRow]:
+    def tile_rows(self) -> Table[TileRow]:
         """``gsmap list MAP tiles``."""
-        return reports.tile_rows(self.store)
+        return Table(reports.tile_rows(self.store))
 
-    def model_rows(self) -> list[ModelRow]:
+    def model_rows(self) -> Table[ModelRow]:
         """``gsmap models list MAP``."""
-        return reports.model_rows(self.store)
+        return Table(reports.model_rows(self.store))
 
-    def pose_rows(self, crs: str | None = None) -> list[PoseRow]:
+    def pose_rows(self, crs: str | None = None) -> Table[PoseRow]:
         """``gsmap poses MAP``: where every placed scene lies, in the map and (``crs``, or the map's own) the world."""
-        return reports.pose_rows(self.store, crs)
+        return Table(reports.pose_rows(self.store, crs))
 
     def status(self) -> MapStatus:
         """``gsmap status MAP``: what is missing, stale or wants a person, each with the verb that helps."""
@@ -771,9 +776,9 @@ class Map(AbstractContextManager["Map"]):
         newest = self.store.graphs.load(scene.id)
         return newest, "" if newest is None else note
 
-    def diff(self, before: int, after: int) -> list[PoseChangeRow]:
+    def diff(self, before: int, after: int) -> Table[PoseChangeRow]:
         """``gsmap diff MAP R1 R2``: how far each scene moved between two revisions, measured at its middle."""
-        return reports.pose_change_rows(self.store, before, after, self._settings_to_look_by())
+        return Table(reports.pose_change_rows(self.store, before, after, self._settings_to_look_by()))
 
     def evaluate(
         self,
@@ -996,10 +1001,10 @@ class Map(AbstractContextManager["Map"]):
         """``gsmap tag MAP NAME``: the map as it is now, which cannot change; `open` it as ``MAP@NAME``."""
         return as_values.branch_row(self.store.branches.make(name, tag=True))
 
-    def branches(self, kind: str | None = None) -> list[BranchRow]:
+    def branches(self, kind: str | None = None) -> Table[BranchRow]:
         """The map's branches and tags, or those of one kind (``branch``, ``tag``)."""
         rows = [as_values.branch_row(branch) for branch in self.store.branches.list()]
-        return [row for row in rows if kind in (None, row.kind)]
+        return Table(row for row in rows if kind in (None, row.kind))
 
     def delete_branch(self, name: str, kind: str | None = None) -> BranchRow:
         """``gsmap branch MAP NAME --delete``: forget a branch or tag; what only it named is reclaimed by `prune`.

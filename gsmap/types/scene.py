@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.types.notebook import html_facts
 from gsmap.types.thinning import Thinning
 
 SCALE_POLICIES = ("auto", "known", "unknown")
@@ -44,3 +45,16 @@ class Scene:
     antialiased: bool = False
     tags: tuple[str, ...] = ()
     thinning: Thinning | None = None
+
+    def _repr_html_(self) -> str:
+        facts = {
+            "id": self.id,
+            "Gaussians": self.num_gaussians,
+            "SH degree": self.sh_degree,
+            "cameras": f"{self.num_cameras}{', synthesised' if self.cameras_synthesised else ''}",
+            "captured": self.captured_at,
+            "size, units": np.ptp(self.bounds, axis=0),
+            "scale": self.scale_policy,
+            "tags": self.tags,
+        }
+        return html_facts(f"Scene {self.name}", facts.items())

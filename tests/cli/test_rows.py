@@ -13,7 +13,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gsmap.cli.console import json_object, print_facts, print_rows, print_table, text
+from gsmap.cli.console import json_object, print_facts, print_rows, print_table
+from gsmap.texts import shown
 from gsmap.types import Sim3, rows
 from gsmap.types.rows import Row
 
@@ -136,7 +137,7 @@ def test_an_empty_table_has_its_headings(capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.parametrize(
-    ("value", "shown"),
+    ("value", "expected"),
     [
         (None, "-"),
         (True, "yes"),
@@ -146,5 +147,5 @@ def test_an_empty_table_has_its_headings(capsys: pytest.CaptureFixture[str]) -> 
         ({"a": 1.0}, "a 1"),
     ],
 )
-def test_values_read_as_people_write_them(value: object, shown: str) -> None:
-    assert text(value) == shown
+def test_values_read_as_people_write_them(value: object, expected: str) -> None:
+    assert shown(value) == expected

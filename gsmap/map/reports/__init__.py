@@ -1,6 +1,7 @@
 """What the map answers, as typed rows (`gsmap.types.rows`), read from the store."""
 
 from gsmap.map.reports.common import names, scenes_by_id
+from gsmap.map.reports.notebook import map_html
 from gsmap.map.reports.one_scene import graph_row, prior_row, scene_report
 from gsmap.map.reports.pairs import EDGE_STATUSES, edge_row, edge_rows, pair_report, rows_of_edges
 from gsmap.map.reports.revisions import made_after, pose_change_rows, revision_row, revision_rows, update_report
@@ -18,6 +19,7 @@ __all__ = [
     "graph_row",
     "ingest_row",
     "made_after",
+    "map_html",
     "model_rows",
     "names",
     "pair_report",

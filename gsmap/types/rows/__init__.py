@@ -9,7 +9,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 """
 
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
-from gsmap.types.rows.base import SCHEMA, Row
+from gsmap.types.rows.base import SCHEMA, Row, Table
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
 from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.find import FindHit, FindReport
@@ -123,6 +123,7 @@ __all__ = [
     "SightingRow",
     "SnapshotRow",
     "SplitReport",
+    "Table",
     "ThinReport",
     "ThinRow",
     "TieRow",

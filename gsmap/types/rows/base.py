@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
+from gsmap.types.notebook import html_facts, html_table
 from gsmap.types.plain import plain
 from gsmap.types.sim3 import Sim3
 
@@ -30,10 +31,24 @@ class Row:
         """The values of a table's line, in the order of ``columns``."""
         return [getattr(self, name) for name in self.columns]
 
+    def _repr_html_(self) -> str:
+        names = self.columns or {field.name: field.name for field in fields(self)}  # type: ignore[arg-type]
+        return html_facts(type(self).__name__, [(heading, getattr(self, name)) for name, heading in names.items()])
+
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and isinstance(other, Row) and self.to_json() == other.to_json()
 
     __hash__ = None  # type: ignore[assignment]
+
+
+R = TypeVar("R", bound=Row)
+
+
+class Table(list[R]):
+    """Rows that a notebook shows as a table; in all else a list."""
+
+    def _repr_html_(self) -> str:
+        return html_table(self[0].columns, self) if self else "<p>none</p>"
 
 
 def coordinates(world: np.ndarray | None) -> str | None:

@@ -1,0 +1,5 @@
+"""The command line, for the page that lists it (`tools/make_docs.py`)."""
+
+from gsmap.cli.app import build
+
+app = build()

@@ -1,0 +1,21 @@
+"""A map as a notebook shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+from gsmap.store import Store
+from gsmap.types.notebook import html_facts, html_table
+from gsmap.types.rows import MapStatus, SceneRow, TodoRow
+
+
+def map_html(store: Store, status: MapStatus, scenes: Sequence[SceneRow]) -> str:
+    """What the map holds, what is to be done, and its scenes."""
+    facts = [(heading, getattr(status, name)) for name, heading in MapStatus.columns.items()]
+    parts = [html_facts(f"Map {PurePosixPath(store.location).name}", facts)]
+    if status.todo:
+        parts.append(html_table(TodoRow.columns, status.todo))
+    if scenes:
+        parts.append(html_table(SceneRow.columns, scenes))
+    return "".join(parts)
