@@ -12,6 +12,7 @@ export interface MapSummary {
   title: string;
   actions: boolean; // whether POST actions/... is there: not in a static page, not with --read-only
   revision: number | null; // the newest; null before the first optimize
+  stale: boolean; // reviews, priors, edges or scenes are newer than that revision: optimize would see them
   components: Component[];
   scenes: SceneEntry[];
   edges: EdgeEntry[];
@@ -54,6 +55,8 @@ export interface SceneEntry {
   ellipsoid: Matrix3 | null; // covariance of its middle, map frame, square units
   middle: Vector; // map frame
   tileset: string; // 3D Tiles, scene frame: levels of detail of this scene
+  tags: string[];
+  prior: string | null; // what people or receivers told of where it lies, in words: "pose, 0.05 m, 2°"
 }
 export type Matrix3 = number[][]; // 3 x 3
 
@@ -95,6 +98,7 @@ export interface ChangeEntry {
   at: string | null; // when the newer capture was made
   confidence: number;
   status: string; // "open", "confirmed", "rejected"
+  note: string; // of the review
   pictures: string | null; // GET: one picture, before and after beside each other
 }
 
