@@ -1,9 +1,10 @@
 // Everything that a person can do on the page, one function each. What changes the map goes through `send`.
-import { act, getEdge, getGraph, getHistory, getMap, getRevision, Gone } from "./api";
+import { act, getEdge, getGraph, getHistory, getMap, getRevision, getState, Gone } from "./api";
 import { fits } from "./address";
-import type { Actions, Box, EdgeEntry, MapSummary, Matrix, Vector } from "./contract";
+import type { Actions, Box, GraphEntry, MapSummary, Matrix, RevisionPoses, Vector } from "./contract";
 import * as derive from "./derive";
 import { Resources } from "./resources";
+import type { Resource } from "./resources";
 import { COMPARISONS, page } from "./state";
 import type { Pick } from "./stage/stage";
 import type { Overlay, Selection, Side, State, Tab, Theme, Undo } from "./state";
@@ -11,18 +12,30 @@ import { middleOf, standpointOf } from "./words";
 
 // ---- what is asked of the server, once --------------------------------------------------------------------------
 
-export const revisions = new Resources((key) => getRevision(Number(key)));
-export const edges = new Resources((key) => {
-  const [target, source] = key.split("-").map(Number);
-  return getEdge(target ?? 0, source ?? 0);
-});
-export const graph = new Resources(() => getGraph());
+// By their addresses, which name them by content: what an address gives stays what it is.
+export const revisions = new Resources(getRevision);
+export const edges = new Resources(getEdge);
+export const graphs = new Resources(getGraph);
+/** By "component at X,Y,Z", in the map as it is. */
 export const histories = new Resources((key) => {
-  const [component, ...at] = key.split(",").map(Number);
-  return getHistory(at as Vector, component ?? 0);
+  const [component, at] = key.split(" ");
+  return getHistory(page.state.map?.history ?? "", at ?? "", Number(component));
 });
 
-export const detailOf = (edge: EdgeEntry) => edges.get(`${edge.target}-${edge.source}`);
+export function graphOf(state: State): Resource<GraphEntry> | null {
+  return state.map?.graph ? graphs.get(state.map.graph) : null;
+}
+
+/** Where everything lay in the revision that is looked at; null for the newest, whose poses the map has. */
+export function posesOf(state: State): Resource<RevisionPoses> | null {
+  const uri = state.map?.revisions.find((row) => row.id === state.revision)?.poses;
+  return uri ? revisions.get(uri) : null;
+}
+
+const objectsOf = (state: State) => {
+  const known = graphOf(state);
+  return known?.status === "ready" ? known.value.objects : [];
+};
 
 // ---- the map ----------------------------------------------------------------------------------------------------
 
@@ -57,8 +70,6 @@ export function setMap(map: MapSummary): void {
     selection: selection && isThere(map, selection) ? selection : null,
     revision: map.revisions.some((row) => row.id === state.revision) ? state.revision : null,
   });
-  edges.forget();
-  graph.forget();
   histories.forget();
 }
 
@@ -214,8 +225,7 @@ export function clipFace(corner: 0 | 1, axis: 0 | 1 | 2, value: number): void {
   if (!now || !whole || !Number.isFinite(value)) return;
   const box = structuredClone(now);
   const least = 0.01 * (whole[1][axis] - whole[0][axis]);
-  box[corner][axis] =
-    corner === 0 ? Math.min(value, now[1][axis] - least) : Math.max(value, now[0][axis] + least);
+  box[corner][axis] = corner === 0 ? Math.min(value, now[1][axis] - least) : Math.max(value, now[0][axis] + least);
   page.set({ clip: box });
 }
 
@@ -250,7 +260,8 @@ export async function copyLink(): Promise<void> {
     say(`The browser does not let the page copy. The link is in the address bar: ${location.href}`, true);
     return;
   }
-  if (state.map && !fits(state, state.map)) say("Too many scenes are hidden to be named in a link: it shows all of them");
+  if (state.map && !fits(state, state.map))
+    say("Too many scenes are hidden to be named in a link: it shows all of them");
 }
 
 // ---- choosing ---------------------------------------------------------------------------------------------------
@@ -299,8 +310,7 @@ export function flyToSelected(selection = page.state.selection): void {
     const unit = photo && derive.componentOf(map, photo.component)?.metres_per_unit;
     if (photo) aim(() => page.stage?.stand(standpointOf(photo, unit ?? 1), true));
   } else {
-    const known = graph.get("");
-    const object = known.status === "ready" ? known.value.objects.find((one) => one.id === key) : undefined;
+    const object = objectsOf(page.state).find((one) => one.id === key);
     if (object) flyTo(grown(object.box));
   }
 }
@@ -319,10 +329,7 @@ export function picked(pick: Pick): void {
     edge: () => edge && derive.edgeKey(map, edge),
     change: () => derive.listedChanges(page.state)[thing.index]?.id,
     photo: () => map.photos[thing.index]?.file,
-    object: () => {
-      const known = graph.get("");
-      return known.status === "ready" ? known.value.objects[thing.index]?.id : undefined;
-    },
+    object: () => objectsOf(page.state)[thing.index]?.id,
     camera: () => undefined,
   }[thing.kind]();
   if (key && thing.kind !== "camera") select({ kind: thing.kind, key }, thing.kind === "photo");
@@ -385,6 +392,7 @@ async function send<Name extends keyof Actions>(
   try {
     const map = await act(name, body);
     page.set({ busy: null, gone: false, undo: said.undo ? [...page.state.undo, said.undo] : page.state.undo });
+    edges.refresh(); // a review is one of its events
     setMap(map);
     say(said.done);
     return true;
@@ -410,6 +418,25 @@ async function refresh(): Promise<void> {
   }
 }
 
+const isStatic = (map: MapSummary) => map.history === null;
+
+/** Looks every few seconds whether others changed the map, and whether the server is there. */
+export async function watch(every_ms = 4000): Promise<void> {
+  for (;;) {
+    await new Promise((rest) => setTimeout(rest, every_ms));
+    const { map, busy, phase } = page.state;
+    if (!map || busy || phase !== "ready" || document.hidden || isStatic(map)) continue;
+    try {
+      const { state } = await getState();
+      const isBack = page.state.gone;
+      if (isBack) await retry();
+      else if (state !== map.state && !page.state.busy) setMap(await getMap());
+    } catch (error) {
+      if (error instanceof Gone) page.set({ gone: true });
+    }
+  }
+}
+
 /** Asks whether the server is back, and sends what it did not get, in order. */
 export async function retry(): Promise<void> {
   if (page.state.phase === "failed") {
@@ -421,7 +448,7 @@ export async function retry(): Promise<void> {
     const map = await getMap();
     const { unsent } = page.state;
     page.set({ gone: false, unsent: [], busy: null });
-    for (const resources of [revisions, edges, graph, histories]) resources.forgetFailed();
+    for (const resources of [revisions, edges, graphs, histories]) resources.forgetFailed();
     setMap(map);
     for (const [index, one] of unsent.entries())
       if (!(await one.send()) && page.state.gone) {
@@ -491,7 +518,11 @@ export async function undo(): Promise<void> {
 }
 
 export const optimize = () =>
-  send("optimize", {}, { doing: "optimizing: all poses are solved for anew", done: "Optimized: a new revision is shown" });
+  send(
+    "optimize",
+    {},
+    { doing: "optimizing: all poses are solved for anew", done: "Optimized: a new revision is shown" },
+  );
 
 // ---- priors -----------------------------------------------------------------------------------------------------
 

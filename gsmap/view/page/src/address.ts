@@ -98,7 +98,10 @@ export function read(hash: string, map: MapSummary): Shared {
     comparison: one("compare", COMPARISONS, "blink"),
     edgeFilter: one("edges", EDGE_FILTERS, "doubtful"),
     until: until && DAY.test(until) ? until : null,
-    revision: map.revisions.some((row) => row.id === revision) && revision !== map.revision ? revision : null,
+    revision:
+      map.revisions.some((row) => row.id === revision && row.poses !== null) && revision !== map.revision
+        ? revision
+        : null,
   };
 }
 

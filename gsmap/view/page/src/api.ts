@@ -1,6 +1,6 @@
 // Every request that the panels make. What comes back is data of a map that may be anybody's: shapes are checked where
 // the page would break, addresses wherever one is loaded, and nothing is ever taken for HTML.
-import type { Actions, EdgeDetail, GraphEntry, MapSummary, PlaceHistory, RevisionPoses, Vector } from "./contract";
+import type { Actions, EdgeDetail, GraphEntry, MapState, MapSummary, PlaceHistory, RevisionPoses } from "./contract";
 
 /** Nobody answered: the server was ended, or the way to it is cut. */
 export class Gone extends Error {}
@@ -31,11 +31,18 @@ export async function getMap(): Promise<MapSummary> {
   return map;
 }
 
-export const getRevision = (id: number) => get<RevisionPoses>(`revisions/${id}.json`);
-export const getEdge = (target: number, source: number) => get<EdgeDetail>(`edges/${target}-${source}.json`);
-export const getGraph = () => get<GraphEntry>("graph.json");
-export const getHistory = (at: Vector, component: number) =>
-  get<PlaceHistory>(`history.json?at=${at.map((v) => v.toFixed(4)).join(",")}&component=${component}`);
+export const getState = () => get<MapState>("state.json");
+export const getRevision = (uri: string) => get<RevisionPoses>(below(uri));
+export const getEdge = (uri: string) => get<EdgeDetail>(below(uri));
+export const getGraph = (uri: string) => get<GraphEntry>(below(uri));
+export const getHistory = (uri: string, at: string, component: number) =>
+  get<PlaceHistory>(`${below(uri)}?at=${at}&component=${component}`);
+
+function below(uri: string): string {
+  const found = relative(uri);
+  if (found === null) throw new Refused(`the map names an address outside this page: ${uri.slice(0, 200)}`, 0);
+  return found;
+}
 
 /** Does one action; gives the map as it is afterwards. */
 export async function act<Name extends keyof Actions>(name: Name, body: Actions[Name]): Promise<MapSummary> {

@@ -1,6 +1,8 @@
 // What the server tells the page and takes from it. gsmap/view/content.py writes the same on the other side; a static
 // page (`gsmap view --export`) is the GET part of it as files. Matrices are rows of rows; lengths are in the frame's
-// unit unless a name says metres; dates are ISO 8601. Addresses are relative to the page.
+// unit unless a name says metres; dates are ISO 8601. Addresses are relative to the page, and are followed as they are
+// given: they name things by content, not by their place in a list. Scene indices are into MapSummary.scenes of the
+// same `state`.
 
 export type Vector = [number, number, number];
 export type Matrix = number[][]; // 4 x 4, [s R | t]
@@ -9,6 +11,7 @@ export type Box = [Vector, Vector]; // lowest and highest corner
 /** GET map.json */
 export interface MapSummary {
   schema: 1;
+  state: string; // another one whenever the map has changed; see MapState
   title: string;
   actions: boolean; // whether POST actions/... is there: not in a static page, not with --read-only
   revision: number | null; // the newest; null before the first optimize
@@ -19,7 +22,14 @@ export interface MapSummary {
   revisions: RevisionEntry[];
   changes: ChangeEntry[];
   photos: PhotoEntry[];
-  counts: { objects: number; gaussians: number };
+  counts: { gaussians: number };
+  graph: string | null; // GET: GraphEntry; null where there is none
+  history: string | null; // GET with ?at=X,Y,Z&component=K: PlaceHistory; null in a static page
+}
+
+/** GET state.json, not in a static page: ask every few seconds, and map.json again when `state` is another. */
+export interface MapState {
+  state: string;
 }
 
 /** One island. A scene that nothing placed is an island of its own. */
@@ -33,9 +43,13 @@ export interface Component {
   merged: string | null; // a tileset of merged tiles, in this component's frame, where one was given
 }
 
-/** The coarsest level of every scene, in the map frame, one after the other in the order of `scenes`. */
+/**
+ * The coarsest level of every scene, in the map frame, one after the other in the order of `scenes`. What a scene looks
+ * like from afar has to be found out once: while some are `pending`, `state` changes as they come.
+ */
 export interface Overview {
-  uri: string; // SPZ
+  uri: string; // SPZ whose numbers are in the map frame as they are: no axes are turned; colours of SH degree 0
+  pending: number; // scenes that are not in it yet
   scenes: number[]; // indices into MapSummary.scenes
   counts: number[]; // Gaussians of each
 }
@@ -54,9 +68,21 @@ export interface SceneEntry {
   sigma_m: number | null; // of its middle, along the worst axis
   ellipsoid: Matrix3 | null; // covariance of its middle, map frame, square units
   middle: Vector; // map frame
-  tileset: string; // 3D Tiles, scene frame: levels of detail of this scene
+  /**
+   * GET: 3D Tiles, levels of detail of this scene, in its frame once the root's `transform` is left out. Answered with
+   * 202 and TreeProgress while it is made; ask again after `retry_s`, the ones that matter most with the lowest
+   * ?rank=0.. . What is no longer asked for is not made.
+   */
+  tileset: string;
+  extras: string; // GET: SceneExtras
   tags: string[];
   prior: string | null; // what people or receivers told of where it lies, in words: "pose, 0.05 m, 2°"
+}
+/** 202 of a tileset that is not there yet. */
+export interface TreeProgress {
+  progress: number; // 0..1 of this one; 0 while it waits
+  waiting: number; // trees before it
+  retry_s: number;
 }
 export type Matrix3 = number[][]; // 3 x 3
 
@@ -73,6 +99,7 @@ export interface EdgeEntry {
   overlap: number;
   num_inliers: number;
   doubt: number; // 0: nobody need look; edges are listed by it, largest first
+  detail: string; // GET: EdgeDetail
 }
 
 export interface RevisionEntry {
@@ -80,9 +107,10 @@ export interface RevisionEntry {
   created_at: string;
   num_scenes: number;
   num_edges_used: number;
+  poses: string | null; // GET: RevisionPoses; null where they were pruned
 }
 
-/** GET revisions/ID.json: where everything lay in that revision. */
+/** GET: where everything lay in a revision; scenes that were removed since are left out. */
 export interface RevisionPoses {
   id: number;
   scenes: { scene: number; component: number; status: string; S_map_scene: Matrix }[];
@@ -111,13 +139,13 @@ export interface PhotoEntry {
   captured_at: string | null;
 }
 
-/** GET scenes/INDEX/extras.json */
+/** GET of SceneEntry.extras */
 export interface SceneExtras {
   layers: Record<string, Vector[]>; // nodes of its graph, map frame
   cameras: Vector[][]; // frusta: apex and four corners, map frame
 }
 
-/** GET edges/TARGET-SOURCE.json (scene indices): why the pair is what it is. */
+/** GET of EdgeEntry.detail: why the pair is what it is. */
 export interface EdgeDetail {
   target: number;
   source: number;
@@ -128,7 +156,7 @@ export interface EdgeDetail {
   views: EdgeView[];
   events: { at: string; what: string; reason: string }[];
 }
-/** Both captures rendered from one camera of the pair; the pictures have the same size. */
+/** Both captures rendered from one camera of the pair; the pictures have the same size. Drawn when they are asked for. */
 export interface EdgeView {
   camera: string;
   target: string; // addresses of JPEGs
@@ -136,10 +164,9 @@ export interface EdgeView {
   difference: string;
 }
 
-/** GET objects.json */
 export interface ObjectEntry {
-  id: string; // "o12"
-  name: string;
+  id: string; // 8 hex digits
+  name: string; // a few words: what it is, or its size and colour
   component: number;
   position: Vector; // map frame
   box: Box;
@@ -148,18 +175,21 @@ export interface ObjectEntry {
   present: boolean;
   num_sightings: number;
 }
-/** GET graph.json: relations between objects, and of scenes to objects. */
+/** GET of MapSummary.graph: objects of the map, and how they stand to each other. It may take a while to make. */
 export interface GraphEntry {
   objects: ObjectEntry[];
-  relations: { a: string; b: string; kind: string }[];
+  relations: { a: string; b: string; kind: string }[]; // ids; kind: "on", "in", "next to"
 }
 
-/** GET history.json?at=X,Y,Z&component=K */
+/** GET of MapSummary.history */
 export interface PlaceHistory {
   rows: { at: string | null; scene: number; what: string; object: string | null }[];
 }
 
-/** POST actions/NAME with JSON; answers {"map": MapSummary} or, with a status of 400 or more, {"error": "..."}. */
+/**
+ * POST actions/NAME with JSON; answers {"map": MapSummary} or, with a status of 400 or more, {"error": "..."}: 400 what
+ * makes no sense, 404 no such thing, 409 another action is at work. Any GET may answer with {"error": "..."}, too.
+ */
 export interface Actions {
   confirm: { what: string; note: string }; // "A:B" by scene ids, or "c12"
   reject: { what: string; note: string };

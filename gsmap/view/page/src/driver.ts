@@ -11,14 +11,13 @@ export const isDark = (state: State) =>
 
 /** Poses of the revision that is looked at, once they are there. */
 export function posesOf(state: State): RevisionPoses | null {
-  if (state.revision === null) return null;
-  const known = actions.revisions.get(String(state.revision));
-  return known.status === "ready" ? known.value : null;
+  const known = actions.posesOf(state);
+  return known?.status === "ready" ? known.value : null;
 }
 
 function detailOf(state: State): EdgeDetail | null {
   const edge = state.correspondences ? derive.selectedEdge(state) : undefined;
-  const known = edge && actions.detailOf(edge);
+  const known = edge && actions.edges.get(edge.detail);
   return known?.status === "ready" ? known.value : null;
 }
 
@@ -100,8 +99,8 @@ export function drive(stage: Stage): () => void {
     ceiling.now(state.ceiling);
     for (const [name, told] of overlays) told.now(state.overlays.has(name));
     if (state.overlays.has("objects") || state.tab === "things") {
-      const known = actions.graph.get("");
-      if (known.status === "ready" && known.value !== things) {
+      const known = actions.graphOf(state);
+      if (known?.status === "ready" && known.value !== things) {
         things = known.value;
         stage.setObjects(known.value.objects, known.value.relations);
       }

@@ -19,7 +19,10 @@ const reviewed = () => {
 /** The form of the chosen edge or change, so that a note which was typed goes with the key. */
 function form(): { send(verdict: actions.Verdict): Promise<void>; focusNote(): void } | null {
   const part = reviewed()?.kind === "edge" ? "gs-edge" : "gs-change";
-  const found = document.querySelector("gs-app")?.shadowRoot?.querySelector(part)?.shadowRoot?.querySelector("gs-verdict");
+  const found = document
+    .querySelector("gs-app")
+    ?.shadowRoot?.querySelector(part)
+    ?.shadowRoot?.querySelector("gs-verdict");
   return (found as unknown as ReturnType<typeof form>) ?? null;
 }
 
@@ -31,13 +34,15 @@ function verdict(name: actions.Verdict): void {
 
 function views(): number {
   const edge = derive.selectedEdge(page.state);
-  const known = edge && actions.detailOf(edge);
+  const known = edge && actions.edges.get(edge.detail);
   return known?.status === "ready" ? known.value.views.length : 0;
 }
 
 function findBox(): void {
   actions.fold(false);
-  const panels = ["gs-look", "gs-review", "gs-things"].map((name) => document.querySelector("gs-app")?.shadowRoot?.querySelector(name));
+  const panels = ["gs-look", "gs-review", "gs-things"].map((name) =>
+    document.querySelector("gs-app")?.shadowRoot?.querySelector(name),
+  );
   const roots = panels.flatMap((panel) => (panel?.shadowRoot ? [panel.shadowRoot] : []));
   const inner = roots.flatMap((root) => root.querySelector("gs-scene-list")?.shadowRoot ?? root);
   for (const root of inner) root.querySelector<HTMLElement>("#filter")?.focus();

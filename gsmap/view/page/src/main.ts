@@ -6,7 +6,7 @@ import { listen } from "./keys";
 import "./panels/app";
 import { page } from "./state";
 import type { State, Theme } from "./state";
-import { createStage } from "./stage";
+import { createStage } from "./view3d";
 
 const REST_MS = 250; // a slider that moves writes the address once
 
@@ -83,6 +83,7 @@ async function main(): Promise<void> {
     follow();
   });
   await actions.load();
+  await actions.watch();
 }
 
 void main();

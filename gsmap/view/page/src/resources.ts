@@ -7,14 +7,15 @@ export type Resource<T> =
 
 export class Resources<T> {
   private readonly kept = new Map<string, Resource<T>>();
+  private readonly old = new Set<string>();
 
   constructor(private readonly ask: (key: string) => Promise<T>) {}
 
   /** What is known of `key`; asks for it where nothing is. */
   get(key: string): Resource<T> {
     const found = this.kept.get(key);
-    if (found) return found;
-    const resource: Resource<T> = { status: "loading" };
+    if (found && !this.old.delete(key)) return found;
+    const resource: Resource<T> = found ?? { status: "loading" };
     this.kept.set(key, resource);
     const put = (made: Resource<T>) => {
       if (this.kept.get(key) !== resource) return; // forgotten or asked again meanwhile
@@ -30,6 +31,11 @@ export class Resources<T> {
       },
     );
     return resource;
+  }
+
+  /** What is known is shown until a new answer is there, which is asked for when it is next looked at. */
+  refresh(): void {
+    for (const [key, resource] of this.kept) if (resource.status === "ready") this.old.add(key);
   }
 
   forget(key?: string): void {

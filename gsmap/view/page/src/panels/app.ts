@@ -336,8 +336,8 @@ export class App extends Panel {
           <h2>The map could not be loaded</h2>
           <p class="anywhere">${failure}</p>
           <p class="muted">
-            Is <kbd>gsmap view</kbd> still running where you started it? If it was started anew, open the address that it
-            prints now: the old one is of the old server.
+            Is <kbd>gsmap view</kbd> still running where you started it? If it was started anew, open the address that
+            it prints now: the old one is of the old server.
           </p>
           <p><button class="main" @click=${() => void actions.retry()}>Try again</button></p>
         </div>

@@ -1,7 +1,7 @@
 // What every element of the page has in common.
 import { LitElement, noChange } from "lit";
 import { directive, Directive, PartType } from "lit/directive.js";
-import type { AttributePart, PartInfo } from "lit/directive.js";
+import type { ElementPart, PartInfo } from "lit/directive.js";
 import { page } from "../state";
 import type { State } from "../state";
 import { shared } from "./css";
@@ -26,21 +26,19 @@ export class Panel extends LitElement {
   }
 }
 
-/**
- * `<div ${vars}=...>` is not valid, so: `<div data-vars=${vars({ "--at": "50%" })}>`. Custom properties set through the
- * object model: the page's CSP has no inline styles, which style attributes are.
- */
+/** `<div ${vars({ "--at": "50%" })}>`: set through the object model, as the page's CSP has no inline styles. */
 class Vars extends Directive {
   constructor(part: PartInfo) {
     super(part);
-    if (part.type !== PartType.ATTRIBUTE) throw new Error("vars() stands in an attribute");
+    if (part.type !== PartType.ELEMENT) throw new Error("vars() stands by itself in a tag");
   }
 
-  render(_values: Record<string, string>): unknown {
+  override render(values: Record<string, string>): unknown {
+    void values; // update() sets them; this gives its type
     return noChange;
   }
 
-  override update(part: AttributePart, [values]: [Record<string, string>]): unknown {
+  override update(part: ElementPart, [values]: [Record<string, string>]): unknown {
     const { style } = part.element as HTMLElement;
     for (const [name, value] of Object.entries(values)) style.setProperty(name, value);
     return noChange;

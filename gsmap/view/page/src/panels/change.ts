@@ -84,9 +84,7 @@ export class ChangeDetail extends Panel {
                     alt="The place before and after, beside each other"
                     @error=${() => (this.broken = change.id)}
                   />
-                  <figcaption>
-                    <span>before: ${before?.name}</span><span>after: ${after?.name}</span>
-                  </figcaption>
+                  <figcaption><span>before: ${before?.name}</span><span>after: ${after?.name}</span></figcaption>
                 </figure>`
               : html`<p class="empty">
                   ${isBroken ? "The picture could not be loaded." : "There is no picture of this change."}

@@ -34,8 +34,7 @@ export class Clip extends Panel {
       <div class="grid" role="group" aria-labelledby="title">
         ${AXES.map(
           (name, axis) =>
-            html`<span class="muted">${name}</span>
-              ${([0, 1] as const).map(
+            html`<span class="muted">${name}</span> ${([0, 1] as const).map(
                 (corner) =>
                   html`<input
                     type="number"

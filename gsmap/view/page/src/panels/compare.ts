@@ -239,7 +239,12 @@ export class Compare extends LitElement {
     const label = (side: string, text: string) => html`<span class="label ${side}">${text}</span>`;
     const enlarge = this.isLarge
       ? nothing
-      : html`<button class="enlarge square" aria-label="Enlarge the pictures" title="Enlarge" @click=${() => (this.isLarge = true)}>
+      : html`<button
+          class="enlarge square"
+          aria-label="Enlarge the pictures"
+          title="Enlarge"
+          @click=${() => (this.isLarge = true)}
+        >
           ${icon("enlarge")}
         </button>`;
     if (this.mode === "beside")
@@ -249,7 +254,7 @@ export class Compare extends LitElement {
     if (this.mode === "difference" && difference)
       return html`<div class="pictures">${this.picture(difference, "Difference of both")()}${enlarge}</div>`;
     if (this.mode === "swipe")
-      return html`<div class="pictures stacked" data-vars=${vars({ "--at": `${this.at}%` })}>
+      return html`<div class="pictures stacked" ${vars({ "--at": `${this.at}%` })}>
         ${a()}${b("swiped")}<span class="swipe-line"></span>
         <input
           class="swipe-range"

@@ -73,7 +73,7 @@ export class Divider extends Panel {
     const { state } = this;
     if (!state.split) return html``;
     const percent = Math.round(100 * state.split.at);
-    return html`<div data-vars=${vars({ "--at": `${percent}%` })}>
+    return html`<div ${vars({ "--at": `${percent}%` })}>
       <span class="name left">${this.name(state.left)}</span>
       <span class="name right">${this.name(state.split)}</span>
       <div

@@ -108,7 +108,7 @@ export class Edge extends Panel {
     if (!map || !edge) return nothing;
     const [a, b] = [map.scenes[edge.target], map.scenes[edge.source]];
     if (!a || !b) return nothing;
-    const known = actions.detailOf(edge);
+    const known = actions.edges.get(edge.detail);
     return html`
       ${heading(
         html`${a.name} <span class="muted">:</span> ${b.name}`,
@@ -122,15 +122,11 @@ export class Edge extends Panel {
         ${waiting(
           known,
           "Both captures are rendered from the cameras of the pair",
-          () => actions.edges.forget(`${edge.target}-${edge.source}`),
+          () => actions.edges.forget(edge.detail),
           (detail) => this.known(detail, edge, map),
         )}
       </div>
-      <gs-verdict
-        .of=${state.selection}
-        .said=${edge.review}
-        .note=${edge.note}
-      ></gs-verdict>
+      <gs-verdict .of=${state.selection} .said=${edge.review} .note=${edge.note}></gs-verdict>
     `;
   }
 
@@ -240,7 +236,10 @@ export class Edge extends Panel {
     const sign =
       step.passed === null
         ? html`<span></span>`
-        : html`<span class=${step.passed ? "passed" : "not-passed"} role="img" aria-label=${step.passed ? "held" : "not held"}
+        : html`<span
+            class=${step.passed ? "passed" : "not-passed"}
+            role="img"
+            aria-label=${step.passed ? "held" : "not held"}
             >${icon(step.passed ? "check" : "cross")}</span
           >`;
     const gauge = gaugeOf(step.value, step.bar);
@@ -251,7 +250,7 @@ export class Edge extends Panel {
           ? html`<span
               class="gauge ${step.passed === false ? "not-held" : ""}"
               aria-hidden="true"
-              data-vars=${vars({ "--value": `${gauge.value}%`, "--bar": `${gauge.bar}%` })}
+              ${vars({ "--value": `${gauge.value}%`, "--bar": `${gauge.bar}%` })}
               ><span class="fill"></span><span class="bar-line"></span
             ></span>`
           : nothing

@@ -32,6 +32,6 @@ export class Kind extends LitElement {
   @property() of: ChangeEntry["kind"] = "moved";
 
   protected override render() {
-    return html`<i data-vars=${vars({ "--kind": KINDS[this.of] ?? "#8a9099" })}></i>`;
+    return html`<i ${vars({ "--kind": KINDS[this.of] ?? "#8a9099" })}></i>`;
   }
 }

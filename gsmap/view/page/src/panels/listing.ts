@@ -165,7 +165,7 @@ export class Listing extends LitElement {
       role="grid"
       aria-label=${this.label}
       aria-rowcount=${this.items.length}
-      data-vars=${height}
+      ${height}
       @keydown=${this.pressed}
       @focusin=${this.entered}
     >
@@ -180,7 +180,7 @@ export class Listing extends LitElement {
             aria-rowindex=${index + 1}
             aria-selected=${isChosen}
             data-index=${index}
-            data-vars=${vars({ "--top": `${index * tall}px` })}
+            ${vars({ "--top": `${index * tall}px` })}
           >
             ${this.row(item)}
           </div>`;

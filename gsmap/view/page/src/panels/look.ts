@@ -77,7 +77,9 @@ export class Look extends Panel {
     if (!map) return nothing;
     const component = derive.componentOf(map, state.component);
     return html`
-      <section class="island stack">${this.island(map.components)} ${component ? this.facts(component) : nothing}</section>
+      <section class="island stack">
+        ${this.island(map.components)} ${component ? this.facts(component) : nothing}
+      </section>
       ${state.split || component?.merged ? this.sources(component) : nothing}
       ${state.clip ? html`<gs-clip></gs-clip>` : nothing}
       <fieldset class="overlays">

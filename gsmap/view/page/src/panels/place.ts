@@ -53,7 +53,7 @@ export class Place extends Panel {
     if (!map || !pick) return nothing;
     const unit = derive.componentOf(map, component)?.metres_per_unit ?? 1;
     const scene = pick.scene === null ? undefined : map.scenes[pick.scene];
-    const key = [component, ...pick.point].join(",");
+    const key = `${component} ${pick.point.map((v) => v.toFixed(4)).join(",")}`;
     const isAsked = this.asked === key;
     return html`<div class="card" role="group" aria-label="The place that was clicked">
       <div class="row">
@@ -65,10 +65,16 @@ export class Place extends Panel {
               </button>`
             : nothing
         }
-        <button class="plain" aria-expanded=${isAsked} @click=${() => (this.asked = isAsked ? null : key)}>
-          ${icon("clock")} What happened here
+        ${
+          map.history === null
+            ? nothing
+            : html`<button class="plain" aria-expanded=${isAsked} @click=${() => (this.asked = isAsked ? null : key)}>
+                ${icon("clock")} What happened here
+              </button>`
+        }
+        <button class="plain square" aria-label="Close" @click=${() => page.set({ pick: null })}>
+          ${icon("close")}
         </button>
-        <button class="plain square" aria-label="Close" @click=${() => page.set({ pick: null })}>${icon("close")}</button>
       </div>
       ${
         isAsked
@@ -98,8 +104,7 @@ export class Place extends Panel {
                     ${object}
                   </button>`
                 : nothing
-            }
-            <span class="muted">${this.state.map?.scenes[row.scene]?.name}</span></span
+            } <span class="muted">${this.state.map?.scenes[row.scene]?.name}</span></span
           >
         </li>`;
       })}

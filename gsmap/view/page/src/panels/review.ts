@@ -109,11 +109,11 @@ export class Review extends Panel {
               ${state.edgeQuery ? `No edge here fits “${state.edgeQuery}”.` : NONE[state.edgeFilter]}
             </p>`
       }
-      ${this.after()}
+      ${this.footer()}
     `;
   }
 
-  private after() {
+  private footer() {
     const { state } = this;
     const last = state.undo[state.undo.length - 1];
     if (!actions.mayAct(state))
@@ -127,7 +127,11 @@ export class Review extends Panel {
           : nothing
       }
       <div class="row">
-        <button class=${state.map?.stale ? "main" : ""} ?disabled=${state.busy !== null} @click=${() => void actions.optimize()}>
+        <button
+          class=${state.map?.stale ? "main" : ""}
+          ?disabled=${state.busy !== null}
+          @click=${() => void actions.optimize()}
+        >
           ${icon("optimize")} Optimize now
         </button>
         <button
@@ -136,7 +140,8 @@ export class Review extends Panel {
           title=${last ? `Undo ${last.label} (u)` : "Nothing to undo"}
           @click=${() => void actions.undo()}
         >
-          ${icon("undo")} Undo${state.undo.length > 1 ? html` <span class="muted">(${state.undo.length})</span>` : nothing}
+          ${icon("undo")}
+          Undo${state.undo.length > 1 ? html` <span class="muted">(${state.undo.length})</span>` : nothing}
         </button>
       </div>
     </footer>`;

@@ -160,7 +160,9 @@ export class SceneDetail extends Panel {
         </div>
         ${
           scene.prior
-            ? html`<p class="small muted">It takes the place of what was told before (${scene.prior}), which the page cannot bring back.</p>`
+            ? html`<p class="small muted">
+                It takes the place of what was told before (${scene.prior}), which the page cannot bring back.
+              </p>`
             : nothing
         }
         <div class="row">

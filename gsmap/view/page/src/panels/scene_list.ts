@@ -87,11 +87,7 @@ export class SceneList extends Panel {
           @change=${() => actions.toggleScene(scene.id)}
       /></span>
       <span role="gridcell" class="wide ${isHidden || isLate ? "off" : ""}"
-        ><button
-          class="choose"
-          title=${scene.name}
-          @click=${() => actions.select({ kind: "scene", key: scene.id })}
-        >
+        ><button class="choose" title=${scene.name} @click=${() => actions.select({ kind: "scene", key: scene.id })}>
           <span class="name">${scene.name}</span>
           <span class="detail"
             ><span class="mark ${MARKS[scene.status] ?? "hollow"}">${scene.status}</span
@@ -101,7 +97,12 @@ export class SceneList extends Panel {
         </button></span
       >
       <span role="gridcell"
-        ><button class="plain square" title="Only this scene" aria-label="Only ${scene.name}" @click=${() => actions.solo(scene.id)}>
+        ><button
+          class="plain square"
+          title="Only this scene"
+          aria-label="Only ${scene.name}"
+          @click=${() => actions.solo(scene.id)}
+        >
           ${icon("solo")}
         </button></span
       >

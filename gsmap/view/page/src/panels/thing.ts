@@ -29,10 +29,12 @@ export class Thing extends Panel {
     const photo = derive.selectedPhoto(state);
     if (photo) return this.photo(photo);
     const key = state.selection?.key;
+    const known = actions.graphOf(state);
+    if (!known) return heading("This map has no graph", "");
     return waiting(
-      actions.graph.get(""),
+      known,
       "Loading the objects",
-      () => actions.graph.forget(),
+      () => actions.graphs.forget(),
       (graph) => {
         const object = graph.objects.find((one) => one.id === key);
         return object
@@ -87,7 +89,7 @@ export class Thing extends Panel {
   }
 
   private photo(one: PhotoEntry) {
-    const [fx, , , ] = one.intrinsics;
+    const [fx, , ,] = one.intrinsics;
     const wide = (2 * Math.atan(one.size[0] / (2 * fx)) * 180) / Math.PI;
     const at = [0, 1, 2].map((r) => one.T_map_camera[r]?.[3] ?? 0) as Vector;
     return html`

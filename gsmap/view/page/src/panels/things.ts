@@ -47,9 +47,7 @@ export class Things extends Panel {
     };
     return html`
       <div class="segments" role="group" aria-label="Which things">
-        <button aria-pressed=${this.kind === "objects"} @click=${() => press("objects")}>
-          Objects <span class="muted">${map.counts.objects}</span>
-        </button>
+        <button aria-pressed=${this.kind === "objects"} @click=${() => press("objects")}>Objects</button>
         <button aria-pressed=${this.kind === "photos"} @click=${() => press("photos")}>
           Photos <span class="muted">${photos.length}</span>
         </button>
@@ -62,25 +60,29 @@ export class Things extends Panel {
         .value=${this.query}
         @input=${(event: Event) => (this.query = (event.target as HTMLInputElement).value)}
       />
-      ${this.kind === "photos" ? this.photos(photos) : this.objects(map.counts.objects)}
+      ${this.kind === "photos" ? this.photos(photos) : this.objects()}
     `;
   }
 
   private fits(...texts: (string | null)[]): boolean {
     const text = texts.join(" ").toLowerCase();
-    return this.query.toLowerCase().split(/\s+/).every((word) => text.includes(word));
+    return this.query
+      .toLowerCase()
+      .split(/\s+/)
+      .every((word) => text.includes(word));
   }
 
-  private objects(count: number) {
-    if (!count)
+  private objects() {
+    const known = actions.graphOf(this.state);
+    if (!known || (known.status === "ready" && !known.value.objects.length))
       return html`<p class="empty">
         No objects are known. They come with describing (<kbd>gsmap update</kbd>) and are followed over the captures by
         <kbd>gsmap graph</kbd>.
       </p>`;
     return waiting(
-      actions.graph.get(""),
+      known,
       "Loading the objects",
-      () => actions.graph.forget(),
+      () => actions.graphs.forget(),
       ({ objects }) => {
         const listed = objects.filter(
           (one) => one.component === this.state.component && this.fits(one.name, one.id, one.last_seen),

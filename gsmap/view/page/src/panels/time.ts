@@ -66,7 +66,8 @@ export class Time extends Panel {
         </p>
       </section>`;
     const last = days.length - 1;
-    const at = state.until === null ? last : Math.max(0, days.filter((one) => derive.isBy(one, state.until)).length - 1);
+    const at =
+      state.until === null ? last : Math.max(0, days.filter((one) => derive.isBy(one, state.until)).length - 1);
     const shown = scenes.filter((scene) => derive.isBy(scene.captured_at, state.until)).length;
     const go = (index: number) => actions.until(index >= last ? null : (days[Math.max(0, index)] ?? null));
     return html`<section>
@@ -82,7 +83,9 @@ export class Time extends Panel {
 
   private revisions() {
     const { state } = this;
-    const rows = [...(state.map?.revisions ?? [])].sort((a, b) => a.id - b.id);
+    const rows = (state.map?.revisions ?? [])
+      .filter((row) => row.poses !== null || row.id === state.map?.revision)
+      .sort((a, b) => a.id - b.id);
     if (!rows.length)
       return html`<section>
         <h3>Poses by revision</h3>
@@ -92,7 +95,7 @@ export class Time extends Panel {
     const at = state.revision === null ? last : rows.findIndex((row) => row.id === state.revision);
     const row = rows[at];
     if (!row) return nothing;
-    const known = state.revision === null ? null : actions.revisions.get(String(state.revision));
+    const known = actions.posesOf(state);
     const go = (index: number) => actions.revision(rows[Math.max(0, Math.min(last, index))]?.id ?? null);
     return html`<section>
       <h3 id="revisions">Poses by revision</h3>
@@ -109,7 +112,7 @@ export class Time extends Panel {
         known?.status === "failed"
           ? html`<div class="failed" role="alert">
               <p>Its poses could not be loaded: ${known.error}</p>
-              <p><button @click=${() => actions.revisions.forget(String(row.id))}>Ask again</button></p>
+              <p><button @click=${() => actions.revisions.forget()}>Ask again</button></p>
             </div>`
           : nothing
       }
