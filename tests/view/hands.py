@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Any
 
 from headless import Page
@@ -21,8 +22,10 @@ globalThis.textOf = (root) => {
   const walk = (node) => {
     if (node.nodeType === 3) return node.data;
     if (node.nodeType === 1 && ["STYLE", "SCRIPT"].includes(node.tagName)) return "";
-    if (node.nodeType === 1 && !node.checkVisibility() && getComputedStyle(node).display === "none") return "";
-    return [...(node.shadowRoot ?? node).childNodes, ...(node.shadowRoot ? node.childNodes : [])].map(walk).join(" ");
+    const display = node.nodeType === 1 ? getComputedStyle(node).display : "inline";
+    if (display === "none") return "";
+    const text = [...(node.shadowRoot ?? node).childNodes, ...(node.shadowRoot ? node.childNodes : [])].map(walk).join("");
+    return display === "inline" ? text : ` ${text} `;
   };
   return walk(root).replace(/\\s+/g, " ").trim();
 };
@@ -57,7 +60,11 @@ class Hands:
         return self.page.value(f"(() => {{ if (!globalThis.findAll) {{ {_FIND} }} return ({expression}); }})()")
 
     def wait(self, expression: str, timeout_s: float = 20) -> None:
-        self.page.wait(f"(() => {{ if (!globalThis.findAll) {{ {_FIND} }} return !!({expression}); }})()", timeout_s)
+        end = time.monotonic() + timeout_s
+        while not self.value(f"!!({expression})"):
+            if time.monotonic() > end:
+                raise AssertionError(f"not true after {timeout_s} s: {expression}; {self.page.failures()}; {self.text()}")
+            time.sleep(0.05)
 
     def text(self, selector: str = "body") -> str:
         return self.value(f"textOf(findAll({json.dumps(selector)})[0] ?? document.createElement('i'))")

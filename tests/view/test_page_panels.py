@@ -61,6 +61,12 @@ def told(hands: Hands, name: str):
     return hands.value(f"fake.calls.filter((call) => call[0] === {json.dumps(name)}).at(-1)?.slice(1) ?? null")
 
 
+def idle(hands: Hands) -> None:
+    """Until the server has done what it was asked for."""
+    hands.value("new Promise((rest) => setTimeout(rest, 50))")
+    hands.wait("!find('gs-notices', null)?.shadowRoot.querySelector('.waiting')")
+
+
 def hash_of(hands: Hands) -> str:
     hands.value("new Promise((rest) => setTimeout(rest, 350))")
     return hands.value("location.hash")
@@ -110,7 +116,7 @@ def test_an_island_is_chosen_and_keeps_nothing_of_the_other(hands):
     hands.value("(() => { const e = find('select', null); e.value = '1'; e.dispatchEvent(new Event('change')); })()")
     assert told(hands, "show") == [14, 1]
     assert told(hands, "setVisible") == [[12, 13]]
-    hands.says("50 cm", "gs-look")  # a unit of half a metre
+    hands.says("0.50 m", "gs-look")  # a unit of half a metre
     assert hands.value("find('gs-look', null).shadowRoot.textContent.includes('Merged')") is False
 
 
@@ -247,7 +253,7 @@ def test_confirm_reject_withdraw_with_notes_and_undo_of_each(hands, server):
     hands.says("Undone: workshop")
     assert server.log[-1] == ("confirm", {"what": pair, "note": ""}), "what it was before"
     hands.press("u")
-    hands.wait("find('gs-review', null).shadowRoot.textContent.includes('Undo') && !find('#withdraw:not(:disabled)', null)")
+    idle(hands)
     assert server.log[-1] == ("withdraw", {"what": pair, "note": ""})
     hands.press("u")
     hands.says("Nothing to undo")
@@ -391,7 +397,9 @@ def test_a_picked_place_tells_its_history_and_picked_things_are_chosen(hands):
     hands.click("button", "stairs 2024-02")
     hands.says("Uncertainty of its middle", "gs-scene")
     for kind, index, word in (("edge", 1, "stairs 2024-02"), ("photo", 2, "IMG_0002.jpg"), ("object", 1, "red cabinet")):
-        hands.press("4") if kind == "object" else None
+        if kind == "object":
+            hands.press("Escape", "Escape", "4")
+            hands.says("red cabinet", "gs-things")
         hands.value(f"fake.pick({{point: [0, 0, 0], scene: null, thing: {{kind: '{kind}', index: {index}}}}})")
         hands.wait(f"find('aside.detail', null) && textOf(find('aside.detail', null)).includes({json.dumps(word)})")
     hands.press("Escape")
@@ -436,7 +444,9 @@ def test_the_whole_view_is_in_the_address_and_comes_back(hands, server):
     hands.go(server.url + address)
     hands.wait("globalThis.fake && find('gs-change', null)")
     hands.wait("fake.calls.some((call) => call[0] === 'setPoses' && call[1] === 2)")
-    assert {name: told(hands, name) for name in before} == before
+    again = {name: told(hands, name) for name in before}
+    np.testing.assert_allclose(again.pop("setClip"), before.pop("setClip"), atol=1e-6)
+    assert again == before
     assert told(hands, "stand")[0] == {"position": [1.5, 2, 3], "target": [4, 5, 6.25]}
     assert hash_of(hands) == address
 
@@ -486,19 +496,18 @@ def test_a_link_is_copied(hands):
 
 def test_by_keyboard_alone_from_the_start_to_a_review(hands, server):
     focused = "(focused().ariaLabel || focused().textContent || focused().id).replace(/\\s+/g, ' ').trim()"
-    seen = []
-    for _ in range(30):
+    seen, in_lists = [], 0
+    for _ in range(40):
         hands.press("Tab")
+        if hands.value("focused() === document.body"):
+            break  # the end of the page
         seen.append(hands.value(focused))
+        in_lists += hands.value("focused().closest('[role=grid]') !== null")
         outline = hands.value("getComputedStyle(focused()).outlineStyle")
         assert outline != "none", f"{seen[-1]} does not show that it has the focus"
-        if len(seen) > 3 and seen[-1] == seen[0]:
-            break
     assert "Fold the panel" in seen[0]
     assert any("Look" in one for one in seen)
-    assert sum("scene" in one.lower() or one.startswith(("hall", "Show hall", "Only hall")) for one in seen) <= 3, (
-        "a list is one stop of the Tab key"
-    )
+    assert in_lists == 1, "a list is one stop of the Tab key"
     # The list of scenes: arrows walk over rows and over what a row offers.
     hands.value("find('[role=grid] [tabindex=\"0\"]', null).focus()")
     hands.press("ArrowDown", "ArrowDown", "ArrowRight", "ArrowRight")
