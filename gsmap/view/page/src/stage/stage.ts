@@ -21,6 +21,8 @@ export interface StageOptions {
   onPick: (pick: Pick) => void;
   onMove: (standpoint: Standpoint) => void; // after the viewer has come to rest
   onError: (message: string) => void;
+  /** What it may cost; see loader.ts. Left out: two million splats, 600 MB. */
+  budget?: { splats?: number; bytes?: number; errorPx?: number; requests?: number };
 }
 
 /** Numbers that tests and the curious look at; `window.gsmap` is one. */
