@@ -14,7 +14,7 @@ const plain = (value: unknown): unknown => {
   return typeof value === "function" ? "function" : value;
 };
 
-export function createStage(options: StageOptions): Stage {
+export async function createStage(options: StageOptions): Promise<Stage> {
   const calls: Fake["calls"] = [];
   let standpoint: Standpoint = { position: [5, 5, 5], target: [0, 0, 0] };
   let onDrag: ((matrix: number[][]) => void) | undefined;

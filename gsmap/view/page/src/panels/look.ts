@@ -130,7 +130,7 @@ export class Look extends Panel {
     const unit = component.metres_per_unit;
     return html`<dl class="facts">
       <dt>Size</dt>
-      <dd>${size}\u00a0m</dd>
+      <dd>${`${size}\u00a0m`}</dd>
       <dt>Unit</dt>
       <dd>${Math.abs(unit - 1) < 5e-4 ? "1 m" : metres(unit)}</dd>
       <dt>Gaussians</dt>
