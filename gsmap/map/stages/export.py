@@ -130,7 +130,8 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
     revision = store.revisions.current() if request.revision is None else request.revision
     graph, placed = _placed(store, revision, request.component)
     metres = map_metres(store, settings, graph)
-    scenes = {scene: store.scenes.get(scene) for scene in placed}
+    living = {scene.id: scene for scene in store.scenes.list()}
+    scenes = {scene: living.get(scene) or store.scenes.get(scene) for scene in placed}  # older poses name removed ones
     notes: tuple[str, ...] = ()
     if request.as_of is not None:
         scenes, notes = _as_of(scenes, request.as_of)
