@@ -327,7 +327,7 @@ export function picked(pick: Pick): void {
   const edge = thing.kind === "edge" ? map.edges[thing.index] : undefined;
   const key = {
     edge: () => edge && derive.edgeKey(map, edge),
-    change: () => derive.listedChanges(page.state)[thing.index]?.id,
+    change: () => map.changes[thing.index]?.id,
     photo: () => map.photos[thing.index]?.file,
     object: () => objectsOf(page.state)[thing.index]?.id,
     camera: () => undefined,

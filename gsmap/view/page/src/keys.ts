@@ -104,6 +104,8 @@ export function listen(): void {
       return;
     }
     if (page.state.help) return; // the dialog has the keys to itself
+    const isInDialog = event.composedPath().some((one) => one instanceof HTMLDialogElement);
+    if (event.key === "Escape" && isInDialog) return; // which it closes
     const found = KEYS.find((one) => one.key === event.key);
     if (!found || page.state.phase !== "ready") return;
     event.preventDefault();

@@ -16,7 +16,7 @@ function restore(hash: string): void {
   const shared = address.read(hash, map);
   page.set({ ...shared, side: "left", drag: null, pick: null });
   const { standpoint } = shared;
-  actions.aim(() => (standpoint ? page.stage?.stand(standpoint) : page.stage?.fit()));
+  actions.aim(() => (standpoint ? page.stage?.stand(standpoint) : page.stage?.fit(undefined, false)));
 }
 
 /** Keeps the address at what is shown. What was chosen makes an entry to go back to; moving about does not. */
@@ -57,15 +57,16 @@ function colours(): void {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => page.tell());
 }
 
-function stage(): void {
+async function stage(): Promise<void> {
   const canvas = document.getElementById("canvas") as HTMLCanvasElement;
   try {
-    page.stage = createStage({
+    page.stage = await createStage({
       canvas,
       onPick: actions.picked,
       onMove: (standpoint) => page.set({ standpoint }),
       onError: (message) => actions.say(message, true),
     });
+    Object.assign(window, { gsmap: page.stage.state });
     drive(page.stage);
   } catch (error) {
     page.set({ stageError: error instanceof Error ? error.message : String(error) });
@@ -79,8 +80,8 @@ async function main(): Promise<void> {
     if (page.state.phase !== "ready") return;
     first();
     restore(location.hash);
-    stage();
     follow();
+    void stage();
   });
   await actions.load();
   await actions.watch();

@@ -29,22 +29,17 @@ export class ChangeDetail extends Panel {
         flex: 1;
         padding: 0 16px 16px;
       }
-      figure {
-        border-radius: 6px;
-        overflow: hidden;
-        background: #000;
-      }
       img {
         display: block;
         width: 100%;
         height: auto;
+        border-radius: 6px;
       }
       figcaption {
         display: grid;
         grid-template-columns: 1fr 1fr;
         gap: 8px;
         padding-top: 6px;
-        background: var(--surface);
         font-size: 0.85rem;
         color: var(--muted);
         overflow-wrap: anywhere;
@@ -69,7 +64,7 @@ export class ChangeDetail extends Panel {
     const isBroken = this.broken === change.id;
     return html`
       ${heading(
-        html`<gs-kind of=${change.kind}></gs-kind> Something ${SAID[change.kind] ?? change.kind}`,
+        html`<gs-kind of=${change.kind}></gs-kind> ${SAID[change.kind] ?? change.kind}`,
         html`<span class="mark ${STANDS[change.status] ?? ""}">${change.status}</span>
           <span>confidence ${percent(change.confidence)}</span> <span>${change.id}</span>`,
         true,
@@ -125,10 +120,10 @@ export class ChangeDetail extends Panel {
 }
 
 const SAID: Record<string, string> = {
-  appeared: "appeared",
-  disappeared: "disappeared",
-  moved: "moved",
-  recoloured: "changed its colour",
-  replaced: "was replaced",
-  lighting: "is lit differently",
+  appeared: "Appeared",
+  disappeared: "Disappeared",
+  moved: "Moved",
+  recoloured: "Another colour",
+  replaced: "Replaced by another",
+  lighting: "Lit differently",
 };

@@ -144,12 +144,13 @@ export class Compare extends LitElement {
         width: fit-content;
         max-width: 100%;
         margin: 0 auto;
+        grid-template-rows: minmax(0, 1fr);
+        align-content: stretch;
       }
       dialog img {
         width: auto;
         max-width: 100%;
         height: 100%;
-        min-height: 0;
         object-fit: contain;
       }
     `,

@@ -30,6 +30,25 @@ export class Edge extends Panel {
         flex: 1;
         padding: 0 16px 16px;
       }
+      .reason {
+        margin-bottom: 10px;
+      }
+      @media (max-width: 759px) {
+        /* Above the sheet, where there is room for them. */
+        .pictures {
+          position: fixed;
+          left: 0;
+          right: 0;
+          bottom: 33.3dvh;
+          padding: 10px 14px 4px;
+          background: var(--surface);
+          border-top: 1px solid var(--line);
+          box-shadow: 0 -4px 20px var(--shade);
+        }
+        .pictures + section {
+          margin-top: 0;
+        }
+      }
       .step {
         display: grid;
         grid-template-columns: 18px minmax(0, 1fr) auto;
@@ -182,7 +201,7 @@ export class Edge extends Panel {
         }
       </p>`;
     const at = detail.views.indexOf(shown);
-    return html`<section>
+    return html`<section class="pictures">
       <gs-compare
         .first=${shown.target}
         .second=${shown.source}

@@ -14,7 +14,9 @@ const HAND: [string, string][] = [
   ["Wheel, pinch", "Nearer, further"],
   ["Click", "Pick a place"],
   ["Double click", "Fly there"],
-  ["Arrows", "Turn (when the view has the focus)"],
+  ["Arrows", "Turn"],
+  ["W A S D, Q E", "Walk, down and up"],
+  ["+ −", "Nearer, further"],
 ];
 
 @customElement("gs-help")
@@ -92,7 +94,7 @@ export class Help extends Panel {
             </div>`,
         )}
         <div class="group">
-          <h3>In the 3D view</h3>
+          <h3>In the 3D view, when it has the focus</h3>
           <dl>
             ${HAND.map(
               ([how, what]) =>

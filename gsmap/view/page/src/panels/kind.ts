@@ -3,16 +3,8 @@ import { css, html } from "lit";
 import { LitElement } from "lit";
 import { customElement, property } from "lit/decorators.js";
 import type { ChangeEntry } from "../contract";
+import { CHANGE_COLOURS } from "../stage/overlays";
 import { vars } from "./base";
-
-export const KINDS: Record<ChangeEntry["kind"], string> = {
-  appeared: "#2f9e5b",
-  disappeared: "#d4493e",
-  moved: "#3b7dd8",
-  recoloured: "#9b5bd4",
-  replaced: "#d98a1f",
-  lighting: "#8a9099",
-};
 
 @customElement("gs-kind")
 export class Kind extends LitElement {
@@ -32,6 +24,8 @@ export class Kind extends LitElement {
   @property() of: ChangeEntry["kind"] = "moved";
 
   protected override render() {
-    return html`<i ${vars({ "--kind": KINDS[this.of] ?? "#8a9099" })}></i>`;
+    return html`<i
+      ${vars({ "--kind": `#${(CHANGE_COLOURS[this.of] ?? 0x8a8f98).toString(16).padStart(6, "0")}` })}
+    ></i>`;
   }
 }

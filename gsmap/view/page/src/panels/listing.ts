@@ -20,6 +20,12 @@ export class Listing extends LitElement {
         overscroll-behavior: contain;
         min-height: 0;
       }
+      @media (max-width: 759px) {
+        :host {
+          max-height: calc(33.3dvh - 70px);
+          overscroll-behavior: auto;
+        }
+      }
       [role="grid"] {
         position: relative;
         height: var(--height);

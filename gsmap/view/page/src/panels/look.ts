@@ -37,6 +37,9 @@ export class Look extends Panel {
         flex: 1;
         min-height: 220px;
       }
+      section + section {
+        margin-top: 0;
+      }
       .overlays {
         border: 0;
         margin: 0;
@@ -58,11 +61,15 @@ export class Look extends Panel {
       }
       @media (max-width: 759px) {
         gs-scene-list {
-          min-height: 300px;
+          flex: none;
           order: -1;
         }
         .island {
           order: -2;
+        }
+        dl.facts {
+          grid-template-columns: repeat(4, auto);
+          justify-content: space-between;
         }
         .overlays label {
           min-height: 36px;
@@ -119,11 +126,11 @@ export class Look extends Panel {
     const scenes = map?.scenes.filter((scene) => scene.component === component.component) ?? [];
     const gaussians = scenes.reduce((sum, scene) => sum + scene.num_gaussians, 0);
     const sides = component.box[1].map((v, i) => (v - (component.box[0][i] ?? v)) * component.metres_per_unit);
-    const size = sides.map((v) => Number(v.toPrecision(3))).join(" × ");
+    const size = sides.map((v) => Number(v.toPrecision(3))).join("\u00a0×\u00a0");
     const unit = component.metres_per_unit;
     return html`<dl class="facts">
       <dt>Size</dt>
-      <dd>${size} m</dd>
+      <dd>${`${size}\u00a0m`}</dd>
       <dt>Unit</dt>
       <dd>${Math.abs(unit - 1) < 5e-4 ? "1 m" : metres(unit)}</dd>
       <dt>Gaussians</dt>

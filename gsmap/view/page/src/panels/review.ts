@@ -62,6 +62,17 @@ export class Review extends Panel {
         padding: 0 4px;
         min-height: 170px;
       }
+      @media (max-width: 759px) {
+        .chips {
+          flex-wrap: nowrap;
+          overflow-x: auto;
+          margin: -10px -14px 0;
+          padding: 10px 14px 2px;
+        }
+        .chips button {
+          flex: none;
+        }
+      }
       footer {
         display: grid;
         gap: 8px;
@@ -98,7 +109,7 @@ export class Review extends Panel {
         edges.length
           ? html`<gs-listing
               label="Edges"
-              rem="4.6"
+              rem="4"
               .items=${edges}
               .keyOf=${(edge: EdgeEntry) => derive.edgeKey(map, edge)}
               .row=${this.row}

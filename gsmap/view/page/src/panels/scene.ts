@@ -81,8 +81,8 @@ export class SceneDetail extends Panel {
             <dd>${number(scene.num_cameras)}</dd>
             <dt>Uncertainty of its middle</dt>
             <dd>${scene.sigma_m === null ? "unknown" : `± ${metres(scene.sigma_m)}`}</dd>
-            <dt>Told of its place</dt>
-            <dd>${scene.prior ?? "nothing"}</dd>
+            <dt>Prior</dt>
+            <dd>${scene.prior ?? "none"}</dd>
             ${
               tags.length
                 ? html`<dt>Tags</dt>

@@ -37,14 +37,27 @@ export class VerdictForm extends Panel {
           padding: 8px 14px;
         }
         form {
-          display: grid;
+          display: flex;
           gap: 6px;
         }
         textarea {
           height: var(--target);
+          min-width: 0;
+          resize: none;
+          white-space: nowrap;
         }
         .buttons {
           margin: 0;
+          gap: 6px;
+          flex: none;
+        }
+        .buttons button {
+          width: 44px;
+          padding: 0;
+        }
+        .buttons button span {
+          position: absolute;
+          clip-path: inset(50%);
         }
       }
     `,
@@ -75,7 +88,7 @@ export class VerdictForm extends Panel {
         ?disabled=${isBusy || (verdict === "withdraw" && !this.said)}
         @click=${() => void this.send(verdict)}
       >
-        ${icon(sign)} ${label}
+        ${icon(sign)} <span>${label}</span>
       </button>`;
     return html`<form @submit=${(event: Event) => event.preventDefault()}>
       <textarea
