@@ -15,6 +15,7 @@ export interface MapSummary {
   title: string;
   actions: boolean; // whether POST actions/... is there: not in a static page, not with --read-only
   revision: number | null; // the newest; null before the first optimize
+  stale: boolean; // reviews, priors, edges or scenes are newer than that revision: optimize would see them
   components: Component[];
   scenes: SceneEntry[];
   edges: EdgeEntry[];
@@ -74,6 +75,8 @@ export interface SceneEntry {
    */
   tileset: string;
   extras: string; // GET: SceneExtras
+  tags: string[];
+  prior: string | null; // what people or receivers told of where it lies, in words: "pose, 0.05 m, 2°"
 }
 /** 202 of a tileset that is not there yet. */
 export interface TreeProgress {
@@ -123,6 +126,7 @@ export interface ChangeEntry {
   at: string | null; // when the newer capture was made
   confidence: number;
   status: string; // "open", "confirmed", "rejected"
+  note: string; // of the review
   pictures: string | null; // GET: one picture, before and after beside each other
 }
 

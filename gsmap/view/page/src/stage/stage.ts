@@ -17,10 +17,12 @@ export interface Pick {
 }
 
 export interface StageOptions {
-  canvas: HTMLCanvasElement;
+  canvas: HTMLCanvasElement; // its size is the layout's and changes as panels open and fold (ResizeObserver)
   onPick: (pick: Pick) => void;
   onMove: (standpoint: Standpoint) => void; // after the viewer has come to rest
   onError: (message: string) => void;
+  /** What it may cost; see loader.ts. Left out: two million splats, 600 MB. */
+  budget?: { splats?: number; bytes?: number; errorPx?: number; requests?: number };
 }
 
 /** Numbers that tests and the curious look at; `window.gsmap` is one. */
@@ -43,7 +45,8 @@ export interface Stage {
   setSource(source: Source): void;
   /** Right of `at` (0..1 of the width) other scenes, or merged instead of scenes; null ends it. */
   setSplit(split: { at: number; scenes: ReadonlySet<number>; source: Source } | null): void;
-  setClip(box: Box | null): void; // drawn with handles to drag; what lies outside is not drawn
+  /** What lies outside is not drawn; drawn with handles, and `onChange` is told as they are dragged. */
+  setClip(box: Box | null, onChange?: (box: Box) => void): void;
   setCeiling(shown: boolean): void; // doll's house
   setOverlay(name: "cameras" | "nodes" | "boxes" | "edges" | "ellipsoids" | "objects" | "photos", shown: boolean): void;
   setObjects(objects: ObjectEntry[], relations: { a: string; b: string; kind: string }[]): void;

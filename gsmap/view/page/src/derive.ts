@@ -1,0 +1,118 @@
+// What follows from the state: which scenes are seen, which edges are listed. Pure functions.
+import type { ChangeEntry, Component, EdgeEntry, MapSummary, PhotoEntry, RevisionPoses, SceneEntry } from "./contract";
+import type { EdgeFilter, Selection, Side, State } from "./state";
+
+export const edgeKey = (map: MapSummary, edge: EdgeEntry) =>
+  `${map.scenes[edge.target]?.id ?? "?"}:${map.scenes[edge.source]?.id ?? "?"}`;
+
+export const sceneOf = (map: MapSummary, id: string) => map.scenes.find((scene) => scene.id === id);
+
+export const edgeOf = (map: MapSummary, key: string) => map.edges.find((edge) => edgeKey(map, edge) === key);
+
+export const componentOf = (map: MapSummary, component: number): Component | undefined =>
+  map.components.find((one) => one.component === component);
+
+export function selectedEdge(state: State): EdgeEntry | undefined {
+  return state.map && state.selection?.kind === "edge" ? edgeOf(state.map, state.selection.key) : undefined;
+}
+
+export function selectedChange(state: State): ChangeEntry | undefined {
+  const { map, selection } = state;
+  return selection?.kind === "change" ? map?.changes.find((one) => one.id === selection.key) : undefined;
+}
+
+export function selectedScene(state: State): SceneEntry | undefined {
+  return state.map && state.selection?.kind === "scene" ? sceneOf(state.map, state.selection.key) : undefined;
+}
+
+export function selectedPhoto(state: State): PhotoEntry | undefined {
+  const { map, selection } = state;
+  return selection?.kind === "photo" ? map?.photos.find((one) => one.file === selection.key) : undefined;
+}
+
+export const isSelected = (state: State, kind: Selection["kind"], key: string) =>
+  state.selection?.kind === kind && state.selection.key === key;
+
+/** Whether a capture was made by the end of that day; one without a date is always there. */
+export const isBy = (at: string | null, until: string | null) =>
+  until === null || at === null || at.slice(0, until.length) <= until;
+
+/** Indices of the scenes that one side shows. */
+export function visible(state: State, side: Side, poses: RevisionPoses | null): Set<number> {
+  const { map, component, until } = state;
+  const out = new Set<number>();
+  if (!map) return out;
+  const then = poses && new Set(poses.scenes.filter((one) => one.status !== "not placed").map((one) => one.scene));
+  map.scenes.forEach((scene, index) => {
+    if (scene.component !== component || side.hidden.has(scene.id) || !isBy(scene.captured_at, until)) return;
+    if (!then || then.has(index)) out.add(index);
+  });
+  return out;
+}
+
+/** Scenes of the island that fit every word of the query: in name, date, tag or status. */
+export function listedScenes(state: State): SceneEntry[] {
+  const { map, component, sceneQuery } = state;
+  if (!map) return [];
+  const words = sceneQuery.toLowerCase().split(/\s+/).filter(Boolean);
+  return map.scenes.filter((scene) => {
+    if (scene.component !== component) return false;
+    const said = [scene.name, scene.captured_at ?? "", scene.status, ...(scene.tags ?? []).map((tag) => `#${tag}`)];
+    const text = said.join(" ").toLowerCase();
+    return words.every((word) => text.includes(word));
+  });
+}
+
+/** Days on which captures of the island were made, in order. */
+export function captureDays(state: State): string[] {
+  const scenes = state.map?.scenes.filter((scene) => scene.component === state.component) ?? [];
+  return [...new Set(scenes.flatMap((scene) => (scene.captured_at ? [scene.captured_at.slice(0, 10)] : [])))].sort();
+}
+
+const IS_IN: Record<EdgeFilter, (edge: EdgeEntry) => boolean> = {
+  doubtful: (edge) => edge.doubt > 0 && edge.review === null,
+  tentative: (edge) => edge.used === "tentative",
+  undecided: (edge) => edge.undecided,
+  rejected: (edge) => edge.status !== "accepted",
+  reviewed: (edge) => edge.review !== null,
+  all: () => true,
+};
+
+const inIsland = (state: State, edge: EdgeEntry) =>
+  [edge.target, edge.source].some((index) => state.map?.scenes[index]?.component === state.component);
+
+export const countEdges = (state: State, filter: EdgeFilter) =>
+  state.map?.edges.filter((edge) => inIsland(state, edge) && IS_IN[filter](edge)).length ?? 0;
+
+/** The edges of the list, the most doubtful first. The selected one stays, so that a review does not take it away. */
+export function listedEdges(state: State): EdgeEntry[] {
+  const { map } = state;
+  if (!map) return [];
+  const words = state.edgeQuery.toLowerCase().split(/\s+/).filter(Boolean);
+  const listed = map.edges.filter((edge) => {
+    if (isSelected(state, "edge", edgeKey(map, edge))) return true;
+    if (!inIsland(state, edge) || !IS_IN[state.edgeFilter](edge)) return false;
+    const names = `${map.scenes[edge.target]?.name} ${map.scenes[edge.source]?.name} ${edge.reason}`.toLowerCase();
+    return words.every((word) => names.includes(word));
+  });
+  return listed.sort((a, b) => b.doubt - a.doubt || a.target - b.target || a.source - b.source);
+}
+
+/** Changes of the island until the date looked at, the newest first. */
+export function listedChanges(state: State): ChangeEntry[] {
+  const { map, component, until, changeFilter } = state;
+  const shown = (one: ChangeEntry) =>
+    changeFilter === "all" || one.status === changeFilter || isSelected(state, "change", one.id);
+  return (map?.changes ?? [])
+    .filter((one) => one.component === component && isBy(one.at, until) && shown(one))
+    .sort((a, b) => (b.at ?? "").localeCompare(a.at ?? "") || b.confidence - a.confidence);
+}
+
+/** How an edge stands, in one word of the map's. */
+export function standing(edge: EdgeEntry): "used" | "tentative" | "undecided" | "unused" | "rejected" | "no match" {
+  if (edge.undecided) return "undecided";
+  if (edge.status === "no_match") return "no match";
+  if (edge.status === "rejected") return "rejected";
+  if (edge.used === "tentative") return "tentative";
+  return edge.used === false ? "unused" : "used";
+}

@@ -1,0 +1,115 @@
+// Tells the 3D view what the state says, and only what is new in it.
+import * as actions from "./actions";
+import type { EdgeDetail, MapSummary, RevisionPoses } from "./contract";
+import * as derive from "./derive";
+import { OVERLAYS, page } from "./state";
+import type { State } from "./state";
+import type { Stage } from "./stage/stage";
+
+export const isDark = (state: State) =>
+  state.theme === "dark" || (state.theme === "system" && matchMedia("(prefers-color-scheme: dark)").matches);
+
+/** Poses of the revision that is looked at, once they are there. */
+export function posesOf(state: State): RevisionPoses | null {
+  const known = actions.posesOf(state);
+  return known?.status === "ready" ? known.value : null;
+}
+
+function detailOf(state: State): EdgeDetail | null {
+  const edge = state.correspondences ? derive.selectedEdge(state) : undefined;
+  const known = edge && actions.edges.get(edge.detail);
+  return known?.status === "ready" ? known.value : null;
+}
+
+/** One call of the stage, made when what it is told differs from last time. */
+class Told<T> {
+  private last: T | undefined;
+  constructor(
+    private readonly isSame: (a: T, b: T) => boolean,
+    private readonly tell: (value: T) => void,
+  ) {}
+
+  now(value: T): void {
+    if (this.last !== undefined && this.isSame(this.last, value)) return;
+    this.last = value;
+    this.tell(value);
+  }
+
+  /** The stage knows this already: it said so itself. */
+  heard(value: T): void {
+    this.last = value;
+  }
+}
+
+const is = <T>(a: T, b: T) => a === b;
+const alike = <T>(a: T, b: T) => JSON.stringify(a) === JSON.stringify(b);
+const sameSet = <T>(a: ReadonlySet<T>, b: ReadonlySet<T>) => a.size === b.size && [...a].every((v) => b.has(v));
+
+/** Keeps the stage at what the state says from now on. */
+export function drive(stage: Stage): () => void {
+  const shown = new Told<{ map: MapSummary; component: number }>(
+    (a, b) => a.map === b.map && a.component === b.component,
+    ({ map, component }) => stage.show(map, component),
+  );
+  const visible = new Told<ReadonlySet<number>>(sameSet, (scenes) => stage.setVisible(scenes));
+  const source = new Told<State["left"]["source"]>(is, (name) => stage.setSource(name));
+  const split = new Told<{ at: number; scenes: ReadonlySet<number>; source: "scenes" | "merged" } | null>(
+    (a, b) => a === b || (!!a && !!b && a.at === b.at && a.source === b.source && sameSet(a.scenes, b.scenes)),
+    (value) => stage.setSplit(value),
+  );
+  const clip: Told<State["clip"]> = new Told<State["clip"]>(alike, (box) =>
+    stage.setClip(box, (now) => {
+      clip.heard(now);
+      page.set({ clip: now });
+    }),
+  );
+  const ceiling = new Told<boolean>(is, (value) => stage.setCeiling(value));
+  const overlays = OVERLAYS.map((name) => [name, new Told<boolean>(is, (on) => stage.setOverlay(name, on))] as const);
+  const changes = new Told<ReturnType<typeof derive.listedChanges>>(
+    (a, b) => a.length === b.length && a.every((one, i) => one === b[i]),
+    (list) => stage.setChanges(list),
+  );
+  const detail = new Told<EdgeDetail | null>(is, (value) => stage.setCorrespondences(value));
+  const poses = new Told<RevisionPoses | null>(is, (value) => stage.setPoses(value));
+  const dragging = new Told<string | null>(is, (id) => {
+    const index = page.state.map?.scenes.findIndex((scene) => scene.id === id) ?? -1;
+    if (id === null || index < 0) stage.drag(null);
+    else stage.drag(index, (S_map_scene) => actions.dragged(S_map_scene));
+  });
+  const theme = new Told<boolean>(is, (dark) => stage.setTheme(dark));
+  let things: unknown = null;
+
+  const sync = () => {
+    const { state } = page;
+    if (!state.map) return;
+    theme.now(isDark(state));
+    const then = posesOf(state);
+    shown.now({ map: state.map, component: state.component });
+    poses.now(then);
+    source.now(state.left.source);
+    visible.now(derive.visible(state, state.left, then));
+    split.now(
+      state.split && {
+        at: state.split.at,
+        source: state.split.source,
+        scenes: derive.visible(state, state.split, then),
+      },
+    );
+    clip.now(state.clip);
+    ceiling.now(state.ceiling);
+    for (const [name, told] of overlays) told.now(state.overlays.has(name));
+    if (state.overlays.has("objects") || state.tab === "things") {
+      const known = actions.graphOf(state);
+      if (known?.status === "ready" && known.value !== things) {
+        things = known.value;
+        stage.setObjects(known.value.objects, known.value.relations);
+      }
+    }
+    changes.now(state.tab === "time" || state.selection?.kind === "change" ? derive.listedChanges(state) : []);
+    detail.now(detailOf(state));
+    dragging.now(state.drag?.scene ?? null);
+    for (const aim of actions.takeAims()) aim();
+  };
+  sync();
+  return page.listen(sync);
+}

@@ -1,0 +1,116 @@
+// One object or one localised photograph.
+import { css, html, nothing } from "lit";
+import { customElement } from "lit/decorators.js";
+import * as actions from "../actions";
+import type { GraphEntry, ObjectEntry, PhotoEntry } from "../contract";
+import * as derive from "../derive";
+import { day, metres, moment, plural, point } from "../words";
+import { Panel } from "./base";
+import { shared } from "./css";
+import { heading } from "./heading";
+import { icon } from "./icons";
+import { waiting } from "./waiting";
+import type { Vector } from "../contract";
+
+@customElement("gs-thing")
+export class Thing extends Panel {
+  static override styles = [
+    shared,
+    heading.styles,
+    css`
+      .body {
+        padding: 0 16px 16px;
+      }
+    `,
+  ];
+
+  protected override render() {
+    const { state } = this;
+    const photo = derive.selectedPhoto(state);
+    if (photo) return this.photo(photo);
+    const key = state.selection?.key;
+    const known = actions.graphOf(state);
+    if (!known) return heading("This map has no graph", "");
+    return waiting(
+      known,
+      "Loading the objects",
+      () => actions.graphs.forget(),
+      (graph) => {
+        const object = graph.objects.find((one) => one.id === key);
+        return object
+          ? this.object(object, graph)
+          : html`${heading("No such object", "")}
+              <div class="body"><p>This map knows no object ${key}: it may have been merged with another.</p></div>`;
+      },
+    );
+  }
+
+  private unit(component: number): number {
+    return (this.state.map && derive.componentOf(this.state.map, component)?.metres_per_unit) ?? 1;
+  }
+
+  private object(one: ObjectEntry, graph: GraphEntry) {
+    const unit = this.unit(one.component);
+    const nameOf = (id: string) => graph.objects.find((other) => other.id === id)?.name ?? id;
+    const relations = graph.relations.filter(({ a, b }) => a === one.id || b === one.id);
+    const sides = one.box[1].map((v, i) => metres((v - (one.box[0][i] ?? v)) * unit));
+    return html`
+      ${heading(one.name, html`<span class="mark ${one.present ? "good" : "hollow"}">${one.present ? "there" : "gone"}</span> <span>${one.id}</span>`)}
+      <div class="body">
+        <section class="row">
+          <button @click=${() => actions.flyToSelected()}>${icon("fly")} Fly to it</button>
+        </section>
+        <section>
+          <dl class="facts">
+            <dt>At</dt>
+            <dd>${point(one.position, unit)}</dd>
+            <dt>Size</dt>
+            <dd>${sides.join(" × ")}</dd>
+            <dt>Seen</dt>
+            <dd>${plural(one.num_sightings, "time")}</dd>
+            <dt>First seen</dt>
+            <dd>${day(one.first_seen)}</dd>
+            <dt>Last seen</dt>
+            <dd>${day(one.last_seen)}</dd>
+          </dl>
+        </section>
+        ${
+          relations.length
+            ? html`<section>
+                <h3>How it stands to others</h3>
+                <ul>
+                  ${relations.map(({ a, b, kind }) => html`<li class="anywhere">${nameOf(a)} ${kind} ${nameOf(b)}</li>`)}
+                </ul>
+              </section>`
+            : nothing
+        }
+      </div>
+    `;
+  }
+
+  private photo(one: PhotoEntry) {
+    const [fx, , ,] = one.intrinsics;
+    const wide = (2 * Math.atan(one.size[0] / (2 * fx)) * 180) / Math.PI;
+    const at = [0, 1, 2].map((r) => one.T_map_camera[r]?.[3] ?? 0) as Vector;
+    return html`
+      ${heading(one.file, "photograph, localised")}
+      <div class="body">
+        <section class="row">
+          <button class="main" @click=${() => actions.flyToSelected()}>${icon("fly")} Stand where it was taken</button>
+        </section>
+        <section>
+          <dl class="facts">
+            <dt>Taken at</dt>
+            <dd>${point(at, this.unit(one.component))}</dd>
+            <dt>Taken on</dt>
+            <dd>${moment(one.captured_at)}</dd>
+            <dt>Picture</dt>
+            <dd>${one.size.join(" × ")}</dd>
+            <dt>Angle of view</dt>
+            <dd>${wide.toFixed(0)}° wide</dd>
+          </dl>
+        </section>
+      </div>
+    `;
+  }
+}

@@ -1,0 +1,145 @@
+// Objects of the map and photographs that were localised in it.
+import { css, html, nothing } from "lit";
+import { customElement, state } from "lit/decorators.js";
+import * as actions from "../actions";
+import type { ObjectEntry, PhotoEntry } from "../contract";
+import { page } from "../state";
+import { day, plural } from "../words";
+import { Panel } from "./base";
+import { shared } from "./css";
+import "./listing";
+import { waiting } from "./waiting";
+
+@customElement("gs-things")
+export class Things extends Panel {
+  static override styles = [
+    shared,
+    css`
+      :host {
+        display: grid;
+        grid-template-rows: auto auto minmax(0, 1fr);
+        gap: 10px;
+      }
+      gs-listing {
+        margin: 0 -8px;
+        padding: 0 4px;
+        min-height: 200px;
+      }
+      .list {
+        display: grid;
+        grid-template-rows: auto minmax(0, 1fr);
+        gap: 8px;
+        min-height: 0;
+      }
+    `,
+  ];
+
+  @state() private kind: "objects" | "photos" = "objects";
+  @state() private query = "";
+
+  protected override render() {
+    const { map, component } = this.state;
+    if (!map) return nothing;
+    const photos = map.photos.filter((photo) => photo.component === component);
+    const press = (kind: "objects" | "photos") => {
+      this.kind = kind;
+      actions.overlay(kind, true);
+    };
+    return html`
+      <div class="segments" role="group" aria-label="Which things">
+        <button aria-pressed=${this.kind === "objects"} @click=${() => press("objects")}>Objects</button>
+        <button aria-pressed=${this.kind === "photos"} @click=${() => press("photos")}>
+          Photos <span class="muted">${photos.length}</span>
+        </button>
+      </div>
+      <input
+        id="filter"
+        type="search"
+        aria-label="Find by name"
+        placeholder=${this.kind === "objects" ? "Find an object by name" : "Find a photo by file or date"}
+        .value=${this.query}
+        @input=${(event: Event) => (this.query = (event.target as HTMLInputElement).value)}
+      />
+      ${this.kind === "photos" ? this.photos(photos) : this.objects()}
+    `;
+  }
+
+  private fits(...texts: (string | null)[]): boolean {
+    const text = texts.join(" ").toLowerCase();
+    return this.query
+      .toLowerCase()
+      .split(/\s+/)
+      .every((word) => text.includes(word));
+  }
+
+  private objects() {
+    const known = actions.graphOf(this.state);
+    if (!known || (known.status === "ready" && !known.value.objects.length))
+      return html`<p class="empty">
+        No objects are known. They come with describing (<kbd>gsmap update</kbd>) and are followed over the captures by
+        <kbd>gsmap graph</kbd>.
+      </p>`;
+    return waiting(
+      known,
+      "Loading the objects",
+      () => actions.graphs.forget(),
+      ({ objects }) => {
+        const listed = objects.filter(
+          (one) => one.component === this.state.component && this.fits(one.name, one.id, one.last_seen),
+        );
+        return listed.length
+          ? this.list("Objects", listed, (one) => one.id, this.object, "object")
+          : html`<p class="empty">No object of this island fits.</p>`;
+      },
+    );
+  }
+
+  private photos(photos: readonly PhotoEntry[]) {
+    if (!photos.length)
+      return html`<p class="empty">No photos were localised here: <kbd>gsmap localize MAP photos/</kbd> does that.</p>`;
+    const listed = photos.filter((one) => this.fits(one.file, one.captured_at));
+    return listed.length
+      ? this.list("Photos", listed, (one) => one.file, this.photo, "photo")
+      : html`<p class="empty">No photo fits “${this.query}”.</p>`;
+  }
+
+  private list<T>(
+    label: string,
+    items: readonly T[],
+    keyOf: (item: T) => string,
+    row: (item: T) => unknown,
+    kind: "object" | "photo",
+  ) {
+    const { selection } = this.state;
+    return html`<div class="list">
+      <p class="muted small" role="status">${plural(items.length, kind)}</p>
+      <gs-listing
+        label=${label}
+        .items=${items}
+        .keyOf=${keyOf}
+        .row=${row}
+        .chosen=${selection?.kind === kind ? selection.key : null}
+        .stamp=${page.state}
+      ></gs-listing>
+    </div>`;
+  }
+
+  private readonly object = (one: ObjectEntry) =>
+    html`<span role="gridcell" class="wide ${one.present ? "" : "off"}"
+      ><button class="choose" title=${one.name} @click=${() => actions.select({ kind: "object", key: one.id })}>
+        <span class="name">${one.name}</span>
+        <span class="detail"
+          ><span>${one.present ? `seen ${plural(one.num_sightings, "time")}` : "gone"}</span
+          ><span>${day(one.last_seen)}</span></span
+        >
+      </button></span
+    >`;
+
+  private readonly photo = (one: PhotoEntry) =>
+    html`<span role="gridcell" class="wide"
+      ><button class="choose" title=${one.file} @click=${() => actions.select({ kind: "photo", key: one.file })}>
+        <span class="name">${one.file}</span>
+        <span class="detail"><span>${one.size.join(" × ")}</span><span>${day(one.captured_at)}</span></span>
+      </button></span
+    >`;
+}

@@ -1,0 +1,208 @@
+// The map through time: what was captured until a day, where everything lay in an old revision, what changed.
+import { css, html, nothing } from "lit";
+import { customElement } from "lit/decorators.js";
+import * as actions from "../actions";
+import type { ChangeEntry } from "../contract";
+import * as derive from "../derive";
+import { CHANGE_FILTERS, page } from "../state";
+import type { ChangeFilter } from "../state";
+import { day, moment, percent, plural } from "../words";
+import { Panel } from "./base";
+import { shared } from "./css";
+import { icon } from "./icons";
+import "./kind";
+import "./listing";
+
+const NAMES: Record<ChangeFilter, string> = { open: "Open", confirmed: "Confirmed", rejected: "Rejected", all: "All" };
+
+@customElement("gs-time")
+export class Time extends Panel {
+  static override styles = [
+    shared,
+    css`
+      .slider {
+        display: grid;
+        grid-template-columns: auto minmax(0, 1fr) auto;
+        gap: 0 6px;
+        align-items: center;
+      }
+      .said {
+        display: flex;
+        justify-content: space-between;
+        gap: 4px 12px;
+        flex-wrap: wrap;
+        font-variant-numeric: tabular-nums;
+      }
+      .said strong {
+        font-weight: 600;
+      }
+      gs-listing {
+        height: min(21rem, 50vh);
+        margin: 4px -8px 0;
+        padding: 0 4px;
+      }
+      .chips {
+        margin-bottom: 6px;
+      }
+    `,
+  ];
+
+  protected override render() {
+    if (!this.state.map) return nothing;
+    return html`${this.dates()} ${this.revisions()} ${this.changes()}`;
+  }
+
+  private dates() {
+    const { state } = this;
+    const days = derive.captureDays(state);
+    const scenes = state.map?.scenes.filter((scene) => scene.component === state.component) ?? [];
+    const undated = scenes.filter((scene) => !scene.captured_at).length;
+    const has = "Scenes by their date";
+    if (!days.length)
+      return html`<section>
+        <h3>${has}</h3>
+        <p class="muted">
+          No capture of this island has a date. <kbd>gsmap edit MAP SCENE --captured-at DATE</kbd> gives it one.
+        </p>
+      </section>`;
+    const last = days.length - 1;
+    const at =
+      state.until === null ? last : Math.max(0, days.filter((one) => derive.isBy(one, state.until)).length - 1);
+    const shown = scenes.filter((scene) => derive.isBy(scene.captured_at, state.until)).length;
+    const go = (index: number) => actions.until(index >= last ? null : (days[Math.max(0, index)] ?? null));
+    return html`<section>
+      <h3 id="dates">${has}</h3>
+      ${this.slider("until", "dates", at, last, `until ${day(days[at] ?? null)}`, go)}
+      <p class="said">
+        <strong>${state.until === null ? "All dates" : `Until ${day(days[at] ?? null)}`}</strong
+        ><span class="muted">${shown} of ${plural(scenes.length, "scene")}</span>
+      </p>
+      ${undated ? html`<p class="muted small">${plural(undated, "scene")} without a date, always shown</p>` : nothing}
+    </section>`;
+  }
+
+  private revisions() {
+    const { state } = this;
+    const rows = (state.map?.revisions ?? [])
+      .filter((row) => row.poses !== null || row.id === state.map?.revision)
+      .sort((a, b) => a.id - b.id);
+    if (!rows.length)
+      return html`<section>
+        <h3>Poses by revision</h3>
+        <p class="muted">No revision yet: optimize makes the first.</p>
+      </section>`;
+    const last = rows.length - 1;
+    const at = state.revision === null ? last : rows.findIndex((row) => row.id === state.revision);
+    const row = rows[at];
+    if (!row) return nothing;
+    const known = actions.posesOf(state);
+    const go = (index: number) => actions.revision(rows[Math.max(0, Math.min(last, index))]?.id ?? null);
+    return html`<section>
+      <h3 id="revisions">Poses by revision</h3>
+      ${this.slider("revision", "revisions", at, last, `revision ${row.id} of ${moment(row.created_at)}`, go)}
+      <p class="said">
+        <strong>Revision ${row.id}${at === last ? ", the newest" : ""}</strong
+        ><span class="muted">${moment(row.created_at)}</span>
+      </p>
+      <p class="muted small figures">
+        ${plural(row.num_scenes, "scene")}, ${plural(row.num_edges_used, "edge")} used
+        ${known?.status === "loading" ? html`<span class="waiting"></span>` : nothing}
+      </p>
+      ${
+        known?.status === "failed"
+          ? html`<div class="failed" role="alert">
+              <p>Its poses could not be loaded: ${known.error}</p>
+              <p><button @click=${() => actions.revisions.forget()}>Ask again</button></p>
+            </div>`
+          : nothing
+      }
+    </section>`;
+  }
+
+  private slider(id: string, label: string, at: number, last: number, text: string, go: (index: number) => void) {
+    return html`<div class="slider">
+      <button class="plain square" aria-label="Earlier: ${label}" ?disabled=${at <= 0} @click=${() => go(at - 1)}>
+        ${icon("back")}
+      </button>
+      <input
+        id=${id}
+        type="range"
+        min="0"
+        max=${last}
+        step="1"
+        aria-labelledby=${label}
+        aria-valuetext=${text}
+        ?disabled=${last === 0}
+        .value=${String(at)}
+        @input=${(event: Event) => go((event.target as HTMLInputElement).valueAsNumber)}
+      />
+      <button class="plain square" aria-label="Later: ${label}" ?disabled=${at >= last} @click=${() => go(at + 1)}>
+        ${icon("next")}
+      </button>
+    </div>`;
+  }
+
+  private changes() {
+    const { state } = this;
+    const changes = derive.listedChanges(state);
+    const inIsland = state.map?.changes.filter((one) => one.component === state.component) ?? [];
+    const chosen = state.selection?.kind === "change" ? state.selection.key : null;
+    const count = (name: ChangeFilter) =>
+      inIsland.filter((one) => (name === "all" || one.status === name) && derive.isBy(one.at, state.until)).length;
+    return html`<section>
+      <h3>What changed</h3>
+      ${
+        inIsland.length
+          ? html`<div class="chips" role="group" aria-label="Which changes">
+              ${CHANGE_FILTERS.map(
+                (name) =>
+                  html`<button
+                    aria-pressed=${state.changeFilter === name}
+                    @click=${() => page.set({ changeFilter: name })}
+                  >
+                    ${NAMES[name]} <span class="count">${count(name)}</span>
+                  </button>`,
+              )}
+            </div>`
+          : nothing
+      }
+      ${
+        changes.length
+          ? html`<gs-listing
+              label="Changes"
+              rem="3.7"
+              .items=${changes}
+              .keyOf=${(one: ChangeEntry) => one.id}
+              .row=${this.row}
+              .chosen=${chosen}
+              .stamp=${state}
+            ></gs-listing>`
+          : html`<p class="empty">
+              ${
+                inIsland.length
+                  ? state.until === null
+                    ? "None of this kind."
+                    : `None until ${day(state.until)}.`
+                  : "No change is known: gsmap changes compares captures of one place with different dates."
+              }
+            </p>`
+      }
+    </section>`;
+  }
+
+  private readonly row = (change: ChangeEntry) => {
+    const { map } = this.state;
+    return html`<span role="gridcell" class="wide"
+      ><button class="choose" @click=${() => actions.select({ kind: "change", key: change.id })}>
+        <span class="name"
+          ><gs-kind of=${change.kind}></gs-kind> ${change.kind}
+          <span class="muted">${percent(change.confidence)}</span></span
+        >
+        <span class="detail"
+          ><span>${change.status === "open" ? map?.scenes[change.after]?.name : change.status}</span
+          ><span>${day(change.at)}</span></span
+        >
+      </button></span
+    >`;
+  };
+}

@@ -1,0 +1,728 @@
+// The 3D view. Everything is drawn on demand: nothing runs while nothing changes.
+import { Box3, Color, Group, Matrix4, Raycaster, Scene, Timer, Vector2, Vector3, Vector4, WebGLRenderer } from "three";
+import { TransformControls } from "three/addons/controls/TransformControls.js";
+import { Object3D } from "three";
+import type {
+  Box,
+  EdgeDetail,
+  MapSummary,
+  Matrix,
+  ObjectEntry,
+  PhotoEntry,
+  RevisionPoses,
+  SceneExtras,
+  Vector,
+} from "../contract";
+import type { ChangeEntry } from "../contract";
+import { ClipBox } from "./clip";
+import { BUDGET, Loader } from "./loader";
+import type { Budget, Placed, Sixteen } from "./loader";
+import { boxLines, CHANGE_COLOURS, COLOURS, crossLines, ellipsoidLines, frustumLines, Overlays } from "./overlays";
+import type { Lines } from "./overlays";
+import { Painter } from "./splats";
+import type { Pick, Source, Stage, StageOptions, StageState, Standpoint } from "./stage";
+import { View } from "./view";
+
+export type { Pick, Source, Stage, StageOptions, StageState, Standpoint } from "./stage";
+
+type OverlayName = Parameters<Stage["setOverlay"]>[0];
+const BACKGROUND = { dark: 0x0d1014, light: 0xf4f4f1 };
+const MAX_PIXEL_RATIO = 2;
+const CLICK_PX = 4;
+/** How far up a room reaches that is drawn without its ceiling: of what its scene shows, from the floor. */
+const CEILING_AT = 0.72;
+/** Islands of at most so many scenes are first seen from where their captures were made. */
+const STAND_INSIDE = 8;
+
+interface Split {
+  at: number;
+  scenes: ReadonlySet<number>;
+  source: Source;
+}
+
+/** Makes the 3D view on a canvas. @throws Error where the browser has no WebGL 2 */
+export function createStage(options: StageOptions): Stage {
+  const stage = new View3D(options);
+  // For tests and the curious.
+  (globalThis as { gsmap?: unknown }).gsmap = { stage, state: stage.state };
+  return stage;
+}
+
+class View3D implements Stage {
+  readonly state: StageState = {
+    phase: "loading",
+    frames: 0,
+    splats: 0,
+    bytesReceived: 0,
+    bytesUploaded: 0,
+    pending: 0,
+    settled: false,
+    error: null,
+  };
+  private readonly renderer: WebGLRenderer;
+  private readonly scene = new Scene();
+  private readonly splats = new Group();
+  private readonly overlays = new Overlays();
+  private readonly painter: Painter;
+  private readonly view: View;
+  private readonly clip: ClipBox;
+  private readonly timer = new Timer();
+  private readonly observer: ResizeObserver;
+  private readonly budget: Budget;
+  private loader: Loader | null = null;
+  private map: MapSummary | null = null;
+  private component = 0;
+  private written: Matrix4[] = [];
+  private revision: RevisionPoses | null = null;
+  private dragged: { scene: number; pose: Matrix4 } | null = null;
+  private visible: ReadonlySet<number> = new Set();
+  private isVisibleKnown = false;
+  private source: Source = "scenes";
+  private split: Split | null = null;
+  private isCeilingShown = true;
+  private gizmos: { handle: Object3D; controls: TransformControls[] } | null = null;
+  private readonly shownOverlays = new Set<OverlayName>();
+  private objects: ObjectEntry[] = [];
+  private relations: { a: string; b: string; kind: string }[] = [];
+  private changes: ChangeEntry[] = [];
+  private detail: EdgeDetail | null = null;
+  private readonly extras = new Map<string, SceneExtras | null>(); // by address; null while it is on its way
+  private hasStood = false;
+  private scheduled = 0;
+  private isStale = true; // the order and the colours are another view's
+  private isPreparing = false;
+  private isMoving = false;
+  private isDisposed = false;
+
+  constructor(private readonly options: StageOptions) {
+    const { canvas } = options;
+    this.budget = { ...BUDGET, ...options.budget };
+    this.renderer = new WebGLRenderer({ canvas, antialias: false, alpha: false, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MAX_PIXEL_RATIO));
+    this.painter = new Painter(this.renderer);
+    this.view = new View(canvas, this.draw);
+    this.clip = new ClipBox(canvas, this.view.camera, () => {
+      this.cut();
+      this.draw();
+    });
+    this.scene.add(this.painter.spark, this.splats, this.overlays.group, this.clip.group);
+    this.setTheme(true);
+    canvas.addEventListener("webglcontextlost", this.onLost);
+    canvas.addEventListener("pointerdown", this.onDown);
+    canvas.addEventListener("pointerup", this.onUp);
+    canvas.addEventListener("dblclick", this.onDouble);
+    this.observer = new ResizeObserver(this.resize);
+    this.observer.observe(canvas);
+    this.resize();
+  }
+
+  // ---- what is shown ----------------------------------------------------------------------------------------------
+
+  show(map: MapSummary, component: number): void {
+    const island = map.components.find((one) => one.component === component);
+    if (!island) return;
+    const isOther = !this.map || this.component !== component;
+    const before = this.loader;
+    this.map = map;
+    this.component = component;
+    this.written = map.scenes.map((scene) => new Matrix4().set(...(scene.S_map_scene.flat() as Sixteen)));
+    if (isOther) {
+      this.isVisibleKnown = false;
+      this.hasStood = false;
+    }
+    if (!this.isVisibleKnown) this.visible = new Set(map.scenes.keys());
+    this.dragged = null;
+    this.loader = new Loader(map, component, this.splats, this.budget, this.refresh, this.fail, before);
+    const box = new Box3(new Vector3(...island.box[0]), new Vector3(...island.box[1]));
+    this.view.setWorld(island.up, box.getSize(new Vector3()).length(), 1 / (island.metres_per_unit || 1));
+    this.state.phase = "ready";
+    this.place();
+    this.drawOverlays();
+    this.cut();
+    if (isOther) this.fit(undefined, false);
+    this.refresh();
+  }
+
+  setVisible(scenes: ReadonlySet<number>): void {
+    this.visible = scenes;
+    this.isVisibleKnown = true;
+    this.place();
+    this.drawOverlays();
+    this.cut();
+  }
+
+  setSource(source: Source): void {
+    this.source = source;
+    this.place();
+  }
+
+  setSplit(split: Split | null): void {
+    this.split = split;
+    this.place();
+  }
+
+  setClip(box: Box | null, onChange?: (box: Box) => void): void {
+    this.clip.set(box, onChange);
+    this.cut();
+    this.draw();
+  }
+
+  setCeiling(shown: boolean): void {
+    this.isCeilingShown = shown;
+    this.cut();
+    this.draw();
+  }
+
+  setOverlay(name: OverlayName, shown: boolean): void {
+    if (shown) this.shownOverlays.add(name);
+    else this.shownOverlays.delete(name);
+    this.drawOverlays();
+  }
+
+  setObjects(objects: ObjectEntry[], relations: { a: string; b: string; kind: string }[]): void {
+    this.objects = objects;
+    this.relations = relations;
+    this.drawOverlays();
+  }
+
+  setChanges(changes: ChangeEntry[]): void {
+    this.changes = changes;
+    this.drawOverlays();
+  }
+
+  setCorrespondences(detail: EdgeDetail | null): void {
+    this.detail = detail;
+    this.drawOverlays();
+  }
+
+  setPoses(revision: RevisionPoses | null): void {
+    this.revision = revision;
+    this.place();
+    this.drawOverlays();
+  }
+
+  setTheme(dark: boolean): void {
+    this.scene.background = new Color(dark ? BACKGROUND.dark : BACKGROUND.light);
+    this.draw();
+  }
+
+  // ---- where scenes lie -------------------------------------------------------------------------------------------
+
+  private poseOf(scene: number): Matrix4 {
+    if (this.dragged?.scene === scene) return this.dragged.pose;
+    const then = this.revision?.scenes.find((one) => one.scene === scene);
+    if (then) return new Matrix4().set(...(then.S_map_scene.flat() as Sixteen));
+    return this.written[scene] ?? new Matrix4();
+  }
+
+  /** From where the map says that something of a scene is to where the scene is drawn. */
+  private movedBy(scene: number): Matrix4 {
+    const written = this.written[scene];
+    return written ? this.poseOf(scene).clone().multiply(written.clone().invert()) : new Matrix4();
+  }
+
+  private isOfIsland(scene: number): boolean {
+    if (!this.revision) return this.map?.scenes[scene]?.component === this.component;
+    return this.revision.scenes.some((one) => one.scene === scene && one.component === this.component);
+  }
+
+  private place(): void {
+    const { map, loader, split } = this;
+    if (!map || !loader) return;
+    const hasMerged = loader.merged !== null;
+    const left = hasMerged ? this.source : "scenes";
+    const right = split ? (hasMerged ? split.source : "scenes") : left;
+    const poses = new Map(this.revision?.scenes.map((one) => [one.scene, one]));
+    const placed: Placed[] = map.scenes.map((scene, i) => {
+      const then = poses.get(i);
+      const component = this.revision ? then?.component : scene.component;
+      const isHere = component === this.component;
+      const isLeft = isHere && left === "scenes" && this.visible.has(i);
+      const isRight = isHere && right === "scenes" && (split?.scenes ?? this.visible).has(i);
+      const pose =
+        this.dragged?.scene === i
+          ? this.dragged.pose
+          : then
+            ? new Matrix4().set(...(then.S_map_scene.flat() as Sixteen))
+            : (this.written[i] as Matrix4);
+      return { pose, sides: (isLeft ? 1 : 0) + (isRight ? 2 : 0) };
+    });
+    loader.place(placed, hasMerged ? (left === "merged" ? 1 : 0) + (right === "merged" ? 2 : 0) : 0);
+    this.painter.setSplit(split ? split.at * this.renderer.domElement.width : null);
+    this.refresh();
+  }
+
+  /** Lowest and highest along the island's up of what is drawn, and the box of it. */
+  private seenBox(): Box3 {
+    const out = new Box3();
+    this.map?.scenes.forEach((scene, i) => {
+      if (!this.isOfIsland(i)) return;
+      if (!this.visible.has(i) && !this.split?.scenes.has(i)) return;
+      out.union(new Box3(new Vector3(...scene.box[0]), new Vector3(...scene.box[1])).applyMatrix4(this.poseOf(i)));
+    });
+    const island = this.map?.components.find((one) => one.component === this.component);
+    if (out.isEmpty() && island) out.set(new Vector3(...island.box[0]), new Vector3(...island.box[1]));
+    return out;
+  }
+
+  private cut(): void {
+    const box = this.clip.box;
+    const clip = box && { low: new Vector3(...box[0]), high: new Vector3(...box[1]) };
+    let ceiling: Vector4 | null = null;
+    if (!this.isCeilingShown && this.map) {
+      const up = this.view.camera.up;
+      let [low, high] = [Infinity, -Infinity];
+      this.map.scenes.forEach((scene, i) => {
+        if (!this.isOfIsland(i) || !this.visible.has(i)) return;
+        const pose = this.poseOf(i);
+        for (let k = 0; k < 8; k++) {
+          const corner = new Vector3(...([0, 1, 2].map((a) => scene.box[(k >> a) & 1]?.[a] ?? 0) as Vector));
+          const height = corner.applyMatrix4(pose).dot(up);
+          [low, high] = [Math.min(low, height), Math.max(high, height)];
+        }
+      });
+      if (high > low) ceiling = new Vector4(up.x, up.y, up.z, low + CEILING_AT * (high - low));
+    }
+    this.painter.setCuts(clip, ceiling);
+  }
+
+  // ---- the view ---------------------------------------------------------------------------------------------------
+
+  stand(at: Standpoint, fly = false): void {
+    this.hasStood = true;
+    this.view.stand(at, fly);
+  }
+
+  standpoint(): Standpoint {
+    return this.view.standpoint();
+  }
+
+  fit(box?: Box, fly = true): void {
+    if (box) {
+      this.hasStood = true;
+      this.view.fit(new Box3(new Vector3(...box[0]), new Vector3(...box[1])), fly);
+      return;
+    }
+    this.view.fit(this.seenBox(), fly);
+    if (!this.hasStood) void this.standInside();
+  }
+
+  standAtCamera(T_map_camera: Matrix, intrinsics: [number, number, number, number], size: [number, number]): void {
+    this.hasStood = true;
+    this.view.standAtCamera(T_map_camera, intrinsics, size);
+  }
+
+  /** A small island is first seen as its captures saw it: from above, a room is its ceiling. */
+  private async standInside(): Promise<void> {
+    const { map, component } = this;
+    const scenes = map?.scenes.filter((scene) => scene.component === component) ?? [];
+    const [first] = [...scenes].sort((a, b) => b.num_gaussians - a.num_gaussians);
+    if (!first || scenes.length > STAND_INSIDE) return;
+    const extras = await this.fetchExtras(first.extras);
+    const cameras = extras?.cameras ?? [];
+    if (!cameras.length || this.hasStood || this.map !== map || this.component !== component) return;
+    // From the camera that has most of the capture before it: the others' places lie ahead.
+    const apexes = cameras.map((frustum) => new Vector3(...(frustum[0] as Vector)));
+    const middle = apexes.reduce((sum, at) => sum.add(at), new Vector3()).divideScalar(apexes.length);
+    const looks = cameras.map((frustum) => {
+      const corners = frustum.slice(1).map((corner) => new Vector3(...corner));
+      const ahead = corners.reduce((sum, at) => sum.add(at), new Vector3()).divideScalar(Math.max(1, corners.length));
+      return ahead.sub(new Vector3(...(frustum[0] as Vector))).normalize();
+    });
+    let best = 0;
+    let most = -Infinity;
+    apexes.forEach((at, i) => {
+      const to = middle.clone().sub(at);
+      const score =
+        to.dot(looks[i] as Vector3) - Math.abs((looks[i] as Vector3).dot(this.view.camera.up)) * to.length();
+      if (score > most) [most, best] = [score, i];
+    });
+    const eye = apexes[best] as Vector3;
+    const distance = Math.max(eye.distanceTo(middle), this.view.controls.minDistance * 5);
+    const target = eye.clone().addScaledVector(looks[best] as Vector3, distance);
+    this.view.stand({ position: eye.toArray(), target: target.toArray() }, false);
+  }
+
+  private readonly resize = (): void => {
+    const { canvas } = this.options;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width || !height) return;
+    this.renderer.setSize(width, height, false);
+    this.view.resize(width, height);
+    if (this.split) this.painter.setSplit(this.split.at * canvas.width);
+    this.refresh();
+  };
+
+  // ---- drawing ----------------------------------------------------------------------------------------------------
+
+  /** Something is drawn otherwise from now on: choose, sort and draw anew. */
+  private readonly refresh = (): void => {
+    this.isStale = true;
+    this.draw();
+  };
+
+  private readonly draw = (): void => {
+    if (this.isDisposed) return;
+    this.state.settled = false;
+    this.scheduled ||= requestAnimationFrame(this.frame);
+  };
+
+  private readonly last = new Matrix4();
+
+  private readonly frame = (now: number): void => {
+    this.scheduled = 0;
+    if (this.isDisposed) return;
+    this.timer.update(now);
+    const { camera } = this.view;
+    const wasMoving = this.isMoving;
+    // After a rest the clock has gone on; the viewer has not.
+    this.isMoving = this.view.update(wasMoving ? Math.min(0.1, this.timer.getDelta()) : 1 / 60);
+    const viewProjection = camera.projectionMatrix.clone().multiply(camera.matrixWorldInverse);
+    if (!viewProjection.equals(this.last)) {
+      this.last.copy(viewProjection);
+      this.isStale = true;
+    }
+    if (this.isStale && this.loader) {
+      const nearest = camera.near;
+      const focalPx = ((camera.projectionMatrix.elements[5] ?? 1) * this.renderer.domElement.height) / 2;
+      const eye = new Vector3().setFromMatrixPosition(camera.matrixWorld);
+      this.loader.update({ viewProjection, eye, focalPx, nearest: Math.max(nearest, 1e-9) });
+    }
+    if (this.isStale && !this.isPreparing) void this.prepare();
+    this.clip.update();
+    this.painter.draw(this.scene, camera, camera.near);
+    this.state.frames++;
+    this.count();
+    if (this.isMoving) this.draw();
+    else {
+      if (wasMoving) this.options.onMove(this.standpoint());
+      this.rest();
+    }
+  };
+
+  private async prepare(): Promise<void> {
+    this.isPreparing = true;
+    this.isStale = false;
+    try {
+      await this.painter.prepare(this.scene, this.view.camera);
+    } catch (error) {
+      this.fail(error instanceof Error ? error.message : String(error));
+    }
+    this.isPreparing = false;
+    this.draw();
+  }
+
+  private count(): void {
+    const { loader, state } = this;
+    if (!loader) return;
+    state.splats = loader.splats;
+    state.bytesReceived = loader.bytesReceived;
+    state.bytesUploaded = loader.bytesUploaded;
+    state.pending = loader.pending;
+  }
+
+  private rest(): void {
+    this.state.settled =
+      this.loader !== null &&
+      !this.isMoving &&
+      !this.isStale &&
+      !this.isPreparing &&
+      !this.scheduled &&
+      !this.state.pending;
+  }
+
+  private readonly fail = (message: string): void => {
+    this.state.error = message;
+    this.options.onError(message);
+  };
+
+  private readonly onLost = (event: Event): void => {
+    event.preventDefault();
+    this.state.phase = "failed";
+    this.fail("the graphics card was lost: reload the page");
+  };
+
+  // ---- overlays ---------------------------------------------------------------------------------------------------
+
+  private fetchExtras(uri: string): Promise<SceneExtras | null> {
+    const known = this.extras.get(uri);
+    if (known !== undefined) return Promise.resolve(known);
+    this.extras.set(uri, null);
+    return fetch(new URL(uri, document.baseURI))
+      .then(async (response) => {
+        if (!response.ok) throw new Error(`${uri}: ${response.status} ${response.statusText}`);
+        const extras = (await response.json()) as SceneExtras;
+        this.extras.set(uri, extras);
+        this.drawOverlays();
+        return extras;
+      })
+      .catch((error: unknown) => {
+        this.fail(error instanceof Error ? error.message : String(error));
+        return null;
+      });
+  }
+
+  private drawOverlays(): void {
+    const { map, shownOverlays: on, overlays } = this;
+    if (!map) return;
+    const here = map.scenes.map((_, i) => i).filter((i) => this.isOfIsland(i) && this.isSeen(i));
+    const island = map.components.find((one) => one.component === this.component);
+    const unit = 1 / (island?.metres_per_unit || 1);
+    const isHere = (component: number) => component === this.component;
+    const middle = (i: number) => new Vector3(...(map.scenes[i]?.middle as Vector)).applyMatrix4(this.movedBy(i));
+
+    const cameras: Lines[] = [];
+    const nodes: Lines[] = [];
+    if (on.has("cameras") || on.has("nodes"))
+      for (const i of here) {
+        const scene = map.scenes[i];
+        const extras = scene && this.extras.get(scene.extras);
+        if (scene && extras === undefined) void this.fetchExtras(scene.extras);
+        if (!extras) continue;
+        const moved = this.movedBy(i);
+        if (on.has("cameras"))
+          extras.cameras.forEach((frustum, index) =>
+            cameras.push({
+              points: frustumLines(frustum, moved),
+              colour: COLOURS.camera,
+              thing: { kind: "camera", index },
+              scene: i,
+            }),
+          );
+        if (on.has("nodes"))
+          for (const points of Object.values(extras.layers))
+            nodes.push({
+              points: points.flatMap((at) => crossLines(new Vector3(...at).applyMatrix4(moved).toArray(), 0.06 * unit)),
+              colour: COLOURS.node,
+              scene: i,
+            });
+      }
+    overlays.set("cameras", cameras);
+    overlays.set("nodes", nodes, 1);
+    overlays.set(
+      "boxes",
+      on.has("boxes")
+        ? here.map((i) => ({
+            points: boxLines(map.scenes[i]?.box as Box, this.poseOf(i)),
+            colour: COLOURS.box,
+            scene: i,
+          }))
+        : [],
+    );
+    const seen = new Set(here);
+    overlays.set(
+      "edges",
+      on.has("edges")
+        ? map.edges.flatMap((edge, index) => {
+            if (!seen.has(edge.target) || !seen.has(edge.source) || edge.status === "no_match") return [];
+            const colour =
+              edge.status === "rejected"
+                ? COLOURS.rejected
+                : edge.used === "tentative"
+                  ? COLOURS.tentative
+                  : edge.used
+                    ? COLOURS.used
+                    : COLOURS.unused;
+            const points = [...middle(edge.target).toArray(), ...middle(edge.source).toArray()];
+            return [{ points, colour, thing: { kind: "edge" as const, index } }];
+          })
+        : [],
+      3,
+    );
+    overlays.set(
+      "ellipsoids",
+      on.has("ellipsoids")
+        ? here.flatMap((i) => {
+            const covariance = map.scenes[i]?.ellipsoid;
+            if (!covariance) return [];
+            return [{ points: ellipsoidLines(middle(i).toArray(), covariance), colour: COLOURS.ellipsoid, scene: i }];
+          })
+        : [],
+    );
+    const things: Lines[] = [];
+    if (on.has("objects")) {
+      const places = new Map(this.objects.map((one) => [one.id, one]));
+      this.objects.forEach((object, index) => {
+        if (isHere(object.component))
+          things.push({ points: boxLines(object.box), colour: COLOURS.object, thing: { kind: "object", index } });
+      });
+      for (const { a, b } of this.relations) {
+        const [from, to] = [places.get(a), places.get(b)];
+        if (from && to && isHere(from.component) && isHere(to.component))
+          things.push({ points: [...from.position, ...to.position], colour: COLOURS.relation });
+      }
+    }
+    overlays.set("objects", things);
+    overlays.set(
+      "photos",
+      on.has("photos")
+        ? map.photos.flatMap((photo, index) =>
+            isHere(photo.component)
+              ? [
+                  {
+                    points: photoLines(photo, 0.4 * unit),
+                    colour: COLOURS.photo,
+                    thing: { kind: "photo" as const, index },
+                  },
+                ]
+              : [],
+          )
+        : [],
+      2,
+    );
+    overlays.set(
+      "changes",
+      this.changes.flatMap((change) => {
+        if (!isHere(change.component)) return [];
+        const index = map.changes.findIndex((one) => one.id === change.id);
+        const thing = { kind: "change" as const, index };
+        return [{ points: boxLines(change.box), colour: CHANGE_COLOURS[change.kind], thing }];
+      }),
+      2.5,
+    );
+    overlays.set(
+      "correspondences",
+      this.detail
+        ? [
+            {
+              points: this.detail.correspondences.flatMap(([a, b]) => [...a, ...b]),
+              colour: COLOURS.correspondence,
+            },
+            {
+              points: this.detail.correspondences.flatMap(([a]) => crossLines(a, 0.03 * unit)),
+              colour: COLOURS.node,
+            },
+          ]
+        : [],
+    );
+    this.draw();
+  }
+
+  private isSeen(scene: number): boolean {
+    return this.visible.has(scene) || (this.split?.scenes.has(scene) ?? false);
+  }
+
+  // ---- picking ----------------------------------------------------------------------------------------------------
+
+  private down: { x: number; y: number; id: number } | null = null;
+
+  private readonly onDown = (event: PointerEvent): void => {
+    this.options.canvas.focus({ preventScroll: true });
+    this.hasStood = true;
+    this.down =
+      event.isPrimary && event.button === 0 ? { x: event.clientX, y: event.clientY, id: event.pointerId } : null;
+  };
+
+  private readonly onUp = (event: PointerEvent): void => {
+    const { down } = this;
+    this.down = null;
+    if (down?.id !== event.pointerId || this.clip.isDragging || this.gizmos?.controls.some((one) => one.axis)) return;
+    if (Math.hypot(event.clientX - down.x, event.clientY - down.y) > CLICK_PX) return;
+    const found = this.pickAt(event);
+    if (found) this.options.onPick(found);
+  };
+
+  private readonly onDouble = (event: MouseEvent): void => {
+    const found = this.pickAt(event);
+    if (found) this.view.flyTo(new Vector3(...found.point));
+  };
+
+  /** What lies under the pointer: a thing by its lines, else the nearest surface. */
+  private pickAt(event: MouseEvent): Pick | null {
+    const { canvas } = this.options;
+    const rect = canvas.getBoundingClientRect();
+    const [x, y] = [event.clientX - rect.left, event.clientY - rect.top];
+    const { camera } = this.view;
+    const line = this.overlays.pick(camera, x, y, rect.width, rect.height);
+    if (line) return { point: line.point.toArray(), scene: line.lines.scene ?? null, thing: line.lines.thing ?? null };
+    const k = canvas.width / rect.width;
+    const hit = this.painter.pick(camera, Math.floor(x * k), Math.floor(y * k), canvas.width, canvas.height);
+    if (!hit) return null;
+    const ray = new Raycaster();
+    ray.setFromCamera(new Vector2((2 * x) / rect.width - 1, 1 - (2 * y) / rect.height), camera);
+    const forward = new Vector3();
+    camera.getWorldDirection(forward);
+    const distance = hit.depth / ray.ray.direction.dot(forward);
+    const point = ray.ray.origin.clone().addScaledVector(ray.ray.direction, distance);
+    const owner = this.painter.owner(hit.splat);
+    const scene = owner && this.loader ? this.loader.sceneOf(owner.tile, owner.index) : -1;
+    return { point: point.toArray(), scene: scene >= 0 ? scene : null, thing: null };
+  }
+
+  // ---- dragging a scene -------------------------------------------------------------------------------------------
+
+  drag(scene: number | null, onDrag?: (S_map_scene: Matrix) => void): void {
+    if (this.gizmos) {
+      for (const one of this.gizmos.controls) {
+        one.detach();
+        this.scene.remove(one.getHelper());
+        one.dispose();
+      }
+      this.scene.remove(this.gizmos.handle);
+      this.gizmos = null;
+    }
+    if (this.dragged) {
+      this.dragged = null;
+      this.place();
+      this.drawOverlays();
+    }
+    const entry = scene === null ? undefined : this.map?.scenes[scene];
+    if (scene === null || !entry) return this.draw();
+    const start = this.poseOf(scene).clone();
+    const handle = new Object3D();
+    handle.position.copy(new Vector3(...entry.middle).applyMatrix4(this.movedBy(scene)));
+    this.scene.add(handle);
+    handle.updateMatrixWorld();
+    const from = handle.matrixWorld.clone().invert();
+    const controls = (["translate", "rotate"] as const).map((mode) => {
+      const one = new TransformControls(this.view.camera, this.options.canvas);
+      one.setMode(mode);
+      one.setSize(mode === "translate" ? 0.8 : 1.1);
+      one.attach(handle);
+      one.addEventListener("dragging-changed", ({ value }) => {
+        this.view.controls.enabled = !value;
+        for (const other of controls) if (other !== one) other.enabled = !value;
+      });
+      one.addEventListener("change", this.draw);
+      one.addEventListener("objectChange", () => {
+        handle.updateMatrixWorld();
+        const pose = handle.matrixWorld.clone().multiply(from).multiply(start);
+        this.dragged = { scene, pose };
+        this.place();
+        this.drawOverlays();
+        const e = pose.elements;
+        onDrag?.([0, 1, 2, 3].map((r) => [0, 1, 2, 3].map((c) => e[4 * c + r] ?? 0)));
+      });
+      this.scene.add(one.getHelper());
+      return one;
+    });
+    this.gizmos = { handle, controls };
+    this.draw();
+  }
+
+  dispose(): void {
+    this.isDisposed = true;
+    cancelAnimationFrame(this.scheduled);
+    const { canvas } = this.options;
+    canvas.removeEventListener("webglcontextlost", this.onLost);
+    canvas.removeEventListener("pointerdown", this.onDown);
+    canvas.removeEventListener("pointerup", this.onUp);
+    canvas.removeEventListener("dblclick", this.onDouble);
+    this.observer.disconnect();
+    this.drag(null);
+    this.clip.dispose();
+    this.loader?.dispose();
+    this.overlays.dispose();
+    this.view.dispose();
+    this.painter.dispose();
+    this.renderer.dispose();
+  }
+}
+
+function photoLines(photo: PhotoEntry, depth: number): number[] {
+  const pose = new Matrix4().set(...(photo.T_map_camera.flat() as Sixteen));
+  const [fx, fy, cx, cy] = photo.intrinsics;
+  const [w, h] = photo.size;
+  const corner = (x: number, y: number): Vector => [((x - cx) / fx) * depth, ((y - cy) / fy) * depth, depth];
+  return frustumLines([[0, 0, 0], corner(0, 0), corner(w, 0), corner(w, h), corner(0, h)], pose);
+}

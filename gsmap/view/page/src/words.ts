@@ -1,0 +1,64 @@
+// Numbers, dates and lengths as the page writes them.
+import type { Box, Matrix, PhotoEntry, Vector } from "./contract";
+import type { Standpoint } from "./stage/stage";
+
+const count = new Intl.NumberFormat("en");
+const short = new Intl.NumberFormat("en", { notation: "compact", maximumFractionDigits: 1 });
+
+export const number = (value: number) => count.format(value);
+export const compact = (value: number) => short.format(value);
+export const plural = (value: number, one: string, many = `${one}s`) => `${number(value)} ${value === 1 ? one : many}`;
+export const percent = (share: number) => `${Math.round(100 * share)} %`;
+
+export function metres(value: number): string {
+  if (!Number.isFinite(value)) return "unknown";
+  if (Math.abs(value) < 0.0995) return `${(100 * value).toPrecision(2)} cm`;
+  return Math.abs(value) < 9.95 ? `${value.toFixed(2)} m` : `${number(Number(value.toPrecision(4)))} m`;
+}
+
+const MONTHS = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
+
+/** "3 Mar 2026" of an ISO date; what is no date stays as it is. */
+export function day(at: string | null): string {
+  if (!at) return "no date";
+  const found = /^(\d{4})-(\d\d)-(\d\d)/.exec(at);
+  const month = found && MONTHS[Number(found[2]) - 1];
+  return found && month ? `${Number(found[3])} ${month} ${found[1]}` : at;
+}
+
+/** The same with hours and minutes, where it has them. */
+export function moment(at: string | null): string {
+  const time = at && /T(\d\d:\d\d)/.exec(at);
+  return time ? `${day(at)}, ${time[1]}` : day(at);
+}
+
+export const point = (at: Vector, metresPerUnit: number) =>
+  at.map((v) => (v * metresPerUnit).toFixed(2)).join(", ") + " m";
+
+/** How far a scene was moved: metres of its middle (scene frame), degrees of its turn. */
+export function moved(from: Matrix, now: Matrix, middle: Vector, metresPerUnit: number) {
+  const column = (m: Matrix, c: number) => [0, 1, 2].map((r) => m[r]?.[c] ?? 0);
+  const at = (m: Matrix) =>
+    [0, 1, 2].map((r) => middle.reduce((sum, v, c) => sum + (m[r]?.[c] ?? 0) * v, m[r]?.[3] ?? 0));
+  const [a, b] = [at(from), at(now)];
+  let trace = 0;
+  for (const c of [0, 1, 2]) {
+    const [x, y] = [column(from, c), column(now, c)];
+    trace += x.reduce((sum, v, i) => sum + v * (y[i] ?? 0), 0) / (Math.hypot(...x) * Math.hypot(...y) || 1);
+  }
+  const cosine = Math.max(-1, Math.min(1, (trace - 1) / 2));
+  return {
+    metres: Math.hypot(...a.map((v, i) => v - (b[i] ?? 0))) * metresPerUnit,
+    degrees: (Math.acos(cosine) * 180) / Math.PI,
+  };
+}
+
+export const middleOf = (box: Box) => box[0].map((v, i) => (v + (box[1][i] ?? v)) / 2) as Vector;
+
+/** Where a photograph was taken from, looking along its axis. */
+export function standpointOf(photo: PhotoEntry, metresPerUnit: number): Standpoint {
+  const T = photo.T_map_camera;
+  const position = [0, 1, 2].map((r) => T[r]?.[3] ?? 0) as Vector;
+  const target = [0, 1, 2].map((r) => (position[r] ?? 0) + (T[r]?.[2] ?? 0) * (2 / metresPerUnit)) as Vector;
+  return { position, target };
+}

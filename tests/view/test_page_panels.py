@@ -1,0 +1,771 @@
+"""What an operator does on the page, done in headless Chromium over a made map; the 3D view remembers what it is told.
+
+The real 3D view over a real map is `test_page_whole.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hands import Hands
+from headless import Page
+from made_map import MadeServer, made_map
+
+PAGE = Path(__file__).parents[2] / "gsmap" / "view" / "page"
+PHONE = (390, 844)
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page with the tests' own 3D view."""
+    if not shutil.which("node"):
+        pytest.skip("needs Node.js, which bundles the page")
+    if not (PAGE / "node_modules" / "esbuild").is_dir():
+        pytest.skip("needs the page's packages: tools/build_page.sh")
+    out = tmp_path_factory.mktemp("page")
+    subprocess.run(["node", str(Path(__file__).parent / "page" / "build.mjs"), str(out)], check=True)
+    return out
+
+
+@pytest.fixture
+def server(built: Path) -> Iterator[MadeServer]:
+    found = MadeServer(built, made_map())
+    yield found
+    if found._http is not None:
+        found.gone()
+
+
+@pytest.fixture
+def hands(server: MadeServer, tmp_path: Path) -> Iterator[Hands]:
+    """A page that is open; whatever is done to it, the console stays free of errors."""
+    with Page(server.url, tmp_path, 1280, 800) as page:
+        found = Hands(page)
+        found.wait("globalThis.fake && find('gs-scene-list', null)")
+        found.expected = []  # failures that a test provokes
+        yield found
+        assert [one for one in page.failures() if not any(word in one for word in found.expected)] == []
+        refused = "findAll('*').length && performance.getEntriesByType('resource').map((e) => e.name)"
+        assert all(name.startswith(server.url) for name in found.value(refused)), "nothing of other servers"
+
+
+def told(hands: Hands, name: str):
+    """What the 3D view was told last by one of its methods; None before it was."""
+    hands.value("new Promise((rest) => setTimeout(rest, 30))")
+    return hands.value(f"fake.calls.filter((call) => call[0] === {json.dumps(name)}).at(-1)?.slice(1) ?? null")
+
+
+def idle(hands: Hands) -> None:
+    """Until the server has done what it was asked for."""
+    hands.value("new Promise((rest) => setTimeout(rest, 50))")
+    hands.wait("!find('gs-notices', null)?.shadowRoot.querySelector('.waiting')")
+
+
+def hash_of(hands: Hands) -> str:
+    hands.value("new Promise((rest) => setTimeout(rest, 350))")
+    return hands.value("location.hash")
+
+
+# --- look ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_opens_and_tells_the_3d_view_what_to_show(hands, server):
+    assert hands.value("document.title") == "Plant 4, ground floor · gsmap"
+    assert told(hands, "show") == [14, 0]
+    assert told(hands, "setVisible") == [list(range(12))]
+    assert told(hands, "setOverlay") is not None
+    assert told(hands, "fit") is not None
+    look = hands.text("gs-look")
+    assert "12 scenes" in look
+    assert "35 × 2 × 2 m" in look.replace("\u00a0", " ")
+    assert "revision 3" in look
+
+
+def test_scenes_are_found_by_name_date_and_tag_and_shown_hidden_alone(hands):
+    hands.click("#filter")
+    hands.type("kitchen")
+    hands.says("2 of 12", "gs-scene-list")
+    hands.value("find('#filter', null).select()")
+    hands.type("#north 2025")
+    hands.says("2 of 12", "gs-scene-list")
+    hands.value("find('#filter', null).select()")
+    hands.type("nothing like it")
+    hands.says("No scene fits", "gs-scene-list")
+    hands.value("find('#filter', null).select()")
+    hands.type("2024-0")
+    hands.click("input[type=checkbox]", "Show stairs 2024-02")
+    assert 1 not in told(hands, "setVisible")[0]
+    hands.click("button", "Only kitchen 2024-03")
+    assert told(hands, "setVisible") == [[2]]
+    hands.says("1 shown", "gs-scene-list")
+    hands.click("button", "Show all")
+    assert told(hands, "setVisible") == [list(range(12))]
+    hands.click("button.choose", "workshop 2024-04")
+    hands.says("Uncertainty of its middle", "gs-scene")
+    assert told(hands, "fit")[0] == [[8, -1, 0], [10, 1, 2]]
+
+
+def test_an_island_is_chosen_and_keeps_nothing_of_the_other(hands):
+    hands.click("button", "Only hall 2024-01")
+    hands.value("(() => { const e = find('select', null); e.value = '1'; e.dispatchEvent(new Event('change')); })()")
+    assert told(hands, "show") == [14, 1]
+    assert told(hands, "setVisible") == [[12, 13]]
+    hands.says("0.50 m", "gs-look")  # a unit of half a metre
+    assert hands.value("find('gs-look', null).shadowRoot.textContent.includes('Merged')") is False
+
+
+def test_split_view_has_a_divider_by_mouse_and_by_keys_and_halves_of_their_own(hands):
+    hands.press("v")
+    assert told(hands, "setSplit") == [{"at": 0.5, "source": "merged", "scenes": list(range(12))}]
+    x, y = hands.middle(".line")
+    hands.drag(x, y, x + 180, y)
+    assert told(hands, "setSplit")[0]["at"] > 0.6
+    hands.value("find('.line', null).focus()")
+    hands.press("Home")
+    assert told(hands, "setSplit")[0]["at"] == 0.05
+    hands.press("ArrowRight")
+    assert told(hands, "setSplit")[0]["at"] == pytest.approx(0.07)
+    hands.click("button", "Scenes")
+    hands.click("button", "Only hall 2024-01")
+    assert told(hands, "setSplit")[0]["scenes"] == [0]
+    assert told(hands, "setVisible") == [list(range(12))], "the left half is not touched"
+    hands.click("button", "Swap the halves")
+    assert told(hands, "setVisible") == [[0]]
+    hands.press("v")
+    assert told(hands, "setSplit") == [None]
+
+
+def test_clip_box_by_numbers_and_by_its_handles(hands):
+    hands.press("x")
+    box = told(hands, "setClip")[0]
+    np.testing.assert_allclose(box, [[4.25, -0.7, 0.3], [28.75, 0.7, 1.7]])
+    hands.value(
+        "(() => { const e = find('input[type=number]', 'highest z'); e.value = '1'; e.dispatchEvent(new Event('change')); })()"
+    )
+    assert told(hands, "setClip")[0][1][2] == 1
+    hands.value(
+        "(() => { const e = find('input[type=number]', 'lowest z'); e.value = '9'; e.dispatchEvent(new Event('change')); })()"
+    )
+    assert told(hands, "setClip")[0][0][2] < 1, "faces do not cross"
+    before = hands.value("fake.calls.length")
+    hands.value("fake.clipTo([[0, 0, 0], [5, 0.5, 1]])")
+    hands.wait("find('input[type=number]', 'highest x').value === '5.00'")
+    calls = hands.value(f"fake.calls.slice({before}).map((call) => call[0])")
+    assert "setClip" not in calls, "the 3D view is not told what it said itself"
+    assert "clip=0,0,0,5,0.5,1" in hash_of(hands)
+    hands.click("button", "Remove")
+    assert told(hands, "setClip") == [None]
+
+
+def test_ceiling_overlays_and_colours(hands):
+    hands.press("h")
+    assert told(hands, "setCeiling") == [False]
+    hands.click("label", "Uncertainty")
+    assert told(hands, "setOverlay") == ["ellipsoids", True]
+    for expected in ("light", "dark", "system"):
+        hands.click("button", "Colours")
+        assert hands.value("document.documentElement.dataset.theme") == expected
+    hands.colours("dark")
+    assert told(hands, "setTheme") == [True]
+    dark = hands.page.picture()[-5:, :100].mean()
+    hands.colours("light")
+    assert told(hands, "setTheme") == [False]
+    assert hands.page.picture()[-5:, :100].mean() > dark + 0.5
+
+
+# --- review ----------------------------------------------------------------------------------------------------------
+
+
+def review(hands: Hands) -> None:
+    hands.press("2", "j")
+    hands.wait("findAll('gs-compare').length")
+
+
+def test_edges_are_listed_by_doubt_and_filtered(hands):
+    hands.press("2")
+    rows = "findAll('[role=row]').map((row) => row.textContent.replace(/\\s+/g, ' ').trim())"
+    listed = hands.value(rows)
+    assert len(listed) == 5
+    assert "undecided" in listed[0]
+    assert "rejected" in listed[-1]
+    for name, count in (("Tentative", 2), ("Undecided", 2), ("Rejected", 2), ("Reviewed", 0), ("All", 11)):
+        hands.click("button", name)
+        hands.wait(f"findAll('[role=row]').length === {count}")
+    hands.click("#filter")
+    hands.type("cellar")
+    hands.wait("findAll('[role=row]').length === 2")
+
+
+def test_one_click_shows_both_captures_and_the_evidence(hands, server):
+    hands.press("2")
+    hands.click("button.choose", "stairs 2024-02")
+    hands.wait("findAll('img').length === 2 && findAll('img').every((e) => e.complete && e.naturalWidth)")
+    said = hands.text("gs-edge")
+    for word in ("no cycle confirms it", "camera 1 of 3", "at least 0.35", "would settle", "2 Mar 2025, 10:00"):
+        assert word in said
+    assert told(hands, "setCorrespondences") == [84]
+    assert told(hands, "fit")[0] == [[2, -1, 0], [7, 1, 2]]
+    shown = "findAll('img').map((e) => getComputedStyle(e).visibility)"
+    first = hands.value(shown)
+    assert sorted(first) == ["hidden", "visible"]
+    hands.wait(f"JSON.stringify({shown}) !== {json.dumps(json.dumps(first, separators=(',', ':')))}", 3)  # it blinks
+    hands.press("b")
+    hands.wait("find('input[type=range]', 'first picture')")
+    hands.press("b")
+    hands.wait("findAll('.pictures.beside img').length === 2")
+    hands.press("b")
+    hands.wait("findAll('img').length === 1 && find('img', null).src.includes('difference')")
+    hands.press(".")
+    hands.wait("find('img', null).src.includes('/31-difference')")
+    hands.click("button", "Enlarge")
+    hands.wait("findAll('dialog[open]').length === 1 && find('img', null).getBoundingClientRect().height > 500")
+    hands.press("Escape")
+    hands.click("label", "84 correspondences")
+    assert told(hands, "setCorrespondences") == [None]
+    hands.click("button", "Beside each other")
+    assert told(hands, "setSplit")[0]["scenes"] == [2]
+    assert told(hands, "setVisible") == [[1]]
+
+
+def test_confirm_reject_withdraw_with_notes_and_undo_of_each(hands, server):
+    review(hands)
+    pair = "000000000003:000000000004"
+    hands.click("#confirm")
+    hands.says("Confirmed: workshop 2024-04 : office east 2024-05")
+    assert server.log == [("confirm", {"what": pair, "note": ""})]
+    hands.says("confirmed by hand", "gs-review")
+    hands.says("The poses are older", "gs-review")
+    hands.press("n")
+    hands.type("same door, see photo 12")
+    hands.press("Escape")
+    hands.press("r")
+    hands.says("Rejected: workshop")
+    assert server.log[-1] == ("reject", {"what": pair, "note": "same door, see photo 12"})
+    assert hands.value("find('textarea', null).value") == ""
+    hands.says("same door, see photo 12", "gs-edge")  # among its events
+    hands.click("button", "Undo")
+    hands.says("Undone: workshop")
+    assert server.log[-1] == ("confirm", {"what": pair, "note": ""}), "what it was before"
+    hands.press("u")
+    idle(hands)
+    assert server.log[-1] == ("withdraw", {"what": pair, "note": ""})
+    hands.press("u")
+    hands.says("Nothing to undo")
+    assert len(server.log) == 4
+    hands.press("c")
+    hands.wait("find('#withdraw:not(:disabled)', null)")
+    hands.press("t")
+    hands.says("Review withdrawn")
+    assert [name for name, _ in server.log[4:]] == ["confirm", "withdraw"]
+
+
+def test_undo_puts_the_note_back_that_a_review_replaced(hands, server):
+    server.map["edges"][3].update(review="reject", note="an old reason")
+    server.map["state"] = "other"
+    hands.press("2")
+    hands.click("button", "All")
+    hands.click("button.choose", "workshop 2024-04")
+    hands.wait("find('textarea', null)?.placeholder.includes('an old reason')", 10)  # the page looks for news by itself
+    hands.press("c")
+    hands.says("Confirmed")
+    hands.press("u")
+    hands.says("Undone")
+    assert server.log[-1] == ("reject", {"what": "000000000003:000000000004", "note": "an old reason"})
+
+
+def test_next_and_previous_keep_the_place_in_the_list_when_a_review_changes_it(hands, server):
+    review(hands)
+    names = []
+    for _ in range(3):
+        hands.press("c")
+        hands.wait(f"{len(names)} < 99 && find('#withdraw:not(:disabled)', null)")
+        names.append(hands.value("find('gs-edge', null).shadowRoot.querySelector('h2').textContent"))
+        hands.press("j")
+        hands.wait("find('#withdraw:disabled', null)")
+    assert len(set(names)) == 3
+    assert len({body["what"] for _, body in server.log}) == 3
+
+
+def test_an_action_that_is_refused_says_why_and_loses_nothing(hands, server):
+    hands.expected = ["actions/confirm"]
+    review(hands)
+    server.refuse = "workshop 2024-04 was removed by someone else <b>meanwhile</b>"
+    hands.press("n")
+    hands.type("a note")
+    hands.press("Escape", "c")
+    hands.says("was removed by someone else <b>meanwhile</b>")
+    assert hands.value("find('textarea', null).value") == "a note"
+    assert hands.value("find('#confirm', null).disabled") is False
+    hands.press("u")
+    hands.says("Nothing to undo")
+
+
+def test_optimize_after_reviews_makes_a_revision(hands, server):
+    review(hands)
+    hands.press("c")
+    hands.says("The poses are older", "gs-review")
+    server.delay_s = 0.5
+    hands.click("button", "Optimize now")
+    hands.says("all poses are solved for anew")
+    hands.press("r")
+    hands.says("One thing at a time")
+    hands.says("Optimized")
+    assert [name for name, _ in server.log] == ["confirm", "optimize"]
+    hands.press("1")
+    hands.says("revision 4", "gs-look")
+
+
+def test_a_scene_is_dragged_and_becomes_a_prior(hands, server):
+    hands.click("button.choose", "stairs 2024-02")
+    hands.click("button", "Move by hand")
+    assert told(hands, "drag") == [1]
+    turned = [[0, -1, 0, 3.0], [1, 0, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1]]
+    hands.value(f"fake.dragTo({turned})")
+    hands.says("Moved by 0.50 m and 90.0°", "gs-scene")
+    hands.value("find('input[name=sigma_m]', null).select()")
+    hands.type("0.25")
+    hands.click("button", "Save as prior")
+    hands.says("pose, 0.25 m, 3", "gs-scene")
+    said = {"scene": "000000000001", "S_map_scene": turned, "sigma_m": 0.25, "sigma_deg": 3}
+    assert server.log == [("prior", said)]
+    assert told(hands, "drag") == [None]
+    hands.press("u")
+    hands.says("Undone: prior of stairs 2024-02")
+    assert server.log[-1] == ("remove_prior", {"scene": "000000000001"})
+    hands.click("button.choose", "office east 2024-05")
+    hands.click("button", "Remove the prior")
+    hands.says("Removed")
+    assert server.map["scenes"][4]["prior"] is None
+    hands.click("button", "Move by hand")
+    hands.press("Escape")
+    assert told(hands, "drag") == [None]
+
+
+# --- time ------------------------------------------------------------------------------------------------------------
+
+
+def test_time_slider_over_dates_and_revisions(hands):
+    hands.press("3")
+    hands.value("find('#until', null).focus()")
+    hands.press("Home")
+    hands.says("Until 11 Jan 2024", "gs-time")
+    assert told(hands, "setVisible") == [[0, 3]]  # one has no date
+    hands.press("ArrowRight")
+    assert told(hands, "setVisible") == [[0, 1, 3]]
+    assert "until=2024-02-11" in hash_of(hands)
+    assert told(hands, "setChanges") == [["c1", "c3"]]
+    hands.press("End")
+    hands.says("All dates", "gs-time")
+    hands.value("find('#revision', null).focus()")
+    hands.press("Home")
+    hands.says("Revision 1", "gs-time")
+    hands.wait("fake.calls.some((call) => call[0] === 'setPoses' && call[1] === 1)")
+    assert told(hands, "setVisible") == [list(range(8))], "scenes that it had placed"
+    hands.press("End")
+    hands.says("the newest", "gs-time")
+    assert told(hands, "setPoses") == [None]
+
+
+def test_changes_are_listed_by_kind_and_reviewed(hands, server):
+    hands.press("3")
+    assert told(hands, "setChanges") == [["c6", "c5", "c4", "c2", "c1", "c3"]]
+    hands.click("button.choose", "replaced")
+    hands.wait("find('img', null)?.naturalWidth === 960")
+    assert told(hands, "fit")[0] == pytest.approx(np.array([[11.4, -0.5, -0.8], [13.2, 1, 1.6]]))
+    hands.press("c")
+    hands.says("confirmed", "gs-change")
+    hands.press("j", "r")
+    hands.says("Rejected: change c4")
+    assert server.log == [("confirm", {"what": "c5", "note": ""}), ("reject", {"what": "c4", "note": ""})]
+    hands.click("button", "Confirmed")
+    hands.press("u")
+    hands.says("Undone: change c4")
+    assert server.log[-1] == ("withdraw", {"what": "c4", "note": ""})
+
+
+def test_a_picked_place_tells_its_history_and_picked_things_are_chosen(hands):
+    hands.value("fake.pick({point: [3.2, 0.1, 0.9], scene: 1, thing: null})")
+    hands.says("3.20, 0.10, 0.90 m", "gs-place")
+    hands.click("button", "What happened here")
+    hands.says("a chair appeared", "gs-place")
+    hands.click("button", "stairs 2024-02")
+    hands.says("Uncertainty of its middle", "gs-scene")
+    for kind, index, word in (("edge", 1, "stairs 2024-02"), ("photo", 2, "IMG_0002.jpg"), ("object", 1, "red cabinet")):
+        if kind == "object":
+            hands.press("Escape", "Escape", "4")
+            hands.says("red cabinet", "gs-things")
+        hands.value(f"fake.pick({{point: [0, 0, 0], scene: null, thing: {{kind: '{kind}', index: {index}}}}})")
+        hands.wait(f"find('aside.detail', null) && textOf(find('aside.detail', null)).includes({json.dumps(word)})")
+    hands.press("Escape")
+    assert hands.value("findAll('gs-place .card').length") == 0
+
+
+def test_objects_and_photos(hands):
+    hands.press("4")
+    hands.says("forklift", "gs-things")
+    hands.click("#filter")
+    hands.type("red")
+    hands.wait("findAll('[role=row]').length === 1")
+    hands.click("button.choose", "red cabinet")
+    hands.says("chair stands beside red cabinet", "gs-thing")
+    assert told(hands, "setObjects") is not None
+    hands.value("(() => { const e = find('#filter', null); e.value = ''; e.dispatchEvent(new Event('input')); })()")
+    hands.click("button", "Photos")
+    hands.click("button.choose", "IMG_0001.jpg")
+    at = told(hands, "stand")
+    assert at[0]["position"] == [2, -4, 1.6]
+    assert at[0]["target"] == [2, -2, 1.6]
+    assert told(hands, "setOverlay") == ["photos", True]
+
+
+# --- the address -----------------------------------------------------------------------------------------------------
+
+
+def test_the_whole_view_is_in_the_address_and_comes_back(hands, server):
+    hands.click("button", "Only hall 2024-01")
+    hands.press("v", "x", "h", "3")
+    hands.click("button.choose", "replaced")
+    hands.value("find('#until', null).focus()")
+    hands.press("ArrowLeft")
+    hands.value("find('#revision', null).focus()")
+    hands.press("ArrowLeft")
+    hands.value("fake.move({position: [1.5, 2, 3], target: [4, 5, 6.25]})")
+    address = hash_of(hands)
+    for part in ("tab=time", "change=c5", "revision=2", "at=1.5,2,3", "to=4,5,6.25", "split=0.500", "ceiling=0", "until="):
+        assert part in address, (part, address)
+    before = {name: told(hands, name) for name in ("setVisible", "setSplit", "setClip", "setCeiling", "setPoses")}
+    hands.go("about:blank")
+    hands.go(server.url + address)
+    hands.wait("globalThis.fake && find('gs-change', null)")
+    hands.wait("fake.calls.some((call) => call[0] === 'setPoses' && call[1] === 2)")
+    again = {name: told(hands, name) for name in before}
+    np.testing.assert_allclose(again.pop("setClip"), before.pop("setClip"), atol=1e-6)
+    assert again == before
+    assert told(hands, "stand")[0] == {"position": [1.5, 2, 3], "target": [4, 5, 6.25]}
+    assert hash_of(hands) == address
+
+
+def test_back_and_forward_go_through_what_was_chosen(hands):
+    hands.press("2", "j")
+    first = hash_of(hands)
+    hands.press("j")
+    second = hash_of(hands)
+    assert first != second
+    hands.value("history.back()")
+    hands.wait(f"location.hash === {json.dumps(first)}")
+    hands.says("workshop 2024-04 : office east", "gs-edge")
+    hands.value("history.forward()")
+    hands.wait(f"location.hash === {json.dumps(second)}")
+    hands.says("kitchen 2025-11", "gs-edge")
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "#island=99&tab=nothing&edge=a:b&revision=77&until=<script>&split=7&clip=1,2&at=1,2,NaN&to=1,2,3&overlays=x,y",
+        "#clip=5,5,5,1,1,1&show=none&hide=" + "a," * 3000 + "&object=javascript:alert(1)&photo=../../etc/passwd&view=-1",
+        "#%E0%A4%A&=&&&island=1e3",
+    ],
+)
+def test_an_address_that_is_wrong_shows_the_map_all_the_same(hands, server, address):
+    hands.go("about:blank")
+    hands.go(server.url + address)
+    hands.wait("globalThis.fake && find('gs-scene-list', null)")
+    assert told(hands, "show") == [14, 0]
+    assert told(hands, "setClip") == [None]
+    assert told(hands, "setPoses") == [None]
+
+
+def test_a_link_is_copied(hands):
+    hands.page._call("Browser.grantPermissions", {"permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]}, None)
+    hands.press("2", "j")
+    address = hash_of(hands)
+    hands.press("l")
+    hands.says("Link copied")
+    assert hands.value("navigator.clipboard.readText()").endswith(address)
+
+
+# --- every hand, every screen ----------------------------------------------------------------------------------------
+
+
+def test_by_keyboard_alone_from_the_start_to_a_review(hands, server):
+    focused = "(focused().ariaLabel || focused().textContent || focused().id).replace(/\\s+/g, ' ').trim()"
+    seen, in_lists = [], 0
+    for _ in range(40):
+        hands.press("Tab")
+        if hands.value("focused() === document.body"):
+            break  # the end of the page
+        seen.append(hands.value(focused))
+        in_lists += hands.value("focused().closest('[role=grid]') !== null")
+        outline = hands.value("getComputedStyle(focused()).outlineStyle")
+        assert outline != "none", f"{seen[-1]} does not show that it has the focus"
+    assert "Fold the panel" in seen[0]
+    assert any("Look" in one for one in seen)
+    assert in_lists == 1, "a list is one stop of the Tab key"
+    # The list of scenes: arrows walk over rows and over what a row offers.
+    hands.value("find('[role=grid] [tabindex=\"0\"]', null).focus()")
+    hands.press("ArrowDown", "ArrowDown", "ArrowRight", "ArrowRight")
+    assert "Only kitchen 2024-03" in hands.value(focused)
+    hands.press("Enter")
+    assert told(hands, "setVisible") == [[2]]
+    hands.press("End")
+    assert "Only workshop 2025-12" in hands.value(focused)
+    hands.press("ArrowLeft", "Enter")
+    hands.says("workshop 2025-12", "gs-scene")
+    hands.press("Escape")
+    # Tabs by arrows, an edge by j, the comparison by b, a word on it by c.
+    hands.value("find('[role=tab][tabindex=\"0\"]', null).focus()")
+    hands.press("ArrowRight")
+    assert hands.value("find('[role=tab][aria-selected=true]', null).textContent").strip().startswith("Review")
+    hands.press("j", "j", "k", "b", "c")
+    hands.says("Confirmed: workshop")
+    hands.press("?")
+    hands.wait("findAll('dialog[open]').length === 1")
+    assert "Take the review back" in hands.text("gs-help")
+    hands.press("r")  # not while the help is open
+    hands.press("Escape")
+    hands.wait("findAll('dialog[open]').length === 0")
+    assert len(server.log) == 1
+    hands.press("/")
+    hands.type("r")  # a letter in a field is a letter
+    assert hands.value("focused().value") == "r"
+    assert len(server.log) == 1
+
+
+def test_on_a_phone_the_panel_takes_a_third_at_most_and_folds(hands):
+    hands.resize(*PHONE, mobile=True)
+    tall = "find('aside', null).getBoundingClientRect().height"
+    for key in ("1", "2", "3", "4"):
+        hands.press(key)
+        assert hands.value(tall) <= PHONE[1] / 3 + 1, key
+        assert hands.value("document.documentElement.scrollWidth") == PHONE[0]
+        small = hands.value(
+            "findAll('button, select, input:not([type=checkbox]):not([type=range])').filter(isShown)"
+            ".map((e) => [e.textContent.trim() || e.ariaLabel, Math.round(e.getBoundingClientRect().height)])"
+            ".filter(([, h]) => h < 36)"
+        )
+        assert small == [], "too small for a finger"
+    hands.press("2", "j")
+    hands.wait("findAll('gs-compare img, img').length")
+    assert hands.value("find('aside.detail', null).getBoundingClientRect().height") <= PHONE[1] / 3 + 1
+    picture = hands.value("find('.pictures', null).getBoundingClientRect().toJSON()")
+    assert picture["bottom"] <= PHONE[1] * 2 / 3 + 1, "pictures stand above the sheet"
+    hands.click("#confirm")
+    hands.says("Confirmed")
+    hands.press("Escape", "p")
+    hands.wait("find('aside', null).getBoundingClientRect().height < 60")
+    hands.click("button", "Open the panel")
+    hands.wait("find('aside', null).getBoundingClientRect().height > 200")
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (900, 700), PHONE])
+def test_no_text_is_clipped(hands, size):
+    """Whatever hides what does not fit has room for all of it; lists and fields scroll."""
+    hands.resize(*size)
+    clipped = """findAll('*').filter((e) => {
+      if (!isShown(e) || e.closest('svg') || e.matches('textarea, select, .visually-hidden, main, dialog')) return false;
+      const style = getComputedStyle(e);
+      const clips = style.overflowX !== 'visible' && style.overflowX !== 'auto';
+      return e.scrollWidth > e.clientWidth + 1 && (clips || style.display === 'inline-flex' || e.matches('button'));
+    }).map((e) => [e.tagName, e.className, e.textContent.trim().slice(0, 60), e.scrollWidth, e.clientWidth])"""
+    for keys in (("1",), ("v", "x"), ("j",), ("Escape", "2"), ("j",), ("Escape", "3"), ("j",), ("Escape", "4"), ("?",)):
+        hands.press(*keys)
+        time.sleep(0.15)
+        assert hands.value(clipped) == [], keys
+        assert hands.value("document.documentElement.scrollWidth") <= size[0], keys
+
+
+def test_controls_have_names_and_roles(hands):
+    nameless = """findAll('button, input, select, textarea, [role=slider], img, dialog').filter((e) =>
+      !(e.ariaLabel || e.textContent.trim() || e.alt || e.closest('label') || e.getAttribute('aria-labelledby')))
+      .map((e) => e.outerHTML.slice(0, 120))"""
+    for keys in (("v", "x"), ("j",), ("2", "j"), ("3", "j"), ("4",), ("?",)):
+        hands.press(*keys)
+        time.sleep(0.15)
+        assert hands.value(nameless) == [], keys
+
+
+# --- a map of others, a server that is away --------------------------------------------------------------------------
+
+
+def test_five_hundred_scenes_are_a_list_of_what_is_in_sight(built, tmp_path):
+    made = MadeServer(built, made_map(scenes=500, second_island=0))
+    try:
+        with Page(made.url, tmp_path, 1280, 800) as page:
+            hands = Hands(page)
+            hands.wait("globalThis.fake && find('gs-scene-list', null)")
+            assert hands.value("findAll('[role=row]').length") < 40
+            assert hands.value("find('[role=grid]', null).getAttribute('aria-rowcount')") == "500"
+            hands.value("find('[role=grid] [tabindex=\"0\"]', null).focus()")
+            hands.press("End")
+            hands.says("workshop 2086-08", "gs-look")
+            started = time.monotonic()
+            for _ in range(10):
+                hands.press("ArrowUp")
+            assert time.monotonic() - started < 3
+            hands.value("find('gs-listing', null).scrollTop = 9000")
+            hands.value("new Promise((rest) => setTimeout(rest, 100))")
+            assert hands.value("findAll('[role=row]').length") < 40
+            hands.click("#filter")
+            hands.type("cellar 2050")
+            hands.wait("findAll('[role=row]').length === 1")
+            assert page.failures() == []
+    finally:
+        made.gone()
+
+
+def test_names_notes_and_addresses_of_a_map_are_not_trusted(built, tmp_path):
+    summary = made_map(hostile=True)
+    summary["changes"][0]["pictures"] = "https://evil.example/x.jpg"
+    summary["changes"][1]["pictures"] = "../../secret.jpg"
+    summary["edges"][2]["detail"] = "//evil.example/edges.json"
+    summary["scenes"][1]["tags"] = ["<svg onload=window.hacked=1>"]
+    made = MadeServer(built, summary)
+    try:
+        with Page(made.url, tmp_path, 1280, 800) as page:
+            hands = Hands(page)
+            hands.wait("globalThis.fake && find('gs-scene-list', null)")
+            assert hands.value("document.title") == "<b>made</b> · gsmap"
+            hands.press("j")
+            hands.says("<img src=x onerror", "gs-scene")
+            hands.press("j")
+            hands.says("#<svg onload", "gs-scene")
+            hands.press("2")
+            hands.click("button", "All")
+            for _ in range(4):
+                hands.press("j")
+                hands.value("new Promise((rest) => setTimeout(rest, 100))")
+            hands.value("find('[role=tab]', 'Time').click()")
+            hands.click("button.choose", "appeared")
+            hands.says("There is no picture", "gs-change")
+            hands.click("button.choose", "disappeared")
+            hands.says("There is no picture", "gs-change")
+            hands.press("2")
+            hands.click("button.choose", "kitchen 2024-03")
+            hands.value("new Promise((rest) => setTimeout(rest, 100))")
+            assert hands.value("globalThis.hacked ?? null") is None
+            assert hands.value("findAll('[onerror], [onload], script:not([src])').length") == 0
+            loaded = hands.value("performance.getEntriesByType('resource').map((e) => e.name)")
+            assert all(name.startswith(made.url) for name in loaded)
+            assert hands.value("document.documentElement.scrollWidth") <= 1280
+            assert page.failures() == []
+    finally:
+        made.gone()
+
+
+def test_a_static_page_hides_what_needs_a_server_and_says_so(built, tmp_path):
+    summary = made_map()
+    summary.update(actions=False, history=None)
+    made = MadeServer(built, summary)
+    try:
+        with Page(made.url, tmp_path, 1280, 800) as page:
+            hands = Hands(page)
+            hands.wait("globalThis.fake && find('gs-scene-list', null)")
+            hands.press("2", "j")
+            hands.says("This page only shows the map", "gs-review")
+            hands.wait("findAll('gs-compare').length")
+            assert hands.value("findAll('#confirm, #reject, textarea').length") == 0
+            hands.press("c", "u", "o")
+            hands.press("1", "j")
+            assert hands.value("find('button', 'Move by hand') ?? null") is None
+            hands.value("fake.pick({point: [3, 0, 1], scene: 1, thing: null})")
+            hands.says("3.00, 0.00, 1.00 m", "gs-place")
+            assert hands.value("find('button', 'What happened') ?? null") is None
+            hands.value("new Promise((rest) => setTimeout(rest, 4500))")
+            asked = hands.value("performance.getEntriesByType('resource').map((e) => e.name)")
+            assert not any("state.json" in name for name in asked)
+            assert made.log == []
+            assert page.failures() == []
+    finally:
+        made.gone()
+
+
+def test_nothing_is_lost_while_the_server_is_away(hands, server):
+    hands.expected = ["ERR_CONNECTION", "Failed to load"]
+    review(hands)
+    hands.press("n")
+    hands.type("kept")
+    hands.press("Escape")
+    server.gone()
+    hands.press("c")
+    hands.says("gsmap view does not answer")
+    hands.says("Not saved yet")
+    assert hands.value("find('textarea', null).value") == "kept"
+    hands.press("j")
+    hands.says("kitchen 2025-11", "gs-edge")  # one can go on looking
+    hands.click("button", "Try again")
+    hands.says("Still no answer")
+    assert server.log == []
+    server.back()
+    hands.click("button", "Try again")
+    hands.says("Confirmed: workshop")
+    assert server.log == [("confirm", {"what": "000000000003:000000000004", "note": "kept"})]
+    hands.wait("!textOf(document.body).includes('does not answer')")
+    hands.press("u")
+    hands.says("Undone")
+
+
+def test_what_others_changed_is_seen_without_reloading(hands, server):
+    review(hands)
+    server.map["scenes"].insert(0, {**server.map["scenes"][0], "id": "ffffffffffff", "name": "a new scene"})
+    for edge in server.map["edges"]:
+        edge["target"] += 1
+        edge["source"] += 1
+    server.map["state"] = "s77"
+    hands.says("workshop 2024-04 : office east 2024-05", "gs-edge")
+    hands.press("1")
+    hands.says("a new scene", "gs-look")
+    hands.says("workshop 2024-04", "gs-edge")  # the same pair, though its numbers are others
+    assert told(hands, "show") == [15, 0]
+
+
+def test_a_map_that_cannot_be_loaded_says_what_to_do(built, tmp_path):
+    made = MadeServer(built, made_map())
+    made.map = {"schema": 7}
+    try:
+        with Page(made.url, tmp_path, 800, 600) as page:
+            hands = Hands(page)
+            hands.says("The map could not be loaded")
+            hands.says("schema 7")
+            made.map = made_map()
+            hands.click("button", "Try again")
+            hands.wait("globalThis.fake && find('gs-scene-list', null)")
+            assert page.failures() == []
+    finally:
+        made.gone()
+
+
+def test_an_empty_map_says_how_it_is_filled(built, tmp_path):
+    summary = made_map()
+    for part in ("scenes", "edges", "components", "changes", "photos", "revisions"):
+        summary[part] = []
+    summary["revision"] = None
+    made = MadeServer(built, summary)
+    try:
+        with Page(made.url, tmp_path, 800, 600) as page:
+            hands = Hands(page)
+            hands.says("This map has no scenes yet")
+            hands.press("2", "3", "4", "1")
+            assert page.failures() == []
+    finally:
+        made.gone()
+
+
+def test_one_failing_answer_leaves_the_rest(hands, server):
+    hands.expected = ["404", "edges/"]
+    server.map["edges"][3]["detail"] = "edges/gone.json"
+    server.map["state"] = "s1"
+    time.sleep(4.5)
+    hands.press("2", "j")
+    hands.says("is not part of this page", "gs-edge")
+    hands.press("c")
+    hands.says("Confirmed")
+    server.map["edges"][3]["detail"] = "edges/000000000003-000000000004.json"
+
+
