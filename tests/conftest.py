@@ -11,6 +11,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure() -> None:
-    """Build the native module when a source is newer, before anything imports it.
+    """Build the native module and the page of `gsmap view` when a source is newer, before anything imports them.
 
     GSMAP_TEST_INSTALLED=1 tests the package as it is installed instead: a wheel, say.
     """
@@ -36,7 +37,9 @@ def pytest_configure() -> None:
             "test, or say GSMAP_TEST_INSTALLED=1 if that is what you want"
         )
     if _native_is_old():
-        _build_native()
+        _build(_native_is_old, "build_native.sh", "the native module")
+    if _page_is_old():
+        _build(_page_is_old, "build_page.sh", "the page of gsmap view")
 
 
 def _native_is_old() -> bool:
@@ -45,14 +48,20 @@ def _native_is_old() -> bool:
     return not module.exists() or max(s.stat().st_mtime_ns for s in sources) > module.stat().st_mtime_ns
 
 
-def _build_native() -> None:
+def _page_is_old() -> bool:
+    built, page = ROOT / "gsmap" / "view" / "built" / "page.js", ROOT / "gsmap" / "view" / "page"
+    sources = [*(p for p in page.iterdir() if p.is_file()), *(p for p in (page / "src").rglob("*") if p.is_file())]
+    return not built.exists() or max(s.stat().st_mtime_ns for s in sources) > built.stat().st_mtime_ns
+
+
+def _build(is_old: Callable[[], bool], tool: str, what: str) -> None:
     (ROOT / "build").mkdir(exist_ok=True)
     with (ROOT / "build" / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # Of several test runs that start at once, one builds.
-        if not _native_is_old():
+        if not is_old():
             return
         done = subprocess.run(
-            [ROOT / "tools" / "build_native.sh"],
+            [ROOT / "tools" / tool],
             env=os.environ | {"PYTHON": sys.executable},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -60,8 +69,7 @@ def _build_native() -> None:
         )
     if done.returncode:
         raise pytest.UsageError(
-            f"{done.stdout}\nthe native module does not build (above): mend it, or run tools/setup.sh test if a tool "
-            "is missing"
+            f"{done.stdout}\n{what} does not build (above): mend it, or run tools/setup.sh test if a tool is missing"
         )
 
 

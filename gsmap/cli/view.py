@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,16 +17,24 @@ def command(
     map: MapPath,
     port: Annotated[int, typer.Option("--port", help="Port on this machine; 0 takes a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+    tiles: Annotated[
+        Path | None,
+        typer.Option("--tiles", metavar="DIR", help="3D Tiles that this map was exported to, shown beside the scenes."),
+    ] = None,
+    read_only: Annotated[
+        bool, typer.Option("--read-only", help="Nothing can be judged or changed from the page.")
+    ] = False,
     json: AsJson = False,
 ) -> None:
-    """Serve a page on this machine with the map's splats, graphs, poses and edges. Ctrl-C ends it.
+    """Serve a page on this machine that shows the map and lets you judge it: its captures at every level of detail,
+    edges with what speaks for them, changes, objects, revisions. Ctrl-C ends it.
 
     Example: `gsmap view site.gsmap`
     """
     from gsmap.types.rows import ViewReport
 
     # A signal is the way to end it, and no interruption.
-    with opened(map) as m, m.view(port=port) as server, suppress(Stopped):
+    with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, suppress(Stopped):
         if json:
             print_rows("view", ViewReport(url=server.url), json)
         else:  # with -q too: without it nobody finds the page

@@ -20,3 +20,21 @@ def box_around(points: np.ndarray) -> np.ndarray:
 def moved_box(bounds: np.ndarray, S_a_b: Sim3) -> np.ndarray:
     """(2, 3) the box of frame a around a box of frame b."""
     return box_around(S_a_b.apply(box_corners(bounds)))
+
+
+def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: float = 0.01) -> np.ndarray:
+    """(2, 3) the box that a share of the points (N, 3), N > 0, lies below and as many lie above, axis by axis: a few
+    strays do not widen it.
+
+    Args:
+        weights: (N,) how much each counts; alike by default.
+        outside: that share, of the weight.
+    """
+    weights = np.ones(len(points)) if weights is None else weights
+    out = np.empty((2, 3))
+    for axis in range(3):
+        order = np.argsort(points[:, axis], kind="stable")
+        share = np.cumsum(weights[order])
+        at = np.searchsorted(share, [outside * share[-1], (1 - outside) * share[-1]])
+        out[:, axis] = points[order[np.minimum(at, len(order) - 1)], axis]
+    return out

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-_BITS = 21  # three axes fill 63 bits
+BITS = 21
+"""Of each axis: three fill 63 bits."""
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
@@ -18,7 +19,7 @@ def morton_codes(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     """(N,) uint64 place of points (N, 3) along the Z-order curve of the smallest cube at the low corner of a box (2, 3)
     that holds them all."""
     low, high = box.astype(np.float64)
-    step = max((high - low).max(), np.finfo(np.float32).tiny) / ((1 << _BITS) - 1)
+    step = max((high - low).max(), np.finfo(np.float32).tiny) / ((1 << BITS) - 1)
     code = np.zeros(len(points), np.uint64)
     for axis in range(3):
         cell = ((points[:, axis] - low[axis]) / step).astype(np.uint64)

@@ -825,12 +825,27 @@ class Map(AbstractContextManager["Map"]):
         )
         return replace(report, images=rows)
 
-    def view(self, *, port: int = 0) -> ViewServer:
-        """``gsmap view MAP``: a page of splats, graphs, cameras and edges, served on this machine only until closed."""
-        from gsmap.map.viewing import view_of
+    def view(
+        self, *, port: int = 0, tiles: str | os.PathLike[str] | None = None, read_only: bool = False
+    ) -> ViewServer:
+        """``gsmap view MAP``: a page that shows the map and lets a person judge it, served on this machine only until
+        closed.
+
+        Args:
+            tiles: a folder that the map was exported to as 3D Tiles, shown beside the scenes.
+            read_only: nothing can be changed from the page; nor can it where the map is open for reading.
+
+        Raises:
+            ConfigError: the port is taken, the page was not built, or that folder holds no 3D Tiles of this map.
+        """
+        from gsmap.map.viewing import MapDoors, cache_folder
+        from gsmap.map.viewing_actions import actions_of
         from gsmap.view import ViewServer
 
-        return ViewServer(view_of(self.store, self._settings_to_look_by()), port=port)
+        settings = self._settings_to_look_by()
+        actions = {} if read_only or not self.store.catalog.writable else actions_of(self)
+        doors = MapDoors(self.store, settings, actions, None if tiles is None else Path(tiles))
+        return ViewServer(doors, cache_folder(), settings.view, port=port)
 
     def report(self, path: str | os.PathLike[str], *, since: str | None = None, pictures: bool = True) -> WrittenReport:
         """``gsmap report MAP OUT.html``: one page that shows the map, what is doubtful and what to do; loads nothing.

@@ -25,7 +25,7 @@ from gsmap.methods import text_digest
 from gsmap.register.view_cache import Params as ViewParams
 from gsmap.register.view_cache import ViewCache
 from gsmap.store import Store
-from gsmap.types import PlacedScene, Scene, SceneGraph, Sim3
+from gsmap.types import Cameras, PlacedScene, Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import ChangeRow
 
@@ -145,10 +145,33 @@ def picture_of_pair(store: Store, a: str, b: str, side_px: int = 320) -> np.ndar
     stored = store.registrations.get(a, b)
     if stored is None or stored.registration.S_target_source is None:
         return None
-    edge, S = stored.registration, stored.registration.S_target_source
-    assert S is not None
-    target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, S)
-    return _side_by_side(target, source, store.graphs.load(edge.target), side_px)
+    from gsmap.view.pair_picture import draw_pair
+
+    seen = pair_as_seen(store, stored.registration, _LOOKS)
+    return draw_pair(seen.target, seen.source, seen.cameras, unit_m=seen.unit_m, side_px=side_px)
+
+
+@dataclass(frozen=True, eq=False)
+class PairAsSeen:
+    """Two captures in the target's frame, cameras (one each) that see most of the other, and metres per unit."""
+
+    target: PlacedScene
+    source: PlacedScene
+    cameras: list[Cameras]
+    unit_m: float
+
+
+def pair_as_seen(store: Store, edge: Registration, looks: int) -> PairAsSeen:
+    """Both captures of an edge that has a pose, and so many cameras of each at most."""
+    assert edge.S_target_source is not None
+    target, source = _placed(store, edge.target, Sim3.identity()), _placed(store, edge.source, edge.S_target_source)
+    graph = store.graphs.load(edge.target)
+    chosen = []
+    for one, other in ((target, source), (source, target)):
+        if one.cameras is not None and len(one.cameras):
+            rows = ViewCache(one.gaussians, one.cameras, _OWN).select_views(other.gaussians.means, looks)
+            chosen += [one.cameras[[row]] for row in rows]
+    return PairAsSeen(target, source, chosen, 1.0 if graph is None else graph.unit_m)
 
 
 def picture_of_change(store: Store, settings: Settings, row: ChangeRow, side_px: int = 320) -> np.ndarray | None:
@@ -207,18 +230,6 @@ def draw_places(
                 write_whole(folder / name, partial(_save, draw_place(placed, box * metres[scene])))
     progress("pictures", 1.0, f"{len(names)} pictures")
     return [str(folder / name) for name in names]
-
-
-def _side_by_side(target: PlacedScene, source: PlacedScene, graph: SceneGraph | None, side_px: int) -> np.ndarray:
-    """The picture of two captures in one frame, from those of their cameras that see most of the other."""
-    from gsmap.view.pair_picture import draw_pair
-
-    chosen = []
-    for one, other in ((target, source), (source, target)):
-        if one.cameras is not None and len(one.cameras):
-            rows = ViewCache(one.gaussians, one.cameras, _OWN).select_views(other.gaussians.means, _LOOKS)
-            chosen += [one.cameras[[row]] for row in rows]
-    return draw_pair(target, source, chosen, unit_m=1.0 if graph is None else graph.unit_m, side_px=side_px)
 
 
 def _save(drawn: np.ndarray, path: Path) -> None:

@@ -18,6 +18,7 @@ from gsmap.durable import write_text_whole
 from gsmap.errors import ConfigError, CorruptError, NotFoundError
 from gsmap.geometry.boxes import box_corners
 from gsmap.geometry.rotations import angle_between
+from gsmap.geometry.uncertainty import middle_covariance_m2
 from gsmap.map import reports
 from gsmap.map.changes import changes_report, within
 from gsmap.map.dates import is_after, parsed
@@ -44,12 +45,12 @@ from gsmap.report import (
     StorageEntry,
     density_picture,
     make_plan,
-    middle_covariance_m2,
     owner_of,
     page,
     top_picture,
 )
-from gsmap.report.words import CHI2_999, verdict
+from gsmap.report.content import CHI2_999
+from gsmap.report.words import verdict
 from gsmap.store import Store
 from gsmap.store.registrations import StoredRegistration
 from gsmap.store.sizes import scene_sizes, sizes
@@ -313,7 +314,7 @@ class _Gatherer:
         """The most doubtful pairs."""
         sizes_ = {entry.row.id: entry.row.num_gaussians for entry in made.scenes}
         doubtful = [edge for edge in made.edges if edge.use in ("undecided", "tentative")]
-        doubtful.sort(key=lambda edge: (edge.use != "undecided", edge.probability or 0.0, edge.row.pair))
+        doubtful.sort(key=lambda edge: (-edge.doubt, edge.row.pair))
         out: list[PairPicture] = []
         left = self.params.pair_pictures
         for edge in doubtful:

@@ -21,6 +21,7 @@ from gsmap import (
     report,
     retrieve,
     thin,
+    view,
     world,
 )
 from gsmap.errors import ConfigError
@@ -85,6 +86,7 @@ class Settings:
         by_shape: how a scan without colours is compared with a scene.
         evaluate: when an edge counts as wrong.
         report: how much a report shows.
+        view: how the map is looked at.
         engine: where jobs run.
     """
 
@@ -104,6 +106,7 @@ class Settings:
     by_shape: by_shape.Params = field(default_factory=by_shape.Params)
     evaluate: judge.Params = field(default_factory=judge.Params)
     report: report.Params = field(default_factory=report.Params)
+    view: view.Params = field(default_factory=view.Params)
     engine: engine.Params = field(default_factory=engine.Params)
 
 

@@ -18,7 +18,7 @@ from gsmap.report.content import (
 )
 from gsmap.report.page import SECTIONS, owner_of, page
 from gsmap.report.params import Params
-from gsmap.report.plan import Plan, PlanEdge, Shown, make_plan, middle_covariance_m2
+from gsmap.report.plan import Plan, PlanEdge, Shown, make_plan
 from gsmap.report.top import density_picture, top_picture
 
 __all__ = [
@@ -38,7 +38,6 @@ __all__ = [
     "StorageEntry",
     "density_picture",
     "make_plan",
-    "middle_covariance_m2",
     "owner_of",
     "page",
     "top_picture",

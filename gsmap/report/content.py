@@ -15,6 +15,9 @@ from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, PoseChangeRow, R
 CHI2_DOF = 7
 """Degrees of freedom of an edge: rotation, translation, scale."""
 
+CHI2_95, CHI2_999 = 14.067, 24.322
+"""Quantiles of the chi-square distribution with 7 degrees of freedom: 95 % and 99.9 %."""
+
 
 @dataclass(frozen=True, eq=False)
 class SceneEntry:
@@ -76,6 +79,18 @@ class EdgeEntry:
         if self.row.used:
             return "used"
         return "unused" if self.row.status == "accepted" else self.row.status
+
+    @property
+    def doubt(self) -> float:
+        """How much it wants a person, 0 to 1: what nothing could decide before what no loop confirms, what is pulled
+        further than its own error explains, and what the others voted out; of these, what is less probable first. 0
+        where nobody need look, as after a review."""
+        if self.row.review is not None:
+            return 0.0
+        unlikely = 1.0 - min(1.0, max(0.0, self.probability or 0.0))
+        is_strained = self.use == "used" and (self.chi2 or 0.0) > CHI2_999
+        low = {"undecided": 0.8, "tentative": 0.6, "unused": 0.2}.get(self.use, 0.4 if is_strained else None)
+        return 0.0 if low is None else low + 0.19 * unlikely
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.report import plots
-from gsmap.report.content import EdgeEntry, Island, Moved, Report
+from gsmap.report.content import CHI2_999, EdgeEntry, Island, Moved, Report
 from gsmap.report.draw_plan import draw_plan
 from gsmap.report.markup import Markup, Part, joined, tag
 from gsmap.report.top import picture_webp
 from gsmap.report.words import (
-    CHI2_999,
     angle,
     chi_square,
     count,

@@ -7,9 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap.geometry.rotations import skew
-from gsmap.types import ScenePose
-
 _KEPT = (0.02, 0.98)  # quantiles of what a scene shows that its footprint holds: what flies about is left out
 _YAWS_DEG = np.arange(0.0, 90.0, 1.0)
 _MARGIN = 0.05  # around everything, as a share of the longer side
@@ -87,24 +84,6 @@ class Plan:
         """(N, 3) points of the map in metres along the plan's axes: right, up the page, height."""
         found: np.ndarray = np.asarray(points, np.float64).reshape(-1, 3) @ self.R_plan_map.T * self.metres_per_unit
         return found
-
-
-def middle_covariance_m2(pose: ScenePose, middle: np.ndarray, metres_per_unit: float) -> np.ndarray | None:
-    """(3, 3) covariance in square metres, axes of the component, of a point that is fixed to a scene.
-
-    To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` of a tangent on the scene side
-    (`gsmap.types.ScenePose`), so that the point moves by ``s R [-skew(m) | I | m] xi``.
-
-    Args:
-        middle: (3,) the point, scene frame and unit.
-        metres_per_unit: of the component's frame.
-    """
-    if pose.covariance is None:
-        return None
-    S = pose.S_map_scene
-    moves = S.scale * S.rotation @ np.concatenate([-skew(middle), np.eye(3), middle[:, None]], axis=1)
-    found: np.ndarray = metres_per_unit**2 * moves @ pose.covariance @ moves.T
-    return found if np.isfinite(found).all() else None
 
 
 def make_plan(

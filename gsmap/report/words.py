@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from gsmap.report.content import EdgeEntry, Report
+from gsmap.report.content import CHI2_999, EdgeEntry, Report
 from gsmap.types.metre import Metre
 
 _SHOWN = 3  # names in a sentence
@@ -223,6 +223,3 @@ def strained(edges: Sequence[EdgeEntry]) -> list[EdgeEntry]:
 
 NOT_PULLED = 1e-6
 """Chi-square below which an edge lies as it likes: no loop checks it."""
-
-CHI2_95, CHI2_999 = 14.067, 24.322
-"""Quantiles of the chi-square distribution with 7 degrees of freedom: 95 % and 99.9 %."""

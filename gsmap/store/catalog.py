@@ -53,6 +53,17 @@ class Catalog:
     def is_sqlite(self) -> bool:
         return self.engine.dialect.name == "sqlite"
 
+    def signature(self) -> str | None:
+        """Another text whenever anything may have been written, by whomever; None where that cannot be told quickly."""
+        if not self.is_sqlite:
+            return None
+        said = []
+        for name in (sqlite.FILE, f"{sqlite.FILE}-wal"):
+            with contextlib.suppress(FileNotFoundError):
+                about = (self.folder / name).stat()
+                said.append(f"{name} {about.st_ino} {about.st_size} {about.st_mtime_ns}")
+        return " ".join(said)
+
     @property
     def _depth(self) -> int:
         """Whether this thread holds the writer lock."""

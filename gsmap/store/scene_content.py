@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,6 +18,7 @@ from gsmap.store.layout import Shape
 from gsmap.store.packed import Column
 from gsmap.stream import blocks
 from gsmap.types import Cameras, Gaussians, GaussianSource, Scene, Thinning
+from gsmap.types.gaussians import CHUNK_ROWS as ROWS_AT_ONCE
 from gsmap.types.gaussians import FIELDS
 
 
@@ -105,6 +108,33 @@ class GaussianBlocks:
             raise ValueError(f"rows from {start} on were asked for out of order")
         column: np.ndarray = getattr(self._block, name)
         return column
+
+
+@dataclass(frozen=True, eq=False)
+class StoredGaussians:
+    """A scene's Gaussians where they lie, a `GaussianSource`.
+
+    Args:
+        num_gaussians, sh_degree: what its row says.
+        read: reads a range of rows.
+        column: reads a range of rows of one field.
+    """
+
+    num_gaussians: int
+    sh_degree: int
+    read: Callable[[int, int], Gaussians]
+    column: Callable[[str, int, int], np.ndarray]
+
+    def chunks(self) -> Iterator[Gaussians]:
+        for start in range(0, self.num_gaussians, ROWS_AT_ONCE):
+            yield self.read(start, min(start + ROWS_AT_ONCE, self.num_gaussians))
+
+    def columns(self, name: str) -> Iterator[np.ndarray]:
+        for start in range(0, self.num_gaussians, ROWS_AT_ONCE):
+            yield self.column(name, start, min(start + ROWS_AT_ONCE, self.num_gaussians))
+
+    def load(self) -> Gaussians:
+        return self.read(0, self.num_gaussians)
 
 
 def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:

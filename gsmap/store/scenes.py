@@ -19,7 +19,7 @@ from gsmap.store.facts import SceneFact
 from gsmap.store.groups import drop_graphs, has_group, manifest, num_bytes, publish, unless_pruned, unname
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.packed import Column
-from gsmap.store.scene_content import GaussianBlocks, camera_arrays, scene_id, scene_of, shapes_of
+from gsmap.store.scene_content import GaussianBlocks, StoredGaussians, camera_arrays, scene_id, scene_of, shapes_of
 from gsmap.store.scene_refs import alive, by_id, find, find_removed, free_name, name_taken
 from gsmap.store.schema import scenes
 from gsmap.stream import bounds as bounds_of
@@ -256,6 +256,31 @@ class Scenes:
         reach = _SIGMAS * np.exp(np.maximum(np.maximum(a, b), c))
         x, y, z = ((p >= low[k] - reach) & (p <= high[k] + reach) for k, p in enumerate(out.means.T))
         return out[x & y & z]
+
+    def source(self, ref: str) -> GaussianSource:
+        """A scene's Gaussians (Morton order), read a few chunks at a time.
+
+        Raises:
+            CorruptError, NotFoundError: as `gaussians`, now or when they are read.
+        """
+        with self._catalog.read() as connection:
+            row = find(connection, ref)
+            files = _manifest(connection, row)
+
+        def read(start: int, stop: int) -> Gaussians:
+            with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+                return self._read(row, files, [(start, stop)])
+
+        def column(name: str, start: int, stop: int) -> np.ndarray:
+            if row.thinned is not None:
+                values: np.ndarray = getattr(read(start, stop), name)
+                return values
+            with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+                shapes = shapes_of(row)
+                span = [(start, stop)]
+                return self._arrays.read(KIND, row.group_id, files, only=[name], rows=span, shapes=shapes)[name]
+
+        return StoredGaussians(row.num_gaussians, row.sh_degree, read, column)
 
     def _read(
         self, row: Row[Any], files: tuple[StoredFile, ...], ranges: Sequence[tuple[int, int]] | None

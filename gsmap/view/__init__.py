@@ -1,14 +1,15 @@
-"""A page in the browser that shows a map: splats of all placed scenes, their graphs, cameras, poses and edges.
+"""A page in the browser that shows a map, and pictures of it.
 
-Nothing here knows the store: `ViewMap` says what there is and how to load it, `ViewServer` serves it on this machine
-only::
+Nothing here knows the store: what is asked of a map stands in `gsmap.view.doors`, and `ViewServer` serves it on this
+machine only::
 
-    with ViewServer(ViewMap("site", scenes, edges)) as server:
+    with ViewServer(doors, cache) as server:
         print(server.url)
         server.serve_forever()
 """
 
-from gsmap.view.content import ViewEdge, ViewMap, ViewScene
+from gsmap.view.content import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
+from gsmap.view.params import Params
 from gsmap.view.server import ViewServer
 
-__all__ = ["ViewEdge", "ViewMap", "ViewScene", "ViewServer"]
+__all__ = ["Params", "ViewChange", "ViewEdge", "ViewMap", "ViewPhoto", "ViewRevision", "ViewScene", "ViewServer"]

@@ -1,43 +1,44 @@
-"""What the page is told: the map as JSON, the splats as bytes that a graphics card takes as they are."""
+"""What the page is told of a map, as `gsmap/view/page/src/contract.ts` has it; values, and how they become JSON.
+
+Nothing here reads anything: `gsmap.view.doors` says what is loaded when the page asks for it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from gsmap.formats.tiles3d import coarser
-from gsmap.geometry.boxes import box_corners
-from gsmap.geometry.sh import rgb_of_sh0
-from gsmap.geometry.transforms import transform_gaussians
-from gsmap.geometry.voxels import covariances
-from gsmap.types import Cameras, Gaussians, Scene, SceneGraph, ScenePose, Sim3
+from gsmap.geometry.boxes import box_around, box_corners
+from gsmap.geometry.uncertainty import middle_covariance_m2
+from gsmap.types import Scene, ScenePose, Sim3
 
-MAX_SPLATS = 1_500_000
-_MAX_NODES = 2_000
-_MAX_CAMERAS = 300
-_LEAST_OPACITY = 1 / 255
-_MAX_SPLAT_TO_SCENE = 0.5  # a Gaussian wider than that is a fog that hides everything
+SCHEMA = 1
+UNPLACED_UP = (0.0, -1.0, 0.0)
+"""Against gravity in the frame of a scene of which nothing is known: trainers' frames are right, down, front."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ViewScene:
-    """One scene: what is known of it, and how to load the rest when the page asks.
+    """One scene.
 
     Args:
+        key: names its present content, in addresses and in the cache.
         pose: None where nothing placed it; it is then a component of its own.
-        metres_per_unit: of the map's frame; cameras are drawn a decimetre long.
-        gaussians, graph, cameras: called from the server's threads; graph and cameras may give None.
+        up: (3,) against gravity in its frame; None where nobody knows.
     """
 
     scene: Scene
+    key: str
     pose: ScenePose | None
-    gaussians: Callable[[], Gaussians]
-    graph: Callable[[], SceneGraph | None] = lambda: None
-    cameras: Callable[[], Cameras | None] = lambda: None
-    metres_per_unit: float = 1.0
+    up: np.ndarray | None = None
+
+    @property
+    def S_map_scene(self) -> Sim3:
+        return self.pose.S_map_scene if self.pose is not None else Sim3.identity()
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,10 @@ class ViewEdge:
         target, source: scene ids.
         status: ``accepted``, ``rejected`` or ``no_match``, a review included.
         used: what the last optimize made of it: True, False or ``"tentative"``; None before.
+        undecided: whether nothing could tell if it is right.
+        review: a person's standing word, ``confirm`` or ``reject``, and what they noted of it.
+        probability: that it is right; None where unknown.
+        doubt: how much a person is needed, 0 to 1.
     """
 
     target: str
@@ -55,99 +60,266 @@ class ViewEdge:
     status: str
     reason: str = ""
     used: bool | str | None = None
-    num_inliers: int = 0
+    undecided: bool = False
+    review: str | None = None
+    note: str = ""
+    probability: float | None = None
     overlap: float = 0.0
+    num_inliers: int = 0
+    doubt: float = 0.0
 
 
 @dataclass(frozen=True)
-class ViewMap:
-    """A map as the page shows it.
+class ViewRevision:
+    """One answer of the optimiser; ``is_kept``: whether its poses are still there."""
+
+    id: int
+    created_at: str
+    num_scenes: int
+    num_edges_used: int
+    is_kept: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class ViewChange:
+    """What changed between two captures (scene ids).
 
     Args:
-        up: (3,) direction against gravity in the map frame.
-        max_splats: over all scenes; a scene beyond its share is shown by a coarser level, merged and not thinned.
+        box: (2, 3) map frame.
+    """
+
+    id: str
+    kind: str
+    component: int
+    box: np.ndarray
+    before: str
+    after: str
+    at: str | None
+    confidence: float
+    status: str
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPhoto:
+    """A photograph that was localised.
+
+    Args:
+        T_map_camera: (4, 4) pose.
+        intrinsics_px: (4,) fx, fy, cx, cy.
+        size_px: width and height.
+    """
+
+    file: str
+    component: int
+    T_map_camera: np.ndarray
+    intrinsics_px: np.ndarray
+    size_px: tuple[int, int]
+    captured_at: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMap:
+    """A map at one moment.
+
+    Args:
+        state: another one whenever the map has changed.
+        revision: whose poses these are; None before the first.
+        metres_per_unit: of each component of the poses.
+        merged: components of which merged tiles were given.
+        has_objects: whether anything is told of objects.
     """
 
     title: str
-    scenes: list[ViewScene]
-    edges: list[ViewEdge] = field(default_factory=list)
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    max_splats: int = MAX_SPLATS
+    scenes: Sequence[ViewScene] = ()
+    edges: Sequence[ViewEdge] = ()
+    revisions: Sequence[ViewRevision] = ()
+    changes: Sequence[ViewChange] = ()
+    photos: Sequence[ViewPhoto] = ()
+    state: str = ""
+    revision: int | None = None
+    metres_per_unit: Mapping[int, float] = field(default_factory=dict)
+    merged: frozenset[int] = frozenset()
+    has_objects: bool = False
 
-    def summary(self) -> dict[str, Any]:
-        """Everything the page lists, without splats, nodes and cameras."""
-        components = 1 + max((s.pose.component for s in self.scenes if s.pose is not None), default=-1)
-        scenes = []
-        for index, entry in enumerate(self.scenes):
-            pose = entry.pose
-            scenes.append(
-                {
-                    "name": entry.scene.name,
-                    "id": entry.scene.id,
-                    "num_gaussians": entry.scene.num_gaussians,
-                    "captured_at": entry.scene.captured_at,
-                    "component": pose.component if pose else components + index,
-                    "status": pose.status if pose else "not placed",
-                    "S_map_scene": _pose(entry).matrix().tolist(),
-                    "corners": _pose(entry).apply(box_corners(entry.scene.bounds)).tolist(),
-                }
-            )
-        at = {entry.scene.id: index for index, entry in enumerate(self.scenes)}
-        edges = [
-            {**asdict(edge), "target": at[edge.target], "source": at[edge.source]}
-            for edge in self.edges
-            if edge.target in at and edge.source in at
-        ]
-        return {"title": self.title, "up": list(self.up), "scenes": scenes, "edges": edges}
-
-    def splats(self, index: int) -> bytes:
-        """Rows of 10 little-endian float32 in the map frame: mean (3), covariance (xx xy xz yy yz zz), RGBA in 4 bytes.
-
-        Colours are of SH degree 0; what is transparent, not finite or larger than half its scene is left out.
-        """
-        entry = self.scenes[index]
-        g = entry.gaussians()
-        finite = np.isfinite(g.means).all(1) & np.isfinite(g.log_scales).all(1) & np.isfinite(g.quats).all(1)
-        largest = float(np.ptp(entry.scene.bounds, axis=0).max()) * _MAX_SPLAT_TO_SCENE
-        shown = finite & (g.opacities > _LEAST_OPACITY) & (g.scales.max(1, initial=0) < max(largest, 1e-6))
-        if not shown.any():
-            return b""
-        g = replace(g, sh=g.sh[:, :1])[shown]
-        g, _ = coarser(g, max(1000, self.max_splats // len(self.scenes)))
-        g = transform_gaussians(g, _pose(entry))
-        rows = np.empty((len(g), 10), "<f4")
-        rows[:, :3] = g.means
-        rows[:, 3:9] = covariances(g).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        rgba = np.concatenate([rgb_of_sh0(g.sh[:, 0]), g.opacities[:, None]], axis=1)
-        rows[:, 9:].view("u1")[:] = np.round(np.clip(rgba, 0, 1) * 255)
-        return rows.tobytes()
-
-    def extras(self, index: int) -> dict[str, Any]:
-        """Nodes and cameras of one scene in the map frame."""
-        entry = self.scenes[index]
-        S_map_scene = _pose(entry)
-        graph, cameras = entry.graph(), entry.cameras()
-        layers = {}
-        for name, layer in (graph.layers if graph else {}).items():
-            strongest = np.argsort(-layer.weights, kind="stable")[:_MAX_NODES]
-            layers[name] = S_map_scene.apply(layer.positions[strongest]).tolist()
-        frusta = []
-        if cameras is not None and not cameras.synthesised:
-            every = -(-len(cameras) // _MAX_CAMERAS)
-            for pose, (fx, fy, cx, cy), (width, height) in zip(
-                cameras.T_frame_camera[::every],
-                cameras.intrinsics_px[::every],
-                cameras.sizes_px[::every],
-                strict=True,
-            ):
-                rays = [
-                    [(u - cx) / fx, (v - cy) / fy, 1] for u, v in ((0, 0), (width, 0), (width, height), (0, height))
-                ]
-                long = 0.1 / (S_map_scene.scale * entry.metres_per_unit)
-                local = np.vstack([np.zeros((1, 3)), np.array(rays) * long])
-                frusta.append(S_map_scene.apply(local @ pose[:3, :3].T + pose[:3, 3]).tolist())
-        return {"layers": layers, "cameras": frusta}
+    def components(self) -> list[int]:
+        """The island of every scene; scenes that nothing placed come after the others, one each."""
+        last = 1 + max((s.pose.component for s in self.scenes if s.pose is not None), default=-1)
+        return [s.pose.component if s.pose else last + i for i, s in enumerate(self.scenes)]
 
 
-def _pose(entry: ViewScene) -> Sim3:
-    return entry.pose.S_map_scene if entry.pose is not None else Sim3.identity()
+@dataclass(frozen=True)
+class ViewOverview:
+    """The coarsest levels of an island's scenes in one file.
+
+    Args:
+        scenes: by their place in the map's list.
+        counts: Gaussians of each.
+        pending: scenes that are not in it yet.
+    """
+
+    uri: str
+    scenes: tuple[int, ...] = ()
+    counts: tuple[int, ...] = ()
+    pending: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Served:
+    """What a server, or a static page, adds to a map: what it answers to, and what it knows from looking.
+
+    Args:
+        actions: whether a person may judge here.
+        boxes: (2, 3) of what a scene shows, without floaters, scene frame, by key; the scene's bounds elsewhere.
+        overviews: by component.
+        live: whether more is computed when the page asks.
+    """
+
+    actions: bool = False
+    boxes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    overviews: Mapping[int, ViewOverview] = field(default_factory=dict)
+    live: bool = True
+
+
+def summary(view: ViewMap, served: Served) -> dict[str, Any]:
+    """``map.json``: everything the page lists."""
+    components = view.components()
+    at = {entry.scene.id: index for index, entry in enumerate(view.scenes)}
+    boxes = [served.boxes.get(entry.key, entry.scene.bounds) for entry in view.scenes]
+    corners = [entry.S_map_scene.apply(box_corners(box)) for entry, box in zip(view.scenes, boxes, strict=True)]
+    members: dict[int, list[int]] = {}
+    for index, component in enumerate(components):
+        members.setdefault(component, []).append(index)
+    edges = [edge for edge in view.edges if edge.target in at and edge.source in at]
+    edges.sort(key=lambda edge: -edge.doubt)
+    return {
+        "schema": SCHEMA,
+        "state": view.state,
+        "title": view.title,
+        "actions": served.actions,
+        "revision": view.revision,
+        "components": [
+            {
+                "component": component,
+                "num_scenes": len(members[component]),
+                "up": up_of([view.scenes[i] for i in members[component]]),
+                "metres_per_unit": view.metres_per_unit.get(component, 1.0),
+                "box": box_around(np.concatenate([corners[i] for i in members[component]])).tolist(),
+                "overview": _overview(served.overviews.get(component)),
+                "merged": f"merged/{component}/tileset.json" if component in view.merged else None,
+            }
+            for component in sorted(members)
+        ],
+        "scenes": [
+            _scene(entry, component, box, entry_corners, view.metres_per_unit.get(component, 1.0))
+            for entry, component, box, entry_corners in zip(view.scenes, components, boxes, corners, strict=True)
+        ],
+        "edges": [_edge(edge, at) for edge in edges],
+        "revisions": [
+            {
+                "id": one.id,
+                "created_at": one.created_at,
+                "num_scenes": one.num_scenes,
+                "num_edges_used": one.num_edges_used,
+                "poses": f"revisions/{one.id}.json" if one.is_kept else None,
+            }
+            for one in view.revisions
+        ],
+        "changes": [
+            {
+                "id": one.id,
+                "kind": one.kind,
+                "component": one.component,
+                "box": one.box.tolist(),
+                "before": at[one.before],
+                "after": at[one.after],
+                "at": one.at,
+                "confidence": _number(one.confidence) or 0.0,
+                "status": one.status,
+                "pictures": f"changes/{one.id}.jpg" if served.live else None,
+            }
+            for one in view.changes
+            if one.before in at and one.after in at
+        ],
+        "photos": [
+            {
+                "file": one.file,
+                "component": one.component,
+                "T_map_camera": one.T_map_camera.tolist(),
+                "intrinsics": one.intrinsics_px.tolist(),
+                "size": list(one.size_px),
+                "captured_at": one.captured_at,
+            }
+            for one in view.photos
+        ],
+        "counts": {"gaussians": sum(entry.scene.num_gaussians for entry in view.scenes)},
+        "graph": "graph.json" if view.has_objects else None,
+        "history": "history.json" if view.has_objects and served.live else None,
+    }
+
+
+def up_of(scenes: Sequence[ViewScene]) -> list[float]:
+    """Against gravity in the frame of an island, by what most of its scenes say; where none does, z of the map, or what
+    trainers use."""
+    told = [entry.S_map_scene.rotation @ entry.up for entry in scenes if entry.up is not None]
+    middle = np.median(np.array(told), axis=0) if told else np.zeros(3)
+    size = float(np.linalg.norm(middle))
+    if size > 1e-3:
+        return [float(value) for value in middle / size]
+    is_alone = len(scenes) == 1 and (scenes[0].pose is None or scenes[0].pose.status == "isolated")
+    return list(UNPLACED_UP) if is_alone else [0.0, 0.0, 1.0]
+
+
+def _scene(
+    entry: ViewScene, component: int, box: np.ndarray, corners: np.ndarray, metres_per_unit: float
+) -> dict[str, Any]:
+    pose, scene, middle = entry.pose, entry.scene, box.mean(0)
+    covariance_m2 = None if pose is None else middle_covariance_m2(pose, middle, metres_per_unit)
+    sigma_m = ellipsoid = None
+    if covariance_m2 is not None:
+        sigma_m = float(np.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance_m2)[-1]))))
+        ellipsoid = (covariance_m2 / metres_per_unit**2).tolist()
+    return {
+        "id": scene.id,
+        "name": scene.name,
+        "num_gaussians": scene.num_gaussians,
+        "num_cameras": scene.num_cameras,
+        "captured_at": scene.captured_at,
+        "component": component,
+        "status": pose.status if pose is not None else "not placed",
+        "S_map_scene": entry.S_map_scene.matrix().tolist(),
+        "box": box.tolist(),
+        "corners": corners.tolist(),
+        "sigma_m": sigma_m,
+        "ellipsoid": ellipsoid,
+        "middle": entry.S_map_scene.apply(middle[None])[0].tolist(),
+        "tileset": f"scenes/{entry.key}/tileset.json",
+        "extras": f"scenes/{scene.id}/extras.json",
+    }
+
+
+def _edge(edge: ViewEdge, at: Mapping[str, int]) -> dict[str, Any]:
+    return {
+        "target": at[edge.target],
+        "source": at[edge.source],
+        "status": edge.status,
+        "used": edge.used,
+        "undecided": edge.undecided,
+        "review": edge.review,
+        "note": edge.note,
+        "reason": edge.reason,
+        "probability": _number(edge.probability),
+        "overlap": _number(edge.overlap) or 0.0,
+        "num_inliers": edge.num_inliers,
+        "doubt": edge.doubt,
+        "detail": f"edges/{edge.target}-{edge.source}.json",
+    }
+
+
+def _overview(one: ViewOverview | None) -> dict[str, Any] | None:
+    if one is None:
+        return None
+    return {"uri": one.uri, "pending": one.pending, "scenes": list(one.scenes), "counts": list(one.counts)}
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)

@@ -34,7 +34,14 @@ def draw_pair(
     return np.concatenate([part for row in wide for part in (row, gap)][:-1])
 
 
-def _row(target: PlacedScene, source: PlacedScene, camera: Cameras, unit_m: float) -> np.ndarray:
+def looks_at(
+    target: PlacedScene, source: PlacedScene, camera: Cameras, unit_m: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The target, the source, and the target with what is not the same marked, from one camera: (H, W, 3) uint8 each.
+
+    Args:
+        target, source, unit_m: as in `draw_pair`.
+    """
     one, other = (render(scene.gaussians, camera) for scene in (target, source))
     looks = [np.clip(np.nan_to_num(seen.colour[0]), 0, 1) for seen in (one, other)]
     depth, other_depth = one.depth[0] * unit_m, other.depth[0] * unit_m
@@ -42,7 +49,11 @@ def _row(target: PlacedScene, source: PlacedScene, camera: Cameras, unit_m: floa
     apart = both & (np.abs(depth - other_depth) > _TOLERANCE_M + _TOLERANCE * np.minimum(depth, other_depth))
     grey = np.repeat(looks[0].mean(-1, keepdims=True), 3, axis=-1)
     marked = np.where(apart[..., None], 0.4 * grey + 0.6 * _MARK, grey)
-    gap = np.ones((looks[0].shape[0], _GAP_PX, 3))
-    row = np.concatenate([looks[0], gap, looks[1], gap, marked], axis=1)
-    found: np.ndarray = (row * 255 + 0.5).astype(np.uint8)
-    return found
+    seen, other_seen, difference = ((look * 255 + 0.5).astype(np.uint8) for look in (*looks, marked))
+    return seen, other_seen, difference
+
+
+def _row(target: PlacedScene, source: PlacedScene, camera: Cameras, unit_m: float) -> np.ndarray:
+    looks = looks_at(target, source, camera, unit_m)
+    gap = np.full((looks[0].shape[0], _GAP_PX, 3), 255, np.uint8)
+    return np.concatenate([looks[0], gap, looks[1], gap, looks[2]], axis=1)

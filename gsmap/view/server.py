@@ -5,63 +5,122 @@ from __future__ import annotations
 import gzip
 import hmac
 import json
+import re
 import secrets
 import threading
 import time
+from collections.abc import Mapping
 from functools import cached_property
 from http import HTTPStatus
 from http.client import LineTooLong
 from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler
-from importlib import resources
+from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import parse_qs
 
-from gsmap.errors import ConfigError, GsmapError
+from gsmap.errors import (
+    BusyError,
+    ConfigError,
+    GsmapError,
+    InputError,
+    NotFoundError,
+    ReadOnlyError,
+)
+from gsmap.view.answers import Answer, Answers
+from gsmap.view.built import built_page
 from gsmap.view.connections import LocalServer
-from gsmap.view.content import ViewMap
+from gsmap.view.doors import Doors
+from gsmap.view.levels import Levels
+from gsmap.view.params import Params
+from gsmap.view.tree_cache import TreeCache
 
-_PAGE = {
-    "/": ("index.html", "text/html; charset=utf-8"),
-    "/viewer.js": ("viewer.js", "text/javascript; charset=utf-8"),
-    "/scene.js": ("scene.js", "text/javascript; charset=utf-8"),
-    "/sort.js": ("sort.js", "text/javascript; charset=utf-8"),
-    "/style.css": ("style.css", "text/css; charset=utf-8"),
-}
 _SECURITY = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; worker-src 'self'; connect-src 'self'; "
-    "style-src 'self'; img-src data:",
+    # What three.js and Spark need and no more: Spark decodes and sorts by WebAssembly that lies in its script as data,
+    # in workers that it makes of its own text.
+    "Content-Security-Policy": "; ".join(
+        [
+            "default-src 'none'",
+            "script-src 'self' 'wasm-unsafe-eval'",
+            "worker-src 'self' blob:",
+            "connect-src 'self' data: blob:",
+            "style-src 'self' 'unsafe-inline'",
+            "img-src 'self' data: blob:",
+            "base-uri 'none'",
+            "form-action 'none'",
+            "frame-ancestors 'none'",
+        ]
+    ),
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
+    # What was purged from a map must not stay in a browser's files.
     "Cache-Control": "no-store",
 }
 _MAX_HEADER_BYTES = 16 << 10
+_MAX_BODY_BYTES = 64 << 10
+_WORTH_BYTES = 1000  # less is not worth compressing
+_ACTION = re.compile(r"/actions/([a-z_]{1,40})")
+_FILE = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})+")
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+_KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".txt": "text/plain; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".wasm": "application/wasm",
+}
+_STATUS: Mapping[type[GsmapError], int] = {
+    NotFoundError: HTTPStatus.NOT_FOUND,
+    BusyError: HTTPStatus.CONFLICT,
+    ReadOnlyError: HTTPStatus.FORBIDDEN,
+    InputError: HTTPStatus.BAD_REQUEST,
+    ConfigError: HTTPStatus.BAD_REQUEST,
+}
 _SEND_S = 30.0  # for a browser to take one part of an answer
 _PART_BYTES = 1 << 20
 
 
 class ViewServer:
-    """Serves a `ViewMap` on 127.0.0.1 until it is closed; a context manager.
+    """Serves a map on 127.0.0.1 until it is closed; a context manager.
 
     Only who knows the token in `url`, new with every server, is answered; the first answer is a cookie that stands for
     it. On Linux other users' connections are closed unread. Requests must name this machine as their host, so no other
-    site can read the map through the visitor's browser.
+    site can read the map through the visitor's browser; what changes the map must come from the page itself.
 
     Args:
+        doors: to the map.
+        cache: where levels of detail are kept; a folder of its own.
+        params: how the map is looked at.
         port: 0 takes a free one.
+        page: the folder of the built page; the one that came with gsmap by default.
 
     Raises:
-        ConfigError: the port is taken or not allowed.
+        ConfigError: the port is taken or not allowed, or the page is not built.
     """
 
-    def __init__(self, view: ViewMap, *, port: int = 0) -> None:
+    def __init__(
+        self,
+        doors: Doors,
+        cache: Path,
+        params: Params | None = None,
+        *,
+        port: int = 0,
+        page: Path | None = None,
+    ) -> None:
+        params = params or Params()
         self.token = secrets.token_hex(16)
-        handler = type("Handler", (_Handler,), {"view": view, "token": self.token})
+        self.page = built_page() if page is None else page
+        shared = {"token": self.token, "page": self.page, "acting": threading.Lock(), "doors": doors}
+        handler: Any = type("Handler", (_Handler,), shared)
         try:
             self._http = LocalServer(port, handler)
         except (OSError, OverflowError) as error:
             raise ConfigError(f"cannot serve on port {port}: {error}; try another --port, or 0") from error
+        self.levels = Levels(doors, TreeCache(cache, int(params.cache_gib * 2**30)), params)
+        handler.answers = Answers(doors, self.levels, params)
         self._thread: threading.Thread | None = None
 
     @cached_property
@@ -92,6 +151,7 @@ class ViewServer:
             self._thread.join()
             self._thread = None
         self._http.server_close()
+        self.levels.close()
 
     def __enter__(self) -> ViewServer:
         return self
@@ -101,8 +161,11 @@ class ViewServer:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    view: ViewMap
     token: str
+    page: Path
+    doors: Doors
+    answers: Answers
+    acting: threading.Lock
     server: LocalServer
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "gsmap", ""
@@ -128,24 +191,79 @@ class _Handler(BaseHTTPRequestHandler):
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
             self.send_error(HTTPStatus.BAD_REQUEST, "A request here has no body")
             return
-        host = self.headers.get("Host", "").rsplit(":", 1)[0].lower()
         path, _, query = self.path.partition("?")
-        told = self._is_token(parse_qs(query).get("token", [""])[0])
-        if host not in ("127.0.0.1", "localhost") or not (told or self._is_token(self._cookie())):
+        asked = parse_qs(query)
+        told = self._is_token(asked.get("token", [""])[0])
+        if not self._is_own_host() or not (told or self._is_token(self._cookie())):
             self.send_error(HTTPStatus.FORBIDDEN, "Open the address that gsmap view printed")
-            return
+        elif path == "/" and told:
+            self._welcome()
+        elif (file := self._file_of_page(path)) is not None:
+            self._answer(Answer(file.read_bytes(), _KINDS[file.suffix]))
+        else:
+            self._guarded(lambda: self.answers.get(path, {name: values[0] for name, values in asked.items()}))
+
+    def do_POST(self) -> None:
+        """What a person does: only from the page itself, small, and one at a time."""
+        self._waits_since(None)
+        length = self.headers.get("Content-Length", "")
+        own = f"http://{self.headers.get('Host', '')}"
+        if not self._is_own_host() or not self._is_token(self._cookie()):
+            self.send_error(HTTPStatus.FORBIDDEN, "Open the address that gsmap view printed")
+        elif self.headers.get("Origin") != own or self.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
+            self.send_error(HTTPStatus.FORBIDDEN, "Only the page itself may ask for this")
+        elif self.headers.get_content_type() != "application/json" or "Transfer-Encoding" in self.headers:
+            self.send_error(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "Actions are JSON")
+        elif not length.isdecimal() or len(length) > 9 or int(length) > _MAX_BODY_BYTES:
+            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"An action has at most {_MAX_BODY_BYTES} bytes")
+        else:
+            self._guarded(lambda: self._act(self.rfile.body(int(length))))
+
+    def _act(self, body: bytes) -> Answer:
+        named = _ACTION.fullmatch(self.path)
+        if named is None:
+            raise NotFoundError(f"there is no {self.path}")
+        action = self.doors.actions.get(named[1])
+        if action is None:
+            if not self.doors.actions:
+                raise ReadOnlyError("this map was opened to be looked at: nothing can be changed from this page")
+            raise NotFoundError(f"there is no action {named[1]}")
         try:
-            if path == "/" and told:
-                self._welcome()
-            elif path in _PAGE:
-                name, kind = _PAGE[path]
-                self._answer(resources.files("gsmap.view").joinpath("page", name).read_bytes(), kind)
-            elif path == "/map.json":
-                self._answer(_json(self.view.summary()), "application/json")
-            else:
-                self._scene(path)
+            said = json.loads(body)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"an action is JSON: {error}") from error
+        if not isinstance(said, dict):
+            raise InputError("an action is a JSON object")
+        if not self.acting.acquire(blocking=False):
+            raise BusyError("another action is at work: wait until it is done")
+        try:
+            action(said)
+        finally:
+            self.acting.release()
+        return Answer.json({"map": self.answers.summary()})
+
+    def _guarded(self, answer: Any) -> None:
+        """An answer, or why there is none."""
+        try:
+            found = answer()
         except GsmapError as error:
-            self._answer(_json({"error": str(error)}), "application/json", HTTPStatus.INTERNAL_SERVER_ERROR)
+            status = next((code for kind, code in _STATUS.items() if isinstance(error, kind)), 500)
+            found = Answer.json({"error": str(error)}, HTTPStatus(status))
+        except (ConnectionError, TimeoutError):
+            raise
+        except Exception as error:
+            found = Answer.json({"error": f"{type(error).__name__}: {error}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
+        self._answer(found)
+
+    def _is_own_host(self) -> bool:
+        host, _, port = self.headers.get("Host", "").partition(":")
+        return host.lower() in ("127.0.0.1", "localhost") and port in ("", str(self.server.server_port))
+
+    def _file_of_page(self, path: str) -> Path | None:
+        """The file of the built page that an address names; what else lies there is none."""
+        name = "index.html" if path == "/" else path[1:]
+        file = self.page / name
+        return file if _FILE.fullmatch(name) and file.suffix in _KINDS and file.is_file() else None
 
     def _waits_since(self, when: float | None) -> None:
         connection = self.server.open.get(self.connection)
@@ -175,26 +293,23 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", "0")
         self.end_headers()
 
-    def _scene(self, path: str) -> None:
-        """``/scenes/INDEX/splats`` and ``/scenes/INDEX/extras``."""
-        words = path.split("/")
-        known = len(words) == 4 and words[1] == "scenes" and words[2].isdecimal() and len(words[2]) < 9
-        if not known or int(words[2]) >= len(self.view.scenes) or words[3] not in ("splats", "extras"):
-            self.send_error(HTTPStatus.NOT_FOUND)
-        elif words[3] == "splats":
-            self._answer(self.view.splats(int(words[2])), "application/octet-stream")
-        else:
-            self._answer(_json(self.view.extras(int(words[2]))), "application/json")
-
-    def _answer(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-        zipped = kind != "application/octet-stream" and "gzip" in self.headers.get("Accept-Encoding", "")
-        if zipped:
+    def _answer(self, answer: Answer) -> None:
+        body, headers, status = answer.body, dict(answer.headers), answer.status
+        if answer.etag and self.headers.get("If-None-Match") == answer.etag:
+            body, status = b"", HTTPStatus.NOT_MODIFIED
+        elif answer.etag and status == HTTPStatus.OK and (part := _range(self.headers.get("Range"), len(body))):
+            headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{len(body)}"
+            body, status = body[part], HTTPStatus.PARTIAL_CONTENT
+        elif answer.is_text and len(body) > _WORTH_BYTES and "gzip" in self.headers.get("Accept-Encoding", ""):
             body = gzip.compress(body, 5)
+            headers["Content-Encoding"] = "gzip"
+        if answer.etag:
+            headers |= {"ETag": answer.etag, "Accept-Ranges": "bytes"}
         self.send_response(status)
-        self.send_header("Content-Type", kind)
+        self.send_header("Content-Type", answer.kind)
         self.send_header("Content-Length", str(len(body)))
-        if zipped:
-            self.send_header("Content-Encoding", "gzip")
+        for name, value in headers.items():
+            self.send_header(name, value)
         self.end_headers()
         if self.command != "HEAD":
             for start in range(0, len(body), _PART_BYTES):
@@ -223,6 +338,13 @@ class _Bounded:
             raise LineTooLong("request")
         return line
 
+    def body(self, size: int) -> bytes:
+        """The body of a request, of a size that was judged already."""
+        data = self._stream.read(size)
+        if len(data) < size:
+            raise ConnectionError("the request ended early")
+        return data
+
     def close(self) -> None:
         self._stream.close()
 
@@ -231,5 +353,13 @@ class _Bounded:
         return self._stream.closed
 
 
-def _json(value: object) -> bytes:
-    return json.dumps(value, allow_nan=False).encode()
+def _range(text: str | None, size: int) -> slice | None:
+    """The one range of bytes that is asked for; None for all, and for what is no range of these."""
+    found = _RANGE.fullmatch(text or "")
+    if found is None or found[1] == found[2] == "":
+        return None
+    if found[1] == "":
+        start, stop = max(0, size - int(found[2])), size
+    else:
+        start, stop = int(found[1]), min(size, int(found[2]) + 1) if found[2] else size
+    return slice(start, stop) if start < stop else None

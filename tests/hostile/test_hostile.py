@@ -22,8 +22,9 @@ from hostile_world import CASES, MAX_MEMORY, VERBS, Case, World, everything_in
 import gsmap.map
 from gsmap.cli import app as command_line
 from gsmap.errors import GsmapError
-from gsmap.map.viewing import view_of
+from gsmap.map.viewing import MapDoors
 from gsmap.texts import escaped
+from gsmap.view.content import Served, summary
 
 assert hostile_arrays
 assert hostile_catalogs
@@ -78,11 +79,12 @@ def _look(arguments: list[str]) -> NoReturn:
     """Make what a browser would ask the page of `gsmap view` for; an error goes to the page as it is."""
     try:
         with gsmap.map.open(arguments[1]) as m:
-            view = view_of(m.store, m.settings)
-            view.summary()
-            for index in range(len(view.scenes)):
-                view.splats(index)
-                view.extras(index)
+            doors = MapDoors(m.store, m.settings)
+            view = doors.content()
+            summary(view, Served())
+            for one in view.scenes:
+                doors.source(one.scene.id).load()
+                doors.extras(one.scene.id)
     except GsmapError as error:
         print(escaped(str(error)))
         raise SystemExit(1) from error

@@ -6,7 +6,8 @@ from PIL import Image
 
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
-from gsmap.report import PlanEdge, Shown, density_picture, make_plan, middle_covariance_m2, top_picture
+from gsmap.geometry.uncertainty import middle_covariance_m2
+from gsmap.report import PlanEdge, Shown, density_picture, make_plan, top_picture
 from gsmap.report.draw_plan import draw_plan, ellipse
 from gsmap.report.plan import rings
 from gsmap.types import Gaussians, ScenePose, Sim3

@@ -1,0 +1,26 @@
+"""How surely places are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmap.geometry.rotations import skew
+from gsmap.types import ScenePose
+
+
+def middle_covariance_m2(pose: ScenePose, middle: np.ndarray, metres_per_unit: float) -> np.ndarray | None:
+    """(3, 3) covariance in square metres, axes of the component, of a point that is fixed to a scene.
+
+    To first order, ``S Exp(xi) m = S (m + rot x m + trans + log_scale m)`` of a tangent on the scene side
+    (`gsmap.types.ScenePose`), so that the point moves by ``s R [-skew(m) | I | m] xi``.
+
+    Args:
+        middle: (3,) the point, scene frame and unit.
+        metres_per_unit: of the component's frame.
+    """
+    if pose.covariance is None:
+        return None
+    S = pose.S_map_scene
+    moves = S.scale * S.rotation @ np.concatenate([-skew(middle), np.eye(3), middle[:, None]], axis=1)
+    found: np.ndarray = metres_per_unit**2 * moves @ pose.covariance @ moves.T
+    return found if np.isfinite(found).all() else None

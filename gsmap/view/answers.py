@@ -1,0 +1,249 @@
+"""What is answered to each address of a map's page; `gsmap/view/page/src/contract.ts` says what is in it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import Any
+
+import numpy as np
+
+from gsmap.durable import open_file
+from gsmap.errors import ConfigError, CorruptError, NotFoundError
+from gsmap.view.content import Served, ViewMap, ViewScene, summary
+from gsmap.view.doors import Doors, PairPictures
+from gsmap.view.levels import Levels
+from gsmap.view.making import Waiting
+from gsmap.view.params import Params
+from gsmap.view.trees import FILE_NAME
+
+JSON, BYTES, JPEG = "application/json", "application/octet-stream", "image/jpeg"
+_RETRY_S = 0.5
+_JPEG_QUALITY = 88
+_ID = r"[0-9a-f]{32}"
+_MERGED = re.compile(r"(?:[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}/){0,4}[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}\.(?:json|glb)")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A body with what is said of it.
+
+    Args:
+        etag: names these bytes, where they never change under their address.
+    """
+
+    body: bytes
+    kind: str
+    status: HTTPStatus = HTTPStatus.OK
+    etag: str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def json(cls, value: object, status: HTTPStatus = HTTPStatus.OK) -> Answer:
+        return cls(json.dumps(value, allow_nan=False, separators=(",", ":")).encode(), JSON, status)
+
+    @property
+    def is_text(self) -> bool:
+        return self.kind == JSON or self.kind.startswith("text/")
+
+
+class Answers:
+    """The addresses of one map's page.
+
+    Args:
+        doors: to the map.
+        levels: what is drawn of it.
+    """
+
+    def __init__(self, doors: Doors, levels: Levels, params: Params) -> None:
+        self._doors, self._levels, self._params = doors, levels, params
+        self._pictures: OrderedDict[str, bytes] = OrderedDict()
+        self._drawing, self._reading = threading.Lock(), threading.Lock()
+        self._content: tuple[str, ViewMap] | None = None
+        self._routes: list[tuple[re.Pattern[str], Callable[..., Answer]]] = [
+            (re.compile(pattern), route)
+            for pattern, route in (
+                (r"/map\.json", self._map),
+                (r"/state\.json", self._state),
+                (rf"/scenes/({_ID})/extras\.json", self._extras),
+                (r"/scenes/([0-9a-z-]{1,80})/tileset\.json", self._tileset),
+                (r"/scenes/([0-9a-z-]{1,80})/(tiles/[0-9a-z-]{1,120}\.glb)", self._tile),
+                (r"/overviews/(\d{1,8})/([0-9a-z]{1,40})\.spz", self._overview),
+                (r"/merged/(\d{1,8})/(.{1,400})", self._merged),
+                (rf"/edges/({_ID})-({_ID})\.json", self._edge),
+                (rf"/edges/({_ID})-({_ID})/(\d{{1,2}})-(target|source|difference)\.jpg", self._pair_picture),
+                (r"/changes/(c\d{1,9})\.jpg", self._change_picture),
+                (r"/revisions/(\d{1,9})\.json", self._revision),
+                (r"/graph\.json", self._graph),
+                (r"/history\.json", self._history),
+            )
+        ]
+
+    def get(self, path: str, asked: Mapping[str, str]) -> Answer:
+        """The answer to an address.
+
+        Args:
+            path: from ``/`` on.
+            asked: what stands behind its question mark.
+
+        Raises:
+            GsmapError: why there is none.
+        """
+        for pattern, route in self._routes:
+            if (found := pattern.fullmatch(path)) is not None:
+                return route(*found.groups(), **({"asked": asked} if route in self._asking else {}))
+        raise NotFoundError(f"there is no {path}")
+
+    @property
+    def _asking(self) -> tuple[Callable[..., Answer], ...]:
+        return self._tileset, self._history
+
+    def content(self) -> ViewMap:
+        """The map as it is now; read again when it has changed."""
+        state = self._doors.state()
+        with self._reading:
+            if self._content is None or self._content[0] != state:
+                self._content = state, self._doors.content()
+            return self._content[1]
+
+    def summary(self) -> dict[str, Any]:
+        """``map.json`` as it is now."""
+        view = self.content()
+        overviews, levels = self._levels.overviews(view)
+        served = Served(bool(self._doors.actions), self._levels.boxes(), overviews)
+        return {**summary(view, served), "state": _state(view.state, levels)}
+
+    def _map(self) -> Answer:
+        return Answer.json(self.summary())
+
+    def _state(self) -> Answer:
+        return Answer.json({"state": _state(self.content().state, self._levels.state())})
+
+    # --- what is drawn -----------------------------------------------------------------------------------------------
+
+    def _entry(self, key: str) -> ViewScene:
+        found = next((one for one in self.content().scenes if one.key == key), None)
+        if found is None:
+            raise NotFoundError("no scene has this content now: ask for map.json again")
+        return found
+
+    def _tileset(self, key: str, asked: Mapping[str, str]) -> Answer:
+        found = self._levels.tree(self._entry(key), _number(asked.get("rank", "0")))
+        return _waiting(found) if isinstance(found, Waiting) else Answer((found / FILE_NAME).read_bytes(), JSON)
+
+    def _tile(self, key: str, uri: str) -> Answer:
+        return Answer(self._levels.tile(self._entry(key), uri), "model/gltf-binary", etag=f'"{uri}"')
+
+    def _overview(self, component: str, name: str) -> Answer:
+        found = self._levels.overview(self.content(), int(component), name)
+        return _waiting(found) if isinstance(found, Waiting) else Answer(found, BYTES, etag=f'"{name}"')
+
+    def _merged(self, component: str, name: str) -> Answer:
+        if not _MERGED.fullmatch(name) or int(component) not in self.content().merged:
+            raise NotFoundError(f"there is no merged/{component}/{name}")
+        path = self._doors.merged(int(component)) / name
+        try:
+            with open(open_file(path), "rb") as file:
+                data = file.read()
+        except (OSError, CorruptError) as error:
+            raise NotFoundError(f"there is no merged/{component}/{name}") from error
+        return Answer(data, JSON if path.suffix == ".json" else "model/gltf-binary")
+
+    # --- what is told ------------------------------------------------------------------------------------------------
+
+    def _extras(self, scene: str) -> Answer:
+        return Answer.json(self._doors.extras(scene))
+
+    def _revision(self, number: str) -> Answer:
+        return Answer.json(self._doors.revision(int(number)))
+
+    def _graph(self) -> Answer:
+        return Answer.json(self._doors.graph())
+
+    def _history(self, asked: Mapping[str, str]) -> Answer:
+        component = asked.get("component", "0")
+        if not component.isdecimal() or len(component) > 8:
+            raise ConfigError(f"a component is a number, got {component!r}")
+        return Answer.json(self._doors.history(asked.get("at", ""), int(component)))
+
+    def _edge(self, target: str, source: str) -> Answer:
+        return Answer.json(self.edge(target, source))
+
+    def edge(self, target: str, source: str) -> dict[str, Any]:
+        """`EdgeDetail` of a pair of scene ids."""
+        detail = self._doors.edge(target, source)
+        at = f"edges/{target}-{source}"
+        names = ("target", "source", "difference")
+        views = [
+            {"camera": camera, **{name: f"{at}/{i}-{name}.jpg" for name in names}}
+            for i, camera in enumerate(self._doors.pair_cameras(target, source))
+        ]
+        return {**detail, "views": views}
+
+    # --- pictures ----------------------------------------------------------------------------------------------------
+
+    def _pair_picture(self, target: str, source: str, place: str, name: str) -> Answer:
+        wanted = f"{target}-{source} {place} {name}"
+
+        def draw() -> dict[str, np.ndarray]:
+            made: PairPictures = self._doors.pair_pictures(target, source)
+            return {
+                f"{target}-{source} {i} {kind}": picture
+                for kind in ("target", "source", "difference")
+                for i, picture in enumerate(getattr(made, kind))
+            }
+
+        return self._drawn(wanted, draw)
+
+    def _change_picture(self, change: str) -> Answer:
+        return self._drawn(change, lambda: {change: self._doors.change_picture(change)})
+
+    def _drawn(self, name: str, draw: Callable[[], Mapping[str, np.ndarray]]) -> Answer:
+        """A picture from memory, or drawn now with those that come with it; one at a time."""
+        state = self._doors.state()
+        with self._drawing:
+            found = self._pictures.get(f"{state} {name}")
+            if found is None:
+                for one, picture in draw().items():
+                    self._pictures[f"{state} {one}"] = jpeg(picture)
+                while len(self._pictures) > self._params.pictures_kept:
+                    self._pictures.popitem(last=False)
+                found = self._pictures.get(f"{state} {name}")
+            else:
+                self._pictures.move_to_end(f"{state} {name}")
+        if found is None:
+            raise NotFoundError(f"there is no such picture of {name.partition(' ')[0]}")
+        return Answer(found, JPEG)
+
+
+def jpeg(picture: np.ndarray) -> bytes:
+    """(H, W, 3) uint8 as a JPEG."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(picture).save(out, "JPEG", quality=_JPEG_QUALITY)
+    return out.getvalue()
+
+
+def _state(of_map: str, of_levels: str) -> str:
+    return hashlib.sha256(f"{of_map}|{of_levels}".encode()).hexdigest()[:24]
+
+
+def _waiting(found: Waiting) -> Answer:
+    said = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": _RETRY_S}
+    return Answer.json(said, HTTPStatus.ACCEPTED)
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise ConfigError(f"a rank is a number, got {text!r}") from error
+    return value if np.isfinite(value) else 0.0

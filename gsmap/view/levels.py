@@ -1,0 +1,267 @@
+"""What a page draws: trees of scenes and overviews of islands, from the cache or made in the background."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import GsmapError, NotFoundError
+from gsmap.formats import spz
+from gsmap.geometry.transforms import transform_gaussians
+from gsmap.types import Gaussians, GaussianSource
+from gsmap.types.progress import Progress
+from gsmap.view.content import ViewMap, ViewOverview, ViewScene
+from gsmap.view.doors import Doors
+from gsmap.view.making import Maker, Waiting
+from gsmap.view.params import Params
+from gsmap.view.tree_cache import TreeCache
+from gsmap.view.trees import Sketch, sketch, write_tree
+
+_SPZ_BYTES = 20  # of a Gaussian of SH degree 0 before it is compressed
+_STEP = 8  # between the sizes of sketches, so that few of them are kept of a scene
+_LEAST = 16
+_FIRST = -1.0  # rank of what everybody waits for: before any tree
+_ISLANDS_KEPT = 8  # whose sketches are in memory
+_FILES_KEPT = 4  # overviews as bytes
+
+
+def sketch_size(num_scenes: int, params: Params) -> int:
+    """Gaussians of a scene in the overview of an island of so many."""
+    share = params.overview_mb * 1e6 / _SPZ_BYTES / max(1, num_scenes)
+    size = params.overview_gaussians
+    while size > share and size > _LEAST:
+        size = max(_LEAST, size // _STEP)
+    return size
+
+
+def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
+    """An SPZ of sketches, one after the other, in the map frame, its numbers as they are."""
+    placed = [transform_gaussians(one.gaussians, entry.S_map_scene) for entry, one in parts]
+    return spz.pack("overview.spz", Gaussians.concatenate(placed))
+
+
+@dataclass(eq=False)
+class _Island:
+    """The sketches of one component that are at hand, and those of them that the page was told of."""
+
+    size: int
+    sketches: dict[str, Sketch] = field(default_factory=dict)
+    told: frozenset[str] = frozenset()
+    looked: set[str] = field(default_factory=set)
+
+
+class Levels:
+    """Trees and overviews of one map, for all who look at it.
+
+    Args:
+        doors: to the map.
+        cache: where they are kept.
+        params: how fine they are.
+    """
+
+    def __init__(self, doors: Doors, cache: TreeCache, params: Params) -> None:
+        self._doors, self._cache, self._params = doors, cache, params
+        self._maker = Maker(params.workers)
+        self._lock = threading.RLock()
+        self._islands: OrderedDict[int, _Island] = OrderedDict()
+        self._files: OrderedDict[str, tuple[tuple[ViewScene, Sketch], ...] | bytes] = OrderedDict()
+
+    def close(self) -> None:
+        self._maker.close()
+
+    # --- trees -------------------------------------------------------------------------------------------------------
+
+    def tree(self, entry: ViewScene, rank: float = 0.0) -> Path | Waiting:
+        """The folder of a scene's tree, or how far it is.
+
+        Args:
+            rank: of those that are asked for, the lowest is made first.
+
+        Raises:
+            GsmapError: why it cannot be made.
+        """
+        if (found := self._cache.tree(entry.key)) is not None:
+            return found
+        work = partial(self._make_tree, entry.scene.id, entry.key)
+        return self._maker.ask(f"tree {entry.key}", work, rank=max(0.0, rank))
+
+    def tile(self, entry: ViewScene, uri: str) -> bytes:
+        """The bytes of a tile of a tree.
+
+        Raises:
+            NotFoundError: there is none of that name now; asking for the tree makes it again.
+        """
+        data = self._cache.tile(entry.key, uri)
+        if data is None:
+            raise NotFoundError(f"{entry.scene.name} has no tile {uri} now: ask for its tileset again")
+        return data
+
+    def make(self, entry: ViewScene, progress: Progress | None = None) -> Path:
+        """The folder of a scene's tree, made in this thread where it is not there."""
+        found = self._cache.tree(entry.key)
+        if found is None:
+            self._make_tree(entry.scene.id, entry.key, progress or (lambda fraction, text: None))
+            found = self._cache.tree(entry.key)
+            if found is None:
+                raise NotFoundError(f"the levels of detail of {entry.scene.name} are gone: {self._cache.root} is full")
+        return found
+
+    def _make_tree(self, scene: str, key: str, progress: Progress) -> None:
+        if self._cache.tree(key) is not None:  # another process was faster
+            return
+        source = self._doors.source(scene)
+        self._cache.make_tree(key, lambda folder: write_tree(folder, source, self._params.tree, progress))
+        self._forget_if_gone(scene)
+
+    def _forget_if_gone(self, scene: str) -> None:
+        """What was purged while it was being made is not kept."""
+        try:
+            self._doors.source(scene)
+        except NotFoundError:
+            self._cache.forget(scene)
+            raise
+
+    # --- overviews ---------------------------------------------------------------------------------------------------
+
+    def boxes(self) -> dict[str, np.ndarray]:
+        """(2, 3) of what scenes show, by key, of those that were looked at."""
+        with self._lock:
+            return {key: one.box for island in self._islands.values() for key, one in island.sketches.items()}
+
+    def overviews(self, view: ViewMap) -> tuple[dict[int, ViewOverview], str]:
+        """The overview of every component, as far as it is known, and the `state` of that; those of the largest are
+        made without being asked."""
+        out = {}
+        members = _members(view)
+        with self._lock:
+            for component, inside in members.items():
+                if component == min(members) or component in self._islands:
+                    out[component] = self._overview(component, inside)
+                else:
+                    out[component] = ViewOverview(f"overviews/{component}/none.spz", pending=len(inside))
+            return out, self.state()
+
+    def overview(self, view: ViewMap, component: int, name: str) -> bytes | Waiting:
+        """The file of an overview by its name, or how far it is.
+
+        Raises:
+            NotFoundError: no such component, or the overview is another by now.
+        """
+        inside = _members(view).get(component)
+        if inside is None:
+            raise NotFoundError(f"there is no component {component}")
+        with self._lock:
+            told = self._overview(component, inside)
+            if name == "none":
+                done = len(inside) - told.pending
+                return Waiting(done / len(inside), told.pending)
+            parts = self._files.get(name)
+            if parts is None:
+                raise NotFoundError("this overview is another by now: ask for map.json again")
+            if not isinstance(parts, bytes):
+                parts = self._files[name] = overview_file(parts)
+            self._files.move_to_end(name)
+            return parts
+
+    def state(self) -> str:
+        """Another text whenever the page is to be told of another overview."""
+        with self._lock:
+            told = [f"{component} {len(island.told)}" for component, island in self._islands.items()]
+        return " ".join(sorted(told))
+
+    def whole(self, inside: Mapping[int, ViewScene]) -> tuple[bytes, ViewOverview, dict[str, np.ndarray]]:
+        """The overview of an island, made in this thread; and the boxes of its scenes, by key."""
+        size = sketch_size(len(inside), self._params)
+        parts, places, boxes = [], [], {}
+        for place, entry in inside.items():
+            made = self._cache.sketch(entry.key, size) or self._make_sketch(entry.scene.id, entry.key, size)
+            parts.append((entry, made))
+            places.append(place)
+            boxes[entry.key] = made.box
+        counts = tuple(len(one.gaussians) for _, one in parts)
+        return overview_file(parts), ViewOverview("", tuple(places), counts), boxes
+
+    def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
+        """What is known of one island; what is not is asked for."""
+        size = sketch_size(len(inside), self._params)
+        island = self._islands.get(component)
+        if island is None or island.size != size:
+            island = self._islands[component] = _Island(size)
+        self._islands.move_to_end(component)
+        while len(self._islands) > _ISLANDS_KEPT:
+            self._islands.popitem(last=False)
+        keys, failed = {entry.key for entry in inside.values()}, 0
+        island.sketches = {key: one for key, one in island.sketches.items() if key in keys}
+        for entry in inside.values():
+            if entry.key in island.sketches:
+                continue
+            if entry.key not in island.looked:
+                island.looked.add(entry.key)
+                if (kept := self._cache.sketch(entry.key, size)) is not None:
+                    island.sketches[entry.key] = kept
+                    continue
+            work = partial(self._add_sketch, component, entry.scene.id, entry.key, size)
+            try:
+                self._maker.ask(f"sketch {entry.key} {size}", work, rank=_FIRST, lasting=True)
+            except GsmapError:  # the page says why when it asks for its tree
+                failed += 1
+        self._tell(island, len(keys) - failed)
+        parts = tuple((entry, island.sketches[e]) for entry in inside.values() if (e := entry.key) in island.told)
+        pending = max(0, len(inside) - len(parts) - failed)
+        if not parts:
+            return ViewOverview(f"overviews/{component}/none.spz", pending=pending)
+        name = _digest(parts)
+        if name not in self._files:
+            self._files[name] = parts
+            while len(self._files) > _FILES_KEPT:
+                self._files.popitem(last=False)
+        places = tuple(place for place, entry in inside.items() if entry.key in island.told)
+        counts = tuple(len(one.gaussians) for _, one in parts)
+        return ViewOverview(f"overviews/{component}/{name}.spz", places, counts, pending)
+
+    def _tell(self, island: _Island, num_scenes: int) -> None:
+        """Have the page ask again once all are there, and whenever twice as many are: not for every one of hundreds."""
+        found = island.sketches.keys()
+        if len(found) >= num_scenes or len(found) >= 2 * len(island.told & found):
+            island.told = frozenset(found)
+        else:
+            island.told &= found
+
+    def _add_sketch(self, component: int, scene: str, key: str, size: int, progress: Progress) -> None:
+        made = self._make_sketch(scene, key, size)
+        with self._lock:
+            island = self._islands.get(component)
+            if island is not None and island.size == size:
+                island.sketches[key] = made
+                self._tell(island, len(island.looked))
+
+    def _make_sketch(self, scene: str, key: str, size: int) -> Sketch:
+        source: GaussianSource = self._doors.source(scene)
+        made = sketch(source, size)
+        self._cache.keep_sketch(key, size, made)
+        self._forget_if_gone(scene)
+        return made
+
+
+def _members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
+    """The scenes of every component by their place in the list."""
+    out: dict[int, dict[int, ViewScene]] = {}
+    for place, (component, entry) in enumerate(zip(view.components(), view.scenes, strict=True)):
+        out.setdefault(component, {})[place] = entry
+    return out
+
+
+def _digest(parts: Sequence[tuple[ViewScene, Sketch]]) -> str:
+    """Names an overview by what is in it and where it lies."""
+    out = hashlib.sha256()
+    for entry, one in parts:
+        out.update(f"{entry.key} {len(one.gaussians)}".encode())
+        out.update(np.ascontiguousarray(entry.S_map_scene.matrix()).tobytes())
+    return out.hexdigest()[:24]

@@ -1,0 +1,139 @@
+"""Work that a page waits for, done in the background: what is asked for most urgently first, what is no longer asked
+for not at all."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from gsmap.errors import GsmapError
+from gsmap.types.progress import Progress
+
+_FORGOTTEN_S = 15.0  # a page asks again every second or so
+_FAILED_S = 20.0  # before what failed is tried again
+
+Work = Callable[[Progress], object]
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """What is not there yet.
+
+    Args:
+        progress: 0 to 1; 0 while it has not begun.
+        waiting: how many are before it.
+    """
+
+    progress: float
+    waiting: int
+
+
+@dataclass(eq=False)
+class _Job:
+    work: Work
+    rank: float
+    lasting: bool
+    asked_at: float = field(default_factory=time.monotonic)
+    state: str = "waiting"  # "working", "failed"
+    progress: float = 0.0
+    error: GsmapError | None = None
+
+
+class _Closed(Exception):
+    """The maker ends."""
+
+
+class Maker:
+    """Threads that do jobs by name, each once, those of the lowest rank first."""
+
+    def __init__(self, workers: int) -> None:
+        self._jobs: dict[str, _Job] = {}
+        self._changed = threading.Condition()
+        self._closed = False
+        self._threads = [threading.Thread(target=self._run, daemon=True) for _ in range(workers)]
+        for thread in self._threads:
+            thread.start()
+
+    def ask(self, name: str, work: Work, *, rank: float = 0.0, lasting: bool = False) -> Waiting:
+        """Have something done; again and again, until it is there.
+
+        Args:
+            name: of it; what is asked for under this name already is not done twice.
+            work: does it, from a thread of this maker.
+            rank: of the jobs that wait, the one with the lowest is next.
+            lasting: done even where nobody asks again.
+
+        Raises:
+            GsmapError: why it could not be done, for a while after it was tried.
+        """
+        with self._changed:
+            job = self._jobs.get(name)
+            now = time.monotonic()
+            if job is not None and job.state == "failed":
+                if now - job.asked_at < _FAILED_S and job.error is not None:
+                    raise job.error
+                job = None
+            if job is None:
+                job = self._jobs[name] = _Job(work, rank, lasting)
+                self._changed.notify()
+            job.rank, job.lasting = min(rank, job.rank) if job.lasting else rank, job.lasting or lasting
+            job.asked_at = now
+            before = sum(j.state == "waiting" and j.rank < job.rank for j in self._jobs.values())
+            return Waiting(job.progress, 0 if job.state == "working" else before)
+
+    def wait(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Until something is true that finished jobs make true; whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._closed or done(), timeout_s) and done()
+
+    def close(self) -> None:
+        """End: what is being done is given up at its next sign of progress."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join(timeout=5)
+
+    def _next(self) -> tuple[str, _Job] | None:
+        """The most urgent job; None where there is none. What nobody asks for any more goes."""
+        now = time.monotonic()
+        for name, job in list(self._jobs.items()):
+            if job.state == "waiting" and not job.lasting and now - job.asked_at > _FORGOTTEN_S:
+                del self._jobs[name]
+        waiting = [(job.rank, job.asked_at, name) for name, job in self._jobs.items() if job.state == "waiting"]
+        if not waiting:
+            return None
+        name = min(waiting)[2]
+        return name, self._jobs[name]
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._closed and (found := self._next()) is None:
+                    self._changed.wait()
+                if self._closed:
+                    return
+                assert found is not None
+                name, job = found
+                job.state = "working"
+            try:
+                job.work(lambda fraction, text, job=job: self._told(job, fraction))  # type: ignore[misc]
+            except _Closed:
+                return
+            except GsmapError as error:
+                job.error = error
+            except Exception as error:
+                job.error = GsmapError(f"{name}: {type(error).__name__} {error}")
+            with self._changed:
+                if job.error is None:
+                    self._jobs.pop(name, None)
+                else:
+                    job.state, job.asked_at = "failed", time.monotonic()
+                self._changed.notify_all()
+
+    def _told(self, job: _Job, fraction: float) -> None:
+        if self._closed:
+            raise _Closed
+        job.progress = fraction

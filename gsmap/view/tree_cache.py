@@ -1,0 +1,200 @@
+"""Trees and sketches of scenes, kept on this machine outside any map, so that a page opens at once the next time.
+
+Entries are named by what they were made of and how (``KEY.tree``, a folder; ``KEY.N.sketch``, a file), so that maps
+share what they have in common. An entry appears whole, by one rename; one that is damaged counts as missing; those that
+were used longest ago go first. Anything here may be deleted at any time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import json
+import os
+import re
+import shutil
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import MALFORMED
+from gsmap.formats.tiles3d import CONTENT_FOLDER
+from gsmap.types import Gaussians
+from gsmap.view.trees import FILE_NAME, Sketch
+
+_MANIFEST = "files.json"
+_TILE = re.compile(rf"{CONTENT_FOLDER}/[0-9a-z]+-([0-9a-f]{{16}})\.glb")
+_COLUMNS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "sh": 3}
+_STALE_S = 3600.0  # what has been in the making for so long was left by a process that died
+
+
+class TreeCache:
+    """What is kept below one folder; several processes may use it at once.
+
+    Args:
+        root: a folder; made when something is kept.
+        max_bytes: of all entries together. One that is larger than that is kept until another comes.
+    """
+
+    def __init__(self, root: Path, max_bytes: int) -> None:
+        self.root = root
+        self.max_bytes = max_bytes
+
+    # --- sketches ----------------------------------------------------------------------------------------------------
+
+    def sketch(self, key: str, max_count: int) -> Sketch | None:
+        """The sketch of a scene; None where there is none that can be read."""
+        path = self._sketch(key, max_count)
+        try:
+            with open(path, "rb") as file:
+                table = np.load(file, allow_pickle=False)
+            # Two rows of a box, then one for each Gaussian.
+            if table.ndim != 2 or table.shape[1] != sum(_COLUMNS.values()) or not 3 <= len(table) <= 2 + max_count:
+                raise ValueError
+            if table.dtype != np.float32 or not np.isfinite(table).all():
+                raise ValueError
+            os.utime(path)
+        except (OSError, EOFError, ValueError):
+            return None
+        parts = dict(zip(_COLUMNS, np.split(table[2:], np.cumsum(list(_COLUMNS.values()))[:-1], axis=1), strict=True))
+        parts |= {"logit_opacities": parts["logit_opacities"][:, 0], "sh": parts["sh"][:, None]}
+        return Sketch(Gaussians(**parts), table[:2, :3].astype(np.float64))
+
+    def keep_sketch(self, key: str, max_count: int, made: Sketch) -> None:
+        """Keep a sketch."""
+        table = np.zeros((2 + len(made.gaussians), sum(_COLUMNS.values())), np.float32)
+        table[:2, :3] = made.box
+        columns = [getattr(made.gaussians, name).reshape(len(table) - 2, -1) for name in _COLUMNS]
+        table[2:] = np.concatenate(columns, axis=1)
+        self._make_folder()
+        staged = self._staged()
+        try:
+            with open(staged, "xb") as file:
+                np.save(file, table)
+            os.replace(staged, self._sketch(key, max_count))
+        finally:
+            staged.unlink(missing_ok=True)
+
+    # --- trees -------------------------------------------------------------------------------------------------------
+
+    def tree(self, key: str) -> Path | None:
+        """The folder of a scene's tree; None where there is none, or its files are not those that were written."""
+        folder = self._tree(key)
+        try:
+            listed = json.loads((folder / _MANIFEST).read_bytes())
+            tileset = (folder / FILE_NAME).read_bytes()
+            if hashlib.sha256(tileset).hexdigest() != listed[FILE_NAME]:
+                raise ValueError
+            if any((folder / uri).stat().st_size != size for uri, size in listed["tiles"].items()):
+                raise ValueError
+            os.utime(folder)
+            return folder
+        except FileNotFoundError:
+            if folder.exists():
+                self._drop(folder)
+            return None
+        except (OSError, *MALFORMED):
+            self._drop(folder)
+            return None
+
+    def tile(self, key: str, uri: str) -> bytes | None:
+        """The bytes of a tile of a tree; None where there is none of that name, or they are not those that were
+        written: the tree is forgotten then."""
+        named = _TILE.fullmatch(uri)
+        if named is None:
+            return None
+        try:
+            data = (self._tree(key) / uri).read_bytes()
+        except OSError:
+            return None
+        if not hashlib.sha256(data).hexdigest().startswith(named[1]):
+            self._drop(self._tree(key))
+            return None
+        return data
+
+    def make_tree(self, key: str, write: Callable[[Path], object]) -> Path:
+        """Let ``write`` fill a folder that does not exist yet, and keep it as the tree of a scene.
+
+        Where another process was faster its tree is the one.
+        """
+        self._make_folder()
+        staged = self._staged()
+        try:
+            write(staged)
+            tiles = {
+                f"{CONTENT_FOLDER}/{path.name}": path.stat().st_size for path in (staged / CONTENT_FOLDER).iterdir()
+            }
+            digest = hashlib.sha256((staged / FILE_NAME).read_bytes()).hexdigest()
+            (staged / _MANIFEST).write_text(json.dumps({FILE_NAME: digest, "tiles": tiles}))
+            self._make_room(sum(tiles.values()))
+            with contextlib.suppress(OSError):  # there is one already
+                os.rename(staged, self._tree(key))
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+        return self._tree(key)
+
+    # --- all of it ---------------------------------------------------------------------------------------------------
+
+    def forget(self, scene: str) -> int:
+        """Delete all that is kept of a scene, by the beginning of its keys; how many files that were."""
+        gone = 0
+        for path in self.root.glob(f"{glob.escape(scene)}*"):
+            gone += sum(found.is_file() for found in path.rglob("*")) if path.is_dir() else 1
+            self._drop(path)
+        return gone
+
+    def _tree(self, key: str) -> Path:
+        return self.root / f"{key}.tree"
+
+    def _sketch(self, key: str, max_count: int) -> Path:
+        return self.root / f"{key}.{max_count}.sketch"
+
+    def _staged(self) -> Path:
+        return self.root / f".{uuid.uuid4().hex}"
+
+    def _make_folder(self) -> None:
+        self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+    def _drop(self, path: Path) -> None:
+        """Delete an entry, in one rename as far as others can see."""
+        grave = self._staged()
+        try:
+            os.rename(path, grave)
+        except OSError:
+            return
+        if grave.is_dir() and not grave.is_symlink():
+            shutil.rmtree(grave, ignore_errors=True)
+        else:
+            grave.unlink(missing_ok=True)
+
+    def _make_room(self, size_bytes: int) -> None:
+        """Delete what was used longest ago until so many bytes more are within bounds, and what dead processes left."""
+        kept = []
+        for entry in os.scandir(self.root):
+            with contextlib.suppress(OSError):
+                about = entry.stat(follow_symlinks=False)
+                if entry.name.startswith("."):
+                    if time.time() - about.st_mtime > _STALE_S:
+                        self._drop(Path(entry))
+                    continue
+                kept.append((about.st_mtime, _num_bytes(Path(entry)), Path(entry)))
+        over = sum(size for _, size, _ in kept) + size_bytes - self.max_bytes
+        for _, size, path in sorted(kept):
+            if over <= 0:
+                break
+            self._drop(path)
+            over -= size
+
+
+def _num_bytes(path: Path) -> int:
+    """Of an entry; of a tree by its list of files, which is quicker than looking at each."""
+    if not path.is_dir():
+        return path.stat().st_size
+    try:
+        return sum(json.loads((path / _MANIFEST).read_bytes())["tiles"].values())
+    except (OSError, *MALFORMED):
+        return 0

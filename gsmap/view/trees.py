@@ -1,0 +1,293 @@
+"""Levels of detail of one scene, for looking at it: a 3D Tiles tree whose leaves are its own Gaussians, and a sketch.
+
+A scene lies in the store along a space-filling curve, so that every cell of an octree is a range of its rows. The tree
+is made in one pass over them, from the leaves up, each level by merging what shares a cell of a grid, moments kept
+(`gsmap.geometry.voxels`): a second or two of CPU a million, where the pairwise merging of an export
+(`gsmap.geometry.decimate`) takes twenty. Memory is bounded by eight tiles a level.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.errors import ConfigError, InputError
+from gsmap.formats import tiles3d
+from gsmap.formats.tiles3d import CONTENT_FOLDER, TileNode
+from gsmap.geometry.boxes import robust_box
+from gsmap.geometry.morton import BITS, morton_codes
+from gsmap.geometry.voxels import axis_deviations, merge_groups
+from gsmap.types import Gaussians, GaussianSource
+from gsmap.types.progress import Progress
+
+VERSION = 1
+"""Of what is made: another one makes all trees and sketches anew."""
+
+FILE_NAME = "tileset.json"
+LEAST_OPACITY = 1 / 255  # what no renderer draws
+_FANOUT = 8
+_SIGMAS = 2.0
+_STRAYS, _STRAYS_OF_SCENE = 0.005, 0.02  # shares beyond a side of the box of a tile, and of a scene
+_EXTENT_ROWS = 2048  # by which the box of a tile is found
+_ERROR_QUANTILE = 0.95
+
+
+@dataclass(frozen=True)
+class TreeParams:
+    """How fine a tree of a scene is.
+
+    Args:
+        leaf_gaussians: of a scene's own in one tile, at most; about half as many on average.
+        coarsening: how many Gaussians become one from one level to the next.
+        root_gaussians: what the coarsest level has at most.
+    """
+
+    leaf_gaussians: int = 32_768
+    coarsening: int = 8
+    root_gaussians: int = 512
+
+    def __post_init__(self) -> None:
+        for name, least in (("leaf_gaussians", 64), ("coarsening", 2), ("root_gaussians", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"view.tree.{name} must be at least {least}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """What a scene looks like from afar, and how much room it takes.
+
+    Args:
+        gaussians: a few, SH degree 0, scene frame.
+        box: (2, 3) around what the scene shows, without floaters, scene frame.
+    """
+
+    gaussians: Gaussians
+    box: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Cell:
+    """A cell of the octree: rows ``[start, stop)``."""
+
+    start: int
+    stop: int
+    children: tuple[_Cell, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Extent:
+    """Lowest and highest corners (K, 3) of some of the Gaussians below a tile, and how many each stands for (K,)."""
+
+    low: np.ndarray
+    high: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def of(cls, gaussians: Gaussians) -> _Extent:
+        every = -(-len(gaussians) // _EXTENT_ROWS)
+        some = gaussians[::every]
+        reach = _SIGMAS * axis_deviations(some)
+        return cls(some.means - reach, some.means + reach, np.full(len(some), float(every)))
+
+    @classmethod
+    def joined(cls, parts: list[_Extent]) -> _Extent:
+        low, high, weight = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("low", "high", "weight")
+        )
+        every = -(-len(low) // _EXTENT_ROWS)
+        share = weight.sum() / weight[::every].sum()
+        return cls(low[::every], high[::every], weight[::every] * share)
+
+    def box(self, outside: float) -> np.ndarray:
+        """(2, 3) around all but a share of them on every side."""
+        low, high = (robust_box(corners, self.weight, outside) for corners in (self.low, self.high))
+        return np.stack([low[0], high[1]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """A finished tile."""
+
+    node: TileNode
+    content: Gaussians
+    extent: _Extent
+
+
+def write_tree(
+    folder: Path, source: GaussianSource, params: TreeParams | None = None, progress: Progress | None = None
+) -> TileNode:
+    """Write the tree of a scene into a folder that does not exist: ``tileset.json`` and the tiles that it names.
+
+    Every tile's name ends with the beginning of the digest of its bytes.
+
+    Args:
+        source: along the Morton curve of its means (`gsmap.stream.in_morton_order`), as scenes are stored.
+
+    Returns:
+        The root. Errors are how far, in the scene's unit, what a tile draws lies from the originals: what a twentieth
+        of what it draws lies beyond.
+
+    Raises:
+        InputError: no Gaussian that can be seen.
+    """
+    params = params or TreeParams()
+    (folder / CONTENT_FOLDER).mkdir(parents=True)
+    builder = _Builder(folder, _Rows(source), params, progress or (lambda fraction, text: None), source.num_gaussians)
+    made = builder.build(_octree(_codes(source), params.leaf_gaussians), "0")
+    if made is None:
+        raise InputError("no Gaussian of it can be seen")
+    while len(made.content) > params.root_gaussians:
+        made = builder.coarser([made], f"r{len(made.content)}", max(params.root_gaussians, 1))
+    tiles3d.write_tileset(folder / FILE_NAME, made.node, transform=np.eye(4))
+    return made.node
+
+
+def sketch(source: GaussianSource, max_count: int) -> Sketch:
+    """What a scene looks like from afar, of every few of its Gaussians: four times as many as are asked for, or more.
+
+    Raises:
+        InputError: no Gaussian that can be seen.
+    """
+    every = max(1, source.num_gaussians // max(4 * max_count, 8192))
+    parts, at = [], 0
+    for chunk in source.chunks():
+        some = chunk[-at % every :: every]
+        parts.append(shown(replace(some, sh=some.sh[:, :1])))
+        at += len(chunk)
+    found = Gaussians.concatenate(parts)
+    if not len(found):
+        raise InputError("no Gaussian of it can be seen")
+    # Those that are left stand for the others: each stops as much light as all of them did.
+    scales = found.log_scales + np.float32(np.log(every) / 2 if every > 1 else 0)
+    box = _Extent.of(found).box(_STRAYS_OF_SCENE)
+    return Sketch(_merged(replace(found, log_scales=scales), max_count)[0], box)
+
+
+def shown(gaussians: Gaussians) -> Gaussians:
+    """Those that are finite and not transparent."""
+    g = gaussians
+    finite = np.isfinite(g.means).all(1) & np.isfinite(g.log_scales).all(1) & np.isfinite(g.quats).all(1)
+    finite &= np.isfinite(g.sh).all((1, 2)) & (g.opacities > LEAST_OPACITY)
+    return g if finite.all() else g[finite]
+
+
+class _Rows:
+    """The rows of a source one after the other, as many as are asked for."""
+
+    def __init__(self, source: GaussianSource) -> None:
+        self._chunks: Iterator[Gaussians] = source.chunks()
+        self._rest = Gaussians.empty(source.sh_degree)
+
+    def take(self, count: int) -> Gaussians:
+        parts, missing = [], count
+        while missing:
+            if not len(self._rest):
+                self._rest = next(self._chunks)
+            parts.append(self._rest[:missing])
+            self._rest = self._rest[missing:]
+            missing -= len(parts[-1])
+        return Gaussians.concatenate(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Builder:
+    folder: Path
+    rows: _Rows
+    params: TreeParams
+    progress: Callable[[float, str], None]
+    num_gaussians: int
+
+    def build(self, cell: _Cell, name: str) -> _Made | None:
+        """The tile of a cell with all below it; None where nothing of it can be seen."""
+        if not cell.children:
+            content = shown(self.rows.take(cell.stop - cell.start))
+            self.progress(cell.stop / self.num_gaussians, "")
+            if not len(content):
+                return None
+            extent = _Extent.of(content)
+            return _Made(TileNode(extent.box(_STRAYS), 0.0, self._write(content, name)), content, extent)
+        below = [self.build(child, f"{name}{i}") for i, child in enumerate(cell.children)]
+        made = [one for one in below if one is not None]
+        return self.coarser(made, name, 1) if made else None
+
+    def coarser(self, below: list[_Made], name: str, least: int) -> _Made:
+        """The tile that is drawn in place of some."""
+        finer = Gaussians.concatenate([one.content for one in below])
+        level, error = _merged(finer, max(least, len(finer) // self.params.coarsening))
+        extent = _Extent.joined([one.extent for one in below])
+        error += max(one.node.error_m for one in below)
+        box = extent.box(_STRAYS)
+        # A level that nothing was merged for must still count as coarser than what it stands for.
+        error = max(error, 1e-6 * float(np.linalg.norm(box[1] - box[0])))
+        node = TileNode(box, error, self._write(level, name), tuple(one.node for one in below))
+        return _Made(node, level, extent)
+
+    def _write(self, content: Gaussians, name: str) -> str:
+        staged = self.folder / CONTENT_FOLDER / f"{name}.glb"
+        tiles3d.write_content(staged, content)
+        with open(staged, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        uri = f"{CONTENT_FOLDER}/{name}-{digest[:16]}.glb"
+        staged.rename(self.folder / uri)
+        return uri
+
+
+def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
+    """At most so many: those that share a cell of the finest grid that has no more of them; and the distance that a
+    twentieth of the Gaussians lie beyond from the one that stands for them."""
+    if len(gaussians) <= max_count:
+        return gaussians, 0.0
+    codes = morton_codes(gaussians.means, np.stack([gaussians.means.min(0), gaussians.means.max(0)]))
+    ordered = np.sort(codes)
+    low, high = 0, 3 * BITS
+    while low < high:  # the least shift that leaves few enough
+        middle = (low + high) // 2
+        if 1 + np.count_nonzero(np.diff(ordered >> np.uint64(middle))) <= max_count:
+            high = middle
+        else:
+            low = middle + 1
+    _, label = np.unique(codes >> np.uint64(low), return_inverse=True)
+    level, _ = merge_groups(gaussians, label)
+    apart = np.linalg.norm(gaussians.means - level.means[label], axis=1)
+    return level, float(np.quantile(apart, _ERROR_QUANTILE))
+
+
+def _codes(source: GaussianSource) -> np.ndarray:
+    """(N,) uint64 places along the curve, in ascending order."""
+    means = np.concatenate(list(source.columns("means")))
+    box = np.stack([means.min(0), means.max(0)])
+    # A thinned scene's means are rounded, so that neighbours may have changed places.
+    return np.maximum.accumulate(morton_codes(means, box))
+
+
+def _octree(codes: np.ndarray, max_leaf: int) -> _Cell:
+    """Cells of which none without children has more than ``max_leaf`` rows."""
+
+    def divide(start: int, stop: int, bit: int) -> _Cell:
+        if stop - start <= max_leaf:
+            return _Cell(start, stop)
+        parts = [(start, stop, bit)]
+        while len(parts) < _FANOUT:
+            largest = max(range(len(parts)), key=lambda i: parts[i][1] - parts[i][0])
+            if parts[largest][1] - parts[largest][0] <= max_leaf:
+                break
+            parts[largest : largest + 1] = _halves(codes, *parts[largest])
+        return _Cell(start, stop, tuple(divide(*part) for part in parts))
+
+    return divide(0, len(codes), 3 * BITS - 1)
+
+
+def _halves(codes: np.ndarray, start: int, stop: int, bit: int) -> list[tuple[int, int, int]]:
+    """Rows of a cell divided where their codes first differ; in the middle where they are all one."""
+    for at in range(bit, -1, -1):
+        shift = np.uint64(at)
+        boundary = ((codes[start] >> shift) | np.uint64(1)) << shift
+        cut = start + int(np.searchsorted(codes[start:stop], boundary))
+        if start < cut < stop:
+            return [(start, cut, at - 1), (cut, stop, at - 1)]
+    middle = (start + stop) // 2
+    return [(start, middle, -1), (middle, stop, -1)]
