@@ -32,10 +32,10 @@ from gsmap.view.trees import FILE_NAME
 CSP = {
     "default-src": "'none'",
     "script-src": "'self' 'wasm-unsafe-eval'",
-    "worker-src": "'self' blob:",
-    "connect-src": "'self' data: blob:",
-    "style-src": "'self' 'unsafe-inline'",
-    "img-src": "'self' data: blob:",
+    "worker-src": "blob:",
+    "connect-src": "'self'",
+    "style-src": "'self'",
+    "img-src": "'self' data:",
     "base-uri": "'none'",
     "form-action": "'none'",
 }
@@ -51,11 +51,9 @@ _EMBEDDED = """
 (() => {
   const files = JSON.parse(document.getElementById("gsmap-files").textContent);
   const kinds = { json: "application/json", glb: "model/gltf-binary", jpg: "image/jpeg" };
-  const real = globalThis.fetch.bind(globalThis);
   const base = new URL(".", document.baseURI).href;
-  globalThis.fetch = async (input, init) => {
+  globalThis.fetch = async (input) => {
     const url = new URL(input instanceof Request ? input.url : String(input), document.baseURI);
-    if (url.protocol === "data:" || url.protocol === "blob:") return real(input, init);
     const whole = url.href.split(/[?#]/)[0];
     const name = whole.startsWith(base) ? decodeURIComponent(whole.slice(base.length)) : whole;
     const text = Object.hasOwn(files, name) ? files[name] : undefined;
@@ -301,6 +299,7 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
         f'<script type="module">{code}</script>'
     )
     html = html[: script.start()] + html[script.end() :]
+    text = ""
     if style is not None:
         text = (page / style[1]).read_text(encoding="utf-8").replace("</style", "<\\/style")
         html = html.replace(style[0], f"<style>{text}</style>")
@@ -308,10 +307,9 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
     html = html[:end] + inside + html[end:]
     policy = CSP | {
         "script-src": f"{_hash(_EMBEDDED)} {_hash(code)} 'wasm-unsafe-eval'",
-        "worker-src": "blob:",
-        "connect-src": "data: blob:",
-        "style-src": "'unsafe-inline'",
-        "img-src": "data: blob:",
+        "connect-src": "'none'",
+        "style-src": _hash(text),
+        "img-src": "data:",
     }
     return _with_policy(html, policy, mark)
 
@@ -319,7 +317,8 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
 def _with_policy(html: str, policy: Mapping[str, str], mark: str = "") -> str:
     said = "; ".join(f"{name} {value}" for name, value in policy.items())
     head = _HEAD.search(html)
-    assert head is not None
+    if head is None:
+        raise GsmapError("the page has no head of its own: build the page again (tools/build_page.sh)")
     meta = f'{mark}<meta http-equiv="Content-Security-Policy" content="{said}" />'
     return html[: head.end()] + meta + html[head.end() :]
 
