@@ -143,7 +143,7 @@ def test_one_file_holds_as_much_of_every_tree_as_fits(doors, levels, tmp_path):
     def glbs(files):
         return sum(len(data) for name, data in files.items() if name.endswith(".glb"))
 
-    tree = levels.make(doors.view.scenes[0])
+    tree = levels.read(doors.view.scenes[0], Path)
     assert sum(f"scenes/{doors.view.scenes[0].key}" in name for name in whole) == 1 + len(list(tree.rglob("*.glb")))
     assert glbs(small) <= 30_000 < glbs(whole)
     for files in (whole, small):
