@@ -41,8 +41,11 @@ interface Split {
 }
 
 /** Makes the 3D view on a canvas. @throws Error where the browser has no WebGL 2 */
-export function createStage(options: StageOptions): Promise<Stage> {
-  return Promise.resolve().then(() => new View3D(options));
+export function createStage(options: StageOptions): Stage {
+  const stage = new View3D(options);
+  // For tests and the curious.
+  (globalThis as { gsmap?: unknown }).gsmap = { stage, state: stage.state };
+  return stage;
 }
 
 class View3D implements Stage {

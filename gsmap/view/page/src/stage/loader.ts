@@ -31,6 +31,11 @@ export interface Placed {
   sides: number;
 }
 
+interface Asked {
+  tree: Tree;
+  tile: Tile | null; // whose finer tiles are asked for; null: the root
+}
+
 export class Loader {
   splats = 0;
   bytesReceived = 0;
@@ -49,7 +54,8 @@ export class Loader {
   private tick = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
   private queue: Tile[] = [];
-  private treeQueue: { tree: Tree; tile: Tile | null }[] = [];
+  private treeQueue: Asked[] = [];
+  private waiting = 0; // trees that are wanted and still being made
   private readonly placed: Placed[];
   private readonly asWritten: Matrix4[];
 
@@ -101,8 +107,7 @@ export class Loader {
   }
 
   get pending(): number {
-    const waiting = [...this.trees, ...(this.merged ? [this.merged] : [])].filter((one) => one.state === "waiting");
-    return this.active + this.queue.length + this.treeQueue.length + waiting.length + (this.overview?.loading ? 1 : 0);
+    return this.active + this.queue.length + this.treeQueue.length + this.waiting;
   }
 
   /** Takes where scenes lie and which are drawn where. */
@@ -173,15 +178,19 @@ export class Loader {
     this.queue = [...missing].sort((a, b) => errorOf(b) - errorOf(a));
     const loading = [...this.loading];
     for (const tile of loading) if (!wanted.includes(tile)) tile.aborter?.abort();
-    const now = performance.now();
-    this.treeQueue = [
+    const asked = [
       ...treesAsked.map((tree) => ({ tree, tile: null })),
       ...this.cut.unknown.map((tile) => ({ tree: tile.tree, tile })),
-    ].filter(({ tree, tile }) =>
+    ];
+    const now = performance.now();
+    const isDue = ({ tree, tile }: Asked) =>
       tile?.external
         ? tile.state !== "loading"
-        : tree.state === "none" || (tree.state === "waiting" && tree.retryAt <= now),
-    );
+        : tree.state === "none" || (tree.state === "waiting" && tree.retryAt <= now);
+    this.treeQueue = asked.filter(isDue);
+    this.waiting = asked.filter(
+      ({ tree, tile }) => !tile?.external && tree.state === "waiting" && tree.retryAt > now,
+    ).length;
     this.pump();
 
     let changed = false;
@@ -313,7 +322,10 @@ export class Loader {
           tree.root = root;
           tree.state = "ready";
           const share = this.shares.get(tree);
-          if (share) share.finer = [root];
+          if (share) {
+            share.finer = [root];
+            guessCounts(root, 2 * share.count);
+          }
         }
       } catch (error) {
         if (external) {
@@ -377,6 +389,12 @@ export class Loader {
     this.overview?.tile?.dispose();
     this.table.dispose();
   }
+}
+
+/** For tiles that do not say how many splats they have: what the coarsest level of their scene lets expect. */
+function guessCounts(tile: Tile, count: number): void {
+  if (tile.isCountGuessed && tile.uri) tile.count = count;
+  for (const finer of tile.finer ?? []) guessCounts(finer, count);
 }
 
 export type Sixteen = Parameters<Matrix4["set"]>;
