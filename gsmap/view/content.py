@@ -172,12 +172,14 @@ class Served:
         boxes: (2, 3) of what a scene shows, without floaters, scene frame, by key; the scene's bounds elsewhere.
         overviews: by component.
         live: whether more is computed when the page asks.
+        drawn: changes whose pictures are there where it is not.
     """
 
     actions: bool = False
     boxes: Mapping[str, np.ndarray] = field(default_factory=dict)
     overviews: Mapping[int, ViewOverview] = field(default_factory=dict)
     live: bool = True
+    drawn: frozenset[str] = frozenset()
 
 
 def summary(view: ViewMap, served: Served) -> dict[str, Any]:
@@ -235,7 +237,7 @@ def summary(view: ViewMap, served: Served) -> dict[str, Any]:
                 "at": one.at,
                 "confidence": _number(one.confidence) or 0.0,
                 "status": one.status,
-                "pictures": f"changes/{one.id}.jpg" if served.live else None,
+                "pictures": f"changes/{one.id}.jpg" if served.live or one.id in served.drawn else None,
             }
             for one in view.changes
             if one.before in at and one.after in at

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.errors import GsmapError, NotFoundError
+from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import spz
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, GaussianSource
@@ -138,11 +138,10 @@ class Levels:
     def overviews(self, view: ViewMap) -> tuple[dict[int, ViewOverview], str]:
         """The overview of every component, as far as it is known, and the `state` of that; those of the largest are
         made without being asked."""
-        out = {}
-        members = _members(view)
+        out, islands = {}, members(view)
         with self._lock:
-            for component, inside in members.items():
-                if component == min(members) or component in self._islands:
+            for component, inside in islands.items():
+                if component == min(islands) or component in self._islands:
                     out[component] = self._overview(component, inside)
                 else:
                     out[component] = ViewOverview(f"overviews/{component}/none.spz", pending=len(inside))
@@ -154,7 +153,7 @@ class Levels:
         Raises:
             NotFoundError: no such component, or the overview is another by now.
         """
-        inside = _members(view).get(component)
+        inside = members(view).get(component)
         if inside is None:
             raise NotFoundError(f"there is no component {component}")
         with self._lock:
@@ -176,15 +175,26 @@ class Levels:
             told = [f"{component} {len(island.told)}" for component, island in self._islands.items()]
         return " ".join(sorted(told))
 
-    def whole(self, inside: Mapping[int, ViewScene]) -> tuple[bytes, ViewOverview, dict[str, np.ndarray]]:
-        """The overview of an island, made in this thread; and the boxes of its scenes, by key."""
-        size = sketch_size(len(inside), self._params)
+    def whole(
+        self, inside: Mapping[int, ViewScene], size: int | None = None
+    ) -> tuple[bytes, ViewOverview, dict[str, np.ndarray]]:
+        """The overview of an island, made in this thread; and the boxes of its scenes, by key.
+
+        Args:
+            size: Gaussians of each at most; by default what fits.
+        """
+        size = size or sketch_size(len(inside), self._params)
         parts, places, boxes = [], [], {}
         for place, entry in inside.items():
-            made = self._cache.sketch(entry.key, size) or self._make_sketch(entry.scene.id, entry.key, size)
+            try:
+                made = self._cache.sketch(entry.key, size) or self._make_sketch(entry.scene.id, entry.key, size)
+            except InputError:  # nothing of it can be seen
+                continue
             parts.append((entry, made))
             places.append(place)
             boxes[entry.key] = made.box
+        if not parts:
+            raise InputError("nothing of it can be seen")
         counts = tuple(len(one.gaussians) for _, one in parts)
         return overview_file(parts), ViewOverview("", tuple(places), counts), boxes
 
@@ -250,7 +260,7 @@ class Levels:
         return made
 
 
-def _members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
+def members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
     """The scenes of every component by their place in the list."""
     out: dict[int, dict[int, ViewScene]] = {}
     for place, (component, entry) in enumerate(zip(view.components(), view.scenes, strict=True)):
