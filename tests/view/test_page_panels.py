@@ -237,6 +237,7 @@ def test_one_click_shows_both_captures_and_the_evidence(hands, server):
     hands.click("button", "Enlarge")
     hands.wait("findAll('dialog[open]').length === 1 && find('img', null).getBoundingClientRect().height > 500")
     hands.press("Escape")
+    hands.wait("findAll('dialog[open]').length === 0 && find('.enlarge', null)")
     hands.click("label", "84 correspondences")
     assert told(hands, "setCorrespondences") == [None]
     hands.click("button", "Beside each other")
