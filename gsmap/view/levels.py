@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,7 +31,10 @@ _STEP = 8  # between the sizes of sketches, so that few of them are kept of a sc
 _LEAST = 16
 _FIRST = -1.0  # rank of what everybody waits for: before any tree
 _ISLANDS_KEPT = 8  # whose sketches are in memory
+_TRIES = 3
 _FILES_KEPT = 4  # overviews as bytes
+
+_T = TypeVar("_T")
 
 
 def sketch_size(num_scenes: int, params: Params) -> int:
@@ -103,15 +108,24 @@ class Levels:
             raise NotFoundError(f"{entry.scene.name} has no tile {uri} now: ask for its tileset again")
         return data
 
-    def make(self, entry: ViewScene, progress: Progress | None = None) -> Path:
-        """The folder of a scene's tree, made in this thread where it is not there."""
-        found = self._cache.tree(entry.key)
-        if found is None:
-            self._make_tree(entry.scene.id, entry.key, progress or (lambda fraction, text: None))
+    def read(self, entry: ViewScene, read: Callable[[Path], _T]) -> _T:
+        """What is read of the folder of a scene's tree, which is made in this thread where it is not there.
+
+        Args:
+            read: again where the tree made room for another one meanwhile.
+
+        Raises:
+            GsmapError: why it cannot be made.
+        """
+        for _ in range(_TRIES):
             found = self._cache.tree(entry.key)
             if found is None:
-                raise NotFoundError(f"the levels of detail of {entry.scene.name} are gone: {self._cache.root} is full")
-        return found
+                self._make_tree(entry.scene.id, entry.key, lambda fraction, text: None)
+                found = self._cache.tree(entry.key)
+            with contextlib.suppress(FileNotFoundError):
+                if found is not None:
+                    return read(found)
+        raise NotFoundError(f"the levels of detail of {entry.scene.name} are gone again: raise view.cache_gib")
 
     def _make_tree(self, scene: str, key: str, progress: Progress) -> None:
         if self._cache.tree(key) is not None:  # another process was faster

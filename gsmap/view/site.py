@@ -14,6 +14,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
 from gsmap.formats.tiles3d import CONTENT_FOLDER
 from gsmap.types.progress import Progress
 from gsmap.view.answers import Answers, jpeg
-from gsmap.view.content import Served, ViewMap, ViewOverview, ViewScene, summary
+from gsmap.view.content import Served, ViewMap, ViewOverview, summary
 from gsmap.view.doors import Doors
 from gsmap.view.levels import Levels, members
 from gsmap.view.params import Params
@@ -32,10 +33,10 @@ from gsmap.view.trees import FILE_NAME
 CSP = {
     "default-src": "'none'",
     "script-src": "'self' 'wasm-unsafe-eval'",
-    "worker-src": "'self' blob:",
-    "connect-src": "'self' data: blob:",
-    "style-src": "'self' 'unsafe-inline'",
-    "img-src": "'self' data: blob:",
+    "worker-src": "blob:",
+    "connect-src": "'self'",
+    "style-src": "'self'",
+    "img-src": "'self' data:",
     "base-uri": "'none'",
     "form-action": "'none'",
 }
@@ -51,11 +52,9 @@ _EMBEDDED = """
 (() => {
   const files = JSON.parse(document.getElementById("gsmap-files").textContent);
   const kinds = { json: "application/json", glb: "model/gltf-binary", jpg: "image/jpeg" };
-  const real = globalThis.fetch.bind(globalThis);
   const base = new URL(".", document.baseURI).href;
-  globalThis.fetch = async (input, init) => {
+  globalThis.fetch = async (input) => {
     const url = new URL(input instanceof Request ? input.url : String(input), document.baseURI);
-    if (url.protocol === "data:" || url.protocol === "blob:") return real(input, init);
     const whole = url.href.split(/[?#]/)[0];
     const name = whole.startsWith(base) ? decodeURIComponent(whole.slice(base.length)) : whole;
     const text = Object.hasOwn(files, name) ? files[name] : undefined;
@@ -183,14 +182,10 @@ def write_site(
     num_scenes = 0
     for i, entry in enumerate(view.scenes):
         progress(0.5 * i / len(view.scenes), entry.scene.name)
-        tree = maker.tried(entry.scene.name, lambda e=entry: levels.make(e))  # type: ignore[misc]
-        if tree is None:
-            continue
-        num_scenes += 1
         target = folder / "scenes" / entry.key
-        (target / CONTENT_FOLDER).mkdir(parents=True)
-        for name in (FILE_NAME, *(f"{CONTENT_FOLDER}/{tile.name}" for tile in (tree / CONTENT_FOLDER).iterdir())):
-            shutil.copyfile(tree / name, target / name)
+        copy = partial(_copy_tree, target=target)
+        if maker.tried(entry.scene.name, lambda e=entry, c=copy: levels.read(e, c)):  # type: ignore[misc]
+            num_scenes += 1
     for component in sorted(view.merged):
         for name, path in _merged(doors.merged(component)):
             target = folder / "merged" / str(component) / name
@@ -232,16 +227,19 @@ def write_page(
     for address, data in maker.told(view, size=size, pictures=False):
         files[address] = data
     left = max_bytes - sum(len(data) for address, data in files.items() if address.startswith("overviews/"))
-    trees = {}
+    trees: dict[str, tuple[dict[str, Any], dict[str, int]]] = {}
     for i, entry in enumerate(view.scenes):
         progress(0.5 * i / len(view.scenes), entry.scene.name)
-        tree = maker.tried(entry.scene.name, lambda e=entry: levels.make(e))  # type: ignore[misc]
-        if tree is not None:
-            trees[entry.key] = tree
-    for key, (tileset, tiles) in _fitting(view.scenes, trees, left).items():
-        files[f"scenes/{key}/{FILE_NAME}"] = _json(tileset)
-        for uri in tiles:
-            files[f"scenes/{key}/{uri}"] = (trees[key] / uri).read_bytes()
+        listed = maker.tried(entry.scene.name, lambda e=entry: levels.read(e, _listed))  # type: ignore[misc]
+        if listed is not None:
+            trees[entry.key] = listed
+    fitting = _fitting(trees, left)
+    for entry in view.scenes:
+        if entry.key in fitting:
+            tileset, tiles = fitting[entry.key]
+            files[f"scenes/{entry.key}/{FILE_NAME}"] = _json(tileset)
+            for uri, data in levels.read(entry, partial(_tiles, uris=tiles)).items():
+                files[f"scenes/{entry.key}/{uri}"] = data
     said = json.loads(files["map.json"])
     for component in said["components"]:
         component["merged"] = None
@@ -251,23 +249,37 @@ def write_page(
     return SiteContents(len(text.encode()), len(trees), tuple(maker.notes))
 
 
+def _copy_tree(tree: Path, target: Path) -> bool:
+    """Copy a tree to a folder."""
+    (target / CONTENT_FOLDER).mkdir(parents=True, exist_ok=True)
+    tiles = [f"{CONTENT_FOLDER}/{tile.name}" for tile in (tree / CONTENT_FOLDER).iterdir()]
+    for name in (FILE_NAME, *tiles):
+        shutil.copyfile(tree / name, target / name)
+    return True
+
+
+def _listed(tree: Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """The tileset of a tree, and the bytes of each of its tiles."""
+    sizes = {f"{CONTENT_FOLDER}/{tile.name}": tile.stat().st_size for tile in (tree / CONTENT_FOLDER).iterdir()}
+    return json.loads((tree / FILE_NAME).read_bytes()), sizes
+
+
+def _tiles(tree: Path, uris: Iterable[str]) -> dict[str, bytes]:
+    return {uri: (tree / uri).read_bytes() for uri in uris}
+
+
 def _fitting(
-    scenes: Iterable[ViewScene], trees: Mapping[str, Path], max_bytes: int
+    trees: Mapping[str, tuple[dict[str, Any], dict[str, int]]], max_bytes: int
 ) -> dict[str, tuple[dict[str, Any], list[str]]]:
     """Of every tree as much as fits, coarse tiles of all before finer ones: its tileset, and the tiles it names."""
     kept: dict[str, set[str]] = {key: set() for key in trees}
-    roots: dict[str, dict[str, Any]] = {}
-    waiting: list[tuple[float, int, int, str, list[dict[str, Any]]]] = []
-    left = max_bytes
-    for place, entry in enumerate(scenes):
-        if entry.key in trees:
-            roots[entry.key] = json.loads((trees[entry.key] / FILE_NAME).read_bytes())
-            tile = roots[entry.key]["root"]
-            heapq.heappush(waiting, (-float("inf"), place, len(waiting), entry.key, [tile]))
-    number = len(waiting)
+    waiting: list[tuple[float, int, str, list[dict[str, Any]]]] = []
+    for place, (key, (tileset, _)) in enumerate(trees.items()):
+        heapq.heappush(waiting, (-float("inf"), place, key, [tileset["root"]]))
+    number, left = len(waiting), max_bytes
     while waiting:
-        error, place, _, key, tiles = heapq.heappop(waiting)
-        size = sum((trees[key] / tile["content"]["uri"]).stat().st_size for tile in tiles)
+        error, _, key, tiles = heapq.heappop(waiting)
+        size = sum(trees[key][1][tile["content"]["uri"]] for tile in tiles)
         if size > left and error != -float("inf"):  # something of every scene
             continue
         left -= size
@@ -275,8 +287,8 @@ def _fitting(
         for tile in tiles:
             if tile.get("children"):
                 number += 1
-                heapq.heappush(waiting, (-tile["geometricError"], place, number, key, tile["children"]))
-    return {key: (roots[key] | {"root": _cut(roots[key]["root"], kept[key])}, sorted(kept[key])) for key in roots}
+                heapq.heappush(waiting, (-tile["geometricError"], number, key, tile["children"]))
+    return {key: (trees[key][0] | {"root": _cut(trees[key][0]["root"], kept[key])}, sorted(kept[key])) for key in trees}
 
 
 def _cut(tile: dict[str, Any], kept: set[str]) -> dict[str, Any]:
@@ -301,6 +313,7 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
         f'<script type="module">{code}</script>'
     )
     html = html[: script.start()] + html[script.end() :]
+    text = ""
     if style is not None:
         text = (page / style[1]).read_text(encoding="utf-8").replace("</style", "<\\/style")
         html = html.replace(style[0], f"<style>{text}</style>")
@@ -308,10 +321,9 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
     html = html[:end] + inside + html[end:]
     policy = CSP | {
         "script-src": f"{_hash(_EMBEDDED)} {_hash(code)} 'wasm-unsafe-eval'",
-        "worker-src": "blob:",
-        "connect-src": "data: blob:",
-        "style-src": "'unsafe-inline'",
-        "img-src": "data: blob:",
+        "connect-src": "'none'",
+        "style-src": _hash(text),
+        "img-src": "data:",
     }
     return _with_policy(html, policy, mark)
 
@@ -319,7 +331,8 @@ def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
 def _with_policy(html: str, policy: Mapping[str, str], mark: str = "") -> str:
     said = "; ".join(f"{name} {value}" for name, value in policy.items())
     head = _HEAD.search(html)
-    assert head is not None
+    if head is None:
+        raise GsmapError("the page has no head of its own: build the page again (tools/build_page.sh)")
     meta = f'{mark}<meta http-equiv="Content-Security-Policy" content="{said}" />'
     return html[: head.end()] + meta + html[head.end() :]
 
