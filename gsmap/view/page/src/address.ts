@@ -151,7 +151,11 @@ function readSelection(get: (name: string) => string | null, map: MapSummary): S
   );
 }
 
-const numbers = (values: readonly number[]) => values.map((v) => String(Number(v.toPrecision(6)))).join(",");
+/** Six digits of the largest; what is nothing beside it is 0. */
+function numbers(values: readonly number[]): string {
+  const digits = Math.min(20, Math.max(0, 5 - Math.floor(Math.log10(Math.max(1e-9, ...values.map(Math.abs))))));
+  return values.map((v) => String(Number(v.toFixed(digits)) || 0)).join(",");
+}
 
 function floats(text: string | null, length: number): number[] | null {
   const values = text?.split(",").map((part) => (part.trim() === "" ? NaN : Number(part))) ?? [];
