@@ -403,13 +403,13 @@ def test_light_and_dark(seen):
 # ---- loading --------------------------------------------------------------------------------------------------------
 
 
-FOUR = [(room(i, 4000, 0), pose(5.0 * i)) for i in range(4)]
+FOUR = [(room(i, 1600, 0), pose(5.0 * i)) for i in range(4)]
 
 
 @pytest.fixture
 def made(tmp_path) -> Iterator[tuple[Path, Served]]:
     bundle("stage.ts", tmp_path / "stage.js")
-    site(tmp_path, FOUR, max_per_tile=500)
+    site(tmp_path, FOUR, max_per_tile=200)
     served = Served(tmp_path)
     yield tmp_path, served
     served.close()
@@ -417,18 +417,18 @@ def made(tmp_path) -> Iterator[tuple[Path, Served]]:
 
 def test_the_budget_is_kept_and_near_things_are_finest(made):
     folder, served = made
-    with opened(folder, served, {"splats": 5000}) as page:
+    with opened(folder, served, {"splats": 2000}) as page:
         seen = Seen(page, served)
         seen.show()
         seen.stand(INSIDE)
-        assert 2000 < seen.state()["splats"] <= 5000
+        assert 1000 < seen.state()["splats"] <= 2000
         assert psnr(page.picture(), rendered(*FOUR, camera=INSIDE[:1])) > 30
         assert page.failures() == []
 
 
 def test_memory_is_bounded_and_what_is_left_behind_is_loaded_again(made):
     folder, served = made
-    with opened(folder, served, {"bytes": 200_000}) as page:
+    with opened(folder, served, {"bytes": 80_000}) as page:
         seen = Seen(page, served)
         seen.show()
         for x in (0.0, 15.0, 0.0):

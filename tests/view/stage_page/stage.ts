@@ -3,11 +3,11 @@ import { createStage } from "../../../gsmap/view/page/src/stage";
 
 const told = { picks: [] as unknown[], moves: [] as unknown[], errors: [] as string[] };
 const query = new URLSearchParams(location.search);
-createStage({
+const stage = createStage({
   canvas: document.querySelector("canvas") as HTMLCanvasElement,
   onPick: (pick) => told.picks.push(pick),
   onMove: (standpoint) => told.moves.push(standpoint),
   onError: (message) => told.errors.push(message),
   budget: JSON.parse(query.get("budget") ?? "{}"),
 });
-Object.assign((globalThis as unknown as { gsmap: object }).gsmap, told);
+Object.assign(globalThis, { gsmap: { stage, state: stage.state, ...told } });

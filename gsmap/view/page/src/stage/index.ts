@@ -42,10 +42,7 @@ interface Split {
 
 /** Makes the 3D view on a canvas. @throws Error where the browser has no WebGL 2 */
 export function createStage(options: StageOptions): Stage {
-  const stage = new View3D(options);
-  // For tests and the curious.
-  (globalThis as { gsmap?: unknown }).gsmap = { stage, state: stage.state };
-  return stage;
+  return new View3D(options);
 }
 
 class View3D implements Stage {
