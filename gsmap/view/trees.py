@@ -209,7 +209,8 @@ class _Builder:
             if not len(content):
                 return None
             extent = _Extent.of(content)
-            return _Made(TileNode(extent.box(_STRAYS), 0.0, self._write(content, name)), content, extent)
+            node = TileNode(extent.box(_STRAYS), 0.0, self._write(content, name), extras=_said(content))
+            return _Made(node, content, extent)
         below = [self.build(child, f"{name}{i}") for i, child in enumerate(cell.children)]
         made = [one for one in below if one is not None]
         return self.coarser(made, name, 1) if made else None
@@ -223,7 +224,7 @@ class _Builder:
         box = extent.box(_STRAYS)
         # A level that nothing was merged for must still count as coarser than what it stands for.
         error = max(error, 1e-6 * float(np.linalg.norm(box[1] - box[0])))
-        node = TileNode(box, error, self._write(level, name), tuple(one.node for one in below))
+        node = TileNode(box, error, self._write(level, name), tuple(one.node for one in below), _said(level))
         return _Made(node, level, extent)
 
     def _write(self, content: Gaussians, name: str) -> str:
@@ -234,6 +235,11 @@ class _Builder:
         uri = f"{CONTENT_FOLDER}/{name}-{digest[:16]}.glb"
         staged.rename(self.folder / uri)
         return uri
+
+
+def _said(content: Gaussians) -> dict[str, float]:
+    """What a tile says of itself, so that a viewer knows its cost before it asks for it."""
+    return {"num_gaussians": len(content)}
 
 
 def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:

@@ -41,8 +41,8 @@ interface Split {
 }
 
 /** Makes the 3D view on a canvas. @throws Error where the browser has no WebGL 2 */
-export function createStage(options: StageOptions): Promise<Stage> {
-  return Promise.resolve().then(() => new View3D(options));
+export function createStage(options: StageOptions): Stage {
+  return new View3D(options);
 }
 
 class View3D implements Stage {

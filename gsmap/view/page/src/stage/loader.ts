@@ -31,6 +31,21 @@ export interface Placed {
   sides: number;
 }
 
+interface DrawnOverview {
+  tile: SplatTile | null; // null while it is on its way
+  of: Overview;
+  ids: string[]; // of the scenes in it
+  written: Matrix4[]; // where they lay when it was made, by scene
+}
+/** A new overview is fetched when it has so many times the splats of the one that is there. */
+const WORTH_FETCHING = 1.5;
+
+interface Asked {
+  tree: Tree;
+  tile: Tile | null; // whose finer tiles are asked for; null: the root
+  rank: number; // 0 matters most
+}
+
 export class Loader {
   splats = 0;
   bytesReceived = 0;
@@ -40,7 +55,7 @@ export class Loader {
   readonly merged: Tree | null;
   private readonly trees: Tree[];
   private readonly shares = new Map<Tree, Tile>();
-  private overview: { tile: SplatTile | null; of: Overview; loading: boolean } | null = null;
+  private overview: DrawnOverview | null = null;
   private cut: Cut<Tile> = { tiles: [], refined: new Set(), unknown: [], splats: 0 };
   private shown = new Set<Tile>();
   private readonly ready = new Set<Tile>();
@@ -49,7 +64,8 @@ export class Loader {
   private tick = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
   private queue: Tile[] = [];
-  private treeQueue: { tree: Tree; tile: Tile | null }[] = [];
+  private treeQueue: Asked[] = [];
+  private waiting = 0; // trees that are wanted and still being made
   private readonly placed: Placed[];
   private readonly asWritten: Matrix4[];
 
@@ -82,27 +98,36 @@ export class Loader {
     if (before) this.takeOver(before, new Set(known.values()));
     this.asWritten = scenes.map((scene) => new Matrix4().set(...(scene.S_map_scene.flat() as Sixteen)));
     this.placed = scenes.map((_, i) => ({ pose: (this.asWritten[i] as Matrix4).clone(), sides: 0 }));
-    const of = map.components.find((one) => one.component === component)?.overview;
-    if (of?.uri) {
-      this.overview = { tile: null, of, loading: false };
-      of.scenes.forEach((index, k) => {
-        const scene = scenes[index];
-        const tree = this.trees[index];
-        const count = of.counts[k] ?? 0;
-        if (!scene || !tree || !count) return;
-        const box = new Box3(new Vector3(...scene.box[0]), new Vector3(...scene.box[1]));
-        // How far apart its splats are, on surfaces that fill the box's largest side.
-        const spacing = box.getSize(new Vector3()).length() / Math.sqrt(count);
-        const finer = tree.root ? [tree.root] : tree.state === "failed" ? [] : null;
-        this.shares.set(tree, new Tile(tree, box, spacing, null, new Matrix4(), count, finer));
-      });
-      this.fetchOverview();
+    const next = map.components.find((one) => one.component === component)?.overview;
+    const kept = before?.keepOverview(map, next ?? null) ?? null;
+    if (kept) {
+      kept.tile?.move(this.table, null);
+      this.overview = kept;
+      this.bytesHeld += kept.tile?.bytes ?? 0;
+    } else if (next?.scenes.length) {
+      const ids = next.scenes.map((index) => scenes[index]?.id ?? "");
+      this.overview = { tile: null, of: next, ids, written: this.asWritten };
     }
+    before?.dispose();
+    const { of } = this.overview ?? {};
+    of?.scenes.forEach((index, k) => {
+      const scene = scenes[index];
+      const tree = this.trees[index];
+      const count = of.counts[k] ?? 0;
+      if (!scene || !tree || !count) return;
+      const box = new Box3(new Vector3(...scene.box[0]), new Vector3(...scene.box[1]));
+      // How far apart its splats are, on surfaces that fill the box's largest side.
+      const spacing = box.getSize(new Vector3()).length() / Math.sqrt(count);
+      const finer = tree.root ? [tree.root] : tree.state === "failed" ? [] : null;
+      const share = new Tile(tree, box, spacing, null, new Matrix4(), count, finer);
+      if (kept) share.state = "ready";
+      this.shares.set(tree, share);
+    });
+    if (this.overview && !kept) this.fetchOverview(this.overview);
   }
 
   get pending(): number {
-    const waiting = [...this.trees, ...(this.merged ? [this.merged] : [])].filter((one) => one.state === "waiting");
-    return this.active + this.queue.length + this.treeQueue.length + waiting.length + (this.overview?.loading ? 1 : 0);
+    return this.active + this.queue.length + this.treeQueue.length + this.waiting;
   }
 
   /** Takes where scenes lie and which are drawn where. */
@@ -173,15 +198,19 @@ export class Loader {
     this.queue = [...missing].sort((a, b) => errorOf(b) - errorOf(a));
     const loading = [...this.loading];
     for (const tile of loading) if (!wanted.includes(tile)) tile.aborter?.abort();
-    const now = performance.now();
-    this.treeQueue = [
+    const asked: Asked[] = [
       ...treesAsked.map((tree) => ({ tree, tile: null })),
       ...this.cut.unknown.map((tile) => ({ tree: tile.tree, tile })),
-    ].filter(({ tree, tile }) =>
+    ].map((one, rank) => ({ ...one, rank }));
+    const now = performance.now();
+    const isDue = ({ tree, tile }: Asked) =>
       tile?.external
         ? tile.state !== "loading"
-        : tree.state === "none" || (tree.state === "waiting" && tree.retryAt <= now),
-    );
+        : tree.state === "none" || (tree.state === "waiting" && tree.retryAt <= now);
+    this.treeQueue = asked.filter(isDue);
+    this.waiting = asked.filter(
+      ({ tree, tile }) => !tile?.external && tree.state === "waiting" && tree.retryAt > now,
+    ).length;
     this.pump();
 
     let changed = false;
@@ -199,7 +228,7 @@ export class Loader {
     for (const [tree, share] of this.shares) {
       const i = tree.row / 2;
       const placed = this.placed[i] as Placed;
-      const written = this.asWritten[i] as Matrix4;
+      const written = this.overview?.written[i] ?? (this.asWritten[i] as Matrix4);
       const moved = new Matrix4().multiplyMatrices(placed.pose, written.clone().invert());
       changed = this.table.set(tree.row + 1, moved, shown.has(share) ? placed.sides : 0) || changed;
     }
@@ -213,7 +242,7 @@ export class Loader {
   private pump(): void {
     while (this.active < this.budget.requests && this.treeQueue.length) {
       const next = this.treeQueue.shift();
-      if (next) void this.fetchTree(next.tree, next.tile, this.treeQueue.length);
+      if (next) void this.fetchTree(next);
     }
     while (this.active < this.budget.requests && this.queue.length) {
       const tile = this.queue.shift();
@@ -233,10 +262,7 @@ export class Loader {
     }
   }
 
-  private fetchOverview(): void {
-    const { overview } = this;
-    if (!overview) return;
-    overview.loading = true;
+  private fetchOverview(overview: DrawnOverview): void {
     void this.during(async () => {
       try {
         const response = await fetch(new URL(overview.of.uri, document.baseURI), { signal: this.aborter.signal });
@@ -257,10 +283,20 @@ export class Loader {
       } catch (error) {
         this.shares.clear(); // the trees show what they have
         throw error;
-      } finally {
-        overview.loading = false;
       }
     });
+  }
+
+  /** Hands the overview on where it still serves; where few scenes have come since, the one that is there does. */
+  private keepOverview(map: MapSummary, next: Overview | null): DrawnOverview | null {
+    const { overview } = this;
+    if (!overview?.tile || !next) return null;
+    const isPlaced = overview.of.scenes.every((index, k) => map.scenes[index]?.id === overview.ids[k]);
+    const total = (of: Overview) => of.counts.reduce((sum, count) => sum + count, 0);
+    const isEnough = next.pending > 0 && total(next) < WORTH_FETCHING * total(overview.of);
+    if (!isPlaced || (next.uri !== overview.of.uri && !isEnough)) return null;
+    this.overview = null;
+    return overview;
   }
 
   /** Ends what is under way; its trees by their addresses, for the next one to go on with. */
@@ -287,10 +323,9 @@ export class Loader {
       }
     }
     before.ready.clear();
-    before.dispose();
   }
 
-  private async fetchTree(tree: Tree, tile: Tile | null, rank: number): Promise<void> {
+  private async fetchTree({ tree, tile, rank }: Asked): Promise<void> {
     const external = tile?.external;
     if (external) tile.state = "loading";
     else tree.state = "loading";
@@ -313,7 +348,10 @@ export class Loader {
           tree.root = root;
           tree.state = "ready";
           const share = this.shares.get(tree);
-          if (share) share.finer = [root];
+          if (share) {
+            share.finer = [root];
+            guessCounts(root, 2 * share.count);
+          }
         }
       } catch (error) {
         if (external) {
@@ -377,6 +415,12 @@ export class Loader {
     this.overview?.tile?.dispose();
     this.table.dispose();
   }
+}
+
+/** For tiles that do not say how many splats they have: what the coarsest level of their scene lets expect. */
+function guessCounts(tile: Tile, count: number): void {
+  if (tile.isCountGuessed && tile.uri) tile.count = count;
+  for (const finer of tile.finer ?? []) guessCounts(finer, count);
 }
 
 export type Sixteen = Parameters<Matrix4["set"]>;

@@ -204,9 +204,10 @@ export class SplatTile extends SplatGenerator {
   }
 
   /** Another table places it from now on. */
-  move(table: Table, row: number): void {
+  move(table: Table, row: number | null): void {
     this.table.value = table.texture;
-    this.row = this.layout.w = row;
+    this.row = row;
+    this.layout.w = row ?? -1;
   }
 
   override dispose(): void {

@@ -29,6 +29,7 @@ export class Tile implements Choice<Tile> {
   state: "none" | "loading" | "ready" | "failed" = "none";
   mesh: SplatTile | null = null;
   lastUsed = 0;
+  readonly isCountGuessed: boolean;
   aborter: AbortController | null = null;
 
   constructor(
@@ -43,6 +44,7 @@ export class Tile implements Choice<Tile> {
     readonly external: string | null = null,
   ) {
     this.finer = finer;
+    this.isCountGuessed = count === null;
     this.count = count ?? (uri ? ASSUMED_COUNT : 0);
   }
 }
