@@ -22,7 +22,7 @@ from gsmap import formats
 from gsmap.cli.edge import read_pose
 from gsmap.errors import NotFoundError
 from gsmap.export.manifest import Manifest
-from gsmap.export.tileset import _known_boxes
+from gsmap.export.tileset import _known_levels
 from gsmap.formats import cameras_json, colmap, g2o, nerfstudio, tum
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.ingest import find_captures, find_date
@@ -177,6 +177,11 @@ def sog(folder: Path) -> list[bytes]:
     return [out.getvalue()]
 
 
+def sog_folder(folder: Path) -> list[bytes]:
+    formats.write(folder / "meta.json", some(12, 1))
+    return [(folder / "meta.json").read_bytes()]
+
+
 def spz(folder: Path) -> list[bytes]:
     """Versions 3 and 4 as written, and the payload of version 3 under the older headers and with an extension."""
     out = written(".spz", {"version": 3}, {"version": 4})(folder)
@@ -305,6 +310,7 @@ TARGETS: dict[str, Target] = {
     "splat": Target("in.splat", written(".splat"), gaussians_file),
     "spz": Target("in.spz", spz, gaussians_file, mutators.spz),
     "sog": Target("in.sog", sog, gaussians_file, mutators.sog),
+    "sog_folder": Target("meta.json", sog_folder, gaussians_file, JSON, sog_folder),
     "glb": Target("in.glb", written(".glb"), gaussians_file, mutators.glb),
     "tileset": Target(
         "tileset.json",
@@ -313,7 +319,7 @@ TARGETS: dict[str, Target] = {
         JSON,
         written("tileset.json", {"max_per_tile": 3}),
     ),
-    "known_boxes": Target("tileset.json", written("tileset.json"), lambda p: _known_boxes(p.parent), JSON),
+    "known_levels": Target("tileset.json", written("tileset.json"), lambda p: _known_levels(p.parent), JSON),
     "cameras_json": Target("cameras.json", one(lambda p: cameras_json.write(p, cameras())), cameras_file, JSON),
     "transforms_json": Target("transforms.json", transforms, cameras_file, JSON),
     "dataparser_json": Target(

@@ -111,7 +111,7 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
         options: of the format; see the ``write`` of its module.
 
     Raises:
-        NotFoundError: the folder does not exist; that of a ``tileset.json`` is made.
+        NotFoundError: the folder does not exist; that of a ``tileset.json`` and its like is made.
         InputError: unknown suffix, a format that is only read, or a path that cannot be written.
     """
     path = Path(path)
@@ -119,7 +119,7 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
     module = _load(suffix)
     if suffix == path.name:  # a folder by what lies in it, such as ``tileset.json``
         with _explained(path.parent, "write"):
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
     staged = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # a name that nobody can have put a link at
     try:
         with _explained(path, "write"):

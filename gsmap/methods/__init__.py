@@ -19,6 +19,7 @@ _FORMATS = (
     (".glb", "gsmap.formats.glb"),
     (".ply", "gsmap.formats.ply"),
     (".sog", "gsmap.formats.sog"),
+    ("meta.json", "gsmap.formats.sog"),
     (".splat", "gsmap.formats.splat"),
     (".spz", "gsmap.formats.spz"),
     ("tileset.json", "gsmap.formats.tiles3d"),

@@ -1,0 +1,56 @@
+"""What gsmap writes, read by PlayCanvas' splat-transform: ``npm install --prefix ~/.cache/gsmap/validators
+@playcanvas/splat-transform`` (node 20 gets 2.7, which reads no streamed SOG; 22 gets 3)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from formats_cases import random_gaussians
+
+from gsmap import formats
+from gsmap.types import Gaussians
+
+PACKAGE = Path(os.environ.get("NPM_VALIDATORS", Path.home() / ".cache" / "gsmap" / "validators"))
+PACKAGE /= "node_modules/@playcanvas/splat-transform"
+
+pytestmark = pytest.mark.slow
+
+
+def splat_transform(source: Path, target: Path) -> None:
+    if not PACKAGE.is_dir() or shutil.which("node") is None:
+        pytest.skip("needs node and splat-transform: see the top of this file")
+    subprocess.run(
+        ["node", PACKAGE / "bin" / "cli.mjs", "-q", "-w", "-g", "cpu", source, target], check=True, timeout=300
+    )
+
+
+def same(ours: Gaussians, theirs: Gaussians) -> None:
+    assert len(ours) == len(theirs)
+    np.testing.assert_allclose(theirs.means, ours.means, atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(theirs.log_scales, ours.log_scales, atol=1e-5)
+    np.testing.assert_allclose(np.abs((theirs.quats * ours.quats).sum(1)), 1, atol=1e-4)
+    np.testing.assert_allclose(theirs.opacities, ours.opacities, atol=1e-3)  # it lets 0 and 255 be 1e-6 from the end
+    np.testing.assert_allclose(theirs.sh, ours.sh, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["a.sog", "a/meta.json"])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_sog(tmp_path, name, degree):
+    formats.write(tmp_path / name, random_gaussians(3000, degree))
+    splat_transform(tmp_path / name, tmp_path / "b.ply")
+    same(formats.read(tmp_path / name), formats.read(tmp_path / "b.ply"))
+
+
+def test_its_sog_folder_is_read(tmp_path):
+    formats.write(tmp_path / "a.ply", random_gaussians(500, 1))
+    (tmp_path / "b").mkdir()
+    splat_transform(tmp_path / "a.ply", tmp_path / "b" / "meta.json")
+    assert json.loads((tmp_path / "b" / "meta.json").read_text())["count"] == 500
+    splat_transform(tmp_path / "b" / "meta.json", tmp_path / "b.ply")
+    same(formats.read(tmp_path / "b" / "meta.json"), formats.read(tmp_path / "b.ply"))
