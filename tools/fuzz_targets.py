@@ -22,7 +22,8 @@ from gsmap import formats
 from gsmap.cli.edge import read_pose
 from gsmap.errors import NotFoundError
 from gsmap.export.manifest import Manifest
-from gsmap.export.tileset import _known_levels
+from gsmap.export.streamed import StreamedSog
+from gsmap.export.tileset import Tiles3D
 from gsmap.formats import cameras_json, colmap, g2o, nerfstudio, tum
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.ingest import find_captures, find_date
@@ -125,7 +126,7 @@ def written(suffix: str, *options: dict) -> Callable[[Path], list[bytes]]:
         out = []
         for chosen in options or ({},):
             for degree in (0, 1, 3):
-                path = folder / (suffix if suffix == "tileset.json" else f"seed{suffix}")
+                path = folder / (suffix if suffix.endswith(".json") else f"seed{suffix}")
                 formats.write(path, some(5 + 260 * (degree == 0 and suffix == ".compressed.ply"), degree), **chosen)
                 out.append(path.read_bytes())
         return out
@@ -319,7 +320,20 @@ TARGETS: dict[str, Target] = {
         JSON,
         written("tileset.json", {"max_per_tile": 3}),
     ),
-    "known_levels": Target("tileset.json", written("tileset.json"), lambda p: _known_levels(p.parent), JSON),
+    "streamed_sog": Target(
+        "lod-meta.json",
+        written("lod-meta.json", {"max_per_leaf": 3}),
+        gaussians_file,
+        JSON,
+        written("lod-meta.json", {"max_per_leaf": 3}),
+    ),
+    "known_levels": Target("tileset.json", written("tileset.json"), lambda p: Tiles3D().known(p.parent), JSON),
+    "known_streams": Target(
+        "lod-meta.json",
+        written("lod-meta.json", {"max_per_leaf": 3}),
+        lambda p: StreamedSog().known(p.parent),
+        JSON,
+    ),
     "cameras_json": Target("cameras.json", one(lambda p: cameras_json.write(p, cameras())), cameras_file, JSON),
     "transforms_json": Target("transforms.json", transforms, cameras_file, JSON),
     "dataparser_json": Target(

@@ -24,7 +24,9 @@ from gsmap.cli.console import (
 def command(
     map: MapPath,
     out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; exporting there again updates it.")],
-    format: Annotated[str, typer.Option("--format", help="ply, compressed.ply, splat, spz, glb or 3dtiles.")] = "ply",
+    format: Annotated[
+        str, typer.Option("--format", help="ply, compressed.ply, splat, spz, sog, glb, 3dtiles or streamed-sog.")
+    ] = "ply",
     tile_size: Annotated[float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")] = 10.0,
     bbox: Annotated[
         tuple[float, float, float, float, float, float] | None,

@@ -16,6 +16,7 @@ MAX_DEPTH = 5
 # What a trainer calls every one of its files, so the folder tells more.
 _GENERIC = re.compile(r"(point_cloud|splat|scene|gaussians|model|output|export|meta)([_-]?\d+)?", re.IGNORECASE)
 _GENERIC_FOLDER = re.compile(r"(iteration_\d+|point_cloud|ply|exports?|splat|outputs?|results?)", re.IGNORECASE)
+_WHOLE = "tileset.json", "lod-meta.json", "meta.json"  # files by which a folder is one scene
 _PICKLED = (".pt", ".pth", ".ckpt")
 
 
@@ -73,8 +74,8 @@ def _folder(folder: Path, depth: int, seen: set[Path]) -> list[Found]:
         return []
     seen.add(folder.resolve())
     whole = _last(folder.glob("point_cloud/iteration_*/point_cloud.*")) or _last(folder.glob("ply/point_cloud_*.*"))
-    if whole is None and (folder / "tileset.json").is_file():  # its tiles are parts of one scene
-        whole = folder / "tileset.json"
+    if whole is None:  # what lies below it are parts of one scene
+        whole = next((folder / name for name in _WHOLE if _is_whole(folder / name)), None)
     if whole is not None:
         return [_file(whole, alone=True)]
     files = _splats(folder)
@@ -85,9 +86,15 @@ def _folder(folder: Path, depth: int, seen: set[Path]) -> list[Found]:
     return out
 
 
+def _is_whole(path: Path) -> bool:
+    """Whether a file makes its folder one scene; a ``meta.json`` may be anybody's."""
+    return path.is_file() and (path.name != "meta.json" or any(path.parent.glob("means_l*.webp")))
+
+
 def _splats(folder: Path) -> list[Path]:
     """Files with a suffix that can be read; not the SfM points that trainers leave as ``input.ply``."""
-    return sorted(p for p in folder.iterdir() if p.is_file() and _readable(p) and p.name != "input.ply")
+    files = (p for p in folder.iterdir() if p.is_file() and _readable(p))
+    return sorted(p for p in files if p.name not in ("input.ply", *_WHOLE))
 
 
 def _readable(path: Path) -> bool:

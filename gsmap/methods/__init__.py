@@ -15,6 +15,7 @@ __all__ = ["Family", "MethodParams", "RecipeKey", "families", "family", "text_di
 
 # A format's name is the suffix of its files.
 _FORMATS = (
+    ("lod-meta.json", "gsmap.formats.streamed_sog"),
     (".compressed.ply", "gsmap.formats.compressed_ply"),
     (".glb", "gsmap.formats.glb"),
     (".ply", "gsmap.formats.ply"),

@@ -119,7 +119,7 @@ def test_a_tileset_says_how_its_levels_look_and_keeps_them(tmp_path, monkeypatch
         poses = {"0" * 32: Sim3.identity()}
         tiles.append(Tile(f"k{i}", 0, bounds, poses, len(mine), {}, False, path, f"digest {i}", ()))
     made = []
-    monkeypatch.setattr("gsmap.export.tileset.make_level", lambda *a: made.append(a) or levels.make_level(*a))
+    monkeypatch.setattr("gsmap.export.pyramid.make_level", lambda *a: made.append(a) or levels.make_level(*a))
     (file,) = write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: before_it(16, seed=1), levels=QUICK)
     first = json.loads(file.read_text())
     assert len(made) == 1

@@ -1,5 +1,5 @@
 """What gsmap writes, read by PlayCanvas' splat-transform: ``npm install --prefix ~/.cache/gsmap/validators
-@playcanvas/splat-transform`` (node 20 gets 2.7, which reads no streamed SOG; 22 gets 3)."""
+@playcanvas/splat-transform@3.7.0`` (its first versions read no streamed SOG)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ PACKAGE /= "node_modules/@playcanvas/splat-transform"
 pytestmark = pytest.mark.slow
 
 
-def splat_transform(source: Path, target: Path) -> None:
+def splat_transform(source: Path, target: Path, *options: str) -> None:
     if not PACKAGE.is_dir() or shutil.which("node") is None:
         pytest.skip("needs node and splat-transform: see the top of this file")
     subprocess.run(
-        ["node", PACKAGE / "bin" / "cli.mjs", "-q", "-w", "-g", "cpu", source, target], check=True, timeout=300
+        ["node", PACKAGE / "bin" / "cli.mjs", "-q", "-w", "-g", "cpu", *options, source, target],
+        check=True,
+        timeout=300,
     )
 
 
@@ -54,3 +56,27 @@ def test_its_sog_folder_is_read(tmp_path):
     assert json.loads((tmp_path / "b" / "meta.json").read_text())["count"] == 500
     splat_transform(tmp_path / "b" / "meta.json", tmp_path / "b.ply")
     same(formats.read(tmp_path / "b" / "meta.json"), formats.read(tmp_path / "b.ply"))
+
+
+def test_streamed_sog(tmp_path):
+    g = random_gaussians(4000, 1)
+    formats.write(tmp_path / "s" / "lod-meta.json", g, max_per_leaf=500)
+    splat_transform(tmp_path / "s" / "lod-meta.json", tmp_path / "b.ply", "-L", "0")
+    ours, theirs = formats.read(tmp_path / "s" / "lod-meta.json"), formats.read(tmp_path / "b.ply")
+    ours, theirs = (one[np.lexsort(one.means.T)] for one in (ours, theirs))
+    same(ours, theirs)
+    counts = json.loads((tmp_path / "s" / "lod-meta.json").read_text())["counts"]
+    for level, count in enumerate(counts):
+        splat_transform(tmp_path / "s" / "lod-meta.json", tmp_path / f"{level}.ply", "-L", str(level))
+        assert len(formats.read(tmp_path / f"{level}.ply")) == count
+
+
+def test_its_streamed_sog_is_read(tmp_path):
+    formats.write(tmp_path / "a.ply", random_gaussians(3000, 1))
+    (tmp_path / "s").mkdir()
+    splat_transform(tmp_path / "a.ply", tmp_path / "s" / "lod-meta.json", "-C", "1")
+    back = formats.read(tmp_path / "s" / "lod-meta.json")
+    assert len(back) == 3000
+    np.testing.assert_allclose(
+        back.means[np.lexsort(back.means.T)].mean(0), random_gaussians(3000, 1).means.mean(0), atol=1e-3
+    )
