@@ -183,6 +183,64 @@ def sog_folder(folder: Path) -> list[bytes]:
     return [(folder / "meta.json").read_bytes()]
 
 
+def ksplat(folder: Path) -> list[bytes]:
+    """One of each compression level: four splats of SH degree 1 in two buckets."""
+    out = []
+    for level, row in ((0, 80), (1, 42), (2, 33)):
+        buckets = 2 * (level > 0)
+        header = struct.pack("<BB2xIIIIHH", 0, 1, 1, 1, 4, 4, level, 0).ljust(4096, b"\0")
+        section = struct.pack("<4If2H4IH", 4, 4, 3, buckets, 5.0, 12, 0, 0, 0, buckets // 2, buckets // 2, 1)
+        rows = np.random.default_rng(level).integers(0, 60, 4 * row).astype(np.uint8).tobytes()
+        out.append(
+            header + section.ljust(1024, b"\0") + struct.pack("<I", 1)[: 2 * buckets] + bytes(12 * buckets) + rows
+        )
+    return out
+
+
+def lcc(folder: Path) -> None:
+    """What lies beside the JSON of an .lcc: two units of two levels."""
+    rng = np.random.default_rng(0)
+    index = b"".join(struct.pack("<I" + "IQI" * 2, i, 3, 96 * i, 96, 0, 0, 0) for i in range(2))
+    (folder / "index.bin").write_bytes(index)
+    (folder / "data.bin").write_bytes(rng.integers(0, 60, 192).astype(np.uint8).tobytes())
+    (folder / "shcoef.bin").write_bytes(rng.integers(0, 256, 384).astype(np.uint8).tobytes())
+
+
+def lcc_json(folder: Path) -> list[bytes]:
+    bounds = [{"name": name, "min": [0.1] * 3, "max": [0.5] * 3} for name in ("scale", "shcoef")]
+    return [
+        json.dumps({"totalLevel": 2, "fileType": kind, "attributes": bounds}).encode()
+        for kind in ("Quality", "Portable")
+    ]
+
+
+def lcc_beside(folder: Path) -> None:
+    lcc(folder)
+    (folder / "in.lcc").write_bytes(lcc_json(folder)[0])
+
+
+def lcc_index(folder: Path) -> list[bytes]:
+    lcc(folder)
+    return [(folder / "index.bin").read_bytes()]
+
+
+def checkpoint(folder: Path) -> list[bytes]:
+    import torch
+
+    g = some(5, 1)
+    table = {"means": g.means, "quats": g.quats, "scales": g.log_scales, "opacities": g.logit_opacities}
+    table |= {"sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}
+    tensors = {name: torch.tensor(values) for name, values in table.items()}
+    out = []
+    for whole in (
+        {"step": 1, "splats": tensors},
+        {"pipeline": {f"_model.gauss_params.{k}": v for k, v in tensors.items()}},
+    ):
+        torch.save(whole, folder / "seed.pt")
+        out.append((folder / "seed.pt").read_bytes())
+    return out
+
+
 def spz(folder: Path) -> list[bytes]:
     """Versions 3 and 4 as written, and the payload of version 3 under the older headers and with an extension."""
     out = written(".spz", {"version": 3}, {"version": 4})(folder)
@@ -311,6 +369,10 @@ TARGETS: dict[str, Target] = {
     "splat": Target("in.splat", written(".splat"), gaussians_file),
     "spz": Target("in.spz", spz, gaussians_file, mutators.spz),
     "sog": Target("in.sog", sog, gaussians_file, mutators.sog),
+    "ksplat": Target("in.ksplat", ksplat, gaussians_file),
+    "lcc": Target("in.lcc", lcc_json, gaussians_file, JSON, lcc),
+    "lcc_index": Target("index.bin", lcc_index, lambda p: gaussians_file(p.with_name("in.lcc")), setup=lcc_beside),
+    "checkpoint": Target("in.pt", checkpoint, gaussians_file),
     "sog_folder": Target("meta.json", sog_folder, gaussians_file, JSON, sog_folder),
     "glb": Target("in.glb", written(".glb"), gaussians_file, mutators.glb),
     "tileset": Target(

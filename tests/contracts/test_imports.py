@@ -69,7 +69,7 @@ HOMES = {
     "open3d": {"formats", "gsmap_synthetic"},
     "av": {"localize"},
     "pycolmap": {"formats", "localize"},
-    "torch": {"render"},
+    "torch": {"formats", "render"},
     "tomlkit": {"settings"},
     "pyproj": {"world"},
     "typer": {"cli"},

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from formats_cases import random_gaussians
+from formats_cases import angles_rad, covariances, random_gaussians
+from test_ksplat import ksplat, near
+from test_lcc import lcc, some
 
 from gsmap import formats
 from gsmap.types import Gaussians
@@ -36,7 +38,7 @@ def same(ours: Gaussians, theirs: Gaussians) -> None:
     assert len(ours) == len(theirs)
     np.testing.assert_allclose(theirs.means, ours.means, atol=1e-5, rtol=1e-5)
     np.testing.assert_allclose(theirs.log_scales, ours.log_scales, atol=1e-5)
-    np.testing.assert_allclose(np.abs((theirs.quats * ours.quats).sum(1)), 1, atol=1e-4)
+    assert angles_rad(ours, theirs).max() < 1e-4
     np.testing.assert_allclose(theirs.opacities, ours.opacities, atol=1e-3)  # it lets 0 and 255 be 1e-6 from the end
     np.testing.assert_allclose(theirs.sh, ours.sh, atol=1e-5)
 
@@ -56,6 +58,30 @@ def test_its_sog_folder_is_read(tmp_path):
     assert json.loads((tmp_path / "b" / "meta.json").read_text())["count"] == 500
     splat_transform(tmp_path / "b" / "meta.json", tmp_path / "b.ply")
     same(formats.read(tmp_path / "b" / "meta.json"), formats.read(tmp_path / "b.ply"))
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 2])
+def test_ksplat(tmp_path, level, degree):
+    (tmp_path / "a.ksplat").write_bytes(ksplat([near(300, degree), near(90, degree, 1)], level))
+    splat_transform(tmp_path / "a.ksplat", tmp_path / "b.ply")
+    ours, theirs = formats.read(tmp_path / "a.ksplat"), formats.read(tmp_path / "b.ply")
+    same(ours, theirs)
+
+
+@pytest.mark.parametrize("with_sh", [False, True])
+def test_lcc(tmp_path, with_sh):
+    """It turns positions, quaternions and SH by 90 degrees: covariances and colours are compared, in its order."""
+    path = lcc(
+        tmp_path / "s", [[some(200, 3 * with_sh, seed), some(20, 3 * with_sh)] for seed in range(2)], with_sh=with_sh
+    )
+    for file in path.parent.iterdir():
+        file.rename(file.with_name(file.name.lower()))
+    splat_transform(path, tmp_path / "b.ply", "-L", "0")
+    ours, theirs = formats.read(path), formats.read(tmp_path / "b.ply")
+    np.testing.assert_allclose(theirs.means, ours.means, atol=1e-5)
+    np.testing.assert_allclose(covariances(theirs), covariances(ours), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(theirs.sh, ours.sh, atol=1e-4)
 
 
 def test_streamed_sog(tmp_path):
