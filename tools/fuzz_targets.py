@@ -373,6 +373,8 @@ TARGETS: dict[str, Target] = {
     "lcc": Target("in.lcc", lcc_json, gaussians_file, JSON, lcc),
     "lcc_index": Target("index.bin", lcc_index, lambda p: gaussians_file(p.with_name("in.lcc")), setup=lcc_beside),
     "checkpoint": Target("in.pt", checkpoint, gaussians_file),
+    "usda": Target("in.usda", written(".usda"), gaussians_file),
+    "usdc": Target("in.usdc", written(".usdc"), gaussians_file),
     "sog_folder": Target("meta.json", sog_folder, gaussians_file, JSON, sog_folder),
     "glb": Target("in.glb", written(".glb"), gaussians_file, mutators.glb),
     "tileset": Target(

@@ -25,7 +25,7 @@ def command(
     map: MapPath,
     out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; exporting there again updates it.")],
     format: Annotated[
-        str, typer.Option("--format", help="ply, compressed.ply, splat, spz, sog, glb, 3dtiles or streamed-sog.")
+        str, typer.Option("--format", help="ply, compressed.ply, splat, spz, sog, glb, usdc, 3dtiles or streamed-sog.")
     ] = "ply",
     tile_size: Annotated[float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")] = 10.0,
     bbox: Annotated[

@@ -28,6 +28,9 @@ _FORMATS = (
     ("meta.json", "gsmap.formats.sog"),
     (".splat", "gsmap.formats.splat"),
     (".spz", "gsmap.formats.spz"),
+    (".usda", "gsmap.formats.usd"),
+    (".usdc", "gsmap.formats.usd"),
+    (".usdz", "gsmap.formats.usd"),
     ("tileset.json", "gsmap.formats.tiles3d"),
 )
 

@@ -70,6 +70,7 @@ HOMES = {
     "av": {"localize"},
     "pycolmap": {"formats", "localize"},
     "torch": {"formats", "render"},
+    "pxr": {"formats"},
     "tomlkit": {"settings"},
     "pyproj": {"world"},
     "typer": {"cli"},
