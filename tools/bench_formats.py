@@ -1,6 +1,9 @@
-"""Seconds (CPU), bytes and picture of every format, next to gsply and Open3D in the same run.
+"""Seconds (CPU), bytes and picture of every format, next to gsply, Open3D and splat-transform in the same run.
 
-    python tools/bench_formats.py [FILE [--cameras CAMERAS] | --count N] [--degree D] [--json OUT]
+    python tools/bench_formats.py [FILE [--cameras CAMERAS] | --count N] [--degree D] [--json OUT] [--peers] [--only NAME]
+
+--peers runs splat-transform too (npm: @playcanvas/splat-transform, see tests/formats/test_splat_transform.py), which
+takes minutes to write a SOG without a GPU. --only: formats with this in their names.
 
 Without FILE, N random Gaussians, which compress worse than trained ones. With CAMERAS, the PSNR of what gsmap reads
 back against FILE itself, over five views that gsmap renders.
@@ -11,6 +14,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
+import resource
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable
@@ -29,15 +35,19 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--degree", type=int, default=3)
     parser.add_argument("--json")
+    parser.add_argument("--peers", action="store_true")
+    parser.add_argument("--only", default="")
     args = parser.parse_args()
     g = formats.read(args.file) if args.file else random_gaussians(args.count, args.degree)
     print(f"{len(g):,} Gaussians, SH degree {g.sh_degree}; CPU seconds")
-    print(f"{'format':20} {'by':8} {'write s':>8} {'read s':>8} {'MB':>8} {'PSNR dB':>8}")
+    print(f"{'format':20} {'by':16} {'write s':>8} {'read s':>8} {'MB':>8} {'bytes':>8} {'PSNR dB':>8}")
     rows = []
     picture_of = renderer(args.cameras) if args.cameras else None
     truth = picture_of(g) if picture_of else None
     with tempfile.TemporaryDirectory() as folder:
-        for name, by, write, read in ways(g, Path(folder)):
+        for name, by, write, read in ways(g, Path(folder), args.file if args.peers else None):
+            if args.only not in name:
+                continue
             (write_s, _), (read_s, back) = timed(write), timed(read)
             row = {
                 "format": name,
@@ -45,22 +55,23 @@ def main() -> None:
                 "write_s": write_s,
                 "read_s": read_s,
                 "mb": size_mb(folder),
+                "bytes_per_gaussian": size_mb(folder) * 1e6 / len(g),
                 "psnr_db": None,
             }
             if truth is not None and isinstance(back, Gaussians):
                 row["psnr_db"] = -10 * math.log10(max(float(((picture_of(back) - truth) ** 2).mean()), 1e-15))
             rows.append(row)
-            keys = ("write_s", "read_s", "mb", "psnr_db")
+            keys = ("write_s", "read_s", "mb", "bytes_per_gaussian", "psnr_db")
             numbers = [f"{row[k]:8.2f}" if row[k] is not None else f"{'-':>8}" for k in keys]
-            print(f"{name:20} {by:8} {' '.join(numbers)}", flush=True)
+            print(f"{name:20} {by:16} {' '.join(numbers)}", flush=True)
             for file in sorted(Path(folder).rglob("*"), reverse=True):
                 file.rmdir() if file.is_dir() else file.unlink()
     if args.json:
         Path(args.json).write_text(json.dumps({"count": len(g), "sh_degree": g.sh_degree, "rows": rows}, indent=1))
 
 
-def ways(g: Gaussians, folder: Path):
-    """(format, by whom, write, read) with nothing to do before it is called."""
+def ways(g: Gaussians, folder: Path, peers_of: str | None):
+    """(format, by whom, write, read) with nothing to do before it is called; splat-transform writes from a file."""
     for name, options in (
         (".ply", {}),
         (".compressed.ply", {}),
@@ -69,10 +80,18 @@ def ways(g: Gaussians, folder: Path):
         (".spz v4", {"version": 4}),
         (".spz 8 bits of SH", {"sh_bits": (8, 8)}),
         (".glb", {}),
+        (".sog", {}),
+        (".sog palette 4096", {"palette_size": 4096}),
+        (".usdc", {}),
+        (".usdc half", {"half": True}),
         ("tileset.json", {}),
+        ("lod-meta.json", {}),
     ):
         path = folder / ("a" + name.split()[0] if name.startswith(".") else name)
         yield name, "gsmap", lambda p=path, o=options: formats.write(p, g, **o), lambda p=path: formats.read(p)
+    for name in (".sog", ".spz", ".compressed.ply") if peers_of else ():
+        path = folder / f"a{name}"
+        yield name, "splat-transform", lambda p=path: splat_transform(peers_of, p), lambda p=path: formats.read(p)
     try:
         import gsply
     except ImportError:
@@ -94,13 +113,25 @@ def ways(g: Gaussians, folder: Path):
     yield ".spz", "open3d", None, lambda: open3d.t.io.read_point_cloud(str(spz))
 
 
+def splat_transform(source: str, target: Path) -> None:
+    home = Path(os.environ.get("NPM_VALIDATORS", Path.home() / ".cache" / "gsmap" / "validators"))
+    program = home / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+    subprocess.run(["node", program, "-q", "-w", "-g", "cpu", "--max-workers", "0", source, target], check=True)
+
+
 def timed(call: Callable[[], object] | None) -> tuple[float | None, object]:
     """CPU seconds of a call, and what it returned."""
     if call is None:
         return None, None
-    start = time.process_time()
+    start = cpu_s()
     back = call()
-    return time.process_time() - start, back
+    return cpu_s() - start, back
+
+
+def cpu_s() -> float:
+    """Of this process and of those that it started and that ended."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def renderer(path: str) -> Callable[[Gaussians], np.ndarray]:

@@ -22,7 +22,8 @@ from gsmap import formats
 from gsmap.cli.edge import read_pose
 from gsmap.errors import NotFoundError
 from gsmap.export.manifest import Manifest
-from gsmap.export.tileset import _known_boxes
+from gsmap.export.streamed import StreamedSog
+from gsmap.export.tileset import Tiles3D
 from gsmap.formats import cameras_json, colmap, g2o, nerfstudio, tum
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.ingest import find_captures, find_date
@@ -125,7 +126,7 @@ def written(suffix: str, *options: dict) -> Callable[[Path], list[bytes]]:
         out = []
         for chosen in options or ({},):
             for degree in (0, 1, 3):
-                path = folder / (suffix if suffix == "tileset.json" else f"seed{suffix}")
+                path = folder / (suffix if suffix.endswith(".json") else f"seed{suffix}")
                 formats.write(path, some(5 + 260 * (degree == 0 and suffix == ".compressed.ply"), degree), **chosen)
                 out.append(path.read_bytes())
         return out
@@ -175,6 +176,69 @@ def sog(folder: Path) -> list[bytes]:
         for name, data in files.items():
             archive.writestr(f"{name}.webp", data)
     return [out.getvalue()]
+
+
+def sog_folder(folder: Path) -> list[bytes]:
+    formats.write(folder / "meta.json", some(12, 1))
+    return [(folder / "meta.json").read_bytes()]
+
+
+def ksplat(folder: Path) -> list[bytes]:
+    """One of each compression level: four splats of SH degree 1 in two buckets."""
+    out = []
+    for level, row in ((0, 80), (1, 42), (2, 33)):
+        buckets = 2 * (level > 0)
+        header = struct.pack("<BB2xIIIIHH", 0, 1, 1, 1, 4, 4, level, 0).ljust(4096, b"\0")
+        section = struct.pack("<4If2H4IH", 4, 4, 3, buckets, 5.0, 12, 0, 0, 0, buckets // 2, buckets // 2, 1)
+        rows = np.random.default_rng(level).integers(0, 60, 4 * row).astype(np.uint8).tobytes()
+        out.append(
+            header + section.ljust(1024, b"\0") + struct.pack("<I", 1)[: 2 * buckets] + bytes(12 * buckets) + rows
+        )
+    return out
+
+
+def lcc(folder: Path) -> None:
+    """What lies beside the JSON of an .lcc: two units of two levels."""
+    rng = np.random.default_rng(0)
+    index = b"".join(struct.pack("<I" + "IQI" * 2, i, 3, 96 * i, 96, 0, 0, 0) for i in range(2))
+    (folder / "index.bin").write_bytes(index)
+    (folder / "data.bin").write_bytes(rng.integers(0, 60, 192).astype(np.uint8).tobytes())
+    (folder / "shcoef.bin").write_bytes(rng.integers(0, 256, 384).astype(np.uint8).tobytes())
+
+
+def lcc_json(folder: Path) -> list[bytes]:
+    bounds = [{"name": name, "min": [0.1] * 3, "max": [0.5] * 3} for name in ("scale", "shcoef")]
+    return [
+        json.dumps({"totalLevel": 2, "fileType": kind, "attributes": bounds}).encode()
+        for kind in ("Quality", "Portable")
+    ]
+
+
+def lcc_beside(folder: Path) -> None:
+    lcc(folder)
+    (folder / "in.lcc").write_bytes(lcc_json(folder)[0])
+
+
+def lcc_index(folder: Path) -> list[bytes]:
+    lcc(folder)
+    return [(folder / "index.bin").read_bytes()]
+
+
+def checkpoint(folder: Path) -> list[bytes]:
+    import torch
+
+    g = some(5, 1)
+    table = {"means": g.means, "quats": g.quats, "scales": g.log_scales, "opacities": g.logit_opacities}
+    table |= {"sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}
+    tensors = {name: torch.tensor(values) for name, values in table.items()}
+    out = []
+    for whole in (
+        {"step": 1, "splats": tensors},
+        {"pipeline": {f"_model.gauss_params.{k}": v for k, v in tensors.items()}},
+    ):
+        torch.save(whole, folder / "seed.pt")
+        out.append((folder / "seed.pt").read_bytes())
+    return out
 
 
 def spz(folder: Path) -> list[bytes]:
@@ -305,6 +369,13 @@ TARGETS: dict[str, Target] = {
     "splat": Target("in.splat", written(".splat"), gaussians_file),
     "spz": Target("in.spz", spz, gaussians_file, mutators.spz),
     "sog": Target("in.sog", sog, gaussians_file, mutators.sog),
+    "ksplat": Target("in.ksplat", ksplat, gaussians_file),
+    "lcc": Target("in.lcc", lcc_json, gaussians_file, JSON, lcc),
+    "lcc_index": Target("index.bin", lcc_index, lambda p: gaussians_file(p.with_name("in.lcc")), setup=lcc_beside),
+    "checkpoint": Target("in.pt", checkpoint, gaussians_file),
+    "usda": Target("in.usda", written(".usda"), gaussians_file),
+    "usdc": Target("in.usdc", written(".usdc"), gaussians_file),
+    "sog_folder": Target("meta.json", sog_folder, gaussians_file, JSON, sog_folder),
     "glb": Target("in.glb", written(".glb"), gaussians_file, mutators.glb),
     "tileset": Target(
         "tileset.json",
@@ -313,7 +384,20 @@ TARGETS: dict[str, Target] = {
         JSON,
         written("tileset.json", {"max_per_tile": 3}),
     ),
-    "known_boxes": Target("tileset.json", written("tileset.json"), lambda p: _known_boxes(p.parent), JSON),
+    "streamed_sog": Target(
+        "lod-meta.json",
+        written("lod-meta.json", {"max_per_leaf": 3}),
+        gaussians_file,
+        JSON,
+        written("lod-meta.json", {"max_per_leaf": 3}),
+    ),
+    "known_levels": Target("tileset.json", written("tileset.json"), lambda p: Tiles3D().known(p.parent), JSON),
+    "known_streams": Target(
+        "lod-meta.json",
+        written("lod-meta.json", {"max_per_leaf": 3}),
+        lambda p: StreamedSog().known(p.parent),
+        JSON,
+    ),
     "cameras_json": Target("cameras.json", one(lambda p: cameras_json.write(p, cameras())), cameras_file, JSON),
     "transforms_json": Target("transforms.json", transforms, cameras_file, JSON),
     "dataparser_json": Target(

@@ -29,7 +29,10 @@ def command(
     out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; exporting there again updates it.")],
     format: Annotated[
         str,
-        typer.Option("--format", help="ply, compressed.ply, splat, spz, glb or 3dtiles; html: one file to look at."),
+        typer.Option(
+            "--format",
+            help="ply, compressed.ply, splat, spz, sog, glb, usdc, 3dtiles or streamed-sog; html: one file to look at.",
+        ),
     ] = "ply",
     tile_size: Annotated[
         float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")

@@ -18,7 +18,9 @@ from gsmap.types import Tile
 VERSION = 1
 """Raised whenever the same merged Gaussians are written otherwise: every tile is then made again."""
 
-_TILES_3D = "3dtiles"
+_TILES_3D, _STREAMED_SOG = "3dtiles", "streamed-sog"
+_TREES = {_TILES_3D: "glb", _STREAMED_SOG: "sog"}
+"""Formats that are a tree of levels over tiles, and the suffix of those tiles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,8 @@ class TileRecipe:
 
     Args:
         merge: of the merger and its settings (`gsmap.merge.recipe_key`).
-        format: suffix of the tiles' files without the dot, or ``3dtiles`` (``.glb`` below a tree of coarser levels).
+        format: suffix of the tiles' files without the dot, or a tree of coarser levels over them: ``3dtiles`` (of
+            ``.glb``) or ``streamed-sog`` (of ``.sog``).
         provenance: whether the file says of each Gaussian which scene it is from (``.ply`` alone).
         budget_s: ceiling on the seconds that merging one tile may take, None for none.
         uncompressed: whether the content of ``3dtiles`` is float32 rather than SPZ.
@@ -45,9 +48,9 @@ class TileRecipe:
     dates: Mapping[str, str | None] | None = None
 
     def __post_init__(self) -> None:
-        if self.format != _TILES_3D and f".{self.format}" not in formats.known("write"):
+        if self.format not in _TREES and f".{self.format}" not in formats.known("write"):
             suffixes = [name[1:] for name in formats.known("write") if name.startswith(".")]
-            known = ", ".join([*suffixes, _TILES_3D])
+            known = ", ".join([*suffixes, *_TREES])
             raise ConfigError(f"cannot write {self.format!r}: choose one of {known}")
         if self.provenance and self.format != "ply":
             raise ConfigError(f"provenance is a property of .ply files, the format asked for is {self.format}")
@@ -61,9 +64,14 @@ class TileRecipe:
         return self.format == _TILES_3D
 
     @property
+    def is_tree(self) -> bool:
+        """Whether the tiles lie below a tree of coarser levels."""
+        return self.format in _TREES
+
+    @property
     def suffix(self) -> str:
         """Of the tiles' files, without the dot."""
-        return "glb" if self.is_tileset else self.format
+        return _TREES.get(self.format, self.format)
 
     def with_dates(self, dates: Mapping[str, str | None]) -> TileRecipe:
         """The same for a merger that uses dates."""

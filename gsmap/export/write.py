@@ -316,7 +316,11 @@ def _remove_doomed(out: Path, manifest: Manifest) -> None:
 
 def leftovers(out: Path) -> list[tuple[str, ...]]:
     """Where in its folder an export that was killed had begun to write."""
-    found = [*out.glob(f".{FILE_NAME}.*"), *out.glob("component_*/.tileset.json.*")]
+    found = [
+        *out.glob(f".{FILE_NAME}.*"),
+        *out.glob("component_*/.tileset.json.*"),
+        *out.glob("component_*/.lod-meta.json.*"),
+    ]
     return [(_STAGING,), *(path.relative_to(out).parts for path in found)]
 
 

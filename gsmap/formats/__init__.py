@@ -26,9 +26,13 @@ _Part = TypeVar("_Part")
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str | None:
-    """The longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None."""
+    """The longest known suffix that the path ends with (``.compressed.ply`` before ``.ply``), or None.
+
+    One without a dot (``tileset.json``) is a whole name: that of a file whose folder is the scene.
+    """
     name = Path(path).name.lower()
-    return max((s for s in _suffixes(tuple(sys.path)) if name.endswith(s)), key=len, default=None)
+    found = (s for s in _suffixes(tuple(sys.path)) if name == s or (s.startswith(".") and name.endswith(s)))
+    return max(found, key=len, default=None)
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
@@ -111,15 +115,15 @@ def write(path: str | os.PathLike[str], gaussians: GaussianSource, **options: ob
         options: of the format; see the ``write`` of its module.
 
     Raises:
-        NotFoundError: the folder does not exist; that of a ``tileset.json`` is made.
+        NotFoundError: the folder does not exist; that of a ``tileset.json`` and its like is made.
         InputError: unknown suffix, a format that is only read, or a path that cannot be written.
     """
     path = Path(path)
     suffix = _suffix(path, "write")
     module = _load(suffix)
-    if suffix == path.name:  # a folder by what lies in it, such as ``tileset.json``
+    if not suffix.startswith("."):  # a folder by what lies in it, such as ``tileset.json``
         with _explained(path.parent, "write"):
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
     staged = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # a name that nobody can have put a link at
     try:
         with _explained(path, "write"):

@@ -16,14 +16,14 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
 from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.formats import glb
+from gsmap.formats.inside import file_inside
 from gsmap.formats.quantise import require_writable
 from gsmap.geometry.decimate import decimate
 from gsmap.geometry.voxels import axis_deviations
@@ -79,7 +79,7 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     if not contents:
         raise InputError(f"{path} has no tiles with content")
     return Gaussians.concatenate(
-        [glb.read_world(_inside(path, uri), matrix @ _Y_UP_TO_Z_UP) for uri, matrix in contents]
+        [glb.read_world(file_inside(path, uri, ".glb"), matrix @ _Y_UP_TO_Z_UP) for uri, matrix in contents]
     )
 
 
@@ -240,20 +240,3 @@ def _finest(path: Path, root: dict[str, Any]) -> Iterator[tuple[str, np.ndarray]
             for content in tile.get("contents", [tile["content"]] if "content" in tile else []):
                 yield content["uri"], matrix
         todo += [(child, matrix, refine, depth + 1) for child in reversed(children)]
-
-
-def _inside(path: Path, uri: str) -> Path:
-    """The file of a relative uri within the tileset's folder, links followed."""
-    name = PurePosixPath(unquote(str(uri)))
-    folder = path.parent.resolve()
-    try:
-        file = (folder / name).resolve()
-    except (ValueError, OSError, RuntimeError) as error:  # a NUL, half a surrogate, a name too long, links in a circle
-        raise InputError(f"{path}: content {uri!r} is no name of a file: {error}") from error
-    if name.is_absolute() or ":" in str(name) or "\\" in str(name) or not file.is_relative_to(folder):
-        raise InputError(f"{path}: content {uri!r} lies outside the tileset's folder; gsmap will not follow it")
-    if file.suffix.lower() != ".glb":
-        raise InputError(f"{path}: content {uri!r} is not a .glb; gsmap reads tilesets of splats in GLB")
-    if not file.is_file():
-        raise InputError(f"{path}: content {uri!r} is missing")
-    return file

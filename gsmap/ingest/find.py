@@ -14,9 +14,15 @@ from gsmap.formats import colmap
 
 MAX_DEPTH = 5
 # What a trainer calls every one of its files, so the folder tells more.
-_GENERIC = re.compile(r"(point_cloud|splat|scene|gaussians|model|output|export|meta)([_-]?\d+)?", re.IGNORECASE)
-_GENERIC_FOLDER = re.compile(r"(iteration_\d+|point_cloud|ply|exports?|splat|outputs?|results?)", re.IGNORECASE)
-_PICKLED = (".pt", ".pth", ".ckpt")
+_GENERIC = re.compile(
+    r"(point_cloud|splat|scene|gaussians|model|output|export|meta|ckpt|step|chkpnt)([_-]?\d+)?(_rank\d+)?",
+    re.IGNORECASE,
+)
+_GENERIC_FOLDER = re.compile(
+    r"(iteration_\d+|point_cloud|ply|ckpts|nerfstudio_models|exports?|splat|outputs?|results?)", re.IGNORECASE
+)
+_WHOLE = "tileset.json", "lod-meta.json", "meta.json"  # files by which a folder is one scene
+_CHECKPOINTS = (".pt", ".pth", ".ckpt")
 
 
 @dataclass(frozen=True)
@@ -73,11 +79,14 @@ def _folder(folder: Path, depth: int, seen: set[Path]) -> list[Found]:
         return []
     seen.add(folder.resolve())
     whole = _last(folder.glob("point_cloud/iteration_*/point_cloud.*")) or _last(folder.glob("ply/point_cloud_*.*"))
-    if whole is None and (folder / "tileset.json").is_file():  # its tiles are parts of one scene
-        whole = folder / "tileset.json"
+    if whole is None:  # what lies below it are parts of one scene
+        whole = next((folder / name for name in _WHOLE if _is_whole(folder / name)), None)
     if whole is not None:
         return [_file(whole, alone=True)]
     files = _splats(folder)
+    newest = None if files else _checkpoint(folder)
+    if newest is not None:
+        return [_file(newest, alone=True)]
     out = [_file(path, alone=len(files) == 1) for path in files]
     if depth > 0:
         for child in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
@@ -85,9 +94,28 @@ def _folder(folder: Path, depth: int, seen: set[Path]) -> list[Found]:
     return out
 
 
+def _checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint of a trainer's output; none where several GPUs have a part each."""
+    found = [
+        *folder.glob("nerfstudio_models/step-*.ckpt"),
+        *folder.glob("ckpts/ckpt_*.pt"),
+        *folder.glob("chkpnt*.pth"),
+    ]
+    if any("_rank" in path.name and not path.name.endswith("_rank0.pt") for path in found):
+        return None
+    numbered = [(int(m[0]), path) for path in found if (m := re.findall(r"\d+", path.name))]
+    return max(numbered, default=(0, None))[1]
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file makes its folder one scene; a ``meta.json`` may be anybody's."""
+    return path.is_file() and (path.name != "meta.json" or any(path.parent.glob("means_l*.webp")))
+
+
 def _splats(folder: Path) -> list[Path]:
     """Files with a suffix that can be read; not the SfM points that trainers leave as ``input.ply``."""
-    return sorted(p for p in folder.iterdir() if p.is_file() and _readable(p) and p.name != "input.ply")
+    files = (p for p in folder.iterdir() if p.is_file() and _readable(p))
+    return sorted(p for p in files if p.name not in ("input.ply", *_WHOLE) and p.suffix.lower() not in _CHECKPOINTS)
 
 
 def _readable(path: Path) -> bool:
@@ -103,8 +131,6 @@ def _last(paths: Iterable[Path]) -> Path | None:
 def _file(path: Path, *, alone: bool) -> Found:
     suffix = formats.suffix_of(path)
     if suffix is None:
-        if path.suffix.lower() in _PICKLED:
-            raise InputError(f"{path} is a pickled checkpoint, which can run code: export a .ply and ingest that")
         raise InputError(
             f"{path} has the unknown suffix {path.suffix!r}: gsmap can read {', '.join(formats.known('read'))}"
         )
@@ -152,6 +178,6 @@ def _shared_cameras(path: Path) -> Path | None:
 
 
 def _why_none(folder: Path) -> str:
-    if any(p.suffix in _PICKLED for p in folder.rglob("*")):
-        return "its checkpoints are pickles, which can run code; export a .ply and ingest that"
+    if any(p.suffix in _CHECKPOINTS for p in folder.rglob("*")):
+        return "it has checkpoints, but not where trainers put those of one GPU: name the file, or export a .ply"
     return f"no file of it ends with {', '.join(formats.known('read'))}"

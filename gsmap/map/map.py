@@ -608,7 +608,7 @@ class Map(AbstractContextManager["Map"]):
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
 
         Args:
-            format: suffix of the tiles' files, or ``3dtiles``.
+            format: suffix of the tiles' files, or a tree of levels: ``3dtiles`` or ``streamed-sog``.
             tile_size_m: edge of a tile; 0 is one file per component.
             bbox: ``x0 y0 z0 x1 y1 z1`` only this box of the map, in its unit, as poses are.
             merge: ``tto``, ``voxel``, ``union``, ``distance``, or one that another package adds; by default what the

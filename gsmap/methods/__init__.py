@@ -15,12 +15,22 @@ __all__ = ["Family", "MethodParams", "RecipeKey", "families", "family", "text_di
 
 # A format's name is the suffix of its files.
 _FORMATS = (
+    ("lod-meta.json", "gsmap.formats.streamed_sog"),
+    (".ckpt", "gsmap.formats.checkpoint"),
     (".compressed.ply", "gsmap.formats.compressed_ply"),
     (".glb", "gsmap.formats.glb"),
+    (".ksplat", "gsmap.formats.ksplat"),
+    (".lcc", "gsmap.formats.lcc"),
     (".ply", "gsmap.formats.ply"),
+    (".pt", "gsmap.formats.checkpoint"),
+    (".pth", "gsmap.formats.checkpoint"),
     (".sog", "gsmap.formats.sog"),
+    ("meta.json", "gsmap.formats.sog"),
     (".splat", "gsmap.formats.splat"),
     (".spz", "gsmap.formats.spz"),
+    (".usda", "gsmap.formats.usd"),
+    (".usdc", "gsmap.formats.usd"),
+    (".usdz", "gsmap.formats.usd"),
     ("tileset.json", "gsmap.formats.tiles3d"),
 )
 

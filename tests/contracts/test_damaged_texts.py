@@ -11,7 +11,7 @@ import pytest
 
 from gsmap.cli.edge import read_pose
 from gsmap.errors import ConfigError, GsmapError, InputError
-from gsmap.export import tileset
+from gsmap.export import streamed, tileset
 from gsmap.export.manifest import Manifest
 from gsmap.formats import g2o
 from gsmap.map.evaluating import _read_truth
@@ -49,7 +49,9 @@ def test_a_tile_whose_path_is_no_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [DEEP, f'{{"root": {{"boundingVolume": {{"box": [{HUGE}, 0]}}}}}}', '{"root": 7}'])
 def test_levels_of_a_tileset_that_is_not_ours_are_made_again(tmp_path: Path, text: str) -> None:
     (tmp_path / "tileset.json").write_text(text)
-    assert tileset._known_levels(tmp_path) == {}
+    assert tileset.Tiles3D().known(tmp_path) == {}
+    (tmp_path / "lod-meta.json").write_text(text)
+    assert streamed.StreamedSog().known(tmp_path) == {}
 
 
 @pytest.mark.parametrize(

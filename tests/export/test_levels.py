@@ -119,7 +119,7 @@ def test_a_tileset_says_how_its_levels_look_and_keeps_them(tmp_path, monkeypatch
         poses = {"0" * 32: Sim3.identity()}
         tiles.append(Tile(f"k{i}", 0, bounds, poses, len(mine), {}, False, path, f"digest {i}", ()))
     made = []
-    monkeypatch.setattr("gsmap.export.tileset.make_level", lambda *a: made.append(a) or levels.make_level(*a))
+    monkeypatch.setattr("gsmap.export.pyramid.make_level", lambda *a: made.append(a) or levels.make_level(*a))
     (file,) = write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: before_it(16, seed=1), levels=QUICK)
     first = json.loads(file.read_text())
     assert len(made) == 1
@@ -158,7 +158,7 @@ def test_a_level_no_better_than_the_next_is_left_out(tmp_path, monkeypatch):
         error = errors["coarse"] if len(made) % 3 == 0 else errors["fine"]  # the root comes last
         return replace(levels.make_level(finer, max_count, None, params), error_m=error)
 
-    monkeypatch.setattr("gsmap.export.tileset.make_level", counted)
+    monkeypatch.setattr("gsmap.export.pyramid.make_level", counted)
 
     def tree(node):
         return [node["content"]["uri"], [tree(child) for child in node.get("children", ())]]

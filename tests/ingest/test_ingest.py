@@ -139,6 +139,53 @@ def test_what_is_no_capture(tmp_path):
             read_captures(given)
 
 
+@pytest.mark.parametrize(
+    ("files", "newest"),
+    [
+        (
+            ("nerfstudio_models/step-000002000.ckpt", "nerfstudio_models/step-000029999.ckpt", "config.yml"),
+            "29999.ckpt",
+        ),
+        (("ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_29999_rank0.pt", "cfg.yml"), "ckpt_29999_rank0.pt"),
+        (("ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_6999_rank1.pt"), None),
+        (("chkpnt7000.pth", "chkpnt30000.pth"), "chkpnt30000.pth"),
+        (("ckpts/ckpt_6999_rank0.pt", "a.ply"), "a.ply"),
+        (("encoder.pt",), None),
+    ],
+)
+def test_the_newest_checkpoint_of_a_trainer_where_there_is_nothing_else(tmp_path, files, newest):
+    for name in files:
+        (tmp_path / "room" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "room" / name).touch()
+    if newest is None:
+        with pytest.raises(InputError, match="checkpoints"):
+            find_captures([tmp_path / "room"])
+        return
+    (found,) = find_captures([tmp_path / "room"])
+    assert found.path.name.endswith(newest)
+    assert found.name == ("a" if newest == "a.ply" else "room")
+
+
+@pytest.mark.parametrize("name", ["tileset.json", "lod-meta.json", "meta.json", "a.lcc", "a.ksplat"])
+def test_a_folder_of_every_kind_is_one_capture(tmp_path, name):
+    folder = tmp_path / "room"
+    folder.mkdir()
+    if name.endswith(".json"):
+        write(folder / name, box())
+    else:
+        (folder / name).touch()
+    (found,) = find_captures([folder])
+    assert found.path == folder / name
+    assert found.name == ("room" if name.endswith(".json") else "a")
+
+
+def test_a_meta_json_of_something_else_is_no_capture(tmp_path):
+    write(tmp_path / "a.ply", box())
+    (tmp_path / "meta.json").write_text("{}")
+    (found,) = find_captures([tmp_path])
+    assert found.path.name == "a.ply"
+
+
 def test_options(tmp_path):
     write(tmp_path / "a.ply", box())
     write(tmp_path / "b.ply", box())

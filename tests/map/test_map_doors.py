@@ -369,7 +369,10 @@ def test_what_cannot_be_asked_for_changes_nothing(
     assert site.revision_rows()[-1].dropped_at is None
     with pytest.raises(ConfigError, match="use larger tiles"):
         site.export(tmp_path / "out", tile_size_m=1e-300)
-    with pytest.raises(ConfigError, match=r"choose one of compressed\.ply, glb, ply, splat, spz, 3dtiles"):
+    with pytest.raises(
+        ConfigError,
+        match=r"choose one of compressed\.ply, glb, ply, sog, splat, spz, usda, usdc, usdz, 3dtiles, streamed-sog",
+    ):
         site.export(tmp_path / "out", format="doc")
     assert not (tmp_path / "out").exists()
     for door in (site.confirm, site.show_pair, site.register):

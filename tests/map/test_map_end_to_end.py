@@ -218,6 +218,33 @@ def test_3dtiles_tree_holds_every_gaussian_at_its_finest(site: Path, tmp_path: P
     assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
 
 
+def test_a_streamed_sog_holds_every_gaussian_at_its_finest_and_is_kept(site: Path, tmp_path: Path) -> None:
+    with gsmap.open(site) as m:
+        tiles = m.export(tmp_path / "t", tile_size_m=4, merge="voxel", format="streamed-sog")
+        file = tmp_path / "t" / "component_0" / "lod-meta.json"
+        before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in file.parent.rglob("*") if p.is_file()}
+        again = m.export(tmp_path / "t", tile_size_m=4, merge="voxel", format="streamed-sog")
+        assert again.recomputed == 0
+        assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in file.parent.rglob("*") if p.is_file()} == before
+        file.unlink()  # all that an export killed at its end lacks
+        m.export(tmp_path / "t", tile_size_m=4, merge="voxel", format="streamed-sog")
+        assert file.read_bytes() == before[file][0]
+        plain = m.export(tmp_path / "p", tile_size_m=0, merge="voxel")
+    finest = formats.read(file)
+    whole = formats.read(tmp_path / "p" / plain.tiles[0].path)
+    assert len(finest) == len(whole) == sum(t.num_gaussians for t in tiles.tiles)
+    np.testing.assert_allclose(np.sort(finest.means, axis=0), np.sort(whole.means, axis=0), atol=1e-3)
+    meta = json.loads(file.read_text())
+    assert meta["lodLevels"] > 1
+    assert meta["counts"][0] > 3 * meta["counts"][-1] > 0
+    told = [meta["tree"]]
+    for node in told:
+        told += node.get("children", [])
+        for level, run in node.get("lods", {}).items():
+            assert (run["error_m"] > 0) == (level != "0")
+            assert (level == "0") != ("psnr_db" in run)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -232,6 +259,7 @@ def test_3dtiles_tree_holds_every_gaussian_at_its_finest(site: Path, tmp_path: P
         ({"merge": "union", "steps": 5}, ConfigError, "takes no steps"),
         ({"format": "spz", "provenance": True}, ConfigError, "provenance"),
         ({"format": "3dtiles", "tile_size_m": 0}, ConfigError, "tile-size"),
+        ({"format": "streamed-sog", "tile_size_m": 0}, ConfigError, "or use sog"),
     ],
 )
 def test_bad_exports_are_refused_and_leave_nothing(

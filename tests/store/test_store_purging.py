@@ -364,6 +364,21 @@ def test_coarser_levels_go_and_come_again(place, tmp_path):
             assert level.read_bytes() not in levels.values()
 
 
+def test_a_streamed_sog_goes_and_comes_again(place, tmp_path):
+    secret = make(place)
+    out = tmp_path / "out"
+    with gsmap.map.open(place) as m:
+        m.export(out, tile_size_m=2, merge="union", format="streamed-sog")
+        before = {p.read_bytes() for p in (out / "component_0").rglob("meta.json")}
+        assert (out / "component_0" / "lod-meta.json").is_file()
+        m.purge(secret)
+        assert not (out / "component_0").exists()
+        m.export(out, tile_size_m=2, merge="union", format="streamed-sog")
+        after = {p.read_bytes() for p in (out / "component_0").rglob("meta.json")}
+        assert after
+        assert not after & before
+
+
 def test_levels_of_an_export_that_was_killed_go(place, tmp_path):
     """The tiles are of today, but the levels above them are from before the scene was removed."""
     secret = make(place)

@@ -1,4 +1,4 @@
-"""The process that reads one mesh, cloud or LAS file by a library, within limits that it sets itself.
+"""The process that reads one mesh, cloud, LAS or USD file by a library, within limits that it sets itself.
 
 It is run as a script, knows nothing of gsmap, and writes one ``.npz`` to the descriptor it is given. What a file makes
 of the library ends here: crashes, aborts for want of memory, and loops.
@@ -26,10 +26,12 @@ def main(out: int, path: str, kind: str, memory_bytes: int, max_points: int) -> 
     if kind == "las":
         import laspy  # noqa: F401
         import lazrs  # noqa: F401
+    elif kind == "usd":
+        from pxr import Usd, UsdGeom, UsdVol  # noqa: F401
     else:
         import open3d  # noqa: F401
     _limit(memory_bytes)
-    read = {"cloud": _cloud, "mesh": _mesh, "las": _las}[kind]
+    read = {"cloud": _cloud, "mesh": _mesh, "las": _las, "usd": _usd}[kind]
     buffer = io.BytesIO()
     np.savez(buffer, **read(Path(path), max_points))
     with os.fdopen(out, "wb") as file:
@@ -84,6 +86,40 @@ def _las(path: Path, max_points: int) -> dict[str, Any]:
         arrays = {name: np.concatenate(parts) for name, parts in columns.items() if parts}
         scales, offsets = np.array(header.scales, float), np.array(header.offsets, float)
         return arrays | {"total": np.array([total, seen]), "scales": scales, "offsets": offsets}
+
+
+def _usd(path: Path, max_points: int) -> dict[str, Any]:
+    """The arrays of every splat by its number, its matrix, and which axis of the stage is up; or why it is refused."""
+    from pxr import Sdf, Usd, UsdGeom, UsdVol
+
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    packed = path.suffix.lower() == ".usdz"
+    if layer is None:
+        return {"refused": np.array("USD cannot read it: it is damaged, or something else")}
+    named = [name for name in layer.GetCompositionAssetDependencies() if name]
+    if any(not packed or name.startswith("/") or ".." in name or ":" in name for name in named):
+        return {"refused": np.array(f"it wants {named[0][:100]!r} read as well, which gsmap does not do: flatten it")}
+    stage = Usd.Stage.Open(layer)
+    if any(used.realPath and Path(used.realPath) != path for used in stage.GetUsedLayers()):
+        return {"refused": np.array("it wants other files read as well, which gsmap does not do: flatten it")}
+    names = {"positions": "positions", "orientations": "orientations", "scales": "scales", "opacities": "opacities"}
+    names["radiance:sphericalHarmonicsCoefficients"] = "sh"
+    arrays: dict[str, Any] = {"up": np.array(str(UsdGeom.GetStageUpAxis(stage)))}
+    when = Usd.TimeCode.EarliestTime()
+    count = 0
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+            continue
+        for theirs, ours in names.items():
+            for name in (theirs, f"{theirs}h"):  # float before half, as the schema says
+                values = prim.GetAttribute(name).Get(when)
+                if values is not None and len(values):
+                    arrays[f"{count}.{ours}"] = np.asarray(values)
+                    break
+        arrays[f"{count}.degree"] = np.array(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get(when) or 0)
+        arrays[f"{count}.matrix"] = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(when))
+        count += 1
+    return arrays | {"count": np.array(count)}
 
 
 def _limit(memory_bytes: int) -> None:

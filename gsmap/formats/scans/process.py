@@ -24,7 +24,7 @@ def asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
     """What a library reads of a file, in a process of its own that ends when it takes too long or too much memory.
 
     Args:
-        kind: ``cloud`` or ``mesh`` (open3d), or ``las`` (laspy).
+        kind: ``cloud`` or ``mesh`` (open3d), ``las`` (laspy), or ``usd`` (usd-core).
 
     Raises:
         InputError: it does not read it, or not within the limits.
@@ -52,7 +52,7 @@ def asked(path: Path, kind: str, params: Params) -> dict[str, np.ndarray]:
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(
             f"{path} cannot be read: its reader gave it up, or needs more than {params.memory_mb} MB: it is damaged "
-            "or too large; convert it to a .ply point cloud"
+            "or too large; convert it to a .ply"
         ) from error
 
 

@@ -17,7 +17,9 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
-from gsmap.export.tileset import is_stale, write_tilesets
+from gsmap.export.pyramid import is_stale
+from gsmap.export.streamed import StreamedSog, write_streams
+from gsmap.export.tileset import Tiles3D, write_tilesets
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.dates import is_until, last_of, undated_note
 from gsmap.map.jobs import TileMaker
@@ -226,20 +228,16 @@ def _export(
             progress=progress,
         )
     _put_aside(store, out, planned, result)
-    if planned.recipe.is_tileset and is_stale(out, result.tiles):
+    layout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
+    if planned.recipe.is_tree and is_stale(out, result.tiles, layout):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
         S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}
-        compressed = not request.uncompressed
-        write_tilesets(
-            out,
-            result.tiles,
-            request.tile_size_m,
-            in_metres_of,
-            S_ecef_map=S_ecef_map,
-            compressed=compressed,
-            cameras=partial(_cameras, store, planned),
-            levels=settings.export.levels,
-        )
+        tree = out, result.tiles, request.tile_size_m, in_metres_of
+        made = {"cameras": partial(_cameras, store, planned), "levels": settings.export.levels}
+        if planned.recipe.is_tileset:
+            write_tilesets(*tree, S_ecef_map=S_ecef_map, compressed=not request.uncompressed, **made)
+        else:
+            write_streams(*tree, **made)
     if store.catalog.writable:
         refused = ""
         try:  # what an interrupted export, or one that could not be noted, left untold is told now
@@ -333,8 +331,10 @@ def _check(request: Request, recipe: TileRecipe) -> None:
     """Refuse what makes no sense before anything is read."""
     if request.budget_s is not None and not request.budget_s > 0:
         raise ConfigError(f"the budget must be a positive number of seconds, got {request.budget_s}")
-    if recipe.is_tileset and not request.tile_size_m > 0:
-        raise ConfigError("3dtiles is a tree of tiles: give --tile-size in metres, or use glb for one file")
+    if recipe.is_tree and not request.tile_size_m > 0:
+        raise ConfigError(
+            f"{recipe.format} is a tree of tiles: give --tile-size in metres, or use {recipe.suffix} for one file"
+        )
 
 
 def _placed(store: Store, revision: int | None, component: int | None) -> tuple[PoseGraph, dict[str, ScenePose]]:

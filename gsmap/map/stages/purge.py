@@ -21,8 +21,9 @@ from gsmap.durable import (
 from gsmap.errors import BusyError, DiskError, DiskFullError, GsmapError, NotFoundError, of_system
 from gsmap.export.lock import folder_lock
 from gsmap.export.manifest import FILE_NAME, Manifest
-from gsmap.export.tileset import FILE_NAME as TILESET
-from gsmap.export.tileset import LEVELS_FOLDER, is_stale
+from gsmap.export.pyramid import LEVELS_FOLDER, is_stale
+from gsmap.export.streamed import StreamedSog
+from gsmap.export.tileset import Tiles3D
 from gsmap.export.write import leftovers
 from gsmap.map.pictures import FILE_NAME as PICTURES
 from gsmap.map.pictures import Pictures
@@ -34,6 +35,7 @@ from gsmap.store.purging import Purge
 from gsmap.view.tree_cache import TreeCache
 
 _COMPONENT = re.compile(r"component_\d+")
+_TREES = (Tiles3D(), StreamedSog())
 
 
 def purge(store: Store, ref: str, *, branches: bool = False) -> list[tuple[str, Purge]]:
@@ -127,8 +129,8 @@ def _passing(error: OSError | GsmapError) -> type[GsmapError] | None:
 def _clean(store: Store, out: Path, begun: Purge) -> Purge:
     """Delete what one folder holds of a scene, if it is this map's export; the purge, with how many files that were.
 
-    Tiles made with it; what no tile is any more, but an export had still to delete; and the coarser levels of 3D Tiles
-    and tilesets of components that had either, or whose levels may be of earlier tiles. The manifest names no tile of
+    Tiles made with it; what no tile is any more, but an export had still to delete; and the coarser levels of trees
+    and those of components that had either, or whose levels may be of earlier tiles. The manifest names no tile of
     these from the beginning, and what is to go until the end, so that an interrupted purge finds all of it again.
     """
     manifest = Manifest.load(out, store.id)
@@ -140,7 +142,7 @@ def _clean(store: Store, out: Path, begun: Purge) -> Purge:
     stale = []
     for folder in _component_folders(out):
         tiles = [tile for tile in kept.values() if tile.path.startswith(f"{folder}/")]
-        if folder in touched or not tiles or is_stale(out, tiles):
+        if folder in touched or not tiles or all(is_stale(out, tiles, tree) for tree in _TREES):
             stale.append(folder)
     num_files = len(paths) + sum(_num_levels(out, folder) for folder in stale)
     if num_files or made_with_it:
@@ -151,7 +153,8 @@ def _clean(store: Store, out: Path, begun: Purge) -> Purge:
         manifest.tiles, manifest.doomed = kept, paths
         manifest.save(out)
     for folder in stale:
-        remove_file(out, folder, TILESET)  # first: it names the levels, which the next export makes again
+        for tree in _TREES:
+            remove_file(out, folder, tree.file_name)  # first: it names the levels, which the next export makes again
         remove_tree(out, folder, LEVELS_FOLDER)
     for path in paths:
         remove_file(out, *path.split("/"))

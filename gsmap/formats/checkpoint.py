@@ -1,0 +1,162 @@
+"""Checkpoints of trainers (read only): gsplat's ``.pt``, nerfstudio's ``.ckpt``, gaussian-splatting's ``.pth``.
+
+Read by ``torch.load(weights_only=True)``, which runs no code of the file, and mapped: what is not asked for is not
+read. Frames are the trainer's own, right-down-front; nerfstudio turns and scales a capture before it trains
+(``dataparser_transforms.json``), and so do what its checkpoints hold.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import struct
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import MALFORMED, InputError
+from gsmap.formats.quantise import check_size
+from gsmap.types import FileInfo, Gaussians
+
+VERSION = 1
+
+_MAX_PICKLE_BYTES = 32 << 20
+_MAX_DEPTH = 6  # of tables in tables that are looked through
+_FIELDS = {
+    "means": ("means", "xyz"),
+    "quats": ("quats", "rotation"),
+    "log_scales": ("scales", "scaling"),
+    "logit_opacities": ("opacities", "opacity"),
+    "sh0": ("sh0", "features_dc"),
+    "shN": ("shN", "features_rest"),
+}
+_TUPLE = ("", "xyz", "features_dc", "features_rest", "scaling", "rotation", "opacity")  # gaussian-splatting's capture()
+_REQUIRED = ("means", "quats", "log_scales", "logit_opacities", "sh0")
+
+
+def read(path: str | os.PathLike[str]) -> Gaussians:
+    """Read the Gaussians of a checkpoint.
+
+    Raises:
+        InputError: not a checkpoint in torch's ZIP layout, one that holds more than weights, no Gaussians in it, or
+            tensors that do not fit together.
+    """
+    found = _tensors(path, _loaded(path))
+    missing = [name for name in _REQUIRED if name not in found]
+    if missing:
+        held = ", ".join(sorted(found)) or "none of what a splat has"
+        raise InputError(f"{path} holds no Gaussians: it has {held} and lacks {', '.join(missing)}")
+    n = len(found["means"])
+    size = os.path.getsize(path)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "sh0": (1, 3)}
+    arrays = {}
+    for name, shape in shapes.items():
+        arrays[name] = _array(path, name, found[name], n, shape, size)
+    sh = arrays["sh0"]
+    if "shN" in found:
+        rest = _array(path, "shN", found["shN"], n, (-1, 3), size)
+        if rest.shape[1] not in (0, 3, 8, 15):
+            raise InputError(f"{path}: {rest.shape[1]} SH coefficients; gsmap reads degrees 0 to 3 (0, 3, 8 or 15)")
+        sh = np.concatenate([sh, rest], axis=1)
+    return Gaussians(arrays["means"], arrays["quats"], arrays["log_scales"], arrays["logit_opacities"], sh)
+
+
+def info(path: str | os.PathLike[str]) -> FileInfo:
+    """That nerfstudio's frame is not that of its cameras' file."""
+    if Path(path).suffix.lower() != ".ckpt":
+        return FileInfo()
+    return FileInfo(notes=(f"{Path(path).name} is in nerfstudio's own frame: see dataparser_transforms.json",))
+
+
+def _loaded(path: str | os.PathLike[str]) -> Any:
+    """What ``torch.load`` makes of it, after its outside was looked at."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, EOFError, *MALFORMED) as error:
+        raise InputError(
+            f"{path} is no checkpoint that gsmap reads: not a ZIP as torch has written since 1.6 ({error}); "
+            "load it with torch and save it again, or export a .ply"
+        ) from error
+    for entry in entries:
+        if entry.compress_type != zipfile.ZIP_STORED or entry.file_size != entry.compress_size:
+            raise InputError(f"{path}: {entry.filename!r} is compressed, which torch never does: damaged or hostile")
+        if entry.filename.endswith(".pkl") and entry.file_size > _MAX_PICKLE_BYTES:
+            raise InputError(f"{path}: its {entry.filename!r} is more than {_MAX_PICKLE_BYTES >> 20} MiB")
+    if not any(entry.filename.endswith("/data.pkl") for entry in entries):
+        raise InputError(f"{path} is a ZIP, but not of torch: it has no data.pkl")
+    import torch
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (
+        struct.error,
+        RuntimeError,
+        pickle.UnpicklingError,
+        EOFError,
+        AssertionError,
+        ImportError,
+        *MALFORMED,
+    ) as error:
+        text = str(error).split("\n")[0]
+        raise InputError(
+            f"{path} cannot be read as weights alone, and gsmap runs no code of a file: {text}; export a .ply"
+        ) from error
+
+
+def _tensors(path: str | os.PathLike[str], loaded: Any) -> dict[str, Any]:
+    """The tensors of Gaussians in a checkpoint by our names, wherever the trainer keeps them."""
+    if isinstance(loaded, tuple | list) and loaded and isinstance(loaded[0], tuple | list):  # (capture(), iteration)
+        loaded = dict(zip(_TUPLE, loaded[0], strict=False))
+    names = {name: ours for ours, all_names in _FIELDS.items() for name in all_names}
+    found: dict[str, Any] = {}
+    todo: list[tuple[Any, int]] = [(loaded, 0)]
+    while todo:
+        table, depth = todo.pop(0)
+        if not isinstance(table, Mapping) or depth > _MAX_DEPTH:
+            continue
+        for name, value in table.items():
+            if not isinstance(name, str) or name in ("optimizers", "schedulers", "scalers"):
+                continue
+            ours = names.get(name.rsplit(".", 1)[-1])
+            if ours is not None and hasattr(value, "stride"):
+                if ours in found:
+                    raise InputError(f"{path} holds {name!r} twice, more than one splat: export a .ply of one")
+                found[ours] = value
+            elif isinstance(value, Mapping):
+                todo.append((value, depth + 1))
+    return found
+
+
+def _array(
+    path: str | os.PathLike[str], name: str, tensor: Any, n: int, shape: tuple[int, ...], size: int
+) -> np.ndarray:
+    """(n, *shape) float32 of a tensor, where the file holds as many numbers; -1 in a shape is any."""
+    import torch
+
+    if tensor.layout != torch.strided or not tensor.is_floating_point() or tensor.dtype.itemsize not in (2, 4, 8):
+        raise InputError(f"{path}: {name} is {tensor.layout} of {tensor.dtype}, not numbers")
+    given = tuple(tensor.shape)
+    if name == "logit_opacities" and given == (n, 1):
+        given, tensor = (n,), tensor[:, 0]
+    if name == "sh0" and given == (n, 3):
+        given, tensor = (n, 1, 3), tensor[:, None]
+    if (
+        len(given) != 1 + len(shape)
+        or given[0] != n
+        or any(b not in (-1, a) for a, b in zip(given[1:], shape, strict=True))
+    ):
+        wanted = ", ".join(["N", *("K" if one < 0 else str(one) for one in shape)])
+        raise InputError(f"{path}: {name} has the shape {given} for {n} Gaussians, expected ({wanted})")
+    if not n:
+        raise InputError(f"{path} has no Gaussians")
+    if tensor.numel() * tensor.dtype.itemsize > size:  # a stride of 0 makes a splat of any size out of one number
+        check_size(path, tensor.numel() * 4, 0)
+        raise InputError(f"{path}: {name} has {tensor.numel()} numbers, more than the file holds")
+    return tensor.detach().to(torch.float32).numpy().copy()

@@ -1,0 +1,32 @@
+"""Files that another file names: within its folder only."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
+
+from gsmap.errors import InputError
+
+
+def file_inside(path: Path, uri: object, suffix: str = "") -> Path:
+    """The file that a relative uri in the file at ``path`` names, which must lie in its folder, links followed.
+
+    Args:
+        suffix: that it must have, with the dot; any if empty.
+
+    Raises:
+        InputError: it lies elsewhere, has another suffix, or is not there.
+    """
+    name = PurePosixPath(unquote(str(uri)))
+    folder = path.parent.resolve()
+    try:
+        file = (folder / name).resolve()
+    except (ValueError, OSError, RuntimeError) as error:  # a NUL, half a surrogate, a name too long, links in a circle
+        raise InputError(f"{path}: content {uri!r} is no name of a file: {error}") from error
+    if name.is_absolute() or ":" in str(name) or "\\" in str(name) or not file.is_relative_to(folder):
+        raise InputError(f"{path}: content {uri!r} lies outside its folder; gsmap will not follow it")
+    if suffix and file.suffix.lower() != suffix:
+        raise InputError(f"{path}: content {uri!r} is not a {suffix}; gsmap reads splats in {suffix} there")
+    if not file.is_file():
+        raise InputError(f"{path}: content {uri!r} is missing")
+    return file
