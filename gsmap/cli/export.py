@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
@@ -20,12 +21,19 @@ from gsmap.cli.console import (
     say,
 )
 
+_TILE_SIZE_M = 10.0
+
 
 def command(
     map: MapPath,
     out: Annotated[str, typer.Argument(metavar="OUT", help="Folder to write; exporting there again updates it.")],
-    format: Annotated[str, typer.Option("--format", help="ply, compressed.ply, splat, spz, glb or 3dtiles.")] = "ply",
-    tile_size: Annotated[float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")] = 10.0,
+    format: Annotated[
+        str,
+        typer.Option("--format", help="ply, compressed.ply, splat, spz, glb or 3dtiles; html: one file to look at."),
+    ] = "ply",
+    tile_size: Annotated[
+        float, typer.Option("--tile-size", help="Edge of a tile in metres; 0 is one file.")
+    ] = _TILE_SIZE_M,
     bbox: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
@@ -63,12 +71,38 @@ def command(
     preset: Preset = None,
     executor: Executor = None,
     scheduler: Scheduler = None,
+    page_mb: Annotated[
+        float, typer.Option("--page-mb", help="Of --format html: megabytes of levels of detail, the finest that fit.")
+    ] = 20.0,
     json: AsJson = False,
 ) -> None:
     """Write merged tiles; only what changed since the last export to OUT is computed.
 
     Example: `gsmap export site.gsmap tiles --format spz --as-of 2024-05-31`
     """
+    if format == "html":
+        _write_page(
+            map,
+            out,
+            page_mb,
+            sets,
+            preset,
+            json,
+            asked={
+                "--bbox": bbox,
+                "--merge": merge,
+                "--revision": revision,
+                "--component": component,
+                "--steps": steps,
+                "--budget": budget,
+                "--provenance": provenance or None,
+                "--uncompressed": uncompressed or None,
+                "--prefer": prefer,
+                "--as-of": as_of,
+                "--tile-size": None if tile_size == _TILE_SIZE_M else tile_size,
+            },
+        )
+        return
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         report = m.export(
             out,
@@ -100,3 +134,22 @@ def command(
         columns = {"path": "file", "component": "component", "num_gaussians": "Gaussians", "truncated": "truncated"}
         print_table(f"tiles in {out}", columns, report.tiles)
     say(f"{report.recomputed} tiles made, {report.reused} unchanged, {report.removed} removed")
+
+
+def _write_page(
+    map: str, out: str, megabytes: float, sets: Sets, preset: Preset, json: bool, asked: Mapping[str, object]
+) -> None:
+    """The page with the map as it is, in one file: there is nothing to merge or to choose from."""
+    from gsmap.errors import ConfigError
+    from gsmap.types.rows import ExportReport
+
+    if said := [option for option, value in asked.items() if value is not None]:
+        raise ConfigError(f"{said[0]} is of merged tiles; html shows the captures as the map has them: leave it out")
+    with opened(map, bars=True, sets=sets, preset=preset) as m:
+        written = m.write_page(out, megabytes=megabytes)
+    for note in written.notes:
+        say(note)
+    if json:
+        report = ExportReport(out=out, tiles=(), recomputed=0, reused=0, removed=0, notes=written.notes)
+        print_rows("export", report, json)
+    say(f"{written.num_bytes:,} bytes in {out}: open it with a double click")

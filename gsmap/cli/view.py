@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gsmap.cli.console import AsJson, MapPath, opened, print_rows
+from gsmap.cli.console import AsJson, MapPath, opened, print_rows, say
 from gsmap.cli.stopping import Stopped
 
 
@@ -24,6 +24,12 @@ def command(
     read_only: Annotated[
         bool, typer.Option("--read-only", help="Nothing can be judged or changed from the page.")
     ] = False,
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            "--export", metavar="DIR", help="Write the page as files that any web server can host; serve nothing."
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Serve a page on this machine that shows the map and lets you judge it: its captures at every level of detail,
@@ -32,6 +38,14 @@ def command(
     Example: `gsmap view site.gsmap`
     """
     from gsmap.types.rows import ViewReport
+
+    if export is not None:
+        with opened(map, bars=True) as m:
+            report = m.write_site(export, tiles=tiles)
+        for note in report.notes:
+            say(note)
+        print_rows("view", report, json) if json else say(f"{report.num_bytes:,} bytes in {report.path}")
+        return
 
     # A signal is the way to end it, and no interruption.
     with opened(map) as m, m.view(port=port, tiles=tiles, read_only=read_only) as server, suppress(Stopped):

@@ -61,6 +61,7 @@ from gsmap.types.rows import (
     ThinReport,
     TileRow,
     UpdateReport,
+    ViewReport,
     WhyReport,
     WorldReport,
     WrittenReport,
@@ -846,6 +847,37 @@ class Map(AbstractContextManager["Map"]):
         actions = {} if read_only or not self.store.catalog.writable else actions_of(self)
         doors = MapDoors(self.store, settings, actions, None if tiles is None else Path(tiles))
         return ViewServer(doors, cache_folder(), settings.view, port=port)
+
+    def write_site(self, folder: str | os.PathLike[str], *, tiles: str | os.PathLike[str] | None = None) -> ViewReport:
+        """``gsmap view MAP --export DIR``: the page as files that any web server can host, whole or not at all.
+
+        Args:
+            folder: an empty or new one, or one that this map's page was written to before, which is replaced.
+            tiles: as in `view`; they are copied.
+
+        Raises:
+            ConfigError: the folder holds something else, the page was not built, or ``tiles`` are not this map's.
+        """
+        from gsmap.map.viewing_site import write_site
+
+        chosen = None if tiles is None else Path(tiles)
+        return write_site(self.store, self._settings_to_look_by(), Path(folder), chosen, self._progress)
+
+    def write_page(self, path: str | os.PathLike[str], *, megabytes: float = 20.0) -> ViewReport:
+        """``gsmap export MAP OUT.html --format html``: the page with the map in it as one file, for a double click.
+
+        Args:
+            path: ends with ``.html``; a page or report of this map that is there is replaced.
+            megabytes: of levels of detail, the finest that fit; the file is about a third larger, and a few more for
+                the page itself.
+
+        Raises:
+            ConfigError: another file, or the page was not built.
+            NotFoundError: no such folder.
+        """
+        from gsmap.map.viewing_site import write_page
+
+        return write_page(self.store, self._settings_to_look_by(), Path(path), megabytes, self._progress)
 
     def report(self, path: str | os.PathLike[str], *, since: str | None = None, pictures: bool = True) -> WrittenReport:
         """``gsmap report MAP OUT.html``: one page that shows the map, what is doubtful and what to do; loads nothing.

@@ -18,11 +18,12 @@ from gsmap.map.objects import Known, history_report, known_objects, objects_repo
 from gsmap.map.one_state import of_one_state
 from gsmap.map.pictures import pair_as_seen, picture_of_change
 from gsmap.map.stages.change import wanted
+from gsmap.map.stages.optimize import pose_basis
 from gsmap.map.viewing_pairs import pair_detail
 from gsmap.methods import text_digest
 from gsmap.report.content import EdgeEntry
 from gsmap.store import Store, cache
-from gsmap.types import GaussianSource, PoseGraph, Scene
+from gsmap.types import GaussianSource, PoseGraph, Prior, Scene
 from gsmap.types.plain import canonical
 from gsmap.types.world import ImagePoint
 from gsmap.view import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
@@ -224,9 +225,15 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
     poses = placed.poses if placed else {}
     graphs = store.graphs.list()
     ups = {one.scene: np.array(one.up, np.float64) for one in graphs if one.up is not None}
-    scenes = [_scene(scene, poses, ups) for scene in store.scenes.list()]
-    living = {entry.scene.id for entry in scenes}
     metres = map_metres(store, settings, placed)
+    told = {}
+    for prior in store.priors.list():
+        pose = poses.get(prior.scene)
+        metre = None if pose is None else metres.get(pose.component)
+        told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit)
+    scenes = [_scene(scene, poses, ups, told) for scene in store.scenes.list()]
+    living = {entry.scene.id for entry in scenes}
+    newest, given = store.revisions.newest(), pose_basis(store, settings)
     found = ViewMap(
         Path(store.location).name,
         scenes,
@@ -241,15 +248,28 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         merged=merged,
         has_objects=placed is not None and bool(graphs),
+        stale=bool(given.scenes) and (newest is None or newest.key != given.key.digest),
     )
     return replace(found, state=text_digest(canonical(found))[:24])
 
 
-def _scene(scene: Scene, poses: Mapping[str, Any], ups: Mapping[str, np.ndarray]) -> ViewScene:
+def prior_words(prior: Prior, metres_per_unit: float) -> str:
+    """What a prior tells, and how surely: ``pose, 0.05 m, 2°``."""
+    turn, place = prior.sigmas[:3], prior.sigmas[3:6] * prior.S_map_scene.scale * metres_per_unit
+    known = [
+        f"{place.max():.2g} m" if np.isfinite(place).all() else "",
+        f"{np.degrees(turn.max()):.2g}°" if np.isfinite(turn).all() else "",
+        "" if prior.up is None else f"vertical {np.degrees(prior.up_sigma_rad):.2g}°",
+    ]
+    what = "pose" if known[0] and known[1] else "position" if known[0] else "direction"
+    return ", ".join([what, *filter(None, known)])
+
+
+def _scene(scene: Scene, poses: Mapping[str, Any], ups: Mapping[str, np.ndarray], told: Mapping[str, str]) -> ViewScene:
     up = ups.get(scene.id)
     if up is None and scene.thinning is not None and scene.thinning.up is not None:
         up = np.array(scene.thinning.up, np.float64)
-    return ViewScene(scene, content_key(scene), poses.get(scene.id), up)
+    return ViewScene(scene, content_key(scene), poses.get(scene.id), up, told.get(scene.id))
 
 
 def content_key(scene: Scene) -> str:
@@ -298,11 +318,25 @@ def _changes(store: Store, settings: Settings, placed: PoseGraph | None, living:
     report = changes_report(store, settings, wanted(store, settings), min_confidence=settings.change.min_confidence)
     return [
         ViewChange(
-            row.id, row.kind, row.component, row.box, row.older, row.newer, row.newer_at, row.confidence, row.status
+            row.id,
+            row.kind,
+            row.component,
+            row.box,
+            row.older,
+            row.newer,
+            row.newer_at,
+            row.confidence,
+            row.status,
+            _note_of(store, row.id),
         )
         for row in report.changes
         if row.box is not None and row.component is not None and {row.older, row.newer} <= living
     ]
+
+
+def _note_of(store: Store, change: str) -> str:
+    words = store.changes.reviews(named(change))
+    return words[-1].note if words and words[-1].review != "withdraw" else ""
 
 
 def _photos(store: Store, placed: PoseGraph | None, living: set[str]) -> list[ViewPhoto]:

@@ -29,12 +29,14 @@ class ViewScene:
         key: names its present content, in addresses and in the cache.
         pose: None where nothing placed it; it is then a component of its own.
         up: (3,) against gravity in its frame; None where nobody knows.
+        prior: what was told of where it lies, in words; None where nothing was.
     """
 
     scene: Scene
     key: str
     pose: ScenePose | None
     up: np.ndarray | None = None
+    prior: str | None = None
 
     @property
     def S_map_scene(self) -> Sim3:
@@ -86,6 +88,7 @@ class ViewChange:
 
     Args:
         box: (2, 3) map frame.
+        note: of the review.
     """
 
     id: str
@@ -97,6 +100,7 @@ class ViewChange:
     at: str | None
     confidence: float
     status: str
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +131,7 @@ class ViewMap:
         metres_per_unit: of each component of the poses.
         merged: components of which merged tiles were given.
         has_objects: whether anything is told of objects.
+        stale: whether `gsmap optimize` would see anything that these poses have not.
     """
 
     title: str
@@ -140,6 +145,7 @@ class ViewMap:
     metres_per_unit: Mapping[int, float] = field(default_factory=dict)
     merged: frozenset[int] = frozenset()
     has_objects: bool = False
+    stale: bool = False
 
     def components(self) -> list[int]:
         """The island of every scene; scenes that nothing placed come after the others, one each."""
@@ -172,12 +178,14 @@ class Served:
         boxes: (2, 3) of what a scene shows, without floaters, scene frame, by key; the scene's bounds elsewhere.
         overviews: by component.
         live: whether more is computed when the page asks.
+        drawn: changes whose pictures are there where it is not.
     """
 
     actions: bool = False
     boxes: Mapping[str, np.ndarray] = field(default_factory=dict)
     overviews: Mapping[int, ViewOverview] = field(default_factory=dict)
     live: bool = True
+    drawn: frozenset[str] = frozenset()
 
 
 def summary(view: ViewMap, served: Served) -> dict[str, Any]:
@@ -197,6 +205,7 @@ def summary(view: ViewMap, served: Served) -> dict[str, Any]:
         "title": view.title,
         "actions": served.actions,
         "revision": view.revision,
+        "stale": view.stale,
         "components": [
             {
                 "component": component,
@@ -235,7 +244,8 @@ def summary(view: ViewMap, served: Served) -> dict[str, Any]:
                 "at": one.at,
                 "confidence": _number(one.confidence) or 0.0,
                 "status": one.status,
-                "pictures": f"changes/{one.id}.jpg" if served.live else None,
+                "note": one.note,
+                "pictures": f"changes/{one.id}.jpg" if served.live or one.id in served.drawn else None,
             }
             for one in view.changes
             if one.before in at and one.after in at
@@ -294,6 +304,8 @@ def _scene(
         "middle": entry.S_map_scene.apply(middle[None])[0].tolist(),
         "tileset": f"scenes/{entry.key}/tileset.json",
         "extras": f"scenes/{scene.id}/extras.json",
+        "tags": list(scene.tags),
+        "prior": entry.prior,
     }
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from gsmap.errors import GsmapError, NotFoundError
+from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import spz
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, GaussianSource
@@ -29,7 +31,10 @@ _STEP = 8  # between the sizes of sketches, so that few of them are kept of a sc
 _LEAST = 16
 _FIRST = -1.0  # rank of what everybody waits for: before any tree
 _ISLANDS_KEPT = 8  # whose sketches are in memory
+_TRIES = 3
 _FILES_KEPT = 4  # overviews as bytes
+
+_T = TypeVar("_T")
 
 
 def sketch_size(num_scenes: int, params: Params) -> int:
@@ -103,15 +108,24 @@ class Levels:
             raise NotFoundError(f"{entry.scene.name} has no tile {uri} now: ask for its tileset again")
         return data
 
-    def make(self, entry: ViewScene, progress: Progress | None = None) -> Path:
-        """The folder of a scene's tree, made in this thread where it is not there."""
-        found = self._cache.tree(entry.key)
-        if found is None:
-            self._make_tree(entry.scene.id, entry.key, progress or (lambda fraction, text: None))
+    def read(self, entry: ViewScene, read: Callable[[Path], _T]) -> _T:
+        """What is read of the folder of a scene's tree, which is made in this thread where it is not there.
+
+        Args:
+            read: again where the tree made room for another one meanwhile.
+
+        Raises:
+            GsmapError: why it cannot be made.
+        """
+        for _ in range(_TRIES):
             found = self._cache.tree(entry.key)
             if found is None:
-                raise NotFoundError(f"the levels of detail of {entry.scene.name} are gone: {self._cache.root} is full")
-        return found
+                self._make_tree(entry.scene.id, entry.key, lambda fraction, text: None)
+                found = self._cache.tree(entry.key)
+            with contextlib.suppress(FileNotFoundError):
+                if found is not None:
+                    return read(found)
+        raise NotFoundError(f"the levels of detail of {entry.scene.name} are gone again: raise view.cache_gib")
 
     def _make_tree(self, scene: str, key: str, progress: Progress) -> None:
         if self._cache.tree(key) is not None:  # another process was faster
@@ -138,11 +152,10 @@ class Levels:
     def overviews(self, view: ViewMap) -> tuple[dict[int, ViewOverview], str]:
         """The overview of every component, as far as it is known, and the `state` of that; those of the largest are
         made without being asked."""
-        out = {}
-        members = _members(view)
+        out, islands = {}, members(view)
         with self._lock:
-            for component, inside in members.items():
-                if component == min(members) or component in self._islands:
+            for component, inside in islands.items():
+                if component == min(islands) or component in self._islands:
                     out[component] = self._overview(component, inside)
                 else:
                     out[component] = ViewOverview(f"overviews/{component}/none.spz", pending=len(inside))
@@ -154,7 +167,7 @@ class Levels:
         Raises:
             NotFoundError: no such component, or the overview is another by now.
         """
-        inside = _members(view).get(component)
+        inside = members(view).get(component)
         if inside is None:
             raise NotFoundError(f"there is no component {component}")
         with self._lock:
@@ -176,15 +189,26 @@ class Levels:
             told = [f"{component} {len(island.told)}" for component, island in self._islands.items()]
         return " ".join(sorted(told))
 
-    def whole(self, inside: Mapping[int, ViewScene]) -> tuple[bytes, ViewOverview, dict[str, np.ndarray]]:
-        """The overview of an island, made in this thread; and the boxes of its scenes, by key."""
-        size = sketch_size(len(inside), self._params)
+    def whole(
+        self, inside: Mapping[int, ViewScene], size: int | None = None
+    ) -> tuple[bytes, ViewOverview, dict[str, np.ndarray]]:
+        """The overview of an island, made in this thread; and the boxes of its scenes, by key.
+
+        Args:
+            size: Gaussians of each at most; by default what fits.
+        """
+        size = size or sketch_size(len(inside), self._params)
         parts, places, boxes = [], [], {}
         for place, entry in inside.items():
-            made = self._cache.sketch(entry.key, size) or self._make_sketch(entry.scene.id, entry.key, size)
+            try:
+                made = self._cache.sketch(entry.key, size) or self._make_sketch(entry.scene.id, entry.key, size)
+            except InputError:  # nothing of it can be seen
+                continue
             parts.append((entry, made))
             places.append(place)
             boxes[entry.key] = made.box
+        if not parts:
+            raise InputError("nothing of it can be seen")
         counts = tuple(len(one.gaussians) for _, one in parts)
         return overview_file(parts), ViewOverview("", tuple(places), counts), boxes
 
@@ -250,7 +274,7 @@ class Levels:
         return made
 
 
-def _members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
+def members(view: ViewMap) -> dict[int, dict[int, ViewScene]]:
     """The scenes of every component by their place in the list."""
     out: dict[int, dict[int, ViewScene]] = {}
     for place, (component, entry) in enumerate(zip(view.components(), view.scenes, strict=True)):

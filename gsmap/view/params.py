@@ -22,6 +22,8 @@ class Params:
         pair_views: cameras of each of two captures that they are compared from.
         pictures_kept: pictures that the server keeps in memory.
         picture_gaussians: Gaussians of a pair of scenes that is drawn at most.
+        site_pairs: pairs that a static page has pictures of, the most doubtful.
+        site_changes: changes that a static page has pictures of, the surest.
         correspondences: of a pair that are shown.
         nodes: of a layer of a scene's graph that are shown, the weightiest.
         cameras: of a scene that are shown, evenly along its capture.
@@ -37,6 +39,8 @@ class Params:
     pictures_kept: int = 64
     picture_gaussians: int = 8_000_000
     correspondences: int = 400
+    site_pairs: int = 24
+    site_changes: int = 48
     nodes: int = 2_000
     cameras: int = 300
 
@@ -47,7 +51,7 @@ class Params:
         for name in ("cache_gib", "overview_mb"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"view.{name} must be positive, got {getattr(self, name)}")
-        for name in ("picture_gaussians", "correspondences"):
+        for name in ("picture_gaussians", "correspondences", "site_pairs", "site_changes"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"view.{name} must not be negative, got {getattr(self, name)}")
         if self.picture_px < 16:

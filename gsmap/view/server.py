@@ -33,23 +33,12 @@ from gsmap.view.connections import LocalServer
 from gsmap.view.doors import Doors
 from gsmap.view.levels import Levels
 from gsmap.view.params import Params
+from gsmap.view.site import CSP
 from gsmap.view.tree_cache import TreeCache
 
 _SECURITY = {
-    # What three.js and Spark need and no more: Spark decodes and sorts by WebAssembly that lies in its script as data,
-    # in workers that it makes of its own text.
     "Content-Security-Policy": "; ".join(
-        [
-            "default-src 'none'",
-            "script-src 'self' 'wasm-unsafe-eval'",
-            "worker-src 'self' blob:",
-            "connect-src 'self' data: blob:",
-            "style-src 'self' 'unsafe-inline'",
-            "img-src 'self' data: blob:",
-            "base-uri 'none'",
-            "form-action 'none'",
-            "frame-ancestors 'none'",
-        ]
+        f"{name} {value}" for name, value in (CSP | {"frame-ancestors": "'none'"}).items()
     ),
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",

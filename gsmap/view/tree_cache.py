@@ -139,13 +139,15 @@ class TreeCache:
 
     # --- all of it ---------------------------------------------------------------------------------------------------
 
-    def forget(self, scene: str) -> int:
-        """Delete all that is kept of a scene, by the beginning of its keys; how many files that were."""
-        gone = 0
+    def num_files(self, scene: str) -> int:
+        """How many files are kept of a scene, by the beginning of its keys."""
+        found = self.root.glob(f"{glob.escape(scene)}*")
+        return sum(sum(f.is_file() for f in path.rglob("*")) if path.is_dir() else 1 for path in found)
+
+    def forget(self, scene: str) -> None:
+        """Delete all that is kept of a scene, by the beginning of its keys."""
         for path in self.root.glob(f"{glob.escape(scene)}*"):
-            gone += sum(found.is_file() for found in path.rglob("*")) if path.is_dir() else 1
             self._drop(path)
-        return gone
 
     def _tree(self, key: str) -> Path:
         return self.root / f"{key}.tree"

@@ -1,4 +1,4 @@
-"""What a person does to a page in headless Chromium, through shadow roots: finds, clicks, types, drags, presses keys."""
+"""What a person does to a page in headless Chromium, through shadow roots: clicks, types, drags, presses keys."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ globalThis.textOf = (root) => {
     if (node.nodeType === 1 && ["STYLE", "SCRIPT"].includes(node.tagName)) return "";
     const display = node.nodeType === 1 ? getComputedStyle(node).display : "inline";
     if (display === "none") return "";
-    const text = [...(node.shadowRoot ?? node).childNodes, ...(node.shadowRoot ? node.childNodes : [])].map(walk).join("");
+    const nodes = [...(node.shadowRoot ?? node).childNodes, ...(node.shadowRoot ? node.childNodes : [])];
+    const text = nodes.map(walk).join("");
     return display === "inline" ? text : ` ${text} `;
   };
   return walk(root).replace(/\\s+/g, " ").trim();
@@ -63,7 +64,9 @@ class Hands:
         end = time.monotonic() + timeout_s
         while not self.value(f"!!({expression})"):
             if time.monotonic() > end:
-                raise AssertionError(f"not true after {timeout_s} s: {expression}; {self.page.failures()}; {self.text()}")
+                raise AssertionError(
+                    f"not true after {timeout_s} s: {expression}; {self.page.failures()}; {self.text()}"
+                )
             time.sleep(0.05)
 
     def text(self, selector: str = "body") -> str:
@@ -71,8 +74,8 @@ class Hands:
 
     def says(self, text: str, selector: str = "body", timeout_s: float = 20) -> None:
         """Waits until a text is to be read."""
-        self.wait(f"textOf(findAll({json.dumps(selector)})[0] ?? document.createElement('i')).includes({json.dumps(text)})",
-                  timeout_s)  # fmt: skip
+        found = f"textOf(findAll({json.dumps(selector)})[0] ?? document.createElement('i'))"
+        self.wait(f"{found}.includes({json.dumps(text)})", timeout_s)
 
     def middle(self, selector: str, text: str | None = None) -> tuple[float, float]:
         found = f"find({json.dumps(selector)}, {json.dumps(text)})"
@@ -117,9 +120,7 @@ class Hands:
         self.page._call("Emulation.setTouchEmulationEnabled", {"enabled": mobile})
 
     def colours(self, scheme: str) -> None:
-        self.page._call(
-            "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-        )
+        self.page._call("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]})
 
     def go(self, url: str) -> None:
         self.page._call("Page.navigate", {"url": url})

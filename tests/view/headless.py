@@ -54,7 +54,7 @@ class Page:
         self._number, self._rest, self.messages = 0, b"", []
         target = self._call("Target.createTarget", {"url": "about:blank"}, None)["targetId"]
         self._session = self._call("Target.attachToTarget", {"targetId": target, "flatten": True}, None)["sessionId"]
-        for domain in ("Runtime", "Page", "Network"):
+        for domain in ("Runtime", "Page", "Network", "Log"):
             self._call(f"{domain}.enable", {})
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self._call("Emulation.setDeviceMetricsOverride", size)
@@ -89,6 +89,8 @@ class Page:
                 kind == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert")
             ):
                 out.append(json.dumps(params)[:500])
+            if kind == "Log.entryAdded" and params["entry"]["source"] == "security":  # the page's policy forbade it
+                out.append(params["entry"]["text"][:500])
             if kind == "Network.responseReceived" and params["response"]["status"] >= 400:
                 out.append(f"{params['response']['url']} {params['response']['status']}")
         return out

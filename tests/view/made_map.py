@@ -14,8 +14,8 @@ from PIL import Image
 
 # As gsmap/view/server.py has it.
 CSP = (
-    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; connect-src 'self' blob: data:; "
-    "style-src 'self'; img-src 'self' data:"
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; "
+    "connect-src 'self' blob: data:; style-src 'self'; img-src 'self' data:"
 )
 KINDS = ("appeared", "disappeared", "moved", "recoloured", "replaced", "lighting")
 _KIND_OF = {".js": "text/javascript", ".css": "text/css", ".html": "text/html; charset=utf-8"}
@@ -253,7 +253,10 @@ class MadeServer:
         edge = next(row for row in self.map["edges"] if (row["target"], row["source"]) == (a, b))
         none = edge["status"] == "no_match"
         views = [
-            {"camera": f"frame_{k:04d}.png", **{w: f"edges/{pair}/{k}-{w}.jpg" for w in ("target", "source", "difference")}}
+            {
+                "camera": f"frame_{k:04d}.png",
+                **{w: f"edges/{pair}/{k}-{w}.jpg" for w in ("target", "source", "difference")},
+            }
             for k in (12, 31, 57)
         ]
         held = edge["status"] == "accepted"
@@ -266,7 +269,8 @@ class MadeServer:
                  "bar": "among the candidates", "passed": True},
                 {"name": "clique", "value": "84", "bar": "", "passed": None},
                 {"name": "coinciding cells", "value": "412", "bar": "at least 60", "passed": True},
-                {"name": "colour correlation", "value": "0.74" if held else "0.21", "bar": "at least 0.35", "passed": held},
+                {"name": "colour correlation", "value": "0.74" if held else "0.21",
+                 "bar": "at least 0.35", "passed": held},
                 {"name": "free-space violation", "value": "0.031", "bar": "at most 0.12", "passed": True},
                 {"name": "probability", "value": "0.93", "bar": "at least 0.9, of all of these", "passed": True},
                 {"name": "the other edges", "value": "tentative", "bar": "bear it out: used", "passed": False},
@@ -274,8 +278,10 @@ class MadeServer:
             "advice": ["a further capture that overlaps both closes a loop that bears it out or contradicts it"],
             "correspondences": [] if none else [[[k, 0, 1], [k + 0.02, 0, 1]] for k in range(84)],
             "views": [] if none else views,
-            "events": [{"at": "2025-03-02T10:00:00+00:00", "what": edge["status"], "reason": edge["reason"]}]
-            + self.events.get(f"{ids[a]}:{ids[b]}", []),
+            "events": [
+                {"at": "2025-03-02T10:00:00+00:00", "what": edge["status"], "reason": edge["reason"]},
+                *self.events.get(f"{ids[a]}:{ids[b]}", []),
+            ],
         }  # fmt: skip
 
     def _graph(self) -> dict[str, Any]:

@@ -138,8 +138,9 @@ def page_folder(tmp_path: Path) -> Path:
     folder = tmp_path / "page"
     folder.mkdir(exist_ok=True)
     (folder / "index.html").write_text(
-        '<!doctype html><title>a page</title><link rel="icon" href="data:," /><canvas></canvas>'
-        '<script type="module" src="page.js"></script>'
+        '<!doctype html><html><head><title>a page</title><link rel="icon" href="data:," />'
+        '<link rel="stylesheet" href="style.css" /><script type="module" src="page.js"></script></head>'
+        "<body><canvas></canvas></body></html>"
     )
     (folder / "page.js").write_text("window.there = true;")
     (folder / "style.css").write_text("canvas { width: 100% }")

@@ -26,9 +26,12 @@ from gsmap.export.tileset import LEVELS_FOLDER, is_stale
 from gsmap.export.write import leftovers
 from gsmap.map.pictures import FILE_NAME as PICTURES
 from gsmap.map.pictures import Pictures
+from gsmap.map.viewing import cache_folder
+from gsmap.map.viewing_site import SITE, site_owner
 from gsmap.report import owner_of
 from gsmap.store import Store, purging
 from gsmap.store.purging import Purge
+from gsmap.view.tree_cache import TreeCache
 
 _COMPONENT = re.compile(r"component_\d+")
 
@@ -86,6 +89,10 @@ def _holds(store: Store, scene: str) -> bool:
 
 def _finish(store: Store, begun: Purge) -> Purge:
     unreachable = []
+    levels = TreeCache(cache_folder(), 0)
+    if num_files := levels.num_files(begun.scene):
+        begun = purging.note(store, begun, str(levels.root), num_files)
+        levels.forget(begun.scene)
     for target in begun.receipt["pending"]["targets"]:
         try:
             out = Path(target)
@@ -95,6 +102,10 @@ def _finish(store: Store, begun: Purge) -> Purge:
             elif is_file(out) and owner_of(out) == store.id:
                 remove_file(out.parent, out.name)  # it shows all scenes; gsmap report makes it anew
                 begun = purging.note(store, begun, str(out), 1)
+            elif os.path.lexists(out / SITE):
+                if site_owner(out) == store.id:  # it shows all scenes; gsmap view --export makes it anew
+                    begun = purging.note(store, begun, str(out), len(files_below(out)))
+                    remove_tree(out.parent, out.name)
             elif os.path.lexists(out / PICTURES):
                 if gone := Pictures.load(out, store.id).forget(out, begun.scene):
                     begun = purging.note(store, begun, str(out), gone)

@@ -261,15 +261,23 @@ class ConvertReport(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewReport(Row):
-    """The page that is being served.
+    """The page that is being served, or that was written.
 
     Args:
-        url: where it is, on this machine only, with the token that opens it.
+        url: where it is, on this machine only, with the token that opens it; null where it was written.
+        path: the folder or file that it was written to; null where it is served.
+        num_bytes: of what was written; null as above.
+        num_scenes: that have their levels of detail in it; null as above.
+        notes: what a person should know, such as scenes that could not be read.
     """
 
-    columns: ClassVar[Mapping[str, str]] = {"url": "page"}
+    columns: ClassVar[Mapping[str, str]] = {"url": "page", "path": "written to"}
 
-    url: str
+    url: str | None = None
+    path: str | None = None
+    num_bytes: int | None = None
+    num_scenes: int | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

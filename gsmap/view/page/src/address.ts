@@ -54,7 +54,7 @@ export function write(state: Shared, map: MapSummary): string {
   if (state.clip) put("clip", numbers(state.clip.flat() as number[]));
   if (!state.ceiling) put("ceiling", "0");
   const overlays = OVERLAYS.filter((name) => state.overlays.has(name)).join(",");
-  if (overlays !== "edges") put("overlays", overlays || "none");
+  put("overlays", overlays);
   if (state.selection) put(BY_KIND[state.selection.kind], state.selection.key);
   if (state.selection?.kind === "edge" && state.view > 0) put("view", String(state.view));
   if (state.comparison !== "blink") put("compare", state.comparison);
@@ -78,7 +78,7 @@ export function read(hash: string, map: MapSummary): Shared {
   const standpoint: Standpoint | null = position && target ? { position, target } : null;
   const at = Number(get("split"));
   const split = get("split") !== null && at >= 0 && at <= 1 ? { at, ...readSide(get, "right-", map, component) } : null;
-  const overlays = get("overlays");
+  const overlays = get("overlays")?.split(",") ?? [];
   const revision = integer(get("revision"));
   const until = get("until");
   return {
@@ -89,10 +89,7 @@ export function read(hash: string, map: MapSummary): Shared {
     left: readSide(get, "", map, component),
     clip: box(get("clip")),
     ceiling: get("ceiling") !== "0",
-    overlays:
-      overlays === null
-        ? new Set<Overlay>(["edges"])
-        : new Set(OVERLAYS.filter((name) => overlays.split(",").includes(name))),
+    overlays: new Set<Overlay>(OVERLAYS.filter((name) => overlays.includes(name))),
     selection: readSelection(get, map),
     view: Math.min(integer(get("view")) ?? 0, 99),
     comparison: one("compare", COMPARISONS, "blink"),
@@ -154,7 +151,11 @@ function readSelection(get: (name: string) => string | null, map: MapSummary): S
   );
 }
 
-const numbers = (values: readonly number[]) => values.map((v) => String(Number(v.toPrecision(6)))).join(",");
+/** Six digits of the largest; what is nothing beside it is 0. */
+function numbers(values: readonly number[]): string {
+  const digits = Math.min(20, Math.max(0, 5 - Math.floor(Math.log10(Math.max(1e-9, ...values.map(Math.abs))))));
+  return values.map((v) => String(Number(v.toFixed(digits)) || 0)).join(",");
+}
 
 function floats(text: string | null, length: number): number[] | null {
   const values = text?.split(",").map((part) => (part.trim() === "" ? NaN : Number(part))) ?? [];

@@ -97,7 +97,9 @@ export function drive(stage: Stage): () => void {
     );
     clip.now(state.clip);
     ceiling.now(state.ceiling);
-    for (const [name, told] of overlays) told.now(state.overlays.has(name));
+    // Who reviews edges sees them, whatever else is drawn.
+    for (const [name, told] of overlays)
+      told.now(state.overlays.has(name) || (name === "edges" && state.tab === "review"));
     if (state.overlays.has("objects") || state.tab === "things") {
       const known = actions.graphOf(state);
       if (known?.status === "ready" && known.value !== things) {

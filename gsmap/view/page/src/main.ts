@@ -64,7 +64,7 @@ async function stage(): Promise<void> {
       canvas,
       onPick: actions.picked,
       onMove: (standpoint) => page.set({ standpoint }),
-      onError: (message) => actions.say(message, true),
+      onError: (message) => actions.say(`3D view: ${message}`, true),
     });
     Object.assign(window, { gsmap: page.stage.state });
     drive(page.stage);

@@ -109,7 +109,7 @@ export function initial(): State {
     side: "left",
     clip: null,
     ceiling: true,
-    overlays: new Set(["edges"]),
+    overlays: new Set(),
     selection: null,
     sceneQuery: "",
     edgeFilter: "doubtful",

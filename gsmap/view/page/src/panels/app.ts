@@ -16,6 +16,7 @@ import "./help";
 import "./look";
 import "./notices";
 import "./place";
+import "./progress";
 import "./review";
 import "./scene";
 import "./thing";
@@ -138,6 +139,11 @@ export class App extends Panel {
         top: 12px;
         right: 12px;
       }
+      gs-progress {
+        position: absolute;
+        top: 12px;
+        left: 12px;
+      }
       .below {
         position: absolute;
         left: 12px;
@@ -221,8 +227,14 @@ export class App extends Panel {
     `,
   ];
 
+  private wasChosen = false;
+
   protected override updated(changed: PropertyValues): void {
     super.updated(changed);
+    const isChosen = this.state.selection !== null;
+    // What had the focus in the details went away with them: go on in the list they were opened from.
+    if (this.wasChosen && !isChosen && document.activeElement === document.body) focusList(this.renderRoot);
+    this.wasChosen = isChosen;
     const title = this.state.map?.title;
     document.title = title ? `${title} · gsmap` : "gsmap";
   }
@@ -264,6 +276,7 @@ export class App extends Panel {
         <slot></slot>
         ${state.split ? html`<gs-divider></gs-divider>` : nothing}
         <gs-tools></gs-tools>
+        <gs-progress></gs-progress>
         <div class="below">
           <gs-place></gs-place>
           <gs-notices></gs-notices>
@@ -363,4 +376,12 @@ export class App extends Panel {
       </div>`;
     return nothing;
   }
+}
+
+function focusList(root: Node): boolean {
+  if (!(root instanceof ShadowRoot)) return false;
+  const list = root.querySelector("gs-listing");
+  const cell = list?.shadowRoot?.querySelector<HTMLElement>('[tabindex="0"]');
+  cell?.focus({ preventScroll: true });
+  return Boolean(cell) || [...root.querySelectorAll("*")].some((one) => one.shadowRoot && focusList(one.shadowRoot));
 }

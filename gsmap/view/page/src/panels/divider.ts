@@ -51,7 +51,7 @@ export class Divider extends Panel {
       }
       .name {
         position: absolute;
-        top: 12px;
+        bottom: 12px;
         padding: 2px 9px;
         border-radius: 6px;
         background: var(--surface);

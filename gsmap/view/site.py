@@ -1,0 +1,352 @@
+"""A map's page without a server: a folder that any web server can host, and one file that opens by a double click.
+
+Both hold what `gsmap.view.answers` answers to every GET, as files under the same addresses, but for what is computed
+when somebody asks for it. A folder has every scene's whole tree; a file as much of the trees as fits.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import heapq
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.errors import CorruptError, GsmapError, InputError, NotFoundError
+from gsmap.formats.tiles3d import CONTENT_FOLDER
+from gsmap.types.progress import Progress
+from gsmap.view.answers import Answers, jpeg
+from gsmap.view.content import Served, ViewMap, ViewOverview, summary
+from gsmap.view.doors import Doors
+from gsmap.view.levels import Levels, members
+from gsmap.view.params import Params
+from gsmap.view.trees import FILE_NAME
+
+CSP = {
+    "default-src": "'none'",
+    "script-src": "'self' 'wasm-unsafe-eval'",
+    "worker-src": "blob:",
+    "connect-src": "'self'",
+    "style-src": "'self'",
+    "img-src": "'self' data:",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+}
+"""What the page needs and no more: Spark decodes and sorts by WebAssembly that lies in its script, in workers that it
+makes of its own text."""
+
+_MERGED_SUFFIXES = (".json", ".glb")
+_HEAD = re.compile(r"<head[^>]*>", re.IGNORECASE)
+_SCRIPT = re.compile(r'<script type="module"[^>]*\bsrc="(?:\./)?([^"]+)"[^>]*>\s*</script>')
+_STYLE = re.compile(r'<link rel="stylesheet"[^>]*\bhref="(?:\./)?([^"]+)"[^>]*/?>')
+# What the page fetches comes from the file itself, and nothing is asked of anybody else.
+_EMBEDDED = """
+(() => {
+  const files = JSON.parse(document.getElementById("gsmap-files").textContent);
+  const kinds = { json: "application/json", glb: "model/gltf-binary", jpg: "image/jpeg" };
+  const base = new URL(".", document.baseURI).href;
+  globalThis.fetch = async (input) => {
+    const url = new URL(input instanceof Request ? input.url : String(input), document.baseURI);
+    const whole = url.href.split(/[?#]/)[0];
+    const name = whole.startsWith(base) ? decodeURIComponent(whole.slice(base.length)) : whole;
+    const text = Object.hasOwn(files, name) ? files[name] : undefined;
+    const missing = JSON.stringify({ error: `${name} is not in this file` });
+    if (text === undefined) return new Response(missing, { status: 404 });
+    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    const kind = kinds[name.split(".").pop()] ?? "application/octet-stream";
+    return new Response(bytes, { headers: { "Content-Type": kind } });
+  };
+})();
+"""
+
+
+@dataclass(frozen=True)
+class SiteContents:
+    """What was written.
+
+    Args:
+        num_bytes: in all.
+        num_scenes: with their levels of detail.
+        notes: what a person should know, such as scenes that could not be read.
+    """
+
+    num_bytes: int
+    num_scenes: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(eq=False)
+class _Maker:
+    doors: Doors
+    levels: Levels
+    params: Params
+    progress: Progress
+    notes: list[str] = field(default_factory=list)
+
+    def told(self, view: ViewMap, *, size: int | None = None, pictures: bool = True) -> Iterator[tuple[str, bytes]]:
+        """Address and bytes of everything but trees and merged tiles; ``map.json`` last.
+
+        Args:
+            size: Gaussians of a scene in an overview; by the size of its island where None.
+        """
+        overviews: dict[int, ViewOverview] = {}
+        boxes: dict[str, np.ndarray] = {}
+        inside_of = members(view)
+        for i, (component, inside) in enumerate(inside_of.items()):
+            self.progress(0.5 + 0.2 * i / len(inside_of), f"overview {component}")
+            made = self.tried(f"the overview of island {component}", lambda c=inside: self.levels.whole(c, size))  # type: ignore[misc]
+            if made is None:
+                continue
+            data, overview, more = made
+            uri = f"overviews/{component}/{hashlib.sha256(data).hexdigest()[:24]}.spz"
+            overviews[component] = ViewOverview(uri, overview.scenes, overview.counts)
+            boxes |= more
+            yield uri, data
+        for entry in view.scenes:
+            extras = self.tried(entry.scene.name, lambda e=entry: self.doors.extras(e.scene.id))  # type: ignore[misc]
+            yield f"scenes/{entry.scene.id}/extras.json", _json(extras or {"layers": {}, "cameras": []})
+        for revision in view.revisions:
+            if revision.is_kept:
+                yield f"revisions/{revision.id}.json", _json(self.doors.revision(revision.id))
+        yield from self._edges(view, pictures)
+        drawn = []
+        surest = sorted(view.changes, key=lambda change: -change.confidence)
+        for change in surest[: self.params.site_changes if pictures else 0]:
+            picture = self.tried(f"change {change.id}", lambda c=change: self.doors.change_picture(c.id))  # type: ignore[misc]
+            if picture is not None:
+                drawn.append(change.id)
+                yield f"changes/{change.id}.jpg", jpeg(picture)
+        has_objects = False
+        if view.has_objects:
+            graph = self.tried("the graph of objects", self.doors.graph)
+            if graph is not None:
+                has_objects = True
+                yield "graph.json", _json(graph)
+        served = Served(False, boxes, overviews, live=False, drawn=frozenset(drawn))
+        said = summary(view, served)
+        yield "map.json", _json(said | {"graph": "graph.json" if has_objects else None})
+
+    def _edges(self, view: ViewMap, pictures: bool) -> Iterator[tuple[str, bytes]]:
+        answers = Answers(self.doors, self.levels, self.params)
+        living = {entry.scene.id for entry in view.scenes}
+        edges = [edge for edge in view.edges if {edge.target, edge.source} <= living]
+        edges.sort(key=lambda edge: -edge.doubt)
+        for place, edge in enumerate(edges):
+            self.progress(0.7 + 0.3 * place / len(edges), "edges")
+            pair, views = (edge.target, edge.source), []
+            detail = self.tried(f"edge {pair}", lambda p=pair: answers.edge(*p))  # type: ignore[misc]
+            if detail is None:
+                continue
+            if pictures and place < self.params.site_pairs and detail["views"]:
+                made = self.tried(f"pictures of {pair}", lambda p=pair: self.doors.pair_pictures(*p))  # type: ignore[misc]
+                for i, camera in enumerate(made.cameras if made else ()):
+                    assert made is not None
+                    names = {}
+                    for kind in ("target", "source", "difference"):
+                        names[kind] = f"edges/{pair[0]}-{pair[1]}/{i}-{kind}.jpg"
+                        yield names[kind], jpeg(getattr(made, kind)[i])
+                    views.append({"camera": camera, **names})
+            yield f"edges/{pair[0]}-{pair[1]}.json", _json(detail | {"views": views})
+
+    def tried(self, what: str, make: Callable[[], Any]) -> Any:
+        """What is made; None, with a note, where it is damaged or not there."""
+        try:
+            return make()
+        except (CorruptError, NotFoundError, InputError) as error:
+            self.notes.append(f"{what} is left out: {error}")
+            return None
+
+
+def write_site(
+    folder: Path,
+    doors: Doors,
+    levels: Levels,
+    params: Params,
+    page: Path,
+    progress: Progress,
+) -> SiteContents:
+    """Write a static page into an empty folder.
+
+    Args:
+        page: the folder of the built page.
+    """
+    view, maker = doors.content(), _Maker(doors, levels, params, progress)
+    num_scenes = 0
+    for i, entry in enumerate(view.scenes):
+        progress(0.5 * i / len(view.scenes), entry.scene.name)
+        target = folder / "scenes" / entry.key
+        copy = partial(_copy_tree, target=target)
+        if maker.tried(entry.scene.name, lambda e=entry, c=copy: levels.read(e, c)):  # type: ignore[misc]
+            num_scenes += 1
+    for component in sorted(view.merged):
+        for name, path in _merged(doors.merged(component)):
+            target = folder / "merged" / str(component) / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+    for address, data in maker.told(view):
+        target = folder / address
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    for file in page.iterdir():
+        if file.is_file():
+            shutil.copyfile(file, folder / file.name)
+    html = (folder / "index.html").read_text(encoding="utf-8")
+    (folder / "index.html").write_text(_with_policy(html, CSP), encoding="utf-8")
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return SiteContents(size, num_scenes, tuple(maker.notes))
+
+
+def write_page(
+    path: Path,
+    doors: Doors,
+    levels: Levels,
+    params: Params,
+    page: Path,
+    max_bytes: int,
+    progress: Progress,
+    mark: str = "",
+) -> SiteContents:
+    """Write one file that is the page with a map in it.
+
+    Args:
+        max_bytes: of levels of detail, before they are written as text, which takes a third more; the finest that fit.
+        mark: stands in the head, to know the file again.
+    """
+    view, maker = doors.content(), _Maker(doors, levels, params, progress)
+    files: dict[str, bytes] = {}
+    # A twentieth for what stands behind everything until the trees are there.
+    size = max(1, min(params.overview_gaussians, max_bytes // (20 * 20 * max(1, len(view.scenes)))))
+    for address, data in maker.told(view, size=size, pictures=False):
+        files[address] = data
+    left = max_bytes - sum(len(data) for address, data in files.items() if address.startswith("overviews/"))
+    trees: dict[str, tuple[dict[str, Any], dict[str, int]]] = {}
+    for i, entry in enumerate(view.scenes):
+        progress(0.5 * i / len(view.scenes), entry.scene.name)
+        listed = maker.tried(entry.scene.name, lambda e=entry: levels.read(e, _listed))  # type: ignore[misc]
+        if listed is not None:
+            trees[entry.key] = listed
+    fitting = _fitting(trees, left)
+    for entry in view.scenes:
+        if entry.key in fitting:
+            tileset, tiles = fitting[entry.key]
+            files[f"scenes/{entry.key}/{FILE_NAME}"] = _json(tileset)
+            for uri, data in levels.read(entry, partial(_tiles, uris=tiles)).items():
+                files[f"scenes/{entry.key}/{uri}"] = data
+    said = json.loads(files["map.json"])
+    for component in said["components"]:
+        component["merged"] = None
+    files["map.json"] = _json(said)
+    text = _one_file(page, files, mark)
+    path.write_text(text, encoding="utf-8")
+    return SiteContents(len(text.encode()), len(trees), tuple(maker.notes))
+
+
+def _copy_tree(tree: Path, target: Path) -> bool:
+    """Copy a tree to a folder."""
+    (target / CONTENT_FOLDER).mkdir(parents=True, exist_ok=True)
+    tiles = [f"{CONTENT_FOLDER}/{tile.name}" for tile in (tree / CONTENT_FOLDER).iterdir()]
+    for name in (FILE_NAME, *tiles):
+        shutil.copyfile(tree / name, target / name)
+    return True
+
+
+def _listed(tree: Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """The tileset of a tree, and the bytes of each of its tiles."""
+    sizes = {f"{CONTENT_FOLDER}/{tile.name}": tile.stat().st_size for tile in (tree / CONTENT_FOLDER).iterdir()}
+    return json.loads((tree / FILE_NAME).read_bytes()), sizes
+
+
+def _tiles(tree: Path, uris: Iterable[str]) -> dict[str, bytes]:
+    return {uri: (tree / uri).read_bytes() for uri in uris}
+
+
+def _fitting(
+    trees: Mapping[str, tuple[dict[str, Any], dict[str, int]]], max_bytes: int
+) -> dict[str, tuple[dict[str, Any], list[str]]]:
+    """Of every tree as much as fits, coarse tiles of all before finer ones: its tileset, and the tiles it names."""
+    kept: dict[str, set[str]] = {key: set() for key in trees}
+    waiting: list[tuple[float, int, str, list[dict[str, Any]]]] = []
+    for place, (key, (tileset, _)) in enumerate(trees.items()):
+        heapq.heappush(waiting, (-float("inf"), place, key, [tileset["root"]]))
+    number, left = len(waiting), max_bytes
+    while waiting:
+        error, _, key, tiles = heapq.heappop(waiting)
+        size = sum(trees[key][1][tile["content"]["uri"]] for tile in tiles)
+        if size > left and error != -float("inf"):  # something of every scene
+            continue
+        left -= size
+        kept[key] |= {tile["content"]["uri"] for tile in tiles}
+        for tile in tiles:
+            if tile.get("children"):
+                number += 1
+                heapq.heappush(waiting, (-tile["geometricError"], number, key, tile["children"]))
+    return {key: (trees[key][0] | {"root": _cut(trees[key][0]["root"], kept[key])}, sorted(kept[key])) for key in trees}
+
+
+def _cut(tile: dict[str, Any], kept: set[str]) -> dict[str, Any]:
+    """A tile without the children that are not there: all of a tile's are, or none."""
+    children = [_cut(child, kept) for child in tile.get("children", ()) if child["content"]["uri"] in kept]
+    rest = {name: value for name, value in tile.items() if name != "children"}
+    return rest | ({"children": children} if children else {})
+
+
+def _one_file(page: Path, files: Mapping[str, bytes], mark: str) -> str:
+    """The page with its style, its script and everything it fetches inside."""
+    html = (page / "index.html").read_text(encoding="utf-8")
+    script, style = _SCRIPT.search(html), _STYLE.search(html)
+    if script is None:
+        raise GsmapError(f"{page / 'index.html'} has no script of its own: build the page again (tools/build_page.sh)")
+    code = (page / script[1]).read_text(encoding="utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    packed = {address: base64.b64encode(data).decode() for address, data in files.items()}
+    data = json.dumps(packed).replace("<", "\\u003c")
+    inside = (
+        f'<script id="gsmap-files" type="application/json">{data}</script>'
+        f"<script>{_EMBEDDED}</script>"
+        f'<script type="module">{code}</script>'
+    )
+    html = html[: script.start()] + html[script.end() :]
+    text = ""
+    if style is not None:
+        text = (page / style[1]).read_text(encoding="utf-8").replace("</style", "<\\/style")
+        html = html.replace(style[0], f"<style>{text}</style>")
+    end = html.rindex("</body>")
+    html = html[:end] + inside + html[end:]
+    policy = CSP | {
+        "script-src": f"{_hash(_EMBEDDED)} {_hash(code)} 'wasm-unsafe-eval'",
+        "connect-src": "'none'",
+        "style-src": _hash(text),
+        "img-src": "data:",
+    }
+    return _with_policy(html, policy, mark)
+
+
+def _with_policy(html: str, policy: Mapping[str, str], mark: str = "") -> str:
+    said = "; ".join(f"{name} {value}" for name, value in policy.items())
+    head = _HEAD.search(html)
+    if head is None:
+        raise GsmapError("the page has no head of its own: build the page again (tools/build_page.sh)")
+    meta = f'{mark}<meta http-equiv="Content-Security-Policy" content="{said}" />'
+    return html[: head.end()] + meta + html[head.end() :]
+
+
+def _hash(code: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'"
+
+
+def _merged(folder: Path) -> Iterator[tuple[str, Path]]:
+    """The files of 3D Tiles in a component's folder of an export, by their addresses."""
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not path.is_symlink() and path.suffix in _MERGED_SUFFIXES:
+            yield path.relative_to(folder).as_posix(), path
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
