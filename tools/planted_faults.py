@@ -37,7 +37,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK_ROOMS = ("geometry", "store", "optimize", "merge", "describe")
-LEFT_OUT = shutil.ignore_patterns(".git", "node_modules", ".venv", "__pycache__", "*.gsmap", ".*_cache", ".hypothesis", "dist")
+LEFT_OUT = shutil.ignore_patterns(
+    ".git", "node_modules", ".venv", "__pycache__", "*.gsmap", ".*_cache", ".hypothesis", "dist"
+)
 
 
 @dataclass(frozen=True)
