@@ -53,7 +53,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sigmas = np.array([0.01] * 3 + [0.02] * 3 + [0.01])
     with create(folder) as m:
         for k, name in enumerate(("hall", "kitchen", "cellar")):
-            m.ingest(room(k, 1500), cameras=capture_cameras(), name=name, captured_at=f"2025-0{k + 1}-10", scale="known")
+            m.ingest(
+                room(k, 1500), cameras=capture_cameras(), name=name, captured_at=f"2025-0{k + 1}-10", scale="known"
+            )
         for a, b in (("hall", "kitchen"), ("kitchen", "cellar")):
             m.add_edge(f"{a}:{b}", Sim3.from_matrix(pose(1.5)), sigmas)
         m.optimize()
