@@ -84,7 +84,7 @@ def tree(count: int) -> None:
             tiles.append(
                 Tile(f"k{i}", 0, bounds, {"0" * 32: Sim3.identity()}, len(g), {}, False, path, f"tile {i}", ())
             )
-            cameras.append(around(i, low + [5, 5, 2.6]))
+            cameras.append(around(i, low + np.array([5, 5, 2.6])))
         poses = np.concatenate(cameras)
         intrinsics = np.tile([240.0, 240.0, 160.0, 120.0], (len(poses), 1))
         all_cameras = Cameras(poses, intrinsics, np.tile([320, 240], (len(poses), 1)))
