@@ -1,6 +1,7 @@
 """Seconds (CPU), bytes and picture of every format, next to gsply, Open3D and splat-transform in the same run.
 
-    python tools/bench_formats.py [FILE [--cameras CAMERAS] | --count N] [--degree D] [--json OUT] [--peers] [--only NAME]
+    python tools/bench_formats.py [FILE [--cameras CAMERAS] | --count N] [--degree D] [--json OUT]
+                                  [--peers] [--only NAME]
 
 --peers runs splat-transform too (npm: @playcanvas/splat-transform, see tests/formats/test_splat_transform.py), which
 takes minutes to write a SOG without a GPU. --only: formats with this in their names.

@@ -82,7 +82,10 @@ class Known:
 class Layout(Protocol):
     """The files of one kind of tree."""
 
-    file_name: str
+    @property
+    def file_name(self) -> str:
+        """Of the tree, in the folder of a component."""
+        ...
 
     @property
     def key(self) -> str:

@@ -62,29 +62,29 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     Raises:
         InputError: another version or compression level, truncated, or sections that do not fit the file.
     """
-    data = np.memmap(path, np.uint8, "r") if Path(path).stat().st_size else np.zeros(0, np.uint8)
-    if len(data) < _HEADER_BYTES:
-        raise InputError(f"{path} is not a .ksplat: it has {len(data)} bytes, its header alone {_HEADER_BYTES}")
-    header = data[: _HEADER.itemsize].view(_HEADER)[0]
+    size = Path(path).stat().st_size
+    if size < _HEADER_BYTES:
+        raise InputError(f"{path} is not a .ksplat: it has {size} bytes, its header alone {_HEADER_BYTES}")
+    header = np.fromfile(path, _HEADER, 1)[0]
     level, count = int(header["level"]), int(header["max_sections"])
     if tuple(header["version"]) != (0, 1) or level > 2:
         version = ".".join(map(str, header["version"]))
         raise InputError(
             f"{path}: .ksplat version {version}, compression level {level}; gsmap reads 0.1, levels 0 to 2"
         )
-    if not 0 < count <= _MAX_SECTIONS or _HEADER_BYTES + count * _SECTION_BYTES > len(data):
-        raise InputError(f"{path}: {count} sections do not fit into its {len(data)} bytes; is it whole?")
+    if not 0 < count <= _MAX_SECTIONS or _HEADER_BYTES + count * _SECTION_BYTES > size:
+        raise InputError(f"{path}: {count} sections do not fit into its {size} bytes; is it whole?")
     low, high = (
         float(end) or standard for end, standard in zip(header["sh_range"], (-_SH_RANGE, _SH_RANGE), strict=True)
     )
     parts, at = [], _HEADER_BYTES + count * _SECTION_BYTES
     for i in range(count):
         begin = _HEADER_BYTES + i * _SECTION_BYTES
-        section = _Section.of(path, data[begin : begin + _SECTION.itemsize].view(_SECTION)[0], level)
-        if at + section.num_bytes > len(data):
-            raise InputError(f"{path}: section {i} ends at byte {at + section.num_bytes} of {len(data)}; is it whole?")
+        section = _Section.of(path, np.fromfile(path, _SECTION, 1, offset=begin)[0], level)
+        if at + section.num_bytes > size:
+            raise InputError(f"{path}: section {i} ends at byte {at + section.num_bytes} of {size}; is it whole?")
         if section.splats:
-            parts.append(section.read(path, data[at : at + section.num_bytes], (low, high)))
+            parts.append(section.read(path, np.fromfile(path, np.uint8, section.num_bytes, offset=at), (low, high)))
         at += section.num_bytes
     if not parts:
         raise InputError(f"{path} has no Gaussians")
@@ -141,12 +141,12 @@ class _Section:
         """The Gaussians in the bytes of a section."""
         begin = 4 * self.partial_buckets + self.bucket_bytes * self.buckets
         rows = data[begin : begin + self.row.itemsize * self.splats].view(self.row)
-        means = rows["mean"].astype(np.float32)
+        means: np.ndarray = rows["mean"].astype(np.float32)
         if self.level:
             steps = self.scale_range or 32767
             means = (means - steps) * np.float32(self.block_size / 2 / steps) + self._centres(path, data)
         sh = np.zeros((self.splats, (self.sh_degree + 1) ** 2, 3), np.float32)
-        rest = rows["sh"].astype(np.float32)
+        rest: np.ndarray = rows["sh"].astype(np.float32)
         if self.level == 2:
             rest = rest / 255 * (sh_range[1] - sh_range[0]) + sh_range[0]
         sh[:, 0] = sh0_of_rgb(rows["rgba"][:, :3].astype(np.float32) / 255)

@@ -111,12 +111,16 @@ class LccSource:
         return 0 if self.sh is None else 3
 
     def chunks(self) -> Iterator[Gaussians]:
-        rows = np.memmap(self.data, _ROW, "r", shape=self.data.stat().st_size // _ROW.itemsize)
-        more = None if self.sh is None else np.memmap(self.sh, "<u4", "r", shape=(self.sh.stat().st_size // 64, 16))
         for first, count in self.runs.tolist():
             for begin in range(first, first + count, CHUNK_ROWS):
-                part = slice(begin, min(begin + CHUNK_ROWS, first + count))
-                yield self._decoded(np.array(rows[part]), None if more is None else np.array(more[part]))
+                wanted = min(CHUNK_ROWS, first + count - begin)
+                rows = np.fromfile(self.data, _ROW, wanted, offset=begin * _ROW.itemsize)
+                more = None
+                if self.sh is not None:
+                    more = np.fromfile(self.sh, "<u4", 16 * wanted, offset=begin * _SH_ROW.itemsize).reshape(-1, 16)
+                if len(rows) != wanted or (more is not None and len(more) != wanted):
+                    raise InputError(f"{self.path}: {self.data.name} was changed while it was read")
+                yield self._decoded(rows, more)
 
     def columns(self, name: str) -> Iterator[np.ndarray]:
         for chunk in self.chunks():
@@ -137,14 +141,14 @@ class LccSource:
             word = more[:, :15]
             level = np.stack([(word & 2047) / 2047, (word >> 11 & 1023) / 1023, word >> 21], axis=2)
             level[:, :, 2] /= 2047
-            sh[:, 1:] = low + (high - low) * level.astype(np.float32)
+            sh[:, 1:] = low + (high - low) * level
         found = Gaussians(rows["mean"], _quats(packed), log_scales, logits_of_bytes(rows["rgba"][:, 3]), sh)
         return change_axes(found, PLY, _AXES)
 
 
 def _quats(packed: np.ndarray) -> np.ndarray:
     """(N, 4) w, x, y, z: three components of 10 bits, and two bits that say which of x, y, z, w is the fourth."""
-    three = np.stack([packed & 1023, packed >> 10 & 1023, packed >> 20 & 1023], axis=1).astype(np.float32)
+    three: np.ndarray = np.stack([packed & 1023, packed >> 10 & 1023, packed >> 20 & 1023], axis=1).astype(np.float32)
     three = three / 1023 * np.float32(2**0.5) - np.float32(0.5**0.5)
     fourth = packed >> 30
     return from_smallest_three(_LARGEST[fourth], np.take_along_axis(three, _OTHERS[fourth], axis=1))

@@ -17,7 +17,7 @@ from gsmap.engine import run_jobs
 from gsmap.errors import ConfigError, DiskFullError, GsmapError, InputError, NotFoundError, ReadOnlyError
 from gsmap.export import ExportResult, PlannedTile, TileRecipe, dirty_reason, export_tiles, plan_tiles
 from gsmap.export.lock import folder_lock
-from gsmap.export.pyramid import is_stale
+from gsmap.export.pyramid import Layout, is_stale
 from gsmap.export.streamed import StreamedSog, write_streams
 from gsmap.export.tileset import Tiles3D, write_tilesets
 from gsmap.geometry.transforms import transform_cameras
@@ -228,16 +228,17 @@ def _export(
             progress=progress,
         )
     _put_aside(store, out, planned, result)
-    layout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
+    layout: Layout = Tiles3D(not request.uncompressed) if planned.recipe.is_tileset else StreamedSog()
     if planned.recipe.is_tree and is_stale(out, result.tiles, layout):
         in_metres_of = {component: metre.metres_per_unit for component, metre in planned.metres.items()}
         S_ecef_map = {component: one.S_ecef_map for component, one in planned.world.items()}
         tree = out, result.tiles, request.tile_size_m, in_metres_of
-        made = {"cameras": partial(_cameras, store, planned), "levels": settings.export.levels}
+        cameras, levels = partial(_cameras, store, planned), settings.export.levels
         if planned.recipe.is_tileset:
-            write_tilesets(*tree, S_ecef_map=S_ecef_map, compressed=not request.uncompressed, **made)
+            packed = not request.uncompressed
+            write_tilesets(*tree, S_ecef_map=S_ecef_map, compressed=packed, cameras=cameras, levels=levels)
         else:
-            write_streams(*tree, **made)
+            write_streams(*tree, cameras=cameras, levels=levels)
     if store.catalog.writable:
         refused = ""
         try:  # what an interrupted export, or one that could not be noted, left untold is told now
