@@ -21,7 +21,6 @@ from gsmap.types import Cameras, Gaussians, Tile
 LEVELS_FOLDER = "levels"
 _MAX_PER_LEVEL = 100_000
 _COARSENING = 4  # a level draws at most this fraction of what replaces it: half the detail on surfaces
-_MEASURED = "measured_error_m"  # of a level alone; its geometric error is not less than those of finer ones
 _Cell = tuple[int, int, int]
 
 
@@ -225,20 +224,10 @@ class _Maker:
             make_folder(path.parent)
             parts, boxes = self.layout.write(path, level.gaussians, tiles)
             # A level must never be finer than what replaces it, or viewers would stop at it too early.
-            error_m = max(level.error_m, 1.5 * max(one.error_m for one in _needed(children, level.error_m)), 1e-3)
+            error_m = max(level.error_m, 1.5 * max(child.error_m for child in children), 1e-3)
             measured = level.psnr_db or ()
             said = {name: round(v, 2) for name, v in zip(("psnr_worst_db", "psnr_db"), measured, strict=False)}
-            said |= {_MEASURED: level.error_m}
-        return Drawn(uri, digest, cell, parts, boxes, error_m, said, _needed(children, said[_MEASURED]), height)
-
-
-def _needed(children: list[Drawn], error_m: float) -> tuple[Drawn, ...]:
-    """What replaces a level of this measured error: finer ones, and of those that are no better what replaces them."""
-    out: list[Drawn] = []
-    for child in children:
-        is_level = bool(child.children)  # the tiles themselves stay, whatever
-        out += child.children if is_level and error_m <= child.error_m else [child]
-    return tuple(out)
+        return Drawn(uri, digest, cell, parts, boxes, error_m, said, tuple(children), height)
 
 
 def boxes_of(gaussians: Gaussians, parts: Sequence[int]) -> np.ndarray:

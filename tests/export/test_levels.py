@@ -132,46 +132,4 @@ def test_a_tileset_says_how_its_levels_look_and_keeps_them(tmp_path, monkeypatch
     assert len(made) == 1
     write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: None, levels=replace(QUICK, steps=61))
     assert len(made) == 2
-    assert "psnr_db" not in json.loads(file.read_text())["root"]["extras"]
-
-
-def test_a_level_no_better_than_the_next_is_left_out(tmp_path, monkeypatch):
-    """Of four tiles in a row: where the root is as good as the level below it, it is replaced by the tiles at once."""
-    from gsmap.export.tileset import write_tilesets
-    from gsmap.formats import tiles3d
-    from gsmap.types import Sim3, Tile
-
-    g = picture_wall(4000)
-    (tmp_path / "component_0").mkdir()
-    tiles = []
-    for i, side in enumerate((-1.0, -0.5, 0.0, 0.5)):
-        mine = g[(g.means[:, 0] >= side) & (g.means[:, 0] < side + 0.5) & (np.abs(g.means[:, 1]) < 0.25)]
-        path = f"component_0/{i}.glb"
-        tiles3d.write_content(tmp_path / path, mine)
-        bounds = np.array([[side, -0.25, -0.25], [side + 0.5, 0.25, 0.25]])
-        tiles.append(Tile(f"k{i}", 0, bounds, {"0" * 32: Sim3.identity()}, len(mine), {}, False, path, f"d{i}", ()))
-    errors = {"fine": 1.0, "coarse": 3.0}
-    made = []
-
-    def counted(finer, max_count, cameras, params):
-        made.append(len(finer))
-        error = errors["coarse"] if len(made) % 3 == 0 else errors["fine"]  # the root comes last
-        return replace(levels.make_level(finer, max_count, None, params), error_m=error)
-
-    monkeypatch.setattr("gsmap.export.pyramid.make_level", counted)
-
-    def tree(node):
-        return [node["content"]["uri"], [tree(child) for child in node.get("children", ())]]
-
-    def written():
-        (file,) = write_tilesets(tmp_path, tiles, 0.5, levels=replace(QUICK, steps=len(made)))
-        uri, children = tree(json.loads(file.read_text())["root"])
-        assert uri.startswith("levels/")
-        return children
-
-    assert [len(children) for _, children in written()] == [2, 2]
-    for equal in (1.0, 0.0):
-        errors["fine"] = errors["coarse"] = equal
-        leaves = written()
-        assert sorted(uri for uri, children in leaves) == ["0.glb", "1.glb", "2.glb", "3.glb"]
-        assert not any(children for _, children in leaves)
+    assert "extras" not in json.loads(file.read_text())["root"]
