@@ -23,9 +23,10 @@ export PATH
 need() { for tool in "$@"; do command -v "$tool" >/dev/null || { echo "this needs $tool" >&2; exit 1; }; done; }
 
 wheel() {
-    need auditwheel patchelf
+    need auditwheel patchelf npm
     rm -rf dist/raw dist/gsmap-*.whl dist/gsmap_synthetic-*.whl
-    "$PYTHON" -m pip wheel -q --no-deps --no-build-isolation -w dist/raw . ./synthetic
+    # The page of gsmap view in it, or no wheel.
+    GSMAP_PAGE=REQUIRED "$PYTHON" -m pip wheel -q --no-deps --no-build-isolation -w dist/raw . ./synthetic
     auditwheel repair -w dist dist/raw/gsmap-*.whl
     mv dist/raw/gsmap_synthetic-*.whl dist/
     rm -rf dist/raw
@@ -54,6 +55,9 @@ import gsmap
 from gsmap.types import Cameras, Gaussians
 
 assert not Path(gsmap.__file__).is_relative_to(sys.argv[1]), gsmap.__file__
+built = Path(gsmap.__file__).parent / "view" / "built"
+assert all((built / name).is_file() for name in ("index.html", "page.js", "LICENCES.txt")), "the page is not in the wheel"
+assert not (built.parent / "page").exists(), "the sources of the page are in the wheel"
 assert (Path(gsmap.__file__).parent / "migrations" / "env.py").is_file(), "the migrations are not in the wheel"
 rng = np.random.default_rng(0)
 count = 2000
@@ -73,6 +77,8 @@ END
     gsmap list small.gsmap scenes
     gsmap migrate small.gsmap
     gsmap check small.gsmap
+    gsmap view small.gsmap --export small_page
+    test -f small_page/page.js -a -f small_page/map.json
     python - <<'END'
 import gsmap
 

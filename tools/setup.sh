@@ -1,5 +1,6 @@
 #!/bin/sh
-# Sets gsmap up in .venv beside this checkout: system libraries, environment, native kernels, command line.
+# Sets gsmap up in .venv beside this checkout: system libraries, environment, native kernels, the page of gsmap view,
+# command line.
 #
 #   tools/setup.sh            what running gsmap needs
 #   tools/setup.sh test       what working on it needs: installed editable, so that tests test this checkout as it lies,
@@ -36,6 +37,13 @@ for pair in libGL.so.1:libgl1 libEGL.so.1:libegl1 libgomp.so.1:libgomp1 libusb-1
     # A library the loader knows is installed, whatever package it came from.
     PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | grep -q "${pair%%:*}" || packages="$packages ${pair##*:}"
 done
+# The page of gsmap view is built by Node.js; gsmap does without where it cannot be had.
+node=""
+command -v npm >/dev/null || node="nodejs npm"
+may_install() { command -v apt-get >/dev/null && { [ "$(id -u)" = 0 ] || command -v sudo >/dev/null; }; }
+if [ -n "$node" ] && may_install; then packages="$packages $node"; elif [ -n "$node" ]; then
+    say "no Node.js with npm here: gsmap view will be left out; install them and run this again to have it"
+fi
 if [ -n "$packages" ]; then
     command -v apt-get >/dev/null || die "please install the equivalents of:$packages, then run this again"
     if [ "$(id -u)" = 0 ]; then as_root=""; elif command -v sudo >/dev/null; then as_root=sudo; else
@@ -68,7 +76,10 @@ if [ "${1:-}" = test ]; then
     purelib=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
     find "$purelib" -maxdepth 1 -name '*gsmap*.pth' -exec sed -i '/^import /d' {} +
     PYTHON="$venv/bin/python" tools/build_native.sh >&2
+    if command -v npm >/dev/null; then tools/build_page.sh; fi
 else
     pip install -q -c constraints.txt . ./synthetic
+    "$venv/bin/python" -P -c 'from gsmap.view.built import built_page; built_page()' 2>/dev/null ||
+        say "the page of gsmap view was left out: GSMAP_PAGE=REQUIRED tools/setup.sh says why"
 fi
 say "ready: $venv/bin/gsmap --help"

@@ -94,6 +94,7 @@ def test_the_page_is_told_what_the_store_holds(folder):
         assert [s["name"] for s in said["scenes"]] == ["hall", "yard"]
         assert (said["title"], said["actions"], said["revision"]) == ("site.gsmap", True, 1)
         assert said["counts"]["gaussians"] == 6000
+        assert (said["stale"], said["scenes"][0]["tags"], said["scenes"][0]["prior"]) == (False, [], None)
         (edge,) = said["edges"]
         hall_, yard = said["scenes"]
         poses = [np.array(s["S_map_scene"]) for s in (hall_, yard)]
@@ -129,9 +130,12 @@ def test_what_a_person_does_is_done_by_the_maps_own_doors(folder):
         after = page.told("actions/optimize", {})["map"]
         assert after["revision"] == 2
         assert [one["id"] for one in after["revisions"]] == [1, 2]
+        assert not after["stale"]
         S = Sim3(np.eye(3), np.array([1.0, 2, 3]), 2.0)
         prior = {"scene": ids[1], "S_map_scene": S.matrix().tolist(), "sigma_m": 0.1, "sigma_deg": 2.0}
-        page.told("actions/prior", prior)
+        after = page.told("actions/prior", prior)["map"]
+        assert after["scenes"][1]["prior"] == "pose, 0.1 m, 2°"
+        assert after["stale"]
         (kept,) = m.store.priors.list()
         np.testing.assert_allclose(kept.S_map_scene.matrix(), S.matrix())
         # Metres are the map's; the residual of a position is counted in the scene's unit.

@@ -2,13 +2,15 @@
 // what is in the bundle. `npm ci && npm run build`; tools/build_page.sh does both.
 import { cpSync, mkdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
+import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
 
-const out = process.argv[2] ?? join(import.meta.dirname, "..", "built");
+const here = fileURLToPath(new URL(".", import.meta.url));
+const out = process.argv[2] ?? join(here, "..", "built");
 rmSync(out, { recursive: true, force: true });
 mkdirSync(out, { recursive: true });
 const result = await build({
-  entryPoints: { page: join(import.meta.dirname, "src", "main.ts") },
+  entryPoints: { page: join(here, "src", "main.ts") },
   outdir: out,
   bundle: true,
   minify: true,
@@ -19,7 +21,7 @@ const result = await build({
   loader: { ".wasm": "file" },
   logLevel: "warning",
 });
-for (const name of ["index.html", "style.css"]) cpSync(join(import.meta.dirname, name), join(out, name));
+for (const name of ["index.html", "style.css"]) cpSync(join(here, name), join(out, name));
 
 const packages = new Set();
 for (const path of Object.keys(result.metafile.inputs)) {
@@ -27,7 +29,7 @@ for (const path of Object.keys(result.metafile.inputs)) {
   if (found) packages.add(found[1]);
 }
 const texts = [...packages].sort().map((name) => {
-  const folder = join(import.meta.dirname, "node_modules", name);
+  const folder = join(here, "node_modules", name);
   const { version, license } = JSON.parse(readFileSync(join(folder, "package.json"), "utf8"));
   let text = "";
   for (const file of ["LICENSE", "LICENSE.md", "LICENSE.txt", "license"]) {
