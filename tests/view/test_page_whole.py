@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+import threading
 from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +22,6 @@ from gsmap.map import create
 from gsmap.map.map import Map
 from gsmap.types import Cameras, Sim3
 from gsmap.view import ViewServer
-from gsmap.view import built as built_module
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "gsmap" / "view" / "page"
@@ -53,7 +55,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sigmas = np.array([0.01] * 3 + [0.02] * 3 + [0.01])
     with create(folder) as m:
         for k, name in enumerate(("hall", "kitchen", "cellar")):
-            m.ingest(room(k, 1500), cameras=capture_cameras(), name=name, captured_at=f"2025-0{k + 1}-10", scale="known")
+            m.ingest(
+                room(k, 1500), cameras=capture_cameras(), name=name, captured_at=f"2025-0{k + 1}-10", scale="known"
+            )
         for a, b in (("hall", "kitchen"), ("kitchen", "cellar")):
             m.add_edge(f"{a}:{b}", Sim3.from_matrix(pose(1.5)), sigmas)
         m.optimize()
@@ -66,15 +70,17 @@ def opened(
 ) -> Iterator[tuple[Map, ViewServer, Hands]]:
     """A copy of the map, served, with its page open and at rest."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(built_module, "built_page", lambda: built)
-    monkeypatch.setattr("gsmap.view.server.built_page", lambda: built, raising=False)
+    monkeypatch.setattr("gsmap.view.server.built_page", lambda: built)
     shutil.copytree(made, tmp_path / "site.gsmap")
-    with gsmap.open(tmp_path / "site.gsmap") as m, m.view().start() as server:
-        with Page(server.url, tmp_path / "browser", 1000, 640) as page:
-            hands = Hands(page)
-            hands.wait("globalThis.gsmap?.settled && find('gs-scene-list', null)", 60)
-            yield m, server, hands
-            assert page.failures() == []
+    with (
+        gsmap.open(tmp_path / "site.gsmap") as m,
+        m.view().start() as server,
+        Page(server.url, tmp_path / "browser", 1000, 640) as page,
+    ):
+        hands = Hands(page)
+        hands.wait("globalThis.gsmap?.settled && find('gs-scene-list', null)", 60)
+        yield m, server, hands
+        assert page.failures() == []
 
 
 def edge_of(m: Map, a: str, b: str):
@@ -158,16 +164,46 @@ def test_time_split_and_clip_are_drawn_and_come_back_by_the_address(opened):
     assert hands.value("location.hash") == address
 
 
+def test_the_page_as_files_shows_the_same_without_a_server(made, built, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("gsmap.map.viewing_site.built_page", lambda: built)
+    with gsmap.open(made) as m:
+        m.write_site(tmp_path / "site")
+        m.write_page(tmp_path / "one.html")
+    quiet = type("Quiet", (SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, directory=tmp_path / "site")) as http:
+        threading.Thread(target=http.serve_forever, daemon=True).start()
+        for url in (f"http://127.0.0.1:{http.server_port}/", (tmp_path / "one.html").as_uri()):
+            with Page(url, tmp_path / f"browser-{url[:4]}", 1000, 640) as page:
+                hands = Hands(page)
+                hands.wait("globalThis.gsmap?.settled && find('gs-scene-list', null)", 60)
+                assert hands.value("gsmap.error") is None
+                hands.press("2")
+                hands.says("This page only shows the map", "gs-review")
+                hands.click("button", "All")
+                hands.press("j")
+                hands.says("Evidence", "gs-edge")
+                hands.press("3", "v", "x", "h")
+                hands.wait("gsmap.settled")
+                hands.value("new Promise((rest) => setTimeout(rest, 400))")
+                assert "split=" in hands.value("location.hash")
+                assert page.failures() == []
+        http.shutdown()
+
+
 def test_a_page_that_only_shows(made, built, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("gsmap.view.server.built_page", lambda: built, raising=False)
-    with gsmap.open(made) as m, m.view(read_only=True).start() as server:
-        with Page(server.url, tmp_path / "browser", 390, 844) as page:
-            hands = Hands(page)
-            hands.resize(390, 844, mobile=True)
-            hands.wait("globalThis.gsmap?.settled && find('gs-scene-list', null)", 60)
-            hands.press("2")
-            hands.says("This page only shows the map", "gs-review")
-            said = json.loads(hands.value("fetch('map.json').then((answer) => answer.text())"))
-            assert said["actions"] is False
-            assert page.failures() == []
+    monkeypatch.setattr("gsmap.view.server.built_page", lambda: built)
+    with (
+        gsmap.open(made) as m,
+        m.view(read_only=True).start() as server,
+        Page(server.url, tmp_path / "browser", 390, 844) as page,
+    ):
+        hands = Hands(page)
+        hands.resize(390, 844, mobile=True)
+        hands.wait("globalThis.gsmap?.settled && find('gs-scene-list', null)", 60)
+        hands.press("2")
+        hands.says("This page only shows the map", "gs-review")
+        said = json.loads(hands.value("fetch('map.json').then((answer) => answer.text())"))
+        assert said["actions"] is False
+        assert page.failures() == []

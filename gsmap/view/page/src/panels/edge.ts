@@ -196,7 +196,9 @@ export class Edge extends Panel {
       return html`<p class="empty">
         ${
           detail.S_target_source
-            ? "There are no pictures of this pair: its captures have no camera in common view."
+            ? map.history === null
+              ? "This page has no pictures of this pair: gsmap view MAP draws them."
+              : "There are no pictures of this pair: its captures have no cameras, or are too large to be drawn here."
             : "There are no pictures of this pair: no pose was found that would lay one over the other."
         }
       </p>`;

@@ -29,6 +29,9 @@ type OverlayName = Parameters<Stage["setOverlay"]>[0];
 const BACKGROUND = { dark: 0x0d1014, light: 0xf4f4f1 };
 const MAX_PIXEL_RATIO = 2;
 const CLICK_PX = 4;
+/** Between pictures while tiles come. */
+const SHORTEST_MS = 50;
+const LONGEST_MS = 2000;
 /** How far up a room reaches that is drawn without its ceiling: of what its scene shows, from the floor. */
 const CEILING_AT = 0.72;
 /** Islands of at most so many scenes are first seen from where their captures were made. */
@@ -88,6 +91,8 @@ class View3D implements Stage {
   private scheduled = 0;
   private isStale = true; // the order and the colours are another view's
   private isPreparing = false;
+  private later = 0; // timer of the next picture while tiles come
+  private costMs = 0; // of the last picture, its sorting included
   private isMoving = false;
   private isDisposed = false;
 
@@ -129,7 +134,7 @@ class View3D implements Stage {
     }
     if (!this.isVisibleKnown) this.visible = new Set(map.scenes.keys());
     this.dragged = null;
-    this.loader = new Loader(map, component, this.splats, this.budget, this.refresh, this.fail, before);
+    this.loader = new Loader(map, component, this.splats, this.budget, this.refreshLater, this.fail, before);
     const box = new Box3(new Vector3(...island.box[0]), new Vector3(...island.box[1]));
     this.view.setWorld(island.up, box.getSize(new Vector3()).length(), 1 / (island.metres_per_unit || 1));
     this.state.phase = "ready";
@@ -358,6 +363,18 @@ class View3D implements Stage {
     this.draw();
   };
 
+  /** As tiles come: what the card takes for a picture is left for fetching the next ones. */
+  private readonly refreshLater = (): void => {
+    this.state.settled = false;
+    this.later ||= window.setTimeout(
+      () => {
+        this.later = 0;
+        this.refresh();
+      },
+      Math.min(LONGEST_MS, Math.max(SHORTEST_MS, this.costMs)),
+    );
+  };
+
   private readonly draw = (): void => {
     if (this.isDisposed) return;
     this.state.settled = false;
@@ -400,12 +417,14 @@ class View3D implements Stage {
   private async prepare(): Promise<void> {
     this.isPreparing = true;
     this.isStale = false;
+    const start = performance.now();
     try {
       await this.painter.prepare(this.scene, this.view.camera);
     } catch (error) {
       this.fail(error instanceof Error ? error.message : String(error));
     }
     this.isPreparing = false;
+    this.costMs = performance.now() - start;
     this.draw();
   }
 
@@ -425,6 +444,7 @@ class View3D implements Stage {
       !this.isStale &&
       !this.isPreparing &&
       !this.scheduled &&
+      !this.later &&
       !this.state.pending;
   }
 
@@ -700,6 +720,7 @@ class View3D implements Stage {
   dispose(): void {
     this.isDisposed = true;
     cancelAnimationFrame(this.scheduled);
+    clearTimeout(this.later);
     const { canvas } = this.options;
     canvas.removeEventListener("webglcontextlost", this.onLost);
     canvas.removeEventListener("pointerdown", this.onDown);

@@ -63,8 +63,7 @@ export class Loader {
   private active = 0;
   private tick = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
-  private queue: Tile[] = [];
-  private treeQueue: Asked[] = [];
+  private queue: (Tile | Asked)[] = []; // what matters most first
   private waiting = 0; // trees that are wanted and still being made
   private readonly placed: Placed[];
   private readonly asWritten: Matrix4[];
@@ -127,7 +126,7 @@ export class Loader {
   }
 
   get pending(): number {
-    return this.active + this.queue.length + this.treeQueue.length + this.waiting;
+    return this.active + this.queue.length + this.waiting;
   }
 
   /** Takes where scenes lie and which are drawn where. */
@@ -180,7 +179,8 @@ export class Loader {
       }
       return error;
     };
-    const isReady = (tile: Tile) => tile.state === "ready" || (!tile.uri && tile.count === 0);
+    const isReady = (tile: Tile) =>
+      tile.state === "ready" || (!tile.uri && tile.count === 0 && tile.finer?.length === 0);
     this.cut = choose(roots, errorOf, this.budget.splats, this.budget.errorPx);
     const shown = new Set(drawable(roots, this.cut, (tile) => errorOf(tile) >= 0, isReady));
     const wanted = [...this.cut.refined, ...this.cut.tiles];
@@ -195,7 +195,6 @@ export class Loader {
       if (!inCut) for (const finer of tile.finer ?? []) want(finer, covered || tile.state === "ready");
     };
     for (const root of roots) want(root, false);
-    this.queue = [...missing].sort((a, b) => errorOf(b) - errorOf(a));
     const loading = [...this.loading];
     for (const tile of loading) if (!wanted.includes(tile)) tile.aborter?.abort();
     const asked: Asked[] = [
@@ -207,7 +206,8 @@ export class Loader {
       tile?.external
         ? tile.state !== "loading"
         : tree.state === "none" || (tree.state === "waiting" && tree.retryAt <= now);
-    this.treeQueue = asked.filter(isDue);
+    const worth = (one: Tile | Asked) => (one instanceof Tile ? errorOf(one) : one.tile ? errorOf(one.tile) : Infinity);
+    this.queue = [...missing, ...asked.filter(isDue)].sort((a, b) => worth(b) - worth(a));
     this.waiting = asked.filter(
       ({ tree, tile }) => !tile?.external && tree.state === "waiting" && tree.retryAt > now,
     ).length;
@@ -240,13 +240,11 @@ export class Loader {
   private readonly loading = new Set<Tile>();
 
   private pump(): void {
-    while (this.active < this.budget.requests && this.treeQueue.length) {
-      const next = this.treeQueue.shift();
-      if (next) void this.fetchTree(next);
-    }
     while (this.active < this.budget.requests && this.queue.length) {
-      const tile = this.queue.shift();
-      if (tile) void this.fetchTile(tile);
+      const next = this.queue.shift();
+      if (next instanceof Tile) {
+        if (next.state === "none") void this.fetchTile(next);
+      } else if (next && (next.tile?.external ? next.tile : next.tree).state !== "loading") void this.fetchTree(next);
     }
   }
 
@@ -258,7 +256,10 @@ export class Loader {
       if (!this.aborter.signal.aborted) this.onError(error instanceof Error ? error.message : String(error));
     } finally {
       this.active--;
-      if (!this.aborter.signal.aborted) this.onChange();
+      if (!this.aborter.signal.aborted) {
+        this.pump(); // what was chosen last; the next frame chooses anew
+        this.onChange();
+      }
     }
   }
 

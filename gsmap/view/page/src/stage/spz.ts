@@ -98,3 +98,57 @@ export async function unpack(
   }
   return { count, degree, stride, step: 2 ** -bits, smallestThree: version >= 3, words };
 }
+
+/** Splats as numbers: those of a glTF without compression. */
+export interface Floats {
+  positions: Float32Array; // x y z
+  rotations: Float32Array; // x y z w, of length 1
+  scales: Float32Array; // linear
+  opacities: Float32Array;
+  sh: Float32Array[]; // red, green and blue of each coefficient
+}
+
+/** Packs as SPZ does, so that one way of drawing serves; positions are counted from `middle`. */
+export function pack({ positions, rotations, scales, opacities, sh }: Floats): Packed & { middle: number[] } {
+  const count = opacities.length;
+  const degree = SH_COEFFICIENTS.indexOf(sh.length - 1);
+  if (degree < 0) throw new Error(`${sh.length} SH coefficients are of no degree`);
+  const low = [Infinity, Infinity, Infinity];
+  const high = [-Infinity, -Infinity, -Infinity];
+  positions.forEach((v, i) => {
+    low[i % 3] = Math.min(low[i % 3] as number, v);
+    high[i % 3] = Math.max(high[i % 3] as number, v);
+  });
+  const middle = low.map((v, i) => (v + (high[i] as number)) / 2);
+  const reach = Math.max(1e-6, ...high.map((v, i) => v - (middle[i] as number)));
+  const step = reach / (2 ** 23 - 1);
+  const stride = 5 + Math.ceil((3 * (sh.length - 1)) / 4);
+  const words = new Uint32Array(count * stride);
+  const byte = (v: number) => Math.min(255, Math.max(0, Math.round(v)));
+  for (let i = 0, to = 0; i < count; i++, to += stride) {
+    const three = (of: Float32Array, k: number) => of[3 * i + k] ?? 0;
+    const colour = [0, 1, 2].map((k) => byte((three(sh[0] as Float32Array, k) * 0.15 + 0.5) * 255)) as number[];
+    const log = [0, 1, 2].map((k) => byte((Math.log(Math.max(three(scales, k), 1e-30)) + 10) * 16)) as number[];
+    const at = (k: number) => Math.round((three(positions, k) - (middle[k] as number)) / step) & 0xffffff;
+    words[to] = at(0) | (byte(255 * (opacities[i] ?? 0)) << 24);
+    words[to + 1] = at(1) | ((colour[0] as number) << 24);
+    words[to + 2] = at(2) | ((colour[1] as number) << 24);
+    words[to + 3] =
+      (colour[2] as number) | ((log[0] as number) << 8) | ((log[1] as number) << 16) | ((log[2] as number) << 24);
+    const q = [0, 1, 2, 3].map((k) => rotations[4 * i + k] ?? 0);
+    const largest = q.reduce((best, v, k) => (Math.abs(v) > Math.abs(q[best] as number) ? k : best), 0);
+    const sign = (q[largest] as number) < 0 ? -1 : 1;
+    let packed = largest;
+    q.forEach((v, k) => {
+      if (k === largest) return;
+      const level = Math.min(511, Math.round(Math.abs(v) * 511 * Math.SQRT2));
+      packed = ((packed << 10) | (v * sign < 0 ? 512 : 0) | level) >>> 0;
+    });
+    words[to + 4] = packed;
+    for (let k = 0; k < 3 * (sh.length - 1); k++) {
+      const value = byte(128 * (three(sh[1 + Math.floor(k / 3)] as Float32Array, k % 3) + 1));
+      words[to + 5 + (k >> 2)] = (words[to + 5 + (k >> 2)] as number) | (value << (8 * (k & 3)));
+    }
+  }
+  return { count, degree, stride, step, smallestThree: true, words, middle };
+}

@@ -1,11 +1,12 @@
 // Trees of 3D Tiles: what they say, and the fetching of what is wanted.
 import { Box3, Frustum, Matrix4, Vector3 } from "three";
-import type { TreeProgress } from "../contract";
+import type { TreeProgress, Vector } from "../contract";
 import type { Choice } from "./lod";
 import type { SplatTile } from "./splats";
-import type { Packed } from "./spz";
-import { unpack } from "./spz";
+import type { Floats, Packed } from "./spz";
+import { pack, unpack } from "./spz";
 
+const EXTENSION = "KHR_gaussian_splatting";
 const SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2";
 /** 3D Tiles turns the content of a tile from y up to z up. */
 const Y_UP_TO_Z_UP = new Matrix4().set(1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1);
@@ -167,8 +168,14 @@ export async function fetchContent(url: string, signal: AbortSignal): Promise<Co
   const response = await fetch(url, { signal });
   if (!response.ok) throw new Error(`${new URL(url).pathname}: ${response.status} ${response.statusText}`);
   const bytes = new Uint8Array(await response.arrayBuffer());
-  const { spz, matrix } = readGlb(bytes, url);
-  return { packed: await unpack(spz), matrix, bytes: bytes.length };
+  const { spz, floats, matrix } = readGlb(bytes, url);
+  if (spz) return { packed: await unpack(spz), matrix, bytes: bytes.length };
+  const packed = pack(floats);
+  return {
+    packed,
+    matrix: matrix.multiply(new Matrix4().makeTranslation(...(packed.middle as Vector))),
+    bytes: bytes.length,
+  };
 }
 
 /**
@@ -189,7 +196,7 @@ const PAYLOAD_BYTES = [0, 9, 24, 45].flatMap((sh) => [19 + sh, 20 + sh]);
 
 interface Gltf {
   nodes?: { mesh?: number; matrix?: number[] }[];
-  accessors?: { count: number }[];
+  accessors?: { count: number; componentType: number; bufferView?: number; byteOffset?: number }[];
   meshes?: {
     primitives: {
       attributes?: Record<string, number>;
@@ -199,19 +206,55 @@ interface Gltf {
   bufferViews?: { byteOffset?: number; byteLength: number }[];
 }
 
-function readGlb(bytes: Uint8Array<ArrayBuffer>, url: string): { spz: Uint8Array<ArrayBuffer>; matrix: Matrix4 } {
+type Read = { matrix: Matrix4 } & (
+  { spz: Uint8Array<ArrayBuffer>; floats?: undefined } | { spz?: undefined; floats: Floats }
+);
+
+function readGlb(bytes: Uint8Array<ArrayBuffer>, url: string): Read {
   const view = new DataView(bytes.buffer);
   if (bytes.length < 28 || view.getUint32(0, true) !== 0x46546c67) throw new Error(`${url} is not a GLB`);
   const jsonLength = view.getUint32(12, true);
   const gltf = JSON.parse(new TextDecoder().decode(bytes.subarray(20, 20 + jsonLength))) as Gltf;
   const node = gltf.nodes?.find((one) => one.mesh !== undefined);
   const primitive = gltf.meshes?.[node?.mesh ?? 0]?.primitives[0];
-  const index = primitive?.extensions?.["KHR_gaussian_splatting"]?.extensions?.[SPZ_EXTENSION]?.bufferView;
-  const part = index === undefined ? undefined : gltf.bufferViews?.[index];
-  if (!part) throw new Error(`${url} holds no splats packed as SPZ: export it without --uncompressed`);
-  const start = 20 + jsonLength + 8 + (part.byteOffset ?? 0);
+  const splatting = primitive?.extensions?.[EXTENSION];
   const matrix = Y_UP_TO_Z_UP.clone();
   if (node?.matrix?.length === 16) matrix.multiply(new Matrix4().fromArray(node.matrix));
-  const count = gltf.accessors?.[primitive?.attributes?.["POSITION"] ?? 0]?.count ?? 0;
-  return { spz: withoutPadding(bytes.slice(start, start + part.byteLength), count), matrix };
+  const part = (index: number | undefined) => {
+    const found = index === undefined ? undefined : gltf.bufferViews?.[index];
+    if (!found) throw new Error(`${url} holds no splats that the page reads`);
+    const start = 20 + jsonLength + 8 + (found.byteOffset ?? 0);
+    return bytes.slice(start, start + found.byteLength);
+  };
+  const packed = splatting?.extensions?.[SPZ_EXTENSION];
+  if (packed) {
+    const count = gltf.accessors?.[primitive?.attributes?.["POSITION"] ?? -1]?.count ?? 0;
+    return { spz: withoutPadding(part(packed.bufferView), count), matrix };
+  }
+  const values = (name: string): Float32Array | null => {
+    const index = primitive?.attributes?.[name];
+    const accessor = index === undefined ? undefined : gltf.accessors?.[index];
+    if (!accessor) return null;
+    if (accessor.componentType !== 5126) throw new Error(`${url}: ${name} is not of float32`);
+    return new Float32Array(part(accessor.bufferView).buffer, accessor.byteOffset ?? 0);
+  };
+  const named = (name: string) => {
+    const found = values(name);
+    if (!found) throw new Error(`${url} holds no splats that the page reads: it has no ${name}`);
+    return found;
+  };
+  const sh: Float32Array[] = [];
+  for (let degree = 0; degree <= 3; degree++)
+    for (let k = 0; k < 2 * degree + 1; k++) {
+      const found = values(`${EXTENSION}:SH_DEGREE_${degree}_COEF_${k}`);
+      if (found) sh.push(found);
+    }
+  const floats = {
+    positions: named("POSITION"),
+    rotations: named(`${EXTENSION}:ROTATION`),
+    scales: named(`${EXTENSION}:SCALE`),
+    opacities: named(`${EXTENSION}:OPACITY`),
+    sh,
+  };
+  return { floats, matrix };
 }
