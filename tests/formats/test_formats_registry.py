@@ -146,4 +146,4 @@ def test_every_format_that_is_written_is_read_by_name_and_makes_its_folder(tmp_p
     assert len(back) == 40
     ours, theirs = (np.sort(x.means, axis=0) for x in (g, back))
     np.testing.assert_allclose(theirs, ours, atol=0.01)
-    assert not [p for p in path.parent.rglob(".*")]
+    assert not list(path.parent.rglob(".*"))
