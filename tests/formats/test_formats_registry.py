@@ -30,6 +30,12 @@ def test_longest_suffix_wins():
     assert formats.suffix_of("a/plain") is None
 
 
+def test_a_name_without_a_dot_is_a_whole_name():
+    assert formats.suffix_of("a/META.json") == "meta.json"
+    assert formats.suffix_of("a/lod-meta.json") == "lod-meta.json"
+    assert formats.suffix_of("a/hall.meta.json") is None  # what somebody says of hall.ply
+
+
 @pytest.fixture
 def added(tmp_path, monkeypatch):
     """A package, installed as pip would, that adds a format with a layout of its own and one that cannot be loaded."""
