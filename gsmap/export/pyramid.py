@@ -138,8 +138,8 @@ def pyramids(
 ) -> Iterator[tuple[int, Path, Drawn]]:
     """Each component, its folder, and the root of the levels above its tiles.
 
-    Levels are named by what they were made from and how, so those whose tiles did not change are not made again. Memory
-    is bounded by eight tiles.
+    Levels are named by what they were made from and how, so those whose tiles did not change are not made again; but
+    for one that was left out, since the level above it may be shown from as near. Memory is bounded by eight tiles.
     """
     by_component: dict[int, list[Tile]] = defaultdict(list)
     for tile in tiles:
@@ -217,17 +217,28 @@ class _Maker:
         if known is not None and is_file(path):
             boxes = known.boxes if known.boxes is not None else boxes_of(self.layout.read(path), known.parts)
             parts, error_m, said = known.parts, known.error_m, dict(known.extras)
+            children = _better(children, error_m)
         else:
             finer = Gaussians.concatenate([self.layout.read(self.folder / child.uri) for child in children])
             most = min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING))
             level = make_level(finer, most, self.cameras(), self.levels)
             make_folder(path.parent)
             parts, boxes = self.layout.write(path, level.gaussians, tiles)
+            children = _better(children, level.error_m)
             # A level must never be finer than what replaces it, or viewers would stop at it too early.
             error_m = max(level.error_m, 1.5 * max(child.error_m for child in children), 1e-3)
             measured = level.psnr_db or ()
             said = {name: round(v, 2) for name, v in zip(("psnr_worst_db", "psnr_db"), measured, strict=False)}
         return Drawn(uri, digest, cell, parts, boxes, error_m, said, tuple(children), height)
+
+
+def _better(children: Sequence[Drawn], error_m: float) -> list[Drawn]:
+    """The children of a level, those left out that are not like enough from nearer than it is: what is below them
+    replaces it instead."""
+    kept: list[Drawn] = []
+    for child in children:
+        kept += [child] if not child.children or child.error_m < error_m else child.children
+    return kept
 
 
 def boxes_of(gaussians: Gaussians, parts: Sequence[int]) -> np.ndarray:

@@ -102,6 +102,42 @@ def test_settings_are_checked(wrong):
         Params(**wrong)
 
 
+@pytest.mark.parametrize(("upper_m", "files"), [(3.0, 1), (5.0, 1), (5.1, 3)])
+def test_a_level_that_is_no_better_than_the_next_is_left_out(tmp_path, monkeypatch, upper_m, files):
+    """Four tiles in a row: two levels with an error of 5 m, and one above them."""
+    from gsmap.export.tileset import write_tilesets
+    from gsmap.formats import tiles3d
+    from gsmap.types import Sim3, Tile
+
+    g = picture_wall(400)
+    (tmp_path / "component_0").mkdir()
+    (tmp_path / "tiles.json").write_text("{}")
+    tiles = []
+    for i in range(4):
+        path = f"component_0/{i}.glb"
+        tiles3d.write_content(tmp_path / path, g[i::4])
+        bounds = np.array([[i, 0, 0], [i + 1, 1, 1]], float)
+        tiles.append(Tile(f"k{i}", 0, bounds, {"0" * 32: Sim3.identity()}, 100, {}, False, path, f"digest {i}", ()))
+    made = []
+
+    def make(finer, count, cameras, params):
+        made.append(count)
+        return levels.Level(finer[:count], 5.0 if len(finer) == 200 else upper_m)
+
+    monkeypatch.setattr("gsmap.export.pyramid.make_level", make)
+    (file,) = write_tilesets(tmp_path, tiles, 1.0)
+    root = json.loads(file.read_text())["root"]
+    assert len(list((tmp_path / "component_0" / "levels").iterdir())) == files
+    leaves = [child["content"]["uri"] for child in root["children"] if "children" not in child]
+    assert leaves == ([] if files == 3 else ["0.glb", "1.glb", "2.glb", "3.glb"])
+    assert root["geometricError"] == pytest.approx(upper_m if files == 1 else 7.5)
+    write_tilesets(tmp_path, tiles, 1.0)
+    again = json.loads(file.read_text())["root"]
+    assert again["geometricError"] == root["geometricError"]
+    assert [c["content"] for c in again["children"]] == [c["content"] for c in root["children"]]
+    assert len(made) == 3 + (0 if files == 3 else 2)  # what was left out is made again to be left out again
+
+
 def test_a_tileset_says_how_its_levels_look_and_keeps_them(tmp_path, monkeypatch):
     from gsmap.export.tileset import write_tilesets
     from gsmap.formats import tiles3d

@@ -30,6 +30,12 @@ def test_longest_suffix_wins():
     assert formats.suffix_of("a/plain") is None
 
 
+def test_a_name_without_a_dot_is_a_whole_name():
+    assert formats.suffix_of("a/META.json") == "meta.json"
+    assert formats.suffix_of("a/lod-meta.json") == "lod-meta.json"
+    assert formats.suffix_of("a/hall.meta.json") is None  # what somebody says of hall.ply
+
+
 @pytest.fixture
 def added(tmp_path, monkeypatch):
     """A package, installed as pip would, that adds a format with a layout of its own and one that cannot be loaded."""
@@ -129,3 +135,21 @@ def test_what_a_damaged_file_says_stays_within_one_line(tmp_path):
     for error in (caught, also):
         assert len(str(error.value)) < len(str(tmp_path)) + 400
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("suffix", sorted(set(formats.known("read")) & set(formats.known("write"))))
+def test_every_format_that_is_written_is_read_by_name_and_makes_its_folder(tmp_path, suffix):
+    """A format that is a folder makes it, and what lies above it; others want theirs to be there."""
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr")
+    g = one(40)
+    if suffix.startswith("."):
+        path = tmp_path / f"a{suffix}"
+    else:
+        path = tmp_path / "new" / "place" / suffix
+    formats.write(path, g)
+    back = formats.read(path)
+    assert len(back) == 40
+    ours, theirs = (np.sort(x.means, axis=0) for x in (g, back))
+    np.testing.assert_allclose(theirs, ours, atol=0.01)
+    assert not list(path.parent.rglob(".*"))
