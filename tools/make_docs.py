@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -71,19 +72,42 @@ def make_pictures(folder: Path) -> None:
 
 
 def page_pictures(path: Path) -> None:
-    """The page of `gsmap view` on a desktop and a phone."""
+    """The page of `gsmap view`: looking, an edge and a change under review, and a phone."""
     sys.path.insert(0, str(ROOT / "tests" / "view"))
+    import gsmap.map
+    from hands import Hands
     from headless import Page
+
+    def settled(hands: Hands) -> None:
+        hands.wait("globalThis.gsmap?.settled && findAll('img').every((e) => e.naturalWidth)", 180)
+
+    with gsmap.map.open(path) as m, m.view().start() as server, tempfile.TemporaryDirectory() as profile:
+        with Page(server.url, Path(profile) / "desk", 1280, 800) as page:
+            hands = Hands(page)
+            settled(hands)
+            _save(page, "page")
+            hands.press("2")
+            hands.click("button", "All")
+            hands.click("button.choose", "capture_b")
+            hands.wait("findAll('img').length >= 2", 60)
+            settled(hands)
+            _save(page, "page_review")
+            hands.press("Escape", "3")
+            hands.click("button.choose", "isappeared")
+            hands.wait("findAll('img').length >= 1", 60)
+            settled(hands)
+            _save(page, "page_time")
+        with Page(server.url, Path(profile) / "phone", 390, 844) as page:
+            hands = Hands(page)
+            hands.resize(390, 844, mobile=True)
+            settled(hands)
+            _save(page, "page_phone")
+
+
+def _save(page: Any, name: str) -> None:
     from PIL import Image
 
-    import gsmap.map
-
-    with gsmap.map.open(path) as m, m.view() as server, tempfile.TemporaryDirectory() as profile:
-        server.start()
-        for name, size in (("page", (1280, 800)), ("page_phone", (390, 844))):
-            with Page(server.url, Path(profile) / name, *size) as page:
-                page.wait("window.gsmap && window.gsmap.settled", 120)
-                Image.fromarray((page.picture() * 255).astype("uint8")).save(PICTURES / f"{name}.png")
+    Image.fromarray((page.picture() * 255).astype("uint8")).save(PICTURES / f"{name}.png", optimize=True)
 
 
 def write_settings() -> None:

@@ -61,6 +61,7 @@ NAMES_NOTHING = (
     "by_shape.",  # nothing of it is kept
     "scan.",  # nothing of it is kept
     "report.",  # a page, made whenever it is asked for
+    "view.",  # levels of detail are named by their own
     "visits.",
     "thin.",
     "export.",
