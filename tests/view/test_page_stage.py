@@ -451,6 +451,22 @@ def test_the_overview_is_drawn_before_any_tree(made):
         assert page.picture().std() > 0.05
 
 
+def test_rooms_are_first_seen_from_within(made):
+    """Not their ceilings: from where one of the captures was made, level, towards most of the others."""
+    folder, served = made
+    with opened(folder, served) as page:
+        seen = Seen(page, served)
+        seen.show()
+        page.wait("Math.abs(gsmap.stage.standpoint().position[1] + 1.2) < 1e-3", 10)
+        at = seen.page.value("gsmap.stage.standpoint()")
+        assert np.allclose(at["position"], [-1, -1.2, 0], atol=1e-3) or np.allclose(
+            at["position"], [1, -1.2, 0], atol=1e-3
+        )
+        assert abs(at["target"][1] - at["position"][1]) < 0.05
+        seen.do("fit()")  # from then on, all of it
+        assert seen.page.value("gsmap.stage.standpoint().position[1]") < -5
+
+
 def test_trees_that_are_still_made_are_asked_for_again(made):
     folder, served = made
     for i in range(4):
