@@ -135,7 +135,9 @@ class Answers:
         return found
 
     def _tileset(self, key: str, asked: Mapping[str, str]) -> Answer:
-        found = self._levels.tree(self._entry(key), _number(asked.get("rank", "0")))
+        entry = self._entry(key)
+        self._levels.look_at(self.content(), entry.scene.id)
+        found = self._levels.tree(entry, _number(asked.get("rank", "0")))
         return _waiting(found) if isinstance(found, Waiting) else Answer((found / FILE_NAME).read_bytes(), JSON)
 
     def _tile(self, key: str, uri: str) -> Answer:

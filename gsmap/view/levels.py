@@ -161,6 +161,15 @@ class Levels:
                     out[component] = ViewOverview(f"overviews/{component}/none.spz", pending=len(inside))
             return out, self.state()
 
+    def look_at(self, view: ViewMap, scene: str) -> None:
+        """Have the overview of a scene's island made, too: somebody is there."""
+        place = next((i for i, entry in enumerate(view.scenes) if entry.scene.id == scene), None)
+        if place is not None:
+            component = view.components()[place]
+            with self._lock:
+                if component not in self._islands:
+                    self._overview(component, members(view)[component])
+
     def overview(self, view: ViewMap, component: int, name: str) -> bytes | Waiting:
         """The file of an overview by its name, or how far it is.
 

@@ -20,18 +20,19 @@ from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import CONTENT_FOLDER, TileNode
 from gsmap.geometry.boxes import robust_box
 from gsmap.geometry.morton import BITS, morton_codes
-from gsmap.geometry.voxels import axis_deviations, merge_groups
+from gsmap.geometry.voxels import axis_deviations, merge_groups, optical_depths, projected_areas
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
 
-VERSION = 1
+VERSION = 2
 """Of what is made: another one makes all trees and sketches anew."""
 
 FILE_NAME = "tileset.json"
 LEAST_OPACITY = 1 / 255  # what no renderer draws
 _FANOUT = 8
-_SIGMAS = 2.0
-_STRAYS, _STRAYS_OF_SCENE = 0.005, 0.02  # shares beyond a side of the box of a tile, and of a scene
+_SIGMAS = 3.0
+_STRAYS = 0.001  # share of the light of a tile beyond a side of its box
+_STRAYS_OF_SCENE = 0.02  # share of the Gaussians of a scene beyond a side of its box
 _EXTENT_ROWS = 2048  # by which the box of a tile is found
 _ERROR_QUANTILE = 0.95
 
@@ -80,7 +81,11 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Extent:
-    """Lowest and highest corners (K, 3) of some of the Gaussians below a tile, and how many each stands for (K,)."""
+    """Lowest and highest corners (K, 3) of some of the Gaussians below a tile, and the light that each stands for (K,).
+
+    Light, not number: what a viewer leaves out because it lies beyond a box must not be missed, and one large haze that
+    reaches into the picture is, where a hundred specks that fly about are not.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -88,22 +93,31 @@ class _Extent:
 
     @classmethod
     def of(cls, gaussians: Gaussians) -> _Extent:
-        every = -(-len(gaussians) // _EXTENT_ROWS)
-        some = gaussians[::every]
-        reach = _SIGMAS * axis_deviations(some)
-        return cls(some.means - reach, some.means + reach, np.full(len(some), float(every)))
+        reach = _SIGMAS * axis_deviations(gaussians)
+        light = optical_depths(gaussians) * projected_areas(gaussians.scales) + 1e-30
+        return cls(gaussians.means - reach, gaussians.means + reach, light).few()
 
     @classmethod
     def joined(cls, parts: list[_Extent]) -> _Extent:
         low, high, weight = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("low", "high", "weight")
         )
-        every = -(-len(low) // _EXTENT_ROWS)
-        share = weight.sum() / weight[::every].sum()
-        return cls(low[::every], high[::every], weight[::every] * share)
+        return cls(low, high, weight).few()
+
+    def few(self) -> _Extent:
+        """The brightest as they are, and every few of the others, which stand for the rest."""
+        if len(self.weight) <= _EXTENT_ROWS:
+            return self
+        order = np.argsort(-self.weight, kind="stable")
+        bright, rest = order[: _EXTENT_ROWS // 2], np.sort(order[_EXTENT_ROWS // 2 :])
+        some = rest[:: -(-len(rest) // (_EXTENT_ROWS // 2))]
+        share = self.weight[rest].sum() / self.weight[some].sum()
+        rows = np.concatenate([bright, some])
+        weight = np.concatenate([self.weight[bright], self.weight[some] * share])
+        return _Extent(self.low[rows], self.high[rows], weight)
 
     def box(self, outside: float) -> np.ndarray:
-        """(2, 3) around all but a share of them on every side."""
+        """(2, 3) around all but a share of the light on every side."""
         low, high = (robust_box(corners, self.weight, outside) for corners in (self.low, self.high))
         return np.stack([low[0], high[1]])
 
@@ -163,7 +177,7 @@ def sketch(source: GaussianSource, max_count: int) -> Sketch:
         raise InputError("no Gaussian of it can be seen")
     # Those that are left stand for the others: each stops as much light as all of them did.
     scales = found.log_scales + np.float32(np.log(every) / 2 if every > 1 else 0)
-    box = _Extent.of(found).box(_STRAYS_OF_SCENE)
+    box = robust_box(found.means, None, _STRAYS_OF_SCENE)
     return Sketch(_merged(replace(found, log_scales=scales), max_count)[0], box)
 
 

@@ -237,6 +237,9 @@ def test_the_map_is_told_with_levels_that_come_by_themselves(server, doors):
     assert ask(server, "/overviews/7/none.spz")[0] == 404
     # The island of one scene is made when somebody asks for it.
     assert said["components"][1]["overview"]["uri"] == "overviews/3/none.spz"
+    state = said["state"]
+    told(server, f"/scenes/{doors.view.scenes[2].key}/tileset.json")
+    assert told(server, "/state.json")["state"] != state
     assert ask(server, "/overviews/3/none.spz")[0] == 202
     end = time.monotonic() + 20
     while told(server, "/map.json")["components"][1]["overview"]["pending"] and time.monotonic() < end:
