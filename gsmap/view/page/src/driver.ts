@@ -3,7 +3,7 @@ import * as actions from "./actions";
 import type { EdgeDetail, MapSummary, RevisionPoses } from "./contract";
 import * as derive from "./derive";
 import { OVERLAYS, page } from "./state";
-import type { State } from "./state";
+import type { Overlay, State, Tab } from "./state";
 import type { Stage } from "./stage/stage";
 
 export const isDark = (state: State) =>
@@ -44,6 +44,9 @@ class Told<T> {
 const is = <T>(a: T, b: T) => a === b;
 const alike = <T>(a: T, b: T) => JSON.stringify(a) === JSON.stringify(b);
 const sameSet = <T>(a: ReadonlySet<T>, b: ReadonlySet<T>) => a.size === b.size && [...a].every((v) => b.has(v));
+
+/** Who reviews edges sees them, and who looks for things, whatever else is drawn. */
+const OF_TAB: Partial<Record<Overlay, Tab>> = { edges: "review", objects: "things", photos: "things" };
 
 /** Keeps the stage at what the state says from now on. */
 export function drive(stage: Stage): () => void {
@@ -97,9 +100,7 @@ export function drive(stage: Stage): () => void {
     );
     clip.now(state.clip);
     ceiling.now(state.ceiling);
-    // Who reviews edges sees them, whatever else is drawn.
-    for (const [name, told] of overlays)
-      told.now(state.overlays.has(name) || (name === "edges" && state.tab === "review"));
+    for (const [name, told] of overlays) told.now(state.overlays.has(name) || OF_TAB[name] === state.tab);
     if (state.overlays.has("objects") || state.tab === "things") {
       const known = actions.graphOf(state);
       if (known?.status === "ready" && known.value !== things) {

@@ -8,7 +8,12 @@ const short = new Intl.NumberFormat("en", { notation: "compact", maximumFraction
 export const number = (value: number) => count.format(value);
 export const compact = (value: number) => short.format(value);
 export const plural = (value: number, one: string, many = `${one}s`) => `${number(value)} ${value === 1 ? one : many}`;
-export const percent = (share: number) => `${Math.round(100 * share)} %`;
+
+/** Never "100 %" of what is less, nor "0 %" of what is more. */
+export function percent(share: number): string {
+  if (share > 0.99 && share < 1) return "> 99 %";
+  return share > 0 && share < 0.01 ? "< 1 %" : `${Math.round(100 * share)} %`;
+}
 
 export function metres(value: number): string {
   if (!Number.isFinite(value)) return "unknown";

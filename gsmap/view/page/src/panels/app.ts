@@ -143,6 +143,7 @@ export class App extends Panel {
         position: absolute;
         top: 12px;
         left: 12px;
+        right: calc(var(--target) + 32px);
       }
       .below {
         position: absolute;

@@ -18,6 +18,8 @@ export class Progress extends Panel {
         pointer-events: none;
       }
       p {
+        width: fit-content;
+        margin-bottom: 6px;
         padding: 2px 10px;
         border-radius: 6px;
         border: 1px solid var(--line);
@@ -51,8 +53,10 @@ export class Progress extends Panel {
     const { map, component } = this.state;
     const making = (map && derive.componentOf(map, component)?.overview?.pending) ?? 0;
     if (!this.isLoading && !making) return nothing;
-    const loading = this.isLoading ? `Loading, ${compact(this.splats)} Gaussians drawn so far` : "";
-    const made = making ? `${plural(making, "scene")} still being prepared, once` : "";
-    return html`<p role="status">${[loading, made].filter(Boolean).join("; ")}</p>`;
+    const said = [
+      this.isLoading ? `loading, ${compact(this.splats)} Gaussians so far` : "",
+      making ? `preparing ${plural(making, "scene")}, once` : "",
+    ];
+    return html`${said.filter(Boolean).map((line) => html`<p role="status">${line}</p>`)}`;
   }
 }

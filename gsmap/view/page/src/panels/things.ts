@@ -41,10 +41,7 @@ export class Things extends Panel {
     const { map, component } = this.state;
     if (!map) return nothing;
     const photos = map.photos.filter((photo) => photo.component === component);
-    const press = (kind: "objects" | "photos") => {
-      this.kind = kind;
-      actions.overlay(kind, true);
-    };
+    const press = (kind: "objects" | "photos") => (this.kind = kind);
     return html`
       <div class="segments" role="group" aria-label="Which things">
         <button aria-pressed=${this.kind === "objects"} @click=${() => press("objects")}>Objects</button>
