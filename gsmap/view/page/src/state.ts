@@ -1,6 +1,6 @@
 // What the page shows, in one value. Elements read it, actions change it, and whoever shows a part of it is told.
 // Scenes, pairs and changes are named by their ids, so a map that others changed meanwhile keeps what was chosen.
-import type { Box, MapSummary, Matrix, Vector } from "./contract";
+import type { Box, MapSummary, Matrix } from "./contract";
 import type { Pick, Source, Stage, Standpoint } from "./stage/stage";
 
 export const TABS = ["look", "review", "time", "things"] as const;
@@ -165,4 +165,3 @@ export class Page {
 
 export const page = new Page();
 
-export const same = (a: Vector, b: Vector) => a.every((v, i) => v === b[i]);

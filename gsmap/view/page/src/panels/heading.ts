@@ -39,6 +39,7 @@ heading.styles = css`
   }
   .heading .ways {
     display: flex;
+    align-self: start;
   }
   .heading .facts {
     grid-column: 1 / 3;

@@ -40,6 +40,10 @@ export class Place extends Panel {
         padding: 3px 0;
         overflow-wrap: anywhere;
       }
+      li button {
+        min-height: 0;
+        padding: 0 4px;
+      }
       li + li {
         border-top: 1px solid var(--line);
       }
