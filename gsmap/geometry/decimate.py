@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from gsmap._native import pair_costs
 from gsmap.errors import ConfigError
+from gsmap.geometry.morton import morton_order
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.geometry.voxels import covariances, merge_groups, optical_depths, projected_areas
 from gsmap.types import Gaussians
@@ -22,6 +23,7 @@ from gsmap.types import Gaussians
 _NEIGHBOURS = 12
 _BLUR = 0.05  # of the median Gaussian's largest deviation: what is thinner is not told apart
 _COVER = 0.1  # how much hiding what is behind counts beside the light of a colour: black is seen, too
+_BLOCK = 1 << 14  # points whose neighbours are compared at once
 _PASSES = 6  # over the pairs of a round, each taking those that are cheapest for both
 
 
@@ -82,11 +84,20 @@ def _cheapest(gaussians: Gaussians, most: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _neighbours(points: np.ndarray) -> np.ndarray:
-    """(E, 2) int32 pairs of points, one among the other's nearest, the lower row first; twice where both are."""
+    """(E, 2) int32 pairs of points, one among the other's nearest, the lower row first; each once."""
     count = min(_NEIGHBOURS, len(points) - 1)
-    near = cKDTree(points).query(points, k=count + 1)[1].astype(np.int32)
-    rows = np.repeat(np.arange(len(points), dtype=np.int32), count + 1)
-    others = near.ravel()
-    apart = rows != others  # among points that coincide a point need not be the first of its own neighbours
-    pairs: np.ndarray = np.stack([np.minimum(rows, others), np.maximum(rows, others)], axis=1)[apart]
-    return pairs
+    # Along a curve through them, as their neighbours are then in the cache.
+    order = morton_order(points)
+    found = cKDTree(points[order]).query(points[order], k=count + 1)[1]
+    near = np.empty((len(points), count + 1), np.int32)
+    near[order] = order[found]
+    kept = []
+    for start in range(0, len(points), _BLOCK):
+        rows = np.arange(start, min(start + _BLOCK, len(points)), dtype=np.int32)[:, None]
+        others = near[rows[:, 0]]
+        # Among points that coincide a point need not be the first of its own neighbours.
+        told_there = (others < rows) & (near[others] == rows[:, :, None]).any(2)
+        new = (others != rows) & ~told_there
+        rows = np.broadcast_to(rows, others.shape)[new]
+        kept.append(np.stack([np.minimum(rows, others[new]), np.maximum(rows, others[new])], axis=1))
+    return np.concatenate(kept)
