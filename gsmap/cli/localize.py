@@ -56,6 +56,19 @@ def command(
     depth_scale: Annotated[
         float, typer.Option("--depth-scale", help="Values of the depth picture that make a metre.")
     ] = 1000.0,
+    changes: Annotated[
+        bool, typer.Option("--changes", help="Say where placed photos show something else than the map.")
+    ] = False,
+    pictures: Annotated[
+        str | None, typer.Option("--pictures", metavar="DIR", help="With --changes: draw these parts, in this folder.")
+    ] = None,
+    add: Annotated[
+        bool, typer.Option("--add", help="Keep placed photos in the map: evidence of what stood there, and when.")
+    ] = False,
+    captured_at: Annotated[
+        str | None,
+        typer.Option("--captured-at", metavar="DATE", help="With --add: when they were taken. By default EXIF's."),
+    ] = None,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
@@ -76,6 +89,10 @@ def command(
             video=video,
             depth=depth,
             depth_scale=depth_scale,
+            changes=changes,
+            pictures=pictures,
+            add=add,
+            captured_at=captured_at,
         )
     for note in report.notes:
         say(note)
@@ -83,4 +100,13 @@ def command(
         print_rows("localize", report, json)
         return
     print_table("localize", report.results[0].columns, report.results)
+    for row in report.results:
+        if row.changes:
+            print_table(f"{row.file} differs", row.changes[0].columns, row.changes)
+        elif row.changes is not None:
+            say(f"{row.file} shows what the map does, as far as it could be compared ({row.compared:.0%} of it)")
+        if row.picture is not None:
+            say(f"drawn in {row.picture}")
+    if add:
+        say(f"{sum(bool(row.added) for row in report.results)} kept: gsmap list {map} photos")
     say(f"{sum(row.status == 'placed' for row in report.results)} of {len(report.results)} placed")

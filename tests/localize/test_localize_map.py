@@ -11,7 +11,7 @@ from PIL import Image
 
 import gsmap.map
 from gsmap.cli.app import run
-from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
+from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, ReadOnlyError
 from gsmap.store import Store
 from gsmap.types import Sim3
 
@@ -98,6 +98,89 @@ def test_nothing_is_begun_where_a_file_is_no_picture(made) -> None:
 def test_an_empty_map_says_what_to_do(made, tmp_path) -> None:
     with gsmap.map.create(tmp_path / "e.gsmap") as m, pytest.raises(NotFoundError, match="gsmap update"):
         m.localize(made[0] / "photo.png")
+
+
+# --- what placed photographs tell, and those that are kept ----------------------------------------------------------
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    """A map of its own, and the photo with a box of stripes standing in it."""
+    folder, lens, _ = made
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        m.clone(tmp_path / "c.gsmap")
+    rgb = np.asarray(Image.open(folder / "photo.png")).copy()
+    stripes = np.array([[230, 40, 40], [40, 220, 60]], np.uint8)[(np.arange(130) // 12) % 2]
+    rgb[130:260, 250:350] = stripes[:, None]
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x9003] = "2026:05:04 10:00:00"
+    Image.fromarray(rgb).save(tmp_path / "changed.jpg", quality=95, exif=exif)
+    return tmp_path, lens
+
+
+def test_changes_are_told_and_drawn(copy, capsys) -> None:
+    folder, lens = copy
+    with gsmap.map.open(folder / "c.gsmap") as m:
+        (row,) = m.localize(folder / "changed.jpg", intrinsics=lens, changes=True, pictures=folder / "drawn").results
+        assert row.status == "placed", row.reason
+        assert row.added is None
+        best = row.changes[0]
+        x0, y0, x1, y1 = best.box_px
+        assert x0 < 300 < x1
+        assert y0 < 200 < y1
+        assert best.scene_name == "room"
+        assert np.isfinite(best.position).all()
+        with Image.open(row.picture) as picture:
+            assert picture.format == "PNG"
+        assert m.photo_rows() == []
+        with pytest.raises(ConfigError, match="--changes"):
+            m.localize(folder / "changed.jpg", pictures=folder / "drawn")
+        with pytest.raises(ConfigError, match="--add"):
+            m.localize(folder / "changed.jpg", captured_at="2026-01-01")
+    with pytest.raises(SystemExit) as ended:
+        run(["-q", "localize", str(folder / "c.gsmap"), str(folder / "changed.jpg"), "--intrinsics", lens, "--changes"])
+    assert not ended.value.code
+    assert "changed.jpg differs" in capsys.readouterr().out
+
+
+def test_a_photo_is_kept_once_and_follows_its_scene(copy) -> None:
+    folder, lens = copy
+    with gsmap.map.open(folder / "c.gsmap") as m:
+        (row,) = m.localize(folder / "changed.jpg", intrinsics=lens, add=True).results
+        assert row.added is True
+        assert row.changes is None
+        report = m.localize(folder / "changed.jpg", intrinsics=lens, add=True)
+        assert report.results[0].added is False
+        assert any("kept already" in note for note in report.notes)
+        (kept,) = m.photo_rows()
+        assert kept.captured_at == "2026-05-04T10:00:00+00:00"
+        assert (kept.file, kept.scene_name, kept.size_px) == ("changed.jpg", "room", (480, 360))
+        assert np.allclose(kept.T_map_camera, row.T_map_camera, atol=1e-9)
+        assert np.allclose(kept.covariance, row.covariance, rtol=1e-6)
+        assert m.store.photos.jpeg(1).startswith(b"\xff\xd8\xff")
+        # The map is turned and grows: the photo goes along.
+        S = Sim3(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, 0, 0]), 2.0)
+        graph = m.pose_graph()
+        from dataclasses import replace
+
+        poses = {k: replace(pose, S_map_scene=S @ pose.S_map_scene) for k, pose in graph.poses.items()}
+        m.store.revisions.save(replace(graph, poses=poses))
+        (moved,) = m.photo_rows()
+        assert np.allclose(moved.T_map_camera[:3, 3], S.apply(row.T_map_camera[:3, 3]))
+        assert np.allclose(moved.T_map_camera[:3, :3], S.rotation @ row.T_map_camera[:3, :3])
+        with pytest.raises(NotFoundError):
+            m.remove_photo("none.jpg")
+        assert m.remove_photo("p1").file == "changed.jpg"
+        assert m.photo_rows() == []
+
+
+def test_a_map_that_is_read_only_keeps_none(copy) -> None:
+    folder, lens = copy
+    with gsmap.map.Map(Store.open(folder / "c.gsmap", "r")) as m, pytest.raises(ReadOnlyError, match="not kept"):
+        m.localize(folder / "changed.jpg", intrinsics=lens, add=True)
+
+
+# --- what is kept ---------------------------------------------------------------------------------------------------
 
 
 def test_features_come_and_go_with_their_scene(made, world, tmp_path) -> None:

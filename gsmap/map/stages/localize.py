@@ -74,7 +74,7 @@ class Localizer:
     """
 
     def __init__(self, store: Store, settings: Settings, progress: StageProgress) -> None:
-        self.store, self.params = store, settings.localize
+        self.store, self.settings, self.params = store, settings, settings.localize
         poses = store.revisions.poses()
         self.scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in poses}
         if not self.scenes:
@@ -99,6 +99,7 @@ class Localizer:
             for scene in self.scenes
         }
         self._used: list[str] = []
+        self._eyes: dict[str, localizing.Eyes] = {}
         self.index = self._index()
         specs = models.specs(store)
         method = family("extractor").get(self.params.extractor)
@@ -136,6 +137,14 @@ class Localizer:
         self._used = [one for one in self._used if one != scene] + [scene]
         while len(self._used) > _KEPT:
             self.placed[self._used.pop(0)].drop()
+
+    def eyes(self, scene: str) -> localizing.Eyes:
+        """What a scene's own cameras saw, for those that photos are compared with."""
+        if scene not in self._eyes:
+            cameras = self.store.scenes.cameras(scene)
+            own = None if cameras is None or cameras.synthesised else cameras
+            self._eyes[scene] = localizing.open_eyes(self.placed[scene], own, self.params.differences)
+        return self._eyes[scene]
 
     def localize(self, photo: Photo, near: Near | None = None) -> Placement:
         """Find one photograph."""

@@ -15,7 +15,7 @@ from gsmap.types.rows.exports import ExportReport, TileRow
 from gsmap.types.rows.find import FindHit, FindReport
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
-from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
+from gsmap.types.rows.localize import LocalizeReport, LocalizeRow, PhotoChangeRow, PhotoRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -90,6 +90,8 @@ __all__ = [
     "LayerRow",
     "LocalizeReport",
     "LocalizeRow",
+    "PhotoChangeRow",
+    "PhotoRow",
     "MapStatus",
     "MeasureReport",
     "MergeReport",
