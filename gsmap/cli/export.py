@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -19,6 +20,12 @@ from gsmap.cli.console import (
     print_table,
     say,
 )
+from gsmap.cli.thin import parse_size
+
+
+class Purpose(StrEnum):
+    view = "view"
+    localize = "localize"
 
 
 def command(
@@ -42,8 +49,17 @@ def command(
         int | None, typer.Option("--steps", help="Optimisation steps per tile; chosen by size else.")
     ] = None,
     budget: Annotated[
-        float | None, typer.Option("--budget", help="Ceiling in seconds per tile; a tile it cuts short is marked.")
+        str | None,
+        typer.Option(
+            "--budget",
+            metavar="SECONDS|SIZE",
+            help="Ceiling in seconds per tile; a tile it cuts short is marked. With --for localize a size, as 50MB.",
+        ),
     ] = None,
+    purpose: Annotated[
+        Purpose,
+        typer.Option("--for", help="What the export is for: view (tiles), or localize (a small map, see --budget)."),
+    ] = Purpose.view,
     provenance: Annotated[
         bool,
         typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
@@ -70,6 +86,14 @@ def command(
     Example: `gsmap export site.gsmap tiles --format spz --as-of 2024-05-31`
     """
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
+        if purpose is Purpose.localize:
+            small = m.export_small(out, parse_size(budget or "50MB"))
+            if json:
+                print_rows("export --for localize", small, json)
+                return
+            print_table(f"small map in {out}", small.scenes[0].columns, small.scenes)
+            say(f"{small.num_bytes / 1e6:.2f} MB; run: gsmap localize {out} PHOTO")
+            return
         report = m.export(
             out,
             format=format,
@@ -79,7 +103,7 @@ def command(
             revision=revision,
             component=component,
             steps=steps,
-            budget_s=budget,
+            budget_s=None if budget is None else _seconds(budget),
             provenance=provenance,
             uncompressed=uncompressed,
             prefer=prefer,
@@ -100,3 +124,12 @@ def command(
         columns = {"path": "file", "component": "component", "num_gaussians": "Gaussians", "truncated": "truncated"}
         print_table(f"tiles in {out}", columns, report.tiles)
     say(f"{report.recomputed} tiles made, {report.reused} unchanged, {report.removed} removed")
+
+
+def _seconds(text: str) -> float:
+    from gsmap.errors import ConfigError
+
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"--budget of tiles is in seconds, got {text!r}; a size goes with --for localize") from None

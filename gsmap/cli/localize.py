@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,8 +16,12 @@ from gsmap.cli.console import (
     opened,
     print_rows,
     print_table,
+    progress_bars,
     say,
 )
+
+if TYPE_CHECKING:
+    from gsmap.types.rows import LocalizeReport
 
 
 def command(
@@ -79,6 +83,29 @@ def command(
 
     Example: `gsmap localize site.gsmap phone.jpg`
     """
+    from gsmap.errors import ConfigError
+    from gsmap.map.localizing_small import localize_small
+    from gsmap.map.small_map import is_small
+    from gsmap.settings import parse
+
+    if is_small(map):
+        if changes or add or pictures is not None or captured_at is not None or depth is not None:
+            raise ConfigError("a small map places photographs, and no more: ask the map that it is of")
+        with progress_bars() as progress:
+            report = localize_small(
+                map,
+                files or (),
+                progress,
+                intrinsics=intrinsics,
+                focal=focal,
+                near=near,
+                together=together,
+                video=video,
+                values=dict(parse(one) for one in sets or ()),
+                preset=preset,
+            )
+        _tell(report, json)
+        return
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         report = m.localize(
             *(files or ()),
@@ -94,6 +121,12 @@ def command(
             add=add,
             captured_at=captured_at,
         )
+    _tell(report, json)
+    if add and not json:
+        say(f"{sum(bool(row.added) for row in report.results)} kept: gsmap list {map} photos")
+
+
+def _tell(report: LocalizeReport, json: bool) -> None:
     for note in report.notes:
         say(note)
     if json:
@@ -107,6 +140,4 @@ def command(
             say(f"{row.file} shows what the map does, as far as it could be compared ({row.compared:.0%} of it)")
         if row.picture is not None:
             say(f"drawn in {row.picture}")
-    if add:
-        say(f"{sum(bool(row.added) for row in report.results)} kept: gsmap list {map} photos")
     say(f"{sum(row.status == 'placed' for row in report.results)} of {len(report.results)} placed")

@@ -29,10 +29,10 @@ class Params:
     """
 
     half_px: int = 6
-    min_chroma: float = 0.08
-    chroma_spreads: float = 3.25
-    min_lightness: float = 0.09
-    lightness_spreads: float = 4.0
+    min_chroma: float = 0.1
+    chroma_spreads: float = 4.0
+    min_lightness: float = 0.11
+    lightness_spreads: float = 5.0
     light_px: float = 40.0
     same_pattern: float = 0.4
     min_area: float = 0.003

@@ -11,6 +11,7 @@ from gsmap.localize import (
     evidence,
     features,
     matching,
+    packing,
     resection,
     settling,
     tracking,
@@ -41,6 +42,7 @@ class Params:
         together: how photographs of one place help each other.
         clips: which frames of a clip are looked at.
         differences: when a placed photo shows something else than the map.
+        small: what a small map keeps.
         max_candidates: rough poses that are looked into.
         sure: once one is this probable, others are looked into only ...
         rival_inliers: ... where so large a share of its matches agrees on them.
@@ -61,6 +63,7 @@ class Params:
     together: tying.Params = field(default_factory=tying.Params)
     clips: clips.Params = field(default_factory=clips.Params)
     differences: differing.Params = field(default_factory=differing.Params)
+    small: packing.Params = field(default_factory=packing.Params)
     max_candidates: int = 5
     sure: float = 0.97
     rival_inliers: float = 0.5

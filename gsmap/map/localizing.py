@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -116,7 +116,8 @@ def _of_pictures(
         found = list(localize_all(localizer, photos, where))
     else:
         found = list(localize(localizer, photos, where, progress))
-    rows = [row_of(store, name, *one) for (name, _), one in zip(named, found, strict=True)]
+    names = {scene.id: scene.name for scene in store.scenes.list()}
+    rows = [row_of(names, name, *one) for (name, _), one in zip(named, found, strict=True)]
     notes: list[str] = []
     if tells.changes or tells.add:
         rows, notes = _with_what_they_tell(localizer, named, [one for one, _ in found], rows, tells, progress)
@@ -201,9 +202,12 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
         raise ConfigError(f"a focal length is auto or pixels, got {focal!r}") from None
 
 
-def row_of(store: Store, file: str, found: Placement, seconds: float) -> LocalizeRow:
-    """What is told of one photo; scenes by name."""
-    names = {scene.id: scene.name for scene in store.scenes.list()} if found.scenes else {}
+def row_of(names: Mapping[str, str], file: str, found: Placement, seconds: float) -> LocalizeRow:
+    """What is told of one photo.
+
+    Args:
+        names: of scenes, by id.
+    """
     return LocalizeRow(
         file=file,
         status="placed" if found.is_placed else "refused",

@@ -57,6 +57,7 @@ from gsmap.types.rows import (
     SceneReport,
     SceneRow,
     SettingRow,
+    SmallMapReport,
     SnapshotRow,
     SplitReport,
     ThinReport,
@@ -657,6 +658,19 @@ class Map(AbstractContextManager["Map"]):
 
         made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait)
         return reports.export_report(self.store, Path(out), made, notes)
+
+    def export_small(self, out: str | os.PathLike[str], budget_bytes: int) -> SmallMapReport:
+        """``gsmap export MAP OUT --for localize``: a small map by which photographs are placed, and no more.
+
+        Raises:
+            StoreError: the folder is not empty.
+            ConfigError: so few bytes that hardly a photograph would be found; how many it takes is said.
+            NotFoundError: the map has no poses yet.
+        """
+        from gsmap.map.small_map import export_small
+
+        with at_work(self.store, "export"):
+            return export_small(self.store, Path(out), budget_bytes, self.settings, self._progress)
 
     # --- look --------------------------------------------------------------------------------------------------------
 

@@ -34,7 +34,7 @@ _SAME_PLACE_M = 0.15  # a thing that was spoken of stands so near to an object's
 
 
 def sighting_of(
-    store: Store, row: LocalizeRow, photo: Photo, told: Told, things: Sequence[ThingInPhoto], captured_at: str | None
+    store: Store, row: LocalizeRow, photo: Photo, things: Sequence[ThingInPhoto], captured_at: str | None
 ) -> PhotoSighting | None:
     """What is kept of a placed photo; None where the scene that supports it is gone.
 

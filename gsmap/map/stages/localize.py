@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -52,10 +52,15 @@ def parse_near(store: Store, text: str) -> Near:
         ConfigError: neither four numbers with a radius above 0, nor a scene.
         NotFoundError: no such scene.
     """
+    return near_of(text, lambda name: store.scenes.get(name).id)
+
+
+def near_of(text: str, id_of: Callable[[str], str]) -> Near:
+    """The same, where scenes are told by ``id_of`` their names."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        return Near(store.scenes.get(text).id)
+        return Near(id_of(text))
     if len(numbers) != 4 or not np.isfinite(numbers).all() or numbers[3] <= 0:
         raise ConfigError(f"near is a scene, or X,Y,Z,R with a radius above 0, got {text!r}")
     return Near(None, (numbers[0], numbers[1], numbers[2]), numbers[3])

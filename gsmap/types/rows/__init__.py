@@ -11,7 +11,7 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
-from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.exports import ExportReport, SmallMapReport, SmallSceneRow, TileRow
 from gsmap.types.rows.find import FindHit, FindReport
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
@@ -128,6 +128,8 @@ __all__ = [
     "ThinReport",
     "ThinRow",
     "TieRow",
+    "SmallMapReport",
+    "SmallSceneRow",
     "TileRow",
     "TodoRow",
     "TrustReport",
