@@ -133,9 +133,9 @@ def compare_photo(
         rows = np.flatnonzero(usable)
         if len(rows) < told.min_share * usable.size:
             continue
-        known = np.zeros(usable.size, bool)
-        known[rows] = _looked_at(scenes[number], eyes[one.scene], places.reshape(-1, 3)[rows], T_metric_camera, told)
-        known = known.reshape(shape)
+        looked = np.zeros(usable.size, bool)
+        looked[rows] = _looked_at(scenes[number], eyes[one.scene], places.reshape(-1, 3)[rows], T_metric_camera, told)
+        known = looked.reshape(shape)
         if known.mean() < told.min_share:
             continue
         line = balance(one.rgb[known], grey[known])

@@ -1,8 +1,8 @@
-"""What localisation needs of a scene, in few bytes: features at four bits a number, and the Gaussians that show most.
+"""What localisation needs of a scene, in few bytes: features at four bits a number, and Gaussians merged.
 
 Features of a view are kept in the order in which its extractor gave them, as many of every view: views are far apart,
-so what is kept covers what the scene shows. Of the Gaussians those that make up most of a pixel in the scene's own
-pictures are kept, without what depends on the direction.
+so what is kept covers what the scene shows. Gaussians that hardly show in the scene's own pictures go, and so does what
+depends on the direction; the others are merged (`gsmap.export.levels`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap.errors import CorruptError, InputError
 from gsmap.localize.placed import PlacedFeatures
@@ -35,18 +34,18 @@ class Params:
         min_gaussians: share of those that show in the scene's own pictures. With fewer, renders are full of holes.
         pictures: of its own in which Gaussians are weighed, evenly along its path; longest_side_px: their size.
         min_weight: a Gaussian that nowhere makes up this share of a pixel goes in any case.
-        near_m: Gaussians so near to a feature that is kept are worth
-        near_worth: as many times as much as others.
+        refine_steps: of fitting what was merged to renders of what it stands for, ...
+        refine_views: ... from so many of the scene's cameras.
     """
 
-    features_share: float = 0.4
+    features_share: float = 0.25
     min_features: int = 40
     min_gaussians: float = 0.15
     pictures: int = 32
     longest_side_px: int = 240
     min_weight: float = 0.01
-    near_m: float = 0.5
-    near_worth: float = 2.0
+    refine_steps: int = 250
+    refine_views: int = 32
 
 
 def weights(scene: PlacedFeatures, cameras: Cameras | None, params: Params) -> np.ndarray:
@@ -62,21 +61,6 @@ def weights(scene: PlacedFeatures, cameras: Cameras | None, params: Params) -> n
         seen = render(scene.gaussians, small[row], depth=False, dominant_id=False, max_weight=True, backend="native")
         np.maximum(largest, seen.max_weight, out=largest)
     return largest
-
-
-def chosen(
-    weight: np.ndarray, gaussians: Gaussians, features: SceneFeatures, unit_m: float, params: Params, most: int
-) -> np.ndarray:
-    """Rows of the Gaussians that are kept, in their order: those that show most, sooner near features."""
-    worth = weight.copy()
-    if len(features.points) and params.near_worth != 1:
-        far = cKDTree(features.points).query(gaussians.means, distance_upper_bound=params.near_m / unit_m)[0]
-        worth[np.isfinite(far)] *= params.near_worth
-    # Of two that show equally the larger one: it leaves the larger hole.
-    size = np.exp(gaussians.log_scales.astype(np.float64)).prod(1) ** (1 / 3)
-    worth = worth * np.clip(size / max(float(np.median(size)), 1e-12), 0.25, 4.0)
-    rows = np.flatnonzero(weight >= params.min_weight)
-    return np.sort(rows[np.argsort(-worth[rows], kind="stable")[:most]])
 
 
 def fewer(features: SceneFeatures, most: int) -> SceneFeatures:

@@ -140,7 +140,8 @@ def _with_what_they_tell(
     """The rows with what placed photographs show otherwise than the map, and what people should know of it; kept if
     that is asked."""
     teller = Teller(localizer, progress)
-    out, notes = [], []
+    out: list[LocalizeRow] = []
+    notes: list[str] = []
     for (name, photo), where, row in zip(named, found, rows, strict=True):
         if not where.is_placed:
             out.append(row)

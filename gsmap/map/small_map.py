@@ -1,7 +1,7 @@
 """A small map, for localisation alone: a folder of ``localize.json`` and one file for each scene; it is only read.
 
-What is in it: of every scene that has a place its pose, metre, name and date, features of its views, and the Gaussians
-that show most, both rounded. It is no map: nothing can be added to it, and no other verb opens it.
+What is in it: of every scene that has a place its pose, metre, name and date, features of its views, and its Gaussians
+merged to fewer, both rounded. It is no map: nothing can be added to it, and no other verb opens it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,16 @@ import numpy as np
 
 from gsmap.durable import open_file, sync_file, sync_folder
 from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, NotFoundError, StoreError
+from gsmap.export.levels import Params as LevelParams
+from gsmap.export.levels import make_level
 from gsmap.geometry.metres import in_metres
+from gsmap.geometry.morton import morton_order
 from gsmap.localize import PlacedFeatures, ViewIndex, packing
 from gsmap.map.settings import Settings, settings_of
 from gsmap.map.stages.localize import Localizer, Near
 from gsmap.methods import family
 from gsmap.store import Store, compact, staging
-from gsmap.types import Gaussians, Sim3
+from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.exports import SmallMapReport, SmallSceneRow
@@ -34,7 +37,9 @@ FILE_NAME = "localize.json"
 _FORMAT, _VERSION = "gsmap small map", 1
 _MAX_JSON, _MAX_SCENE = 1 << 26, 1 << 31
 _HEADER_BYTES = 1500  # of a scene in localize.json, about
-_ROUNDS = 5
+_ROUNDS = 3
+_GAUSSIAN_BYTES = 14.5  # of one, packed
+_DEVIATION_PX = 2.0  # of merged Gaussians in the pictures that they are fitted to
 _FEATURES = ("starts", "box", "points", "range", "descriptors", "angles", "poses", "intrinsics", "sizes", "summaries")
 
 
@@ -85,22 +90,28 @@ def export_small(
     localizer = Localizer(store, settings, progress)
     params = settings.localize.small
     scenes = sorted(localizer.placed)
-    weights = {}
+    weights: dict[str, np.ndarray] = {}
+    own: dict[str, Cameras | None] = {}
     for number, scene in enumerate(scenes):
         progress("export", 0.5 * number / len(scenes), f"what of {localizer.scenes[scene].name} shows")
         placed = localizer.placed[scene]
         held = store.scenes.cameras(scene)
-        own = None if held is None or held.synthesised else held
-        weights[scene] = np.where(_gone(store, scene), 0, packing.weights(placed, own, params)).astype(np.float32)
+        own[scene] = None if held is None or held.synthesised else held
+        weights[scene] = np.where(_gone(store, scene), 0, packing.weights(placed, own[scene], params)).astype(
+            np.float32
+        )
     shown = {scene: int((weights[scene] >= params.min_weight).sum()) for scene in scenes}
     share = {scene: shown[scene] / max(sum(shown.values()), 1) for scene in scenes}
     free = budget_bytes - _HEADER_BYTES * len(scenes) - 500
-    factor, files = 1.0, {}
+    factor = 1.0
+    files: dict[str, bytes] = {}
+    rows: list[SmallSceneRow] = []
+    total = 0
     for _ in range(_ROUNDS):
         files, rows = {}, []
         for number, scene in enumerate(scenes):
             progress("export", 0.5 + 0.4 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
-            content, row = _packed(localizer, scene, weights[scene], factor * free * share[scene], params)
+            content, row = _packed(localizer, scene, weights[scene], own[scene], factor * free * share[scene], params)
             files[scene] = content
             rows.append(row)
         total = sum(map(len, files.values())) + _HEADER_BYTES * len(scenes) + 500
@@ -140,7 +151,12 @@ def _gone(store: Store, scene: str) -> np.ndarray | bool:
 
 
 def _packed(
-    localizer: Localizer, scene: str, weight: np.ndarray, num_bytes: float, params: packing.Params
+    localizer: Localizer,
+    scene: str,
+    weight: np.ndarray,
+    cameras: Cameras | None,
+    num_bytes: float,
+    params: packing.Params,
 ) -> tuple[bytes, SmallSceneRow]:
     """A scene's file of about so many bytes."""
     placed = localizer.placed[scene]
@@ -150,16 +166,12 @@ def _packed(
     kept = packing.fewer(features, max(most, 1))
     arrays = packing.pack_features(kept)
     head = _npz(arrays)
-    unit = placed.S_metric_scene.scale
-    rest, count = max(num_bytes - len(head), 0), int(max(num_bytes - len(head), 0) / 13)
-    for _ in range(3):  # what a Gaussian takes once it is packed is known by packing some
-        rows = packing.chosen(weight, gaussians, kept, unit, params, count)
-        chosen = packing.without_direction(gaussians[rows])
-        content = _npz(arrays | compact.pack(chosen))
-        size = len(content) - len(head)
-        if abs(size - rest) < 0.03 * rest or (size < rest and len(rows) < count):
-            break
-        count = int(count * rest / max(size, 1))
+    count = max(int((num_bytes - len(head)) / _GAUSSIAN_BYTES), 1)
+    shown = packing.without_direction(gaussians[np.flatnonzero(weight >= params.min_weight)])
+    told = LevelParams(views=params.refine_views, steps=params.refine_steps, deviation_px=_DEVIATION_PX)
+    merged = make_level(shown, count, cameras, told).gaussians if len(shown) > count else shown
+    chosen = merged[morton_order(merged.means)]
+    content = _npz(arrays | compact.pack(chosen))
     row = SmallSceneRow(
         scene=scene,
         scene_name=localizer.scenes[scene].name,

@@ -273,8 +273,7 @@ def test_features_survive_four_bits_a_number(world) -> None:
     assert np.array_equal(features.summaries, back.summaries)
     fewer = packing.fewer(features, 10)
     assert fewer.num_features == np.minimum(np.diff(features.starts), 10).sum()
-    first = features.starts[1]
-    assert np.array_equal(fewer.points[fewer.starts[1]], features.points[first])
+    assert np.array_equal(fewer.points[fewer.starts[1]], features.points[features.starts[1]])
 
 
 # --- what is kept ---------------------------------------------------------------------------------------------------
