@@ -89,7 +89,7 @@ def command(
         if purpose is Purpose.localize:
             small = m.export_small(out, parse_size(budget or "50MB"))
             if json:
-                print_rows("export --for localize", small, json)
+                print_rows("export --for", small, json)
                 return
             print_table(f"small map in {out}", small.scenes[0].columns, small.scenes)
             say(f"{small.num_bytes / 1e6:.2f} MB; run: gsmap localize {out} PHOTO")

@@ -32,7 +32,8 @@ class Params:
         features_share: of a scene's bytes; the rest are Gaussians.
         min_features: of a view. With fewer, hardly a photograph is found.
         min_gaussians: share of those that show in the scene's own pictures. With fewer, renders are full of holes.
-        pictures: of its own in which Gaussians are weighed, evenly along its path; longest_side_px: their size.
+        pictures: of its own in which Gaussians are weighed, evenly along its path.
+        longest_side_px: size of these.
         min_weight: a Gaussian that nowhere makes up this share of a pixel goes in any case.
         refine_steps: of fitting what was merged to renders of what it stands for, ...
         refine_views: ... from so many of the scene's cameras.
