@@ -5,10 +5,16 @@
     python tools/bench_localize.py DATA WORK --only c0 c1    # photographs of these captures alone
     python tools/bench_localize.py DATA WORK --perturb       # exposure, resolution, focal length, people
     python tools/bench_localize.py DATA WORK --elsewhere     # photographs of other places: none may be placed
+    python tools/bench_localize.py DATA WORK --beside        # and retrieval alone, and SIFT + PnP on photographs
+    python tools/bench_localize.py DATA WORK --small 0.05    # and a small map in so much of the captures' bytes
 
 DATA is the folder of the given captures; maps are made in WORK once. The captures' poses in the map are gsmap's own,
 and the truth of a photograph is taken to the map through the scene that supports it most. A photograph's coverage is
 the share of its pixels whose surface another capture of the map shows where it is (5 cm and 2 % of the depth).
+
+Beside it (of the house): the pose of the most alike view, alone; and what is done without renders of the map: SIFT of
+the captures' own photographs, lifted by their splats' depth, matched with the 20 most alike ones by ratio and mutually,
+one pose by LO-RANSAC (pycolmap), said where 12 agree. That needs the photographs to be kept with their poses.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -22,6 +28,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import argparse
 import json
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -34,8 +41,13 @@ from PIL import Image
 import gsmap.map
 from gsmap.geometry.rotations import angle_between
 from gsmap.localize import localize_photo
-from gsmap.localize.localizing import near
+from gsmap.localize.features import lifted, quantised
+from gsmap.localize.localizing import near, photo_features, prepared
+from gsmap.localize.matching import Described, matched
+from gsmap.localize.retrieval import most_alike
+from gsmap.localize.summaries import summarised
 from gsmap.map.logs import logged
+from gsmap.map.small_map import SmallLocalizer, export_small
 from gsmap.map.stages.localize import Localizer
 from gsmap.render import render
 from gsmap.types import Cameras, Sim3
@@ -60,9 +72,13 @@ class World:
     S_scene_world: dict[str, Sim3]  # by scene id
     ids: dict[str, str]  # by name
 
-    def localize(self, photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
-        """In a map of some of its scenes; and CPU seconds."""
-        held = self.localizer
+    def localize(self, photo: Photo, allowed: set[str], within: Localizer | None = None) -> tuple[Placement, float]:
+        """In a map of some of its scenes; and CPU seconds.
+
+        Args:
+            within: a small map of it.
+        """
+        held = within or self.localizer
         began = time.process_time()
         index = near(held.index, allowed)
         found = localize_photo(photo, index, held.placed, held.extractor, held.params, held.metres)
@@ -211,13 +227,123 @@ PERTURBED: dict[str, Callable[[Photo], Photo]] = {
     "focal length unknown": unknown_focal,
 }
 
+# --- others ---------------------------------------------------------------------------------------------------------
+
+
+def retrieval_alone(held: World) -> Localise:
+    """The pose of the view that looks most alike."""
+
+    def localise(photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
+        began = time.process_time()
+        localizer = held.localizer
+        index = near(localizer.index, allowed)
+        picture, _ = prepared(photo, localizer.params)
+        found = photo_features(picture, localizer.extractor, [localizer.params.matching.smooth_px])
+        rows, _ = most_alike(index, summarised(found.descriptors), 1)
+        scene = index.scenes[index.scene[rows[0]]]
+        placed = localizer.placed[scene]
+        pose = _in_map(held, scene, placed.features.cameras.T_frame_camera[index.view[rows[0]]])
+        return Placement(photo.name, "", pose, None, placed.component, (scene,)), time.process_time() - began
+
+    return localise
+
+
+def _in_map(held: World, scene: str, T_scene_camera: np.ndarray) -> np.ndarray:
+    placed = held.localizer.placed[scene]
+    S = placed.S_metric_scene
+    out = np.eye(4)
+    out[:3, :3] = S.rotation @ T_scene_camera[:3, :3]
+    out[:3, 3] = S.apply(T_scene_camera[:3, 3]) / held.localizer.metres.get(placed.component, 1.0)
+    return out
+
+
+class PosedPhotos:
+    """The captures' own photographs: features, lifted to the map (metres) by the depth of the capture's splat."""
+
+    def __init__(self, data: Path, held: World) -> None:
+        self.held = held
+        self.features: list[tuple[str, Described, np.ndarray, np.ndarray]] = []  # scene, features, summary, points
+        began = time.process_time()
+        for shot, scene in _photographs(data, held):
+            camera = Cameras(shot.T_world_camera[None], shot.photo.intrinsics_px[None], np.array([shot.photo.size_px]))
+            placed = held.localizer.placed[scene]
+            shown = render(placed.gaussians, camera, dominant_id=False, backend="native")
+            found = held.localizer.extractor.extract(shot.photo.rgb)
+            rows, points = lifted(found, shown, camera)
+            described = Described(quantised(found.descriptors[rows]), np.zeros(len(rows), np.uint8))
+            at = placed.S_metric_scene.apply(points)
+            self.features.append((scene, described, summarised(found.descriptors), at))
+        print(f"features of {len(self.features)} posed photographs: {time.process_time() - began:.0f} CPU s")
+
+    def __call__(self, photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
+        import pycolmap
+
+        began = time.process_time()
+        localizer = self.held.localizer
+        found = localizer.extractor.extract(photo.rgb)
+        mine = Described(quantised(found.descriptors), np.zeros(len(found), np.uint8))
+        summary = summarised(found.descriptors).astype(np.float32)
+        known = [one for one in self.features if one[0] in allowed]
+        likeness = np.array([one[2].astype(np.float32) @ summary for one in known])
+        parts: dict[int, list[tuple[str, np.ndarray, np.ndarray]]] = {}
+        for k in np.argsort(-likeness, kind="stable")[:MOST_PHOTOS]:
+            scene, described, _, points = known[k]
+            rows, columns = matched(mine, described, localizer.params.matching)
+            component = localizer.placed[scene].component
+            parts.setdefault(component, []).append((scene, found.pixels[rows], points[columns]))
+        best, why = None, Placement(photo.name, "too few agree")
+        for component, held in parts.items():
+            pixels, points = (np.concatenate([part[n] for part in held]).astype(np.float64) for n in (1, 2))
+            if len(pixels) < 4:
+                continue
+            width, height = photo.size_px
+            camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=photo.intrinsics_px)
+            options = pycolmap.AbsolutePoseEstimationOptions()
+            options.ransac.max_error = 4.0 * max(photo.size_px) / 480
+            answer = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, options)
+            if answer is None or answer["num_inliers"] < max(AGREE, best or 0):
+                continue
+            best = answer["num_inliers"]
+            T = np.vstack([answer["cam_from_world"].matrix(), [0, 0, 0, 1]])
+            pose = np.linalg.inv(T)
+            pose[:3, 3] /= localizer.metres.get(component, 1.0)
+            ids = np.repeat(np.arange(len(held)), [len(part[1]) for part in held])
+            most = np.bincount(ids[answer["inlier_mask"]], minlength=len(held)).argmax()
+            why = Placement(photo.name, "", pose, None, component, (held[most][0],))
+        return why, time.process_time() - began
+
+
+MOST_PHOTOS, AGREE = 20, 12
+
+
+def _photographs(data: Path, held: World) -> Iterator[tuple[Shot, str]]:
+    """Every photograph of every capture with the pose of its camera in the capture's own frame, and the capture."""
+    for name, scene in sorted(held.ids.items()):
+        cameras = held.localizer.store.scenes.cameras(scene)
+        numbers = {int(camera): row for row, camera in enumerate(cameras.names)} if cameras.names[0].isdigit() else {}
+        for path in sorted((data / "frames").glob(f"{name}_*.jpg")):
+            row = numbers.get(int(path.stem[-3:]), int(path.stem[-3:]))
+            photo = Photo(np.asarray(Image.open(path).convert("RGB")), cameras.intrinsics_px[row], 0.0, path.name)
+            yield Shot(photo, cameras.T_frame_camera[row], 0.0, set()), scene
+
+
 # --- what is said ----------------------------------------------------------------------------------------------------
 
 
-def measure(held: World, shots: list[Shot], change: Callable[[Photo], Photo], verbose: bool) -> list[dict]:
+Localise = Callable[[Photo, set[str]], tuple[Placement, float]]
+
+
+def measure(
+    held: World,
+    shots: list[Shot],
+    change: Callable[[Photo], Photo],
+    verbose: bool,
+    localise: Localise | None = None,
+) -> list[dict]:
+    """What is found of each photograph; by gsmap, or as ``localise`` finds it."""
     rows = []
     for shot in shots:
-        found, seconds = held.localize(change(shot.photo), shot.allowed)
+        found, seconds = (localise or held.localize)(change(shot.photo), shot.allowed)
         row = {"name": shot.photo.name, "coverage": shot.coverage, "cpu": seconds, "placed": found.is_placed}
         if found.is_placed:
             truth = held.truth(shot, found.scenes[0])
@@ -226,8 +352,9 @@ def measure(held: World, shots: list[Shot], change: Callable[[Photo], Photo], ve
             row["deg"] = float(np.degrees(angle_between(pose[:3, :3], truth[:3, :3])))
             unit = held.localizer.metres.get(found.component, 1.0)
             row["m"] = float(np.linalg.norm(pose[:3, 3] - truth[:3, 3]) * unit)
+            known = found.covariance
             xi = np.r_[_log(turn), pose[:3, :3].T @ (truth[:3, 3] - pose[:3, 3])]
-            row["nees"] = float(xi @ np.linalg.solve(found.covariance, xi))
+            row["nees"] = np.nan if known is None else float(xi @ np.linalg.solve(known, xi))
         rows.append(row)
         if verbose:
             told = (
@@ -271,15 +398,19 @@ def main() -> int:
     parser.add_argument("--kitchen", action="store_true")
     parser.add_argument("--perturb", action="store_true")
     parser.add_argument("--elsewhere", action="store_true")
+    parser.add_argument("--beside", action="store_true")
+    parser.add_argument("--small", type=float, metavar="SHARE")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("-v", action="store_true")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     if args.kitchen:
-        held = world(args.data / "kitchen_splats", args.work, ["k0", "k3", "k5"])
+        data = args.data / "kitchen_splats"
+        held = world(data, args.work, ["k0", "k3", "k5"])
         shots, deg, metres = list(kitchen_shots(args.data / "kitchen_splats", held)), 2.0, 0.08
     else:
-        held = world(args.data / "house", args.work, ["c0", "c1", "c2", "c3", "c5"])
+        data = args.data / "house"
+        held = world(data, args.work, ["c0", "c1", "c2", "c3", "c5"])
         shots, deg, metres = list(house_shots(args.data / "house", held, args.only)), 1.0, 0.05
     if args.elsewhere:
         if args.kitchen:
@@ -292,7 +423,30 @@ def main() -> int:
         return 0
     for name, change in PERTURBED.items() if args.perturb else [("as it is", PERTURBED["as it is"])]:
         say(name, measure(held, shots, change, args.v), deg, metres)
+    as_is = PERTURBED["as it is"]
+    if args.beside:
+        say("retrieval alone", measure(held, shots, as_is, args.v, retrieval_alone(held)), deg, metres)
+        say("SIFT + PnP on photographs", measure(held, shots, as_is, args.v, PosedPhotos(data, held)), deg, metres)
+    if args.small is not None:
+        small = small_map(held, data, args.work, args.small)
+        rows = measure(held, shots, as_is, args.v, lambda *asked: held.localize(*asked, within=small))
+        say("the small map", rows, deg, metres)
     return 0
+
+
+def small_map(held: World, data: Path, work: Path, share: float) -> SmallLocalizer:
+    """A small map in a share of the bytes of the captures' files, made anew."""
+    out = work / "small"
+    shutil.rmtree(out, ignore_errors=True)
+    whole = sum((data / f"{name}.ply").stat().st_size for name in held.ids)
+    store, settings = held.localizer.store, held.localizer.settings
+    began = time.process_time()
+    report = export_small(store, out, int(share * whole), settings, logged(None))
+    print(
+        f"small map: {report.num_bytes / 1e6:.2f} MB of {whole / 1e6:.1f} ({report.num_bytes / whole:.1%}), "
+        f"{time.process_time() - began:.1f} CPU s"
+    )
+    return SmallLocalizer(out)
 
 
 if __name__ == "__main__":

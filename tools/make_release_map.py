@@ -16,10 +16,12 @@ import os
 import sys
 import tarfile
 import tempfile
+from io import BytesIO
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from tiny_encoder import image_encoder
 
 import gsmap.map
@@ -76,6 +78,8 @@ def write(path: Path) -> None:
         m.optimize()
         if hasattr(m.store, "changes"):  # younger than this script
             compare(m)
+        if hasattr(m.store, "photos"):  # younger than this script
+            keep_photo(m)
         m.remove("shed")
         m.optimize()
         m.prune(keep_revisions=3)
@@ -160,6 +164,29 @@ def compare(m: Map) -> None:
             key = recipe.of(a, b)
         m.store.changes.save(report, key, older=a, newer=b, **where)
     m.confirm("c1", "I moved it")
+
+
+def keep_photo(m: Map) -> None:
+    """A photograph as it might have been localised in the hall, and one that was taken back."""
+    from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
+
+    for number in (1, 2):
+        sighting = PhotoSighting(
+            digest=f"{number:064x}",
+            name=f"phone{number}.jpg",
+            captured_at="2026-01-05T03:04:05+00:00",
+            scene=m.store.scenes.get("hall").id,
+            T_scene_camera=np.eye(4),
+            covariance=np.eye(6) * 1e-4,
+            intrinsics_px=np.array([500.0, 500, 320, 240]),
+            size_px=(640, 480),
+            probability=0.984375,
+            things=(ThingInPhoto(np.array([1.0, 0.5, 0.25]), "absent", 0.75),),
+        )
+        content = BytesIO()
+        Image.new("RGB", (64, 48), (200, 180, 20 * number)).save(content, "JPEG")
+        m.store.photos.add(sighting, content.getvalue())
+    m.store.photos.remove(2)
 
 
 def pack(path: Path, out: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -20,6 +21,13 @@ from gsmap.cli.console import (
     print_table,
     say,
 )
+from gsmap.cli.thin import parse_size
+
+
+class Purpose(StrEnum):
+    view = "view"
+    localize = "localize"
+
 
 _TILE_SIZE_M = 10.0
 
@@ -53,8 +61,17 @@ def command(
         int | None, typer.Option("--steps", help="Optimisation steps per tile; chosen by size else.")
     ] = None,
     budget: Annotated[
-        float | None, typer.Option("--budget", help="Ceiling in seconds per tile; a tile it cuts short is marked.")
+        str | None,
+        typer.Option(
+            "--budget",
+            metavar="SECONDS|SIZE",
+            help="Ceiling in seconds per tile; a tile it cuts short is marked. With --for localize a size, as 50MB.",
+        ),
     ] = None,
+    purpose: Annotated[
+        Purpose,
+        typer.Option("--for", help="What the export is for: view (tiles), or localize (a small map, see --budget)."),
+    ] = Purpose.view,
     provenance: Annotated[
         bool,
         typer.Option("--provenance", help="Add the property `scene` to .ply: which capture each Gaussian is from."),
@@ -107,6 +124,14 @@ def command(
         )
         return
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
+        if purpose is Purpose.localize:
+            small = m.export_small(out, parse_size(budget or "50MB"))
+            if json:
+                print_rows("export --for", small, json)
+                return
+            print_table(f"small map in {out}", small.scenes[0].columns, small.scenes)
+            say(f"{small.num_bytes / 1e6:.2f} MB; run: gsmap localize {out} PHOTO")
+            return
         report = m.export(
             out,
             format=format,
@@ -116,7 +141,7 @@ def command(
             revision=revision,
             component=component,
             steps=steps,
-            budget_s=budget,
+            budget_s=None if budget is None else _seconds(budget),
             provenance=provenance,
             uncompressed=uncompressed,
             prefer=prefer,
@@ -156,3 +181,12 @@ def _write_page(
         report = ExportReport(out=out, tiles=(), recomputed=0, reused=0, removed=0, notes=written.notes)
         print_rows("export", report, json)
     say(f"{written.num_bytes:,} bytes in {out}: open it with a double click")
+
+
+def _seconds(text: str) -> float:
+    from gsmap.errors import ConfigError
+
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"--budget of tiles is in seconds, got {text!r}; a size goes with --for localize") from None

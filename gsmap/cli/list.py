@@ -20,6 +20,7 @@ class What(StrEnum):
     edges = "edges"
     revisions = "revisions"
     tiles = "tiles"
+    photos = "photos"
 
 
 def command(
@@ -44,7 +45,7 @@ def command(
     as_of: AsOf = None,
     json: AsJson = False,
 ) -> None:
-    """List scenes, edges, revisions or tiles.
+    """List scenes, edges, revisions, tiles, or photographs that the map keeps.
 
     Example: `gsmap list site.gsmap edges --status accepted --json`
     """
@@ -74,13 +75,15 @@ def _rows(
     if what is What.edges:
         return m.edge_rows(component=component, status=status, after=after, tag=tag, as_of=as_of)
     useless: dict[str, object]
-    if what is What.tiles:
+    if what in (What.tiles, What.photos):
         useless = {"--status": status, "--after": after, "--tag": tag, "--as-of": as_of}
     else:
         useless = {"--status": status, "--component": component, "--tag": tag, "--as-of": as_of}
     for option, value in useless.items():
         if value is not None:
             raise ConfigError(f"{what} are not chosen by {option}: leave it out")
+    if what is What.photos:
+        return [row for row in m.photo_rows() if component is None or row.component == component]
     if what is What.tiles:
         return [row for row in m.tile_rows() if component is None or row.component == component]
     from gsmap.map.reports import made_after

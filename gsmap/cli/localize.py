@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,8 +16,12 @@ from gsmap.cli.console import (
     opened,
     print_rows,
     print_table,
+    progress_bars,
     say,
 )
+
+if TYPE_CHECKING:
+    from gsmap.types.rows import LocalizeReport
 
 
 def command(
@@ -56,6 +60,19 @@ def command(
     depth_scale: Annotated[
         float, typer.Option("--depth-scale", help="Values of the depth picture that make a metre.")
     ] = 1000.0,
+    changes: Annotated[
+        bool, typer.Option("--changes", help="Say where placed photos show something else than the map.")
+    ] = False,
+    pictures: Annotated[
+        str | None, typer.Option("--pictures", metavar="DIR", help="With --changes: draw these parts, in this folder.")
+    ] = None,
+    add: Annotated[
+        bool, typer.Option("--add", help="Keep placed photos in the map: evidence of what stood there, and when.")
+    ] = False,
+    captured_at: Annotated[
+        str | None,
+        typer.Option("--captured-at", metavar="DATE", help="With --add: when they were taken. By default EXIF's."),
+    ] = None,
     sets: Sets = None,
     preset: Preset = None,
     executor: Executor = None,
@@ -66,6 +83,29 @@ def command(
 
     Example: `gsmap localize site.gsmap phone.jpg`
     """
+    from gsmap.errors import ConfigError
+    from gsmap.map.localizing_small import localize_small
+    from gsmap.map.small_map import is_small
+    from gsmap.settings import parse
+
+    if is_small(map):
+        if changes or add or pictures is not None or captured_at is not None or depth is not None:
+            raise ConfigError("a small map places photographs, and no more: ask the map that it is of")
+        with progress_bars() as progress:
+            report = localize_small(
+                map,
+                files or (),
+                progress,
+                intrinsics=intrinsics,
+                focal=focal,
+                near=near,
+                together=together,
+                video=video,
+                values=dict(parse(one) for one in sets or ()),
+                preset=preset,
+            )
+        _tell(report, json)
+        return
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         report = m.localize(
             *(files or ()),
@@ -76,11 +116,28 @@ def command(
             video=video,
             depth=depth,
             depth_scale=depth_scale,
+            changes=changes,
+            pictures=pictures,
+            add=add,
+            captured_at=captured_at,
         )
+    _tell(report, json)
+    if add and not json:
+        say(f"{sum(bool(row.added) for row in report.results)} kept: gsmap list {map} photos")
+
+
+def _tell(report: LocalizeReport, json: bool) -> None:
     for note in report.notes:
         say(note)
     if json:
         print_rows("localize", report, json)
         return
     print_table("localize", report.results[0].columns, report.results)
+    for row in report.results:
+        if row.changes:
+            print_table(f"{row.file} differs", row.changes[0].columns, row.changes)
+        elif row.changes is not None:
+            say(f"{row.file} shows what the map does, as far as it could be compared ({row.compared:.0%} of it)")
+        if row.picture is not None:
+            say(f"drawn in {row.picture}")
     say(f"{sum(row.status == 'placed' for row in report.results)} of {len(report.results)} placed")

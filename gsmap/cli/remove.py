@@ -22,6 +22,9 @@ def command(
     branches: Annotated[
         bool, typer.Option("--branches", help="With --purge: from the branches and tags of the map, too.")
     ] = False,
+    photo: Annotated[
+        bool, typer.Option("--photo", help="It names a photograph that is kept: by file, number (p3) or digest.")
+    ] = False,
     json: AsJson = False,
 ) -> None:
     """Take a scene out of the map. Older revisions keep it; `gsmap prune` reclaims bytes nothing names.
@@ -34,7 +37,15 @@ def command(
 
     if branches and not purge:
         raise ConfigError("--branches goes with --purge: without it a branch keeps its own scenes")
+    if photo and (purge or branches):
+        raise ConfigError("--photo goes alone: gsmap prune reclaims the picture of one that was taken back")
     with opened(map) as m:
+        if photo:
+            taken_back = m.remove_photo(scene)
+            say(f"removed photo {taken_back.file}")
+            if json:
+                print_rows("remove --photo", taken_back, json)
+            return
         if purge:
             report = m.purge(scene, branches=branches)
             _tell(report, map)

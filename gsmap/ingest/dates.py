@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -70,6 +71,16 @@ def given_date(when: str | datetime | None) -> CaptureDate:
         return CaptureDate()
     known = _zoned(date).isoformat()
     return CaptureDate(known, "", "" if date.tzinfo else f"dated {known} as told: no zone was given, taken as UTC")
+
+
+def photo_date(path: str | os.PathLike[str]) -> CaptureDate:
+    """When a photograph was taken, as its EXIF says; nothing where that says nothing plausible."""
+    found = _exif_date(Path(path), datetime.now(UTC) + timedelta(days=1))
+    if found is None:
+        return CaptureDate()
+    date, zoned = found
+    name = shown(Path(path).name)
+    return _dated(date, f"the EXIF of {name}", "" if zoned else f"{name}: its EXIF has no zone, taken as UTC")
 
 
 def find_date(

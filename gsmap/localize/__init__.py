@@ -1,6 +1,7 @@
 """Where a photograph, a clip or a scan was taken: found in the map, sharpened on it, and judged."""
 
 from gsmap.localize.clips import read_clip
+from gsmap.localize.differences import Differences, Eyes, Region, compare_photo, open_eyes
 from gsmap.localize.features import scene_features
 from gsmap.localize.localizing import localize_photo
 from gsmap.localize.params import Params
@@ -11,12 +12,17 @@ from gsmap.localize.retrieval import ViewIndex
 from gsmap.localize.together import localize_together
 
 __all__ = [
+    "Differences",
+    "Eyes",
     "Lens",
     "Params",
     "PlacedFeatures",
+    "Region",
     "ViewIndex",
+    "compare_photo",
     "localize_photo",
     "localize_together",
+    "open_eyes",
     "read_clip",
     "read_photo",
     "recipe_key",

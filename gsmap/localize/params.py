@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from gsmap.localize import (
     clips,
     covariance,
+    differing,
     evidence,
     features,
     matching,
+    packing,
     resection,
     settling,
     tracking,
@@ -39,6 +41,8 @@ class Params:
         verdict: the bars that a pose must clear.
         together: how photographs of one place help each other.
         clips: which frames of a clip are looked at.
+        differences: when a placed photo shows something else than the map.
+        small: what a small map keeps.
         max_candidates: rough poses that are looked into.
         sure: once one is this probable, others are looked into only ...
         rival_inliers: ... where so large a share of its matches agrees on them.
@@ -58,6 +62,8 @@ class Params:
     verdict: verdict.Params = field(default_factory=verdict.Params)
     together: tying.Params = field(default_factory=tying.Params)
     clips: clips.Params = field(default_factory=clips.Params)
+    differences: differing.Params = field(default_factory=differing.Params)
+    small: packing.Params = field(default_factory=packing.Params)
     max_candidates: int = 5
     sure: float = 0.97
     rival_inliers: float = 0.5

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from gsmap.errors import ConfigError
+from gsmap.errors import ConfigError, ReadOnlyError
 from gsmap.formats.scans import is_scan
+from gsmap.ingest.dates import CaptureDate, given_date, photo_date
 from gsmap.localize import Lens, read_clip, read_photo
 from gsmap.map.localizing_scans import scan_rows
 from gsmap.map.metres import metre_notes, metres_at
+from gsmap.map.photo_changes import Teller, Told, write_picture
+from gsmap.map.photos import sighting_of, small_jpeg
 from gsmap.map.stages.localize import Localizer, localize, localize_all, parse_near
 from gsmap.store import Store
 from gsmap.types.localization import Photo, Placement
@@ -21,6 +25,34 @@ if TYPE_CHECKING:
     from gsmap.map.settings import Settings
 
 Numbers = str | Sequence[float] | None
+
+
+@dataclass(frozen=True)
+class Tells:
+    """What is asked of photographs that are placed.
+
+    Args:
+        changes: where they show something else than the map.
+        pictures: folder for pictures with these parts drawn.
+        add: keep them in the map as evidence.
+        captured_at: when they were taken, as a person says; by default as the files do (EXIF).
+
+    Raises:
+        ConfigError: pictures, or a date, of what is not asked for; or no date.
+    """
+
+    changes: bool = False
+    pictures: str | os.PathLike[str] | None = None
+    add: bool = False
+    captured_at: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.pictures is not None and not self.changes:
+            raise ConfigError("--pictures are of what differs: ask for it by --changes")
+        if self.captured_at is not None:
+            if not self.add:
+                raise ConfigError("--captured-at dates photographs that are kept: add them by --add")
+            given_date(self.captured_at)
 
 
 def localize_files(
@@ -36,6 +68,7 @@ def localize_files(
     progress: StageProgress,
     depth: str | os.PathLike[str] | None = None,
     depth_scale: float = 1000.0,
+    tells: Tells | None = None,
 ) -> LocalizeReport:
     """Read photographs, find them, and tell of each; nothing is begun where one cannot be read. Scans go their own way.
 
@@ -44,19 +77,23 @@ def localize_files(
         video: a clip, in place of files.
         depth: a depth picture of the view of the one photo given, which makes a scan of it.
         depth_scale: its values that make a metre.
+        tells: what else is asked of photographs that are placed.
     """
+    tells = tells or Tells()
+    if tells.add and not store.catalog.writable:
+        raise ReadOnlyError(f"{store.location} is open to be read only: photographs can be placed in it, but not kept")
     if bool(files) == (video is not None):
         raise ConfigError("name the photographs to localise, or one clip by --video")
     lens = parse_lens(intrinsics, focal)
     if video is not None:
         clip = read_clip(video, lens, settings.localize.clips)
         frames = [(f"{os.fspath(video)}#{at:.2f}", photo) for at, photo in clip]
-        return _of_pictures(store, settings, frames, near, True, progress)
+        return _of_pictures(store, settings, frames, near, True, progress, tells)
     pictures = [(os.fspath(path), read_photo(path, lens)) for path in files if depth is None and not is_scan(path)]
     of_scans, notes = scan_rows(store, settings, files, depth, depth_scale, lens, near, progress)
     report = LocalizeReport(results=())
     if pictures:
-        report = _of_pictures(store, settings, pictures, near, together, progress)
+        report = _of_pictures(store, settings, pictures, near, together, progress, tells)
     told = iter(report.results)
     rows = tuple(of_scans[number] if number in of_scans else next(told) for number in range(len(files)))
     return LocalizeReport(results=rows, notes=(*notes, *report.notes))
@@ -69,21 +106,76 @@ def _of_pictures(
     near: str | None,
     together: bool,
     progress: StageProgress,
+    tells: Tells,
 ) -> LocalizeReport:
     """What is told of photographs, by name."""
     where = None if near is None else parse_near(store, near)
     localizer = Localizer(store, settings, progress)
     photos = [photo for _, photo in named]
     if together:
-        found = localize_all(localizer, photos, where)
+        found = list(localize_all(localizer, photos, where))
     else:
-        found = localize(localizer, photos, where, progress)
-    rows = [row_of(store, name, *one) for (name, _), one in zip(named, found, strict=True)]
+        found = list(localize(localizer, photos, where, progress))
+    names = {scene.id: scene.name for scene in store.scenes.list()}
+    rows = [row_of(names, name, *one) for (name, _), one in zip(named, found, strict=True)]
+    notes: list[str] = []
+    if tells.changes or tells.add:
+        rows, notes = _with_what_they_tell(localizer, named, [one for one, _ in found], rows, tells, progress)
     metres = metres_at(store, settings)
     components = {row.component for row in rows if row.component is not None and row.status == "placed"}
     return LocalizeReport(
-        results=tuple(rows), notes=metre_notes({c: metres[c] for c in sorted(components) if c in metres})
+        results=tuple(rows),
+        notes=(*metre_notes({c: metres[c] for c in sorted(components) if c in metres}), *notes),
     )
+
+
+def _with_what_they_tell(
+    localizer: Localizer,
+    named: Sequence[tuple[str, Photo]],
+    found: Sequence[Placement],
+    rows: Sequence[LocalizeRow],
+    tells: Tells,
+    progress: StageProgress,
+) -> tuple[list[LocalizeRow], list[str]]:
+    """The rows with what placed photographs show otherwise than the map, and what people should know of it; kept if
+    that is asked."""
+    teller = Teller(localizer, progress)
+    out: list[LocalizeRow] = []
+    notes: list[str] = []
+    for (name, photo), where, row in zip(named, found, rows, strict=True):
+        if not where.is_placed:
+            out.append(row)
+            continue
+        told = teller.tell(photo, where)
+        picture = None if tells.pictures is None else write_picture(tells.pictures, name, photo, told, localizer)
+        shown = None if picture is None else os.fspath(picture)
+        if tells.changes:
+            row = replace(row, changes=told.rows, compared=told.found.judged, picture=shown)
+            notes += told.notes
+        if tells.add:
+            added, more = _add(localizer.store, teller, photo, row, told, tells.captured_at)
+            row = replace(row, added=added)
+            notes += more
+        out.append(row)
+    return out, notes
+
+
+def _add(
+    store: Store, teller: Teller, photo: Photo, row: LocalizeRow, told: Told, captured_at: str | None
+) -> tuple[bool, list[str]]:
+    """Keep a placed photo; whether it is new, and what people should know."""
+    if captured_at is not None:
+        date = given_date(captured_at)
+    else:
+        date = photo_date(row.file) if os.path.isfile(row.file) else CaptureDate()
+    sighting = sighting_of(store, row, photo, teller.things(row, told), date.when)
+    if sighting is None:
+        return False, [f"{row.file} was not kept: the scene that it was found by is gone"]
+    notes = [date.note] if date.note else []
+    if date.when is None:
+        notes.append(f"{row.file} has no date: what it shows comes last in histories (--captured-at DATE says it)")
+    added = store.photos.add(sighting, small_jpeg(photo))
+    return added, notes if added else [f"{row.file} is kept already"]
 
 
 def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
@@ -111,9 +203,12 @@ def parse_lens(intrinsics: Numbers, focal: str | float | None) -> Lens:
         raise ConfigError(f"a focal length is auto or pixels, got {focal!r}") from None
 
 
-def row_of(store: Store, file: str, found: Placement, seconds: float) -> LocalizeRow:
-    """What is told of one photo; scenes by name."""
-    names = {scene.id: scene.name for scene in store.scenes.list()} if found.scenes else {}
+def row_of(names: Mapping[str, str], file: str, found: Placement, seconds: float) -> LocalizeRow:
+    """What is told of one photo.
+
+    Args:
+        names: of scenes, by id.
+    """
     return LocalizeRow(
         file=file,
         status="placed" if found.is_placed else "refused",

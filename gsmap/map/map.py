@@ -46,6 +46,7 @@ from gsmap.types.rows import (
     ModelRow,
     ObjectsReport,
     PairReport,
+    PhotoRow,
     PoseChangeRow,
     PoseRow,
     PriorRow,
@@ -56,6 +57,7 @@ from gsmap.types.rows import (
     SceneReport,
     SceneRow,
     SettingRow,
+    SmallMapReport,
     SnapshotRow,
     SplitReport,
     Table,
@@ -486,6 +488,10 @@ class Map(AbstractContextManager["Map"]):
         video: str | os.PathLike[str] | None = None,
         depth: str | os.PathLike[str] | None = None,
         depth_scale: float = 1000.0,
+        changes: bool = False,
+        pictures: str | os.PathLike[str] | None = None,
+        add: bool = False,
+        captured_at: str | None = None,
     ) -> LocalizeReport:
         """``gsmap localize MAP FILE...``: where photographs were taken and scans lie, or why that is not said.
 
@@ -498,13 +504,15 @@ class Map(AbstractContextManager["Map"]):
             together: the photos show one place and overlap: whoever is placed helps the others.
             video: a clip, whose sharpest frames are photos of one place; needs the extra ``video``.
             depth, depth_scale: a depth picture of the view of the one photo given, and its values that make a metre.
+            changes: say where a placed photo shows something else than the map; ``pictures`` draws it in a folder.
+            add: keep placed photos as evidence of what stood there, dated by ``captured_at`` or their EXIF.
 
         Raises:
             NotFoundError: no such file or scene, or nothing in the map has a place.
             InputError: a file is neither a picture nor a scan.
             ConfigError: what is said of the lens or the place makes no sense.
         """
-        from gsmap.map.localizing import localize_files
+        from gsmap.map.localizing import Tells, localize_files
 
         with at_work(self.store, "localize"):
             return localize_files(
@@ -519,6 +527,7 @@ class Map(AbstractContextManager["Map"]):
                 progress=self._progress,
                 depth=depth,
                 depth_scale=depth_scale,
+                tells=Tells(changes, pictures, add, captured_at),
             )
 
     def find(
@@ -651,6 +660,19 @@ class Map(AbstractContextManager["Map"]):
 
         made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait)
         return reports.export_report(self.store, Path(out), made, notes)
+
+    def export_small(self, out: str | os.PathLike[str], budget_bytes: int) -> SmallMapReport:
+        """``gsmap export MAP OUT --for localize``: a small map by which photographs are placed, and no more.
+
+        Raises:
+            StoreError: the folder is not empty.
+            ConfigError: so few bytes that hardly a photograph would be found; how many it takes is said.
+            NotFoundError: the map has no poses yet.
+        """
+        from gsmap.map.small_map import export_small
+
+        with at_work(self.store, "export"):
+            return export_small(self.store, Path(out), budget_bytes, self.settings, self._progress)
 
     def _repr_html_(self) -> str:
         return reports.map_html(self.store, self.status(), self.scene_rows())
@@ -1033,6 +1055,23 @@ class Map(AbstractContextManager["Map"]):
             metres_per_unit=metres_per_unit,
         )
         return reports.scene_row(self.store, scene, self.metres())
+
+    def photo_rows(self) -> list[PhotoRow]:
+        """``gsmap list MAP photos``: the photographs that the map keeps, oldest first, by the newest poses."""
+        from gsmap.map.photos import photo_rows
+
+        return photo_rows(self.store)
+
+    def remove_photo(self, which: str) -> PhotoRow:
+        """``gsmap remove MAP PHOTO --photo``: take back a photograph that is kept, by file, number (``p3``) or digest.
+
+        Raises:
+            NotFoundError: none is called so, or several.
+        """
+        number = self.store.photos.find(which).number
+        row = next(row for row in self.photo_rows() if row.id == f"p{number}")
+        self.store.photos.remove(number)
+        return row
 
     def remove(self, ref: str) -> SceneRow:
         """Take a scene out; older revisions keep it."""

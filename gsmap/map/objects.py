@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from gsmap.errors import ConfigError, NotFoundError
 from gsmap.map.dates import parsed
 from gsmap.map.metres import map_metres
 from gsmap.map.one_state import of_one_state
+from gsmap.map.photos import with_photos
 from gsmap.map.settings import Settings
 from gsmap.objects import (
     Capture,
@@ -50,16 +51,24 @@ class Known:
         scenes: the placed captures by id.
         notes: who tells nothing, and why.
         metres: per unit of the map, by component.
+        photos: photographs that the map keeps, by digest: (file, date).
     """
 
     objects: list[MapObject]
     scenes: dict[str, Scene]
     notes: tuple[str, ...]
     metres: dict[int, float]
+    photos: Mapping[str, tuple[str, str | None]] = field(default_factory=dict)
 
     @property
     def dates(self) -> dict[str, str | None]:
-        return {scene.id: scene.captured_at for scene in self.scenes.values()}
+        """Of captures and photographs, by id."""
+        of_photos = {photo: when for photo, (_, when) in self.photos.items()}
+        return {scene.id: scene.captured_at for scene in self.scenes.values()} | of_photos
+
+    def name_of(self, who: str) -> str:
+        """Of a capture or a photograph."""
+        return self.scenes[who].name if who in self.scenes else self.photos[who][0]
 
 
 @of_one_state
@@ -129,8 +138,15 @@ def known_objects(
             params=settings.objects,
             progress=told,
         )
+    kept = store.photos.list() if graphs is None else []
+    if kept:
+        at = {scene: pose.S_map_scene for scene, pose in placed.poses.items()}
+        objects = with_photos(
+            objects, kept, scenes, at, metres, {scene: pose.component for scene, pose in placed.poses.items()}
+        )
     progress("objects", 1.0, f"{len(objects)} objects")
-    return Known(objects, scenes, tuple(notes), metres)
+    photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
+    return Known(objects, scenes, tuple(notes), metres, photos)
 
 
 def _when(scene: Scene) -> tuple[bool, float, str]:
@@ -212,8 +228,8 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
         SightingRow(
             object=thing.id,
             scene=sighting.scene,
-            scene_name=known.scenes[sighting.scene].name,
-            captured_at=known.scenes[sighting.scene].captured_at,
+            scene_name=known.name_of(sighting.scene),
+            captured_at=known.dates[sighting.scene],
             state=sighting.state,
             box=sighting.box,
             box_m=None if sighting.box is None else sighting.box * known.metres[thing.component],

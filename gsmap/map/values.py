@@ -50,6 +50,7 @@ def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
         num_facts=merged.facts,
         num_priors=merged.priors,
         num_observations=merged.observations,
+        num_photos=merged.photos,
         num_models=merged.models,
         num_comparisons=merged.comparisons,
         num_change_reviews=merged.change_reviews,

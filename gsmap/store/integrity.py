@@ -26,6 +26,8 @@ from gsmap.store.groups import manifest
 from gsmap.store.indexes import KIND as INDEXES
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
+from gsmap.store.photos import KIND as PHOTOS
+from gsmap.store.photos import claimed_groups
 from gsmap.store.revisions import forget_dropped, named_by_kept
 from gsmap.store.schema import (
     CHUNK_BOXES,
@@ -35,6 +37,7 @@ from gsmap.store.schema import (
     groups,
     index_segments,
     models,
+    photo_sightings,
     revisions,
     scenes,
     view_features,
@@ -286,6 +289,7 @@ def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
     views = select(view_features.c.group_id).where(view_features.c.scene.not_in(lost))
     claimed |= set(connection.execute(views).scalars())
+    claimed |= claimed_groups(connection, lost)
     known = {(g.kind, g.id) for g in connection.execute(select(groups))}
     return _Waste(
         dropped,
@@ -302,7 +306,7 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
         forget_dropped(connection)
         connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
         connection.execute(delete(view_features).where(view_features.c.group_id.in_(ids)))
-        for table in (scenes, comparisons):
+        for table in (scenes, comparisons, photo_sightings):
             connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))
         for _, number in waste.scenes:
             boxes = text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s")
@@ -319,6 +323,8 @@ def _advice(connection: Connection, kind: str, group: str, location: str | None)
         return " (the index of retrieval: it is made anew when the next new scene asks it)"
     if kind == VIEWS:
         return " (features of a scene's views: they are made anew when the next photograph is localised)"
+    if kind == PHOTOS:
+        return " (the small picture of a photo that is kept: remove the photo and add it again)"
     if kind != "graphs":
         return ""
     of_scene = graphs.join(scenes, scenes.c.id == graphs.c.scene)

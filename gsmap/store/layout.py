@@ -279,6 +279,7 @@ def mend(kind: str) -> str:
         "graphs": "make the graph again (gsmap describe MAP SCENE)",
         "changes": "compare its two scenes again (gsmap changes MAP A:B)",
         "views": "localise a photograph: what is lost of this is made anew when the next one asks it",
+        "photos": "remove the photo and add it again (gsmap localize MAP PHOTO --add)",
         "indexes": "add a capture: the index is made anew when the next one asks it",
     }
     return f"run gsmap check, and {again.get(kind, 'ingest the scene again')}"

@@ -29,7 +29,7 @@ class Merged:
 
     Args:
         scenes, removed, known: scenes that are new here and live, that are new or now removed, and that both maps had.
-        graphs, registrations, reviews, facts, priors, observations, models, recipes, revisions, comparisons,
+        graphs, registrations, reviews, facts, priors, observations, photos, models, recipes, revisions, comparisons,
             change_reviews: rows that are new here.
         renamed: (old, new) names of scenes whose name was taken.
         revision: number of the joint revision; None where none was needed.
@@ -46,6 +46,7 @@ class Merged:
     facts: int = 0
     priors: int = 0
     observations: int = 0
+    photos: int = 0
     models: int = 0
     recipes: int = 0
     revisions: int = 0
@@ -75,6 +76,7 @@ def merge(into: Store, source: Store) -> Merged:
         comparisons_of(transfer)
         transfer.priors()
         transfer.observations()
+        transfer.photos()
         transfer.models()
         number = _revisions(transfer)
         transfer.notes += _other_settings(into, source)
@@ -96,6 +98,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
         comparisons_of(transfer)
         transfer.priors()
         transfer.observations()
+        transfer.photos()
         transfer.models()
         number = None
         newest = newest_poses(transfer.theirs)
@@ -132,6 +135,7 @@ def bring_scene(into: Store, source: Store, scene: str) -> Merged:
         comparisons_of(transfer)
         transfer.priors()
         transfer.observations()
+        transfer.photos()
         return replace(_merged(transfer, None), notes=())
 
 

@@ -38,6 +38,7 @@ from gsmap.store.schema import (
     leases,
     lookups,
     observations,
+    photo_sightings,
     poses,
     priors,
     purges,
@@ -258,6 +259,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     _forget_lookups(connection, scene)
     drop("graphs", graphs, graphs.c.scene == scene)
     drop("view_features", view_features, view_features.c.scene == scene)
+    drop("photos", photo_sightings, photo_sightings.c.scene == scene)
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
     claimed = set(connection.execute(select(scenes.c.group_id)).scalars())
@@ -265,6 +267,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     claimed |= set(connection.execute(select(comparisons.c.group_id)).scalars())
     claimed |= set(connection.execute(select(index_segments.c.group_id)).scalars())
     claimed |= set(connection.execute(select(view_features.c.group_id)).scalars())
+    claimed |= set(connection.execute(select(photo_sightings.c.group_id)).scalars())
     unclaimed = [group for group in connection.execute(select(groups.c.id)).scalars() if group not in claimed]
     sizes = select(files.c.group_id, func.sum(files.c.size_bytes)).where(files.c.group_id.in_(unclaimed))
     bodies = {group: int(size) for group, size in connection.execute(sizes.group_by(files.c.group_id))}
@@ -387,6 +390,9 @@ def _linked_files(store: Store, connection: Connection, scene: str) -> int:
         "scenes": select(scenes.c.group_id).where(scenes.c.id == scene, scenes.c.group_id.is_not(None)),
         "graphs": select(graphs.c.group_id).where(graphs.c.scene == scene),
         "changes": select(comparisons.c.group_id).where(with_it, comparisons.c.group_id.is_not(None)),
+        "photos": select(photo_sightings.c.group_id).where(
+            photo_sightings.c.scene == scene, photo_sightings.c.group_id.is_not(None)
+        ),
     }
     ids = [(kind, group) for kind, query in of_scene.items() for group in connection.execute(query).scalars()]
     found = (files_below(store.arrays.root / kind / name) for kind, name in ids)

@@ -57,7 +57,7 @@ from gsmap.store.matrices import (
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
 from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0008"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0009"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -113,7 +113,7 @@ about = _table(
 groups = _table(
     "groups",
     Column("id", Digest, primary_key=True),  # digest of the content
-    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes, views
+    Column("kind", Kind, nullable=False),  # scenes, graphs, changes, indexes, views, photos
     Column("created_at", Text, nullable=False),
 )
 files = _table(
@@ -370,6 +370,20 @@ observations = _table(
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
     CheckConstraint("kind in ('frame', 'point', 'image', 'fix', 'bar')", name="kind"),
+)
+
+# Photographs that are kept as evidence: when, from where, what they show; one that is taken back says when.
+photo_sightings = _table(
+    "photo_sightings",
+    Column("number", Integer, primary_key=True),
+    Column("digest", Digest, nullable=False, index=True),  # SHA-256 of the file
+    Column("name", Line, nullable=False),
+    Column("captured_at", Line),
+    _scene("scene", index=True),  # whose frame its pose is in
+    Column("value", Json(an_object), nullable=False),  # as of `gsmap.types.photo_sighting`
+    Column("group_id", Digest, ForeignKey("groups.id")),  # of its small JPEG; null once it was taken back and pruned
+    Column("created_at", Text, nullable=False),
+    Column("removed_at", Text),
 )
 
 models = _table(

@@ -32,6 +32,7 @@ from gsmap.store.integrity import Check, Pruned
 from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.object_arrays import ObjectArrays
+from gsmap.store.photos import Photos
 from gsmap.store.priors import Priors
 from gsmap.store.recipes import Recipes
 from gsmap.store.registrations import Registrations
@@ -47,11 +48,11 @@ from gsmap.version import __version__
 class Store:
     """An open map: ``site.gsmap/map.sqlite`` (the catalog) and ``site.gsmap/arrays`` (immutable arrays).
 
-    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``indexes``, ``view_features``, ``registrations``,
-    ``changes``, ``revisions``, ``priors``, ``world``, ``models``, ``exports``, ``branches``, ``backups``, ``leases``
-    and ``set_aside``. Every method that changes something is one transaction, durable when it returns; `transaction`
-    makes several of them one. Killed anywhere, the map opens whole. Threads may share a store; processes open their
-    own.
+    One attribute per noun: ``scenes``, ``recipes``, ``graphs``, ``indexes``, ``view_features``, ``photos``,
+    ``registrations``, ``changes``, ``revisions``, ``priors``, ``world``, ``models``, ``exports``, ``branches``,
+    ``backups``, ``leases`` and ``set_aside``. Every method that changes something is one transaction, durable when it
+    returns; `transaction` makes several of them one. Killed anywhere, the map opens whole. Threads may share a store;
+    processes open their own.
 
     A map may have branches (`gsmap.store.branches`): other catalogs over the same arrays.
 
@@ -82,6 +83,7 @@ class Store:
         self.graphs = Graphs(catalog, self.arrays)
         self.indexes = Indexes(catalog, self.arrays)
         self.view_features = ViewFeatures(catalog, self.arrays)
+        self.photos = Photos(catalog, self.arrays)
         self.registrations = Registrations(catalog)
         self.changes = Changes(catalog, self.arrays)
         self.revisions = Revisions(catalog)

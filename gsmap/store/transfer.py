@@ -20,6 +20,7 @@ from gsmap.store.change_rows import named_groups
 from gsmap.store.graphs import KIND as GRAPHS
 from gsmap.store.groups import drop_graphs, has_group, manifest, name, publish
 from gsmap.store.models import model_path
+from gsmap.store.photos import KIND as PHOTOS
 from gsmap.store.scene_refs import free_name
 from gsmap.store.scenes import KIND as SCENES
 from gsmap.store.schema import (
@@ -27,6 +28,7 @@ from gsmap.store.schema import (
     groups,
     models,
     observations,
+    photo_sightings,
     priors,
     purges,
     recipes,
@@ -365,6 +367,23 @@ class Transfer:
                 earlier = observations.c.number == row.number
                 self.ours.execute(update(observations).where(earlier).values(removed_at=rows[-1].created_at))
 
+    def photos(self) -> None:
+        """Photographs that are kept of these scenes; one that either map took back stays so."""
+        mine = {_identity(row, "removed_at", "group_id"): row for row in self.ours.execute(select(photo_sightings))}
+        standing = {row.digest for row in mine.values() if row.removed_at is None}
+        for row in self.theirs.execute(select(photo_sightings).order_by(photo_sightings.c.number)).all():
+            known = mine.get(_identity(row, "removed_at", "group_id"))
+            if row.scene not in self.wanted:
+                continue
+            if known is not None:
+                if row.removed_at is not None and known.removed_at is None:
+                    taken_back = photo_sightings.c.number == known.number
+                    self.ours.execute(update(photo_sightings).where(taken_back).values(removed_at=row.removed_at))
+            elif row.removed_at is None and row.digest not in standing:
+                self.bring_group(PHOTOS, row.group_id)
+                self.ours.execute(insert(photo_sightings), _content(row))
+                self.counts["photos"] += 1
+
     def models(self) -> None:
         """Models of kinds that this map lacks; where both have one under a name, this map's stays."""
         here = self.ours.execute(select(models).order_by(models.c.number)).all()
@@ -402,6 +421,8 @@ def _missing_groups(
     made = theirs.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id))
     named += [(GRAPHS, row.scene, row.group_id) for row in made if known.get(row.key, row.group_id) == row.group_id]
     named += named_groups(ours, theirs, only)
+    kept = select(photo_sightings).where(photo_sightings.c.removed_at.is_(None))
+    named += [(PHOTOS, row.scene, row.group_id) for row in theirs.execute(kept)]
     here, forgotten = set(ours.execute(select(groups.c.id)).scalars()), _forgotten(ours)
 
     def is_lacking(kind: str, group: str) -> bool:

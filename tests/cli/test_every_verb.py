@@ -22,6 +22,7 @@ from gsmap import formats
 from gsmap.cli.app import build
 from gsmap.cli.objects import OBJECTS, Many, Maybe
 from gsmap.store import trust
+from gsmap.types.photo_sighting import PhotoSighting
 
 Run = Callable[..., Any]
 
@@ -60,11 +61,13 @@ RUNS = {
     "find": "find MAP --like left:0",
     "localize": "localize MAP TMP/photo.png --focal auto",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
+    "export --for": "export MAP TMP/small --for localize --budget 50MB",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",
     "list scenes": "list MAP scenes",
     "list edges": "list MAP edges",
     "list revisions": "list MAP revisions",
     "list tiles": "list MAP tiles",
+    "list photos": "list MAP photos",
     "show SCENE": "show MAP left",
     "show A:B": "show MAP left:right",
     "show CHANGE": "show MAP c1",
@@ -85,6 +88,7 @@ RUNS = {
     "split": "split MAP TMP/part.gsmap --island 0",
     "remove": "remove MAP odd:one",
     "remove --purge": "remove MAP odd:one --purge",
+    "remove --photo": "remove MAP photo.jpg --photo",
     "restore-scene": "restore-scene MAP left --from SITE",
     "check": "check MAP",
     "prune": "prune MAP --dry-run",
@@ -103,6 +107,23 @@ SILENT = {
     *("backup", "restore", "clone"),
 }
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""
+
+
+def save_photo(site: Path) -> None:
+    """Keep a photograph of the scene `left`, as localising one does."""
+    with gsmap.map.open(site) as m:
+        sighting = PhotoSighting(
+            digest="1" * 64,
+            name="photo.jpg",
+            captured_at=None,
+            scene=m.store.scenes.get("left").id,
+            T_scene_camera=np.eye(4),
+            covariance=np.eye(6),
+            intrinsics_px=np.array([100.0, 100, 80, 60]),
+            size_px=(160, 120),
+            probability=0.99,
+        )
+        m.store.photos.add(sighting, b"\xff\xd8\xff\xe0")
 
 
 @pytest.fixture
@@ -124,6 +145,8 @@ def gsmap_run(
     def call(line: str) -> Any:
         if "c1" in line.split() or "changes" in line.split():
             save_changes(site)
+        if "--photo" in line or "photos" in line:
+            save_photo(site)
         if "TMP/saved" in line:
             with gsmap.map.open(site) as m:
                 m.backup(tmp_path / "saved")

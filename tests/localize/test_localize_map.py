@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from PIL import Image
 
 import gsmap.map
 from gsmap.cli.app import run
-from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError
+from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, ReadOnlyError, StoreError
+from gsmap.localize import packing
+from gsmap.map.localizing_small import localize_small
 from gsmap.store import Store
 from gsmap.types import Sim3
 
@@ -98,6 +101,182 @@ def test_nothing_is_begun_where_a_file_is_no_picture(made) -> None:
 def test_an_empty_map_says_what_to_do(made, tmp_path) -> None:
     with gsmap.map.create(tmp_path / "e.gsmap") as m, pytest.raises(NotFoundError, match="gsmap update"):
         m.localize(made[0] / "photo.png")
+
+
+# --- what placed photographs tell, and those that are kept ----------------------------------------------------------
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    """A map of its own, and the photo with a box of stripes standing in it."""
+    folder, lens, _ = made
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        m.clone(tmp_path / "c.gsmap")
+    rgb = np.asarray(Image.open(folder / "photo.png")).copy()
+    stripes = np.array([[230, 40, 40], [40, 220, 60]], np.uint8)[(np.arange(130) // 12) % 2]
+    rgb[130:260, 250:350] = stripes[:, None]
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x9003] = "2026:05:04 10:00:00"
+    Image.fromarray(rgb).save(tmp_path / "changed.jpg", quality=95, exif=exif)
+    return tmp_path, lens
+
+
+def test_changes_are_told_and_drawn(copy, capsys) -> None:
+    folder, lens = copy
+    with gsmap.map.open(folder / "c.gsmap") as m:
+        (row,) = m.localize(folder / "changed.jpg", intrinsics=lens, changes=True, pictures=folder / "drawn").results
+        assert row.status == "placed", row.reason
+        assert row.added is None
+        best = row.changes[0]
+        x0, y0, x1, y1 = best.box_px
+        assert x0 < 300 < x1
+        assert y0 < 200 < y1
+        assert best.scene_name == "room"
+        assert np.isfinite(best.position).all()
+        with Image.open(row.picture) as picture:
+            assert picture.format == "PNG"
+        assert m.photo_rows() == []
+        with pytest.raises(ConfigError, match="--changes"):
+            m.localize(folder / "changed.jpg", pictures=folder / "drawn")
+        with pytest.raises(ConfigError, match="--add"):
+            m.localize(folder / "changed.jpg", captured_at="2026-01-01")
+    with pytest.raises(SystemExit) as ended:
+        run(["-q", "localize", str(folder / "c.gsmap"), str(folder / "changed.jpg"), "--intrinsics", lens, "--changes"])
+    assert not ended.value.code
+    assert "changed.jpg differs" in capsys.readouterr().out
+
+
+def test_a_photo_is_kept_once_and_follows_its_scene(copy) -> None:
+    folder, lens = copy
+    with gsmap.map.open(folder / "c.gsmap") as m:
+        (row,) = m.localize(folder / "changed.jpg", intrinsics=lens, add=True).results
+        assert row.added is True
+        assert row.changes is None
+        report = m.localize(folder / "changed.jpg", intrinsics=lens, add=True)
+        assert report.results[0].added is False
+        assert any("kept already" in note for note in report.notes)
+        (kept,) = m.photo_rows()
+        assert kept.captured_at == "2026-05-04T10:00:00+00:00"
+        assert (kept.file, kept.scene_name, kept.size_px) == ("changed.jpg", "room", (480, 360))
+        assert np.allclose(kept.T_map_camera, row.T_map_camera, atol=1e-9)
+        assert np.allclose(kept.covariance, row.covariance, rtol=1e-6)
+        assert m.store.photos.jpeg(1).startswith(b"\xff\xd8\xff")
+        # The map is turned and grows: the photo goes along.
+        S = Sim3(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, 0, 0]), 2.0)
+        graph = m.pose_graph()
+        from dataclasses import replace
+
+        poses = {k: replace(pose, S_map_scene=S @ pose.S_map_scene) for k, pose in graph.poses.items()}
+        m.store.revisions.save(replace(graph, poses=poses))
+        (moved,) = m.photo_rows()
+        assert np.allclose(moved.T_map_camera[:3, 3], S.apply(row.T_map_camera[:3, 3]))
+        assert np.allclose(moved.T_map_camera[:3, :3], S.rotation @ row.T_map_camera[:3, :3])
+        with pytest.raises(NotFoundError):
+            m.remove_photo("none.jpg")
+        assert m.remove_photo("p1").file == "changed.jpg"
+        assert m.photo_rows() == []
+
+
+def test_a_map_that_is_read_only_keeps_none(copy) -> None:
+    folder, lens = copy
+    with gsmap.map.Map(Store.open(folder / "c.gsmap", "r")) as m, pytest.raises(ReadOnlyError, match="not kept"):
+        m.localize(folder / "changed.jpg", intrinsics=lens, add=True)
+
+
+# --- a small map ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small(made):
+    """A small map of a quarter of a megabyte, and what is said of it."""
+    folder, _, _ = made
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        report = m.export_small(folder / "small", 600_000)
+    return folder / "small", report
+
+
+def test_a_small_map_places_the_photo_where_the_whole_one_does(made, small) -> None:
+    folder, lens, whole = made
+    out, told = small
+    assert told.num_bytes == sum(path.stat().st_size for path in out.iterdir()) <= 600_000
+    (kept,) = told.scenes
+    assert 0 < kept.num_features < kept.features_of
+    assert 0 < kept.num_gaussians < kept.gaussians_of
+    (row,) = localize_small(out, [folder / "photo.png"], intrinsics=lens).results
+    assert row.status == "placed", row.reason
+    assert row.scenes == ("room",)
+    assert np.linalg.norm(row.T_map_camera[:3, 3] - whole.results[0].T_map_camera[:3, 3]) < 0.05
+    assert localize_small(out, [folder / "photo.png"], intrinsics=lens, near="room").results[0].status == "placed"
+    with pytest.raises(NotFoundError):
+        localize_small(out, [folder / "photo.png"], near="nowhere")
+
+
+def test_the_command_line_opens_a_small_map_and_says_what_it_is_not_for(made, small, capsys) -> None:
+    folder, lens, _ = made
+    out, _ = small
+    photo = str(folder / "photo.png")
+    with pytest.raises(SystemExit) as ended:
+        run(["-q", "localize", str(out), photo, "--intrinsics", lens, "--json"])
+    assert not ended.value.code
+    assert json.loads(capsys.readouterr().out)["results"][0]["status"] == "placed"
+    for wrong in (
+        ["localize", str(out), photo, "--changes"],
+        ["export", str(folder / "m.gsmap"), "x", "--budget", "5MB"],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            run(["-q", *wrong])
+        assert ended.value.code
+    assert not (folder / "x").exists()
+
+
+def test_too_small_a_budget_is_refused_with_one_that_would_do(made, tmp_path) -> None:
+    folder, _, _ = made
+    with gsmap.map.open(folder / "m.gsmap") as m:
+        with pytest.raises(ConfigError, match=r"too few for 1 scenes.*give about [0-9.]+ MB"):
+            m.export_small(tmp_path / "small", 60_000)
+        assert list(tmp_path.iterdir()) == []
+        (tmp_path / "full").mkdir()
+        (tmp_path / "full" / "mine.txt").touch()
+        with pytest.raises(StoreError, match="exists already"):
+            m.export_small(tmp_path / "full", 600_000)
+
+
+@pytest.mark.parametrize("what", ["bytes", "json", "version", "missing"])
+def test_a_damaged_small_map_is_told(made, small, tmp_path, what) -> None:
+    folder, lens, _ = made
+    out = tmp_path / "small"
+    shutil.copytree(small[0], out)
+    (scene,) = out.glob("*.npz")
+    header = out / "localize.json"
+    if what == "bytes":
+        content = bytearray(scene.read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        scene.write_bytes(bytes(content))
+    elif what == "missing":
+        scene.unlink()
+    elif what == "json":
+        header.write_text(header.read_text().replace('"S_map_scene"', '"S"'))
+    else:
+        header.write_text(header.read_text().replace('"version": 1', '"version": 2'))
+    with pytest.raises(ConfigError if what == "version" else CorruptError, match="again"):
+        localize_small(out, [folder / "photo.png"], intrinsics=lens)
+
+
+def test_features_survive_four_bits_a_number(world) -> None:
+    features = world.placed.features
+    back = packing.unpack_features("scene", packing.pack_features(features))
+    a, b = (x.descriptors.astype(np.float64) for x in (features, back))
+    cosine = (a * b).sum(1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+    assert np.quantile(cosine, 0.05) > 0.98
+    assert np.abs(np.linalg.norm(b, axis=1) - 254).max() < 8
+    assert np.abs(features.points - back.points).max() < 1e-3
+    assert np.array_equal(features.summaries, back.summaries)
+    fewer = packing.fewer(features, 10)
+    assert fewer.num_features == np.minimum(np.diff(features.starts), 10).sum()
+    assert np.array_equal(fewer.points[fewer.starts[1]], features.points[features.starts[1]])
+
+
+# --- what is kept ---------------------------------------------------------------------------------------------------
 
 
 def test_features_come_and_go_with_their_scene(made, world, tmp_path) -> None:

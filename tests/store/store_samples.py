@@ -4,6 +4,7 @@ import numpy as np
 
 from gsmap.methods import RecipeKey
 from gsmap.types import Cameras, Change, ChangeReport, Gaussians, Sim3
+from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
 
 
 def key(stage: str, *inputs: str, **settings: object) -> RecipeKey:
@@ -43,3 +44,26 @@ def save_comparison(store, older, newer, *found, version=1, S=None, S_frame_newe
     made = key("change", older, newer, version=version)
     poses = {"S_newer_older": S or identity, "S_frame_newer": S_frame_newer or identity}
     return store.changes.save(report, made, older=older, newer=newer, **poses)
+
+
+JPEG = b"\xff\xd8\xff\xe0" + bytes(range(200))
+
+
+def kept_photo(scene: str, number: int = 0, **values) -> PhotoSighting:
+    """A photograph of a scene; others by number."""
+    pose = np.eye(4)
+    pose[:3, 3] = [1.0, 2.0, number]
+    told = {"captured_at": "2026-03-01T12:00:00+00:00", "probability": 0.99}
+    things = (ThingInPhoto(np.array([0.5, 0.25, 1.0]), "absent", 0.75),)
+    lens = np.array([500.0, 500, 320, 240])
+    return PhotoSighting(
+        digest=f"{number:064x}",
+        name=f"photo{number}.jpg",
+        scene=scene,
+        T_scene_camera=pose,
+        covariance=np.eye(6) * 1e-4,
+        intrinsics_px=lens,
+        size_px=(640, 480),
+        things=things,
+        **told | values,
+    )

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 from sqlalchemy import func, insert, select, text
-from store_samples import key, made_change, make_cameras, make_gaussians, save_comparison
+from store_samples import JPEG, kept_photo, key, made_change, make_cameras, make_gaussians, save_comparison
 from test_store_nouns import graph_of, layer, registration, tile
 
 from gsmap.errors import StoreError
@@ -43,6 +43,7 @@ def fill(store):
     summaries = np.zeros((len(cameras), 8), np.int8)
     views = SceneFeatures(a.id, cameras, starts, np.zeros((0, 3), np.float32), shown, angles, summaries)
     store.view_features.save(views, key("localize", a.id))
+    store.photos.add(kept_photo(a.id), JPEG)
     with store.transaction(), store.catalog.read() as connection:
         blank = {"name": "m", "kind": "clip", "path": "/m.onnx", "copied": 0, "sha256": "0" * 64, "size_bytes": 2**40}
         connection.execute(insert(schema.models), blank | {"options": {"x": 0.1}, "created_at": now()})

@@ -114,6 +114,7 @@ def test_nothing_of_it_is_left(place):
             "changes": 0,
             "change_reviews": 0,
             "view_features": 0,
+            "photos": 0,
         },
         "set_aside": 0,
         "observations": 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -52,10 +52,15 @@ def parse_near(store: Store, text: str) -> Near:
         ConfigError: neither four numbers with a radius above 0, nor a scene.
         NotFoundError: no such scene.
     """
+    return near_of(text, lambda name: store.scenes.get(name).id)
+
+
+def near_of(text: str, id_of: Callable[[str], str]) -> Near:
+    """The same, where scenes are told by ``id_of`` their names."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        return Near(store.scenes.get(text).id)
+        return Near(id_of(text))
     if len(numbers) != 4 or not np.isfinite(numbers).all() or numbers[3] <= 0:
         raise ConfigError(f"near is a scene, or X,Y,Z,R with a radius above 0, got {text!r}")
     return Near(None, (numbers[0], numbers[1], numbers[2]), numbers[3])
@@ -74,7 +79,7 @@ class Localizer:
     """
 
     def __init__(self, store: Store, settings: Settings, progress: StageProgress) -> None:
-        self.store, self.params = store, settings.localize
+        self.store, self.settings, self.params = store, settings, settings.localize
         poses = store.revisions.poses()
         self.scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in poses}
         if not self.scenes:
@@ -99,6 +104,7 @@ class Localizer:
             for scene in self.scenes
         }
         self._used: list[str] = []
+        self._eyes: dict[str, localizing.Eyes] = {}
         self.index = self._index()
         specs = models.specs(store)
         method = family("extractor").get(self.params.extractor)
@@ -136,6 +142,14 @@ class Localizer:
         self._used = [one for one in self._used if one != scene] + [scene]
         while len(self._used) > _KEPT:
             self.placed[self._used.pop(0)].drop()
+
+    def eyes(self, scene: str) -> localizing.Eyes:
+        """What a scene's own cameras saw, for those that photos are compared with."""
+        if scene not in self._eyes:
+            cameras = self.store.scenes.cameras(scene)
+            own = None if cameras is None or cameras.synthesised else cameras
+            self._eyes[scene] = localizing.open_eyes(self.placed[scene], own, self.params.differences)
+        return self._eyes[scene]
 
     def localize(self, photo: Photo, near: Near | None = None) -> Placement:
         """Find one photograph."""

@@ -11,11 +11,11 @@ Ids and names go together under the same keys everywhere: ``scene`` and ``scene_
 from gsmap.types.rows.backups import BackupReport, CloneReport, RestoreReport, SnapshotRow
 from gsmap.types.rows.base import SCHEMA, Row, Table
 from gsmap.types.rows.changes import ChangeDetail, ChangeRow, ChangesReport, ComparisonRow
-from gsmap.types.rows.exports import ExportReport, TileRow
+from gsmap.types.rows.exports import ExportReport, SmallMapReport, SmallSceneRow, TileRow
 from gsmap.types.rows.find import FindHit, FindReport
 from gsmap.types.rows.leases import AtWorkRow
 from gsmap.types.rows.life import ThinReport, ThinRow
-from gsmap.types.rows.localize import LocalizeReport, LocalizeRow
+from gsmap.types.rows.localize import LocalizeReport, LocalizeRow, PhotoChangeRow, PhotoRow
 from gsmap.types.rows.maps import (
     CheckReport,
     ConvertReport,
@@ -90,6 +90,8 @@ __all__ = [
     "LayerRow",
     "LocalizeReport",
     "LocalizeRow",
+    "PhotoChangeRow",
+    "PhotoRow",
     "MapStatus",
     "MeasureReport",
     "MergeReport",
@@ -127,6 +129,8 @@ __all__ = [
     "ThinReport",
     "ThinRow",
     "TieRow",
+    "SmallMapReport",
+    "SmallSceneRow",
     "TileRow",
     "TodoRow",
     "TrustReport",

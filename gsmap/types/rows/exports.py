@@ -54,6 +54,60 @@ class TileRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class SmallSceneRow(Row):
+    """What a small map keeps of a scene.
+
+    Args:
+        scene: id.
+        scene_name: name.
+        num_views: views of it that photographs are found by.
+        num_features: features of these that are kept.
+        features_of: of so many.
+        num_gaussians: Gaussians that are kept.
+        gaussians_of: of so many.
+        num_bytes: of its file.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "scene_name": "scene",
+        "num_views": "views",
+        "num_features": "features",
+        "features_of": "of",
+        "num_gaussians": "Gaussians",
+        "gaussians_of": "of",
+        "num_bytes": "bytes",
+    }
+
+    scene: str
+    scene_name: str
+    num_views: int
+    num_features: int
+    features_of: int
+    num_gaussians: int
+    gaussians_of: int
+    num_bytes: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SmallMapReport(Row):
+    """A small map, for localisation alone.
+
+    Args:
+        out: its folder.
+        scenes: what it keeps of each.
+        num_bytes: of all its files.
+        budget_bytes: that were allowed.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {"scenes": "scenes", "num_bytes": "bytes"}
+
+    out: str
+    scenes: tuple[SmallSceneRow, ...]
+    num_bytes: int
+    budget_bytes: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ExportReport(Row):
     """What an export did.
 

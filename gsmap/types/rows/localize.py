@@ -13,6 +13,42 @@ from gsmap.types.sim3 import Sim3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class PhotoChangeRow(Row):
+    """A part of a placed photo that shows something else than the map does there.
+
+    Args:
+        kind: as far as one photo can tell: ``appeared`` (something stands there that the map has not), ``disappeared``
+            (what the map has there is gone), ``recoloured`` or ``replaced``.
+        box_px: ``x0 y0 x1 y1`` around it, in pixels of the upright photo.
+        share: of the picture.
+        strength: its mean difference in units of what light and noise explain there; above 1.
+        position: the middle of what the map has there; frame and unit of the photo's component.
+        object: id of the nearest thing of the map there (`gsmap graph`); null where none was told apart.
+        scene: id of the capture that the photo was compared with there.
+        scene_name: its name.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "kind": "what",
+        "box_px": "box (px)",
+        "share": "of the picture",
+        "strength": "strength",
+        "position": "at",
+        "object": "object",
+        "scene_name": "compared with",
+    }
+
+    kind: str
+    box_px: np.ndarray
+    share: float
+    strength: float
+    position: np.ndarray
+    object: str | None
+    scene: str
+    scene_name: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LocalizeRow(Row):
     """One photograph, frame of a clip, or scan.
 
@@ -33,6 +69,10 @@ class LocalizeRow(Row):
         evidence: numbers behind it, by name.
         num_gaussians: of the supporting scenes, that the photo shows.
         seconds: it took, of the wall clock.
+        changes: where a placed photo shows something else than the map, the clearest first; null where not asked.
+        compared: share of the picture that could be compared for it; null where it was not asked.
+        picture: file with these parts drawn; null where none was asked for.
+        added: whether the map keeps the photo from now on; false where it did already; null where it was not asked.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
@@ -59,6 +99,10 @@ class LocalizeRow(Row):
     evidence: Mapping[str, float] = field(default_factory=dict)
     num_gaussians: int = 0
     seconds: float = 0.0
+    changes: tuple[PhotoChangeRow, ...] | None = None
+    compared: float | None = None
+    picture: str | None = None
+    added: bool | None = None
 
     @property
     def position(self) -> str:
@@ -75,6 +119,64 @@ class LocalizeRow(Row):
             return "-"
         turn, shift = (np.sqrt(np.linalg.eigvalsh(self.covariance[p, p])[-1]) for p in (slice(3), slice(3, 6)))
         return f"{np.degrees(turn):.2f} deg {shift:.3f}"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhotoRow(Row):
+    """A photograph that the map keeps, where it stands by the newest poses.
+
+    Args:
+        id: ``p`` and a number.
+        file: its name.
+        digest: SHA-256 of the file; of a frame of a clip, of its pixels.
+        captured_at: when it was taken, ISO 8601; null where nothing says it.
+        component: whose frame its pose is in; null where the scene that supports it has no pose now.
+        T_map_camera: (4, 4) camera-to-map (OpenCV axes), frame and unit of the component; null as above.
+        covariance: (6, 6) over [rot_rad (3), trans (3)] on the camera's side, in the map's unit, of its place in the
+            scene; null as above.
+        intrinsics_px: (4,) ``fx fy cx cy`` of the photo itself.
+        size_px: its width and height.
+        probability: that its pose is right, when it was added.
+        scene: id of the capture that it was placed by, and moves with.
+        scene_name: its name.
+        num_seen: objects that it shows.
+        num_absent: objects that it shows to be gone.
+        added_at: when it was added.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "id": "photo",
+        "file": "file",
+        "captured_at": "captured",
+        "component": "component",
+        "position": "at",
+        "scene_name": "scene",
+        "num_seen": "shows",
+        "num_absent": "shows to be gone",
+    }
+
+    id: str
+    file: str
+    digest: str
+    captured_at: str | None
+    component: int | None
+    T_map_camera: np.ndarray | None
+    covariance: np.ndarray | None
+    intrinsics_px: np.ndarray
+    size_px: tuple[int, int]
+    probability: float
+    scene: str
+    scene_name: str
+    num_seen: int
+    num_absent: int
+    added_at: str
+
+    @property
+    def position(self) -> str:
+        """Where the camera stood, map unit."""
+        if self.T_map_camera is None:
+            return "-"
+        return " ".join(f"{value:.3f}" for value in self.T_map_camera[:3, 3])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

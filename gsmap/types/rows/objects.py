@@ -95,8 +95,8 @@ class SightingRow(Row):
 
     Args:
         object: id of it.
-        scene: id of the capture.
-        scene_name: of it.
+        scene: id of the capture; of a photograph that the map keeps, its digest.
+        scene_name: of it; of a photograph, its file.
         captured_at: when it was captured, ISO 8601; null where nobody knows.
         state: ``seen``; ``absent`` (the capture looked at or through its place, and it is not there); ``unseen`` (the
             capture did not look there, which says nothing).

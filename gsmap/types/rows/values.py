@@ -59,6 +59,7 @@ class MergeReport(Row):
         num_facts: names, dates, notes and tags.
         num_priors: priors.
         num_observations: observations of the world.
+        num_photos: photographs that are kept.
         num_models: models.
         num_comparisons: pairs that were looked at for changes.
         num_change_reviews: reviews of changes.
@@ -90,6 +91,7 @@ class MergeReport(Row):
     num_facts: int
     num_priors: int
     num_observations: int
+    num_photos: int
     num_models: int
     num_comparisons: int
     num_change_reviews: int

@@ -1,0 +1,247 @@
+"""Photographs that a map keeps: what each says of the map's things, where they stand by the newest poses, as rows."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from gsmap.geometry.projection import in_image, project
+from gsmap.map.dates import parsed
+from gsmap.map.placed_photos import placed_photo
+from gsmap.store import Store
+from gsmap.store.photos import MAX_BYTES, StoredPhoto
+from gsmap.types import MapObject, Scene, SceneGraph, Sighting, Sim3
+from gsmap.types.localization import Photo
+from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
+from gsmap.types.rows.localize import LocalizeRow, PhotoRow
+
+if TYPE_CHECKING:
+    from gsmap.map.photo_changes import Told
+
+_SIDE_PX = 640  # of the picture that is kept: to be shown
+_ON_M = 0.12  # a surface so near to a thing's sample is the thing's
+_FEWEST, _LEAST = 8, 0.1  # samples, and share of them, that must be in sight to say anything of a thing
+_SEEN, _GONE = 0.6, 0.5  # share of what is in sight that agrees, or lies in a region that differs
+_SAME_PLACE_M = 0.15  # a thing that was spoken of stands so near to an object's box
+
+
+def sighting_of(
+    store: Store, row: LocalizeRow, photo: Photo, things: Sequence[ThingInPhoto], captured_at: str | None
+) -> PhotoSighting | None:
+    """What is kept of a placed photo; None where the scene that supports it is gone.
+
+    Args:
+        things: what it says, places in the map's frame.
+    """
+    poses, ids = store.revisions.poses(), {scene.name: scene.id for scene in store.scenes.list()}
+    placed = placed_photo(row, photo.size_px, poses, ids)
+    if placed is None:
+        return None
+    S_scene_map = poses[placed.scene].S_map_scene.inverse()
+    width, height = placed.size_px
+    return PhotoSighting(
+        digest=digest_of(row.file, photo),
+        name=os.path.basename(row.file) or "photo",
+        captured_at=captured_at,
+        scene=placed.scene,
+        T_scene_camera=placed.T_scene_camera,
+        covariance=placed.covariance,
+        intrinsics_px=placed.intrinsics_px,
+        size_px=(int(width), int(height)),
+        probability=row.probability,
+        things=tuple(replace(one, position=S_scene_map.apply(one.position)) for one in things),
+    )
+
+
+def digest_of(file: str, photo: Photo) -> str:
+    """SHA-256 of a photo's file; of a frame of a clip, of its pixels."""
+    made = hashlib.sha256()
+    if os.path.isfile(file):
+        with open(file, "rb") as stream:
+            for part in iter(partial(stream.read, 1 << 20), b""):
+                made.update(part)
+    else:
+        made.update(f"{photo.rgb.shape}".encode() + photo.rgb.tobytes())
+    return made.hexdigest()
+
+
+def small_jpeg(photo: Photo) -> bytes:
+    """The photo as it is kept to be shown."""
+    image = Image.fromarray(photo.rgb)
+    image.thumbnail((_SIDE_PX, _SIDE_PX))
+    for quality in (82, 60, 30):
+        content = BytesIO()
+        image.save(content, "JPEG", quality=quality)
+        if content.tell() <= MAX_BYTES:
+            break
+    return content.getvalue()
+
+
+def things_in(
+    told: Told,
+    row: LocalizeRow,
+    unit: float,
+    objects: Sequence[MapObject],
+    graph_of: Callable[[str], SceneGraph | None],
+    poses: Mapping[str, Sim3],
+) -> list[ThingInPhoto]:
+    """What a placed photo says of the objects of its component: those it shows, and those it shows to be gone.
+
+    An object is in sight where the map, seen from the photo, shows its surface: where something the map has stands
+    before it nothing is said, and neither where something new does.
+
+    Args:
+        unit: metres per unit of the map.
+        poses: ``S_map_scene`` by scene id.
+    """
+    assert row.T_map_camera is not None
+    assert row.intrinsics_px is not None
+    height, width = told.found.compared.shape
+    hidden = np.zeros((height, width), bool)
+    gone = np.zeros((height, width), bool)
+    for region in told.found.regions:
+        (hidden if region.kind in ("appeared", "recoloured") else gone)[region.mask] = True
+    T_camera_map = np.linalg.inv(row.T_map_camera)
+    lens = row.intrinsics_px * told.found.scale
+    out = []
+    for thing in objects:
+        points = _points(thing, graph_of, poses) if thing.component == row.component else None
+        if points is None:
+            continue
+        pixels, depth = project(points, T_camera_map, lens)
+        rows = np.flatnonzero(in_image(pixels, depth, np.array([width, height])))
+        column, line = pixels[rows].astype(np.int64).T
+        surface = told.found.points[line, column]
+        on = np.linalg.norm(surface - points[rows] * unit, axis=1) < _ON_M  # NaN where nothing was compared: not on
+        column, line = column[on], line[on]
+        share = len(column) / len(points)
+        if len(column) < _FEWEST or share < _LEAST:
+            continue
+        if gone[line, column].mean() >= _GONE:
+            out.append(ThingInPhoto(thing.position, "absent", share))
+        elif (told.found.agrees & ~hidden)[line, column].mean() >= _SEEN:
+            out.append(ThingInPhoto(thing.position, "seen", share))
+    return out
+
+
+def _points(
+    thing: MapObject, graph_of: Callable[[str], SceneGraph | None], poses: Mapping[str, Sim3]
+) -> np.ndarray | None:
+    """(K, 3) samples of an object's surface where it was last a thing of a capture, map frame."""
+    for sighting in reversed(thing.sightings):
+        if sighting.state != "seen" or sighting.thing < 0:
+            continue
+        graph = graph_of(sighting.scene)
+        if graph is None or graph.things is None or sighting.scene not in poses:
+            return None
+        mine = np.repeat(np.arange(len(graph.things)), graph.things.sample_counts) == sighting.thing
+        return poses[sighting.scene].apply(graph.things.samples[mine])
+    return None
+
+
+def with_photos(
+    objects: Sequence[MapObject],
+    kept: Sequence[StoredPhoto],
+    scenes: Mapping[str, Scene],
+    poses: Mapping[str, Sim3],
+    metres: Mapping[int, float],
+    components: Mapping[str, int],
+) -> list[MapObject]:
+    """Objects with what kept photographs say of them, among the captures in the order of dates.
+
+    What a photo said of a thing holds for the object that stands or stood at that place.
+
+    Args:
+        poses: ``S_map_scene`` by scene id. components: the same of components.
+        metres: per unit, by component.
+    """
+    said: dict[int, dict[str, Sighting]] = {}
+    for photo in kept:
+        one = photo.sighting
+        if one.scene not in poses:
+            continue
+        component = components[one.scene]
+        for thing in one.things:
+            at = poses[one.scene].apply(thing.position)
+            number = _at(objects, component, at, _SAME_PLACE_M / metres[component])
+            if number is not None:
+                sighting = Sighting(one.digest, thing.state, -1, None, thing.share)
+                said.setdefault(number, {}).setdefault(one.digest, sighting)
+    whens = {scene.id: _when(scene.captured_at, scene.ingested_at) for scene in scenes.values()}
+    whens |= {photo.sighting.digest: _when(photo.sighting.captured_at, photo.created_at) for photo in kept}
+    out = list(objects)
+    for number, sightings in said.items():
+        everything = [*objects[number].sightings, *sightings.values()]
+        ordered = sorted(everything, key=lambda sighting: whens[sighting.scene])
+        out[number] = replace(objects[number], sightings=tuple(ordered))
+    return out
+
+
+def _at(objects: Sequence[MapObject], component: int, at: np.ndarray, near: float) -> int | None:
+    """The object that stands or stood at a place: of several the one whose box's middle is nearest."""
+    best, far = None, np.inf
+    for number, thing in enumerate(objects):
+        if thing.component != component:
+            continue
+        for sighting in thing.sightings:
+            if sighting.box is None or not ((at >= sighting.box[0] - near) & (at <= sighting.box[1] + near)).all():
+                continue
+            distance = float(np.linalg.norm(at - sighting.box.mean(0)))
+            if distance < far:
+                best, far = number, distance
+    return best
+
+
+def _when(captured_at: str | None, came_at: str | None) -> tuple[bool, float, str]:
+    """Dated ones by their date; then the others, as they came."""
+    if captured_at is None:
+        return True, 0.0, came_at or ""
+    return False, parsed(captured_at).timestamp(), came_at or ""
+
+
+def photo_rows(store: Store) -> list[PhotoRow]:
+    """The photographs that a map keeps, oldest first, each where it stands by the newest poses.
+
+    One whose scene has no pose now has neither component nor pose.
+    """
+    poses, names = store.revisions.poses(), {scene.id: scene.name for scene in store.scenes.list()}
+    rows = []
+    for photo in store.photos.list():
+        one = photo.sighting
+        placed = poses.get(one.scene)
+        pose, known = None, None
+        if placed is not None:
+            S = placed.S_map_scene
+            pose = np.eye(4)
+            pose[:3, :3] = S.rotation @ one.T_scene_camera[:3, :3]
+            pose[:3, 3] = S.apply(one.T_scene_camera[:3, 3])
+            unit = np.r_[np.ones(3), np.full(3, S.scale)]
+            known = one.covariance * np.outer(unit, unit)
+        rows.append(
+            PhotoRow(
+                id=f"p{photo.number}",
+                file=one.name,
+                digest=one.digest,
+                captured_at=one.captured_at,
+                component=None if placed is None else placed.component,
+                T_map_camera=pose,
+                covariance=known,
+                intrinsics_px=one.intrinsics_px,
+                size_px=one.size_px,
+                probability=one.probability,
+                scene=one.scene,
+                scene_name=names[one.scene],
+                num_seen=sum(thing.state == "seen" for thing in one.things),
+                num_absent=sum(thing.state == "absent" for thing in one.things),
+                added_at=photo.created_at,
+            )
+        )
+    return rows

@@ -1,0 +1,394 @@
+"""A small map, for localisation alone: a folder of ``localize.json`` and one file for each scene; it is only read.
+
+What is in it: of every scene that has a place its pose, metre, name and date, features of its views, and its Gaussians
+merged to fewer, both rounded. It is no map: nothing can be added to it, and no other verb opens it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.durable import open_file, sync_file, sync_folder
+from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, NotFoundError, StoreError
+from gsmap.export.levels import Params as LevelParams
+from gsmap.export.levels import make_level
+from gsmap.geometry.metres import in_metres
+from gsmap.geometry.morton import morton_order
+from gsmap.localize import PlacedFeatures, ViewIndex, packing
+from gsmap.map.settings import Settings, settings_of
+from gsmap.map.stages.localize import Localizer, Near
+from gsmap.methods import family
+from gsmap.store import Store, compact, staging
+from gsmap.types import Cameras, Gaussians, Sim3
+from gsmap.types.localization import SceneFeatures
+from gsmap.types.progress import StageProgress
+from gsmap.types.rows.exports import SmallMapReport, SmallSceneRow
+
+FILE_NAME = "localize.json"
+_FORMAT, _VERSION = "gsmap small map", 1
+_MAX_JSON, _MAX_SCENE = 1 << 26, 1 << 31
+_HEADER_BYTES = 1500  # of a scene in localize.json, about
+_ROUNDS = 3
+_GAUSSIAN_BYTES = 14.5  # of one, packed
+_DEVIATION_PX = 2.0  # of merged Gaussians in the pictures that they are fitted to
+_FEATURES = ("starts", "box", "points", "range", "descriptors", "angles", "poses", "intrinsics", "sizes", "summaries")
+
+
+@dataclass(frozen=True, eq=False)
+class SmallScene:
+    """What a small map knows of a scene without reading its arrays.
+
+    Args:
+        id, name, captured_at: as in the map.
+        component: whose frame ``S_map_scene`` is in.
+        covariance: (7, 7) of that pose, or None.
+        bounds: (2, 3) of its Gaussians, scene frame.
+        sha256: of its file.
+    """
+
+    id: str
+    name: str
+    captured_at: str | None
+    component: int
+    S_map_scene: Sim3
+    covariance: np.ndarray | None
+    bounds: np.ndarray
+    sha256: str
+
+
+# --- made ------------------------------------------------------------------------------------------------------------
+
+
+def export_small(
+    store: Store, out: Path, budget_bytes: int, settings: Settings, progress: StageProgress
+) -> SmallMapReport:
+    """Write a small map; it appears whole or not at all.
+
+    Args:
+        budget_bytes: of all its files together.
+
+    Raises:
+        StoreError: the folder is not empty.
+        ConfigError: with so few bytes hardly a photograph would be found; how many it takes is said.
+        NotFoundError: the map has no poses yet.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StoreError(f"{out} exists already: choose another name")
+    if settings.localize.extractor != "sift":
+        raise ConfigError(
+            "a small map holds no model: export it with the built-in features (--set localize.extractor=sift)"
+        )
+    localizer = Localizer(store, settings, progress)
+    params = settings.localize.small
+    scenes = sorted(localizer.placed)
+    weights: dict[str, np.ndarray] = {}
+    own: dict[str, Cameras | None] = {}
+    for number, scene in enumerate(scenes):
+        progress("export", 0.5 * number / len(scenes), f"what of {localizer.scenes[scene].name} shows")
+        placed = localizer.placed[scene]
+        held = store.scenes.cameras(scene)
+        own[scene] = None if held is None or held.synthesised else held
+        weights[scene] = np.where(_gone(store, scene), 0, packing.weights(placed, own[scene], params)).astype(
+            np.float32
+        )
+    shown = {scene: int((weights[scene] >= params.min_weight).sum()) for scene in scenes}
+    share = {scene: shown[scene] / max(sum(shown.values()), 1) for scene in scenes}
+    free = budget_bytes - _HEADER_BYTES * len(scenes) - 500
+    factor = 1.0
+    files: dict[str, bytes] = {}
+    rows: list[SmallSceneRow] = []
+    total = 0
+    for _ in range(_ROUNDS):
+        files, rows = {}, []
+        for number, scene in enumerate(scenes):
+            progress("export", 0.5 + 0.4 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
+            content, row = _packed(localizer, scene, weights[scene], own[scene], factor * free * share[scene], params)
+            files[scene] = content
+            rows.append(row)
+        total = sum(map(len, files.values())) + _HEADER_BYTES * len(scenes) + 500
+        if total <= budget_bytes:
+            break
+        factor *= 0.97 * free / max(total - (budget_bytes - free), 1)
+    _require_enough(rows, shown, params, budget_bytes, total)
+    header = _header(store, localizer, files, settings)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with staging.beside(out.absolute()) as staged:
+        for name, content in (*((f"{scene}.npz", files[scene]) for scene in scenes), (FILE_NAME, header)):
+            (staged / name).write_bytes(content)
+            sync_file(staged / name)
+        if out.exists():
+            out.rmdir()
+        os.rename(staged, out)
+        sync_folder(out.absolute().parent)
+    num_bytes = sum(map(len, files.values())) + len(header)
+    progress("export", 1.0, f"{num_bytes / 1e6:.2f} MB")
+    return SmallMapReport(out=os.fspath(out), scenes=tuple(rows), num_bytes=num_bytes, budget_bytes=budget_bytes)
+
+
+def _gone(store: Store, scene: str) -> np.ndarray | bool:
+    """Which Gaussians of a scene are of things that changes say are gone since; none where nobody looked."""
+    out: np.ndarray | bool = False
+    for comparison in store.changes.current():
+        if comparison.older != scene or not comparison.changes:
+            continue
+        found = store.changes.load(comparison.number).changes
+        for change, kept in zip(found, comparison.changes, strict=True):
+            if kept.status != "rejected" and kept.kind in ("disappeared", "moved", "replaced"):
+                if out is False:
+                    out = np.zeros(store.scenes.get(scene).num_gaussians, bool)
+                rows = change.before[change.before < len(out)]  # type: ignore[arg-type]
+                out[rows] = True  # type: ignore[index]
+    return out
+
+
+def _packed(
+    localizer: Localizer,
+    scene: str,
+    weight: np.ndarray,
+    cameras: Cameras | None,
+    num_bytes: float,
+    params: packing.Params,
+) -> tuple[bytes, SmallSceneRow]:
+    """A scene's file of about so many bytes."""
+    placed = localizer.placed[scene]
+    features, gaussians = placed.features, placed.gaussians
+    per_feature = features.descriptors.shape[1] / 2 + 7
+    most = int(params.features_share * num_bytes / per_feature / max(features.num_views, 1))
+    kept = packing.fewer(features, max(most, 1))
+    arrays = packing.pack_features(kept)
+    head = _npz(arrays)
+    count = max(int((num_bytes - len(head)) / _GAUSSIAN_BYTES), 1)
+    shown = packing.without_direction(gaussians[np.flatnonzero(weight >= params.min_weight)])
+    told = LevelParams(views=params.refine_views, steps=params.refine_steps, deviation_px=_DEVIATION_PX)
+    merged = make_level(shown, count, cameras, told).gaussians if len(shown) > count else shown
+    chosen = merged[morton_order(merged.means)]
+    content = _npz(arrays | compact.pack(chosen))
+    row = SmallSceneRow(
+        scene=scene,
+        scene_name=localizer.scenes[scene].name,
+        num_views=kept.num_views,
+        num_features=kept.num_features,
+        features_of=features.num_features,
+        num_gaussians=len(chosen),
+        gaussians_of=len(gaussians),
+        num_bytes=len(content),
+    )
+    localizer.placed[scene].drop()
+    return content, row
+
+
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    made = io.BytesIO()
+    np.savez_compressed(made, **arrays)  # type: ignore[arg-type]
+    return made.getvalue()
+
+
+def _require_enough(
+    rows: Sequence[SmallSceneRow], shown: Mapping[str, int], params: packing.Params, budget: int, total: int
+) -> None:
+    for row in rows:
+        per_view = min(row.num_features, row.features_of) / max(row.num_views, 1)
+        whole = row.features_of / max(row.num_views, 1)
+        part = row.num_gaussians / max(shown[row.scene], 1)
+        lacks = max(
+            min(params.min_features, whole) / max(per_view, 1e-9),
+            params.min_gaussians / max(part, 1e-9),
+            total / budget,
+        )
+        if lacks > 1:
+            need = budget * lacks * 1.1
+            raise ConfigError(
+                f"{budget / 1e6:.2f} MB are too few for {len(rows)} scenes: {row.scene_name} would keep "
+                f"{per_view:.0f} features a view and {part:.0%} of the Gaussians that show, by which hardly a "
+                f"photograph would be found; give about {need / 1e6:.1f} MB"
+            )
+
+
+def _header(store: Store, localizer: Localizer, files: Mapping[str, bytes], settings: Settings) -> bytes:
+    import hashlib
+
+    poses = store.revisions.poses()
+    scenes = []
+    for scene, content in files.items():
+        pose, about = poses[scene], localizer.scenes[scene]
+        scenes.append(
+            {
+                "id": scene,
+                "name": about.name,
+                "captured_at": about.captured_at,
+                "component": pose.component,
+                "S_map_scene": pose.S_map_scene.matrix().tolist(),
+                "covariance": None if pose.covariance is None else np.asarray(pose.covariance).tolist(),
+                "bounds": np.asarray(about.bounds).tolist(),
+                "sha256": hashlib.sha256(content).hexdigest(),
+            }
+        )
+    told = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "metres_per_unit": {str(component): value for component, value in localizer.metres.items()},
+        "world": [
+            {"component": tie.component, "S_world_map": tie.S_world_map.matrix().tolist(), "crs": tie.frame.crs}
+            for tie in store.revisions.world()
+            if tie.S_world_map is not None and tie.frame is not None
+        ],
+        "scenes": scenes,
+    }
+    return json.dumps(told).encode()
+
+
+# --- read ------------------------------------------------------------------------------------------------------------
+
+
+def is_small(path: str | os.PathLike[str]) -> bool:
+    """Whether a small map lies there."""
+    return (Path(path) / FILE_NAME).is_file()
+
+
+class SmallLocalizer(Localizer):
+    """The scenes of a small map, ready for photographs; see `Localizer`.
+
+    Args:
+        folder: of the small map.
+        settings: how photographs are looked for; of what is kept nothing depends on them.
+
+    Raises:
+        CorruptError: it was not written by gsmap, or bytes differ.
+        ConfigError: it was written by a newer one; or another extractor is asked for.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], settings: Settings | None = None) -> None:
+        self.settings = settings or settings_of({})
+        self.params = self.settings.localize
+        self.folder = Path(folder)
+        if self.params.extractor != "sift":
+            raise ConfigError("a small map holds features of the built-in extractor: localize.extractor must be sift")
+        told = _read_header(self.folder / FILE_NAME)
+        try:
+            self.metres = {int(k): _positive(v) for k, v in told["metres_per_unit"].items()}
+            small = [_scene(row) for row in told["scenes"]]
+        except (GsmapError, *MALFORMED) as error:
+            raise _corrupt(self.folder, error) from error
+        self.small = {one.id: one for one in small}
+        self.scenes = self.small  # type: ignore[assignment]
+        self.placed = {}
+        summaries = []
+        for one in small:
+            self.placed[one.id] = PlacedFeatures(
+                one.id,
+                in_metres(one.S_map_scene, self.metres.get(one.component, 1.0)),
+                one.component,
+                one.covariance,
+                partial(self._small_gaussians, one.id),
+                partial(self._small_features, one.id),
+            )
+            summaries.append(self._arrays(one.id, ("summaries",))["summaries"])
+        self._used, self._eyes = [], {}
+        counts = [len(s) for s in summaries]
+        self.index = ViewIndex(
+            tuple(self.placed),
+            np.concatenate(summaries) if summaries else np.zeros((0, 0), np.int8),
+            np.repeat(np.arange(len(counts)), counts),
+            np.concatenate([np.zeros(0, np.int64), *(np.arange(count) for count in counts)]),
+        )
+        method = family("extractor").get(self.params.extractor)
+        self.extractor = method.make({}, self.params.extractors[self.params.extractor])
+
+    def near(self, text: str) -> Near:
+        """``SCENE``, or ``X,Y,Z,R``, see `gsmap.map.stages.localize.parse_near`."""
+        from gsmap.map.stages.localize import near_of
+
+        return near_of(text, self._id_of)
+
+    def _id_of(self, name: str) -> str:
+        found = [one.id for one in self.small.values() if name in (one.name, one.id)]
+        if not found:
+            raise NotFoundError(f"no scene is called {name!r} in {self.folder}")
+        return found[0]
+
+    def _small_gaussians(self, scene: str) -> Gaussians:
+        self._use(scene)
+        arrays = self._arrays(scene, [*compact.shapes(0, 0)])
+        try:
+            count = len(arrays["compact.quats"])
+            wanted = compact.shapes(count, 0)
+            if any(arrays[name].shape != shape for name, shape in wanted.items()):
+                raise ValueError("arrays that do not fit each other")
+            return compact.unpack(arrays, np.arange(count))
+        except MALFORMED as error:
+            raise _corrupt(self.folder / f"{scene}.npz", error) from error
+
+    def _small_features(self, scene: str) -> SceneFeatures:
+        self._use(scene)
+        return packing.unpack_features(scene, self._arrays(scene, _FEATURES))
+
+    def _arrays(self, scene: str, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Arrays of a scene's file, whose bytes are those that were written."""
+        import hashlib
+
+        path = self.folder / f"{scene}.npz"
+        try:
+            with open(open_file(path), "rb") as file:
+                content = file.read(_MAX_SCENE + 1)
+            if len(content) > _MAX_SCENE or hashlib.sha256(content).hexdigest() != self.small[scene].sha256:
+                raise ValueError("its bytes differ from what was written")
+            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+                return {name: stored[name] for name in names}
+        except FileNotFoundError as error:
+            raise CorruptError(f"{path} is missing: export the small map again") from error
+        except (OSError, EOFError, *MALFORMED) as error:
+            raise _corrupt(path, error) from error
+
+
+def _read_header(path: Path) -> dict[str, Any]:
+    try:
+        with open(open_file(path), "rb") as file:
+            told = json.loads(file.read(_MAX_JSON))
+        if told["format"] != _FORMAT or not isinstance(told["version"], int):
+            raise ValueError("it is of another format")
+    except (OSError, *MALFORMED) as error:
+        raise _corrupt(path, error) from error
+    if told["version"] != _VERSION:
+        raise ConfigError(f"{path.parent} was written by another version of gsmap ({told['version']}): export it again")
+    return dict(told)
+
+
+def _scene(row: Mapping[str, Any]) -> SmallScene:
+    known = None if row["covariance"] is None else np.array(row["covariance"], np.float64)
+    bounds = np.array(row["bounds"], np.float64)
+    if bounds.shape != (2, 3) or not np.isfinite(bounds).all():
+        raise ValueError("a box that is none")
+    if known is not None and (known.shape != (7, 7) or not np.isfinite(known).all()):
+        raise ValueError("a covariance that is none")
+    texts = (row["id"], row["name"], row["sha256"])
+    if not all(isinstance(text, str) for text in texts) or not row["id"].isalnum():
+        raise ValueError("names that are none")
+    return SmallScene(
+        row["id"],
+        row["name"],
+        row["captured_at"] if isinstance(row["captured_at"], str) else None,
+        int(row["component"]),
+        Sim3.from_matrix(np.array(row["S_map_scene"], np.float64)),
+        known,
+        bounds,
+        row["sha256"],
+    )
+
+
+def _positive(value: Any) -> float:
+    if not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{value} metres per unit")
+    return float(value)
+
+
+def _corrupt(path: Path, error: Exception) -> CorruptError:
+    return CorruptError(f"{path} is no small map that gsmap wrote, or damaged ({error}): export it again")
