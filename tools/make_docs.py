@@ -74,9 +74,10 @@ def make_pictures(folder: Path) -> None:
 def page_pictures(path: Path) -> None:
     """The page of `gsmap view`: looking, an edge and a change under review, and a phone."""
     sys.path.insert(0, str(ROOT / "tests" / "view"))
-    import gsmap.map
     from hands import Hands
     from headless import Page
+
+    import gsmap.map
 
     def settled(hands: Hands) -> None:
         hands.wait("globalThis.gsmap?.settled && findAll('img').every((e) => e.naturalWidth)", 180)
