@@ -62,7 +62,11 @@ def made_room(seed: int, count: int, sh_degree: int = 1) -> Gaussians:
     scales[np.arange(count), axis] = np.log(0.002)
     sh = rng.normal(0, 0.08, (count, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = sh0
-    made = Gaussians(means, np.tile([1.0, 0, 0, 0], (count, 1)), scales, rng.normal(2.5, 1, count), sh)
+    # Turned about their normals and of many sizes, or they would pack far better than trained ones do.
+    scales += rng.normal(0, 0.5, (count, 3))
+    half, quats = rng.uniform(0, np.pi, count), np.zeros((count, 4))
+    quats[:, 0], quats[np.arange(count), 1 + axis] = np.cos(half), np.sin(half)
+    made = Gaussians(means, quats, scales, rng.normal(2.5, 1, count), sh)
     return made[morton_order(made.means)]
 
 

@@ -25,7 +25,7 @@ from gsmap.view.params import Params
 from gsmap.view.trees import FILE_NAME
 
 JSON, BYTES, JPEG = "application/json", "application/octet-stream", "image/jpeg"
-_RETRY_S = 0.5
+_RETRY_S, _EACH_S, _LONGEST_S = 0.5, 0.1, 10.0  # what has many before it is asked for less often
 _JPEG_QUALITY = 88
 _ID = r"[0-9a-f]{32}"
 _MERGED = re.compile(r"(?:[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}/){0,4}[A-Za-z0-9_-][A-Za-z0-9._-]{0,200}\.(?:json|glb)")
@@ -239,7 +239,8 @@ def _state(of_map: str, of_levels: str) -> str:
 
 
 def _waiting(found: Waiting) -> Answer:
-    said = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": _RETRY_S}
+    retry_s = min(_LONGEST_S, _RETRY_S + _EACH_S * found.waiting)
+    said = {"progress": round(found.progress, 4), "waiting": found.waiting, "retry_s": round(retry_s, 2)}
     return Answer.json(said, HTTPStatus.ACCEPTED)
 
 

@@ -263,7 +263,7 @@ def summary(view: ViewMap, served: Served) -> dict[str, Any]:
         ],
         "counts": {"gaussians": sum(entry.scene.num_gaussians for entry in view.scenes)},
         "graph": "graph.json" if view.has_objects else None,
-        "history": "history.json" if view.has_objects and served.live else None,
+        "history": "history.json" if served.live else None,
     }
 
 

@@ -26,7 +26,7 @@ from gsmap.view.params import Params
 from gsmap.view.tree_cache import TreeCache
 from gsmap.view.trees import Sketch, sketch, write_tree
 
-_SPZ_BYTES = 20  # of a Gaussian of SH degree 0 before it is compressed
+_SPZ_BYTES = 19  # of a Gaussian of SH degree 0 before it is compressed, and grids that are not quite full
 _STEP = 8  # between the sizes of sketches, so that few of them are kept of a scene
 _LEAST = 16
 _FIRST = -1.0  # rank of what everybody waits for: before any tree

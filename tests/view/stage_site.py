@@ -46,6 +46,7 @@ def room(seed: int, count: int = 3000, degree: int = 1) -> Gaussians:
     means[np.arange(count), axis] = (side % 2) * size[axis]
     means -= [size[0] / 2, size[1], size[2] / 2]
     log_scales = rng.uniform(np.log(0.04), np.log(0.09), (count, 3))
+    log_scales[: count // 3] -= np.log(15)  # smaller than a pixel: what is added to every covariance shows
     log_scales[np.arange(count), axis] = np.log(0.004)
     base = np.array([[1.2, -0.6, -0.6], [-0.6, 1.2, -0.6], [-0.6, -0.6, 1.2], [1, 1, -0.8], [1, -0.8, 1], [-0.8, 1, 1]])
     sh = np.zeros((count, (degree + 1) ** 2, 3))

@@ -423,7 +423,7 @@ def test_the_budget_is_kept_and_near_things_are_finest(made):
         seen.show()
         seen.stand(INSIDE)
         assert 1000 < seen.state()["splats"] <= 2600
-        assert psnr(page.picture(), rendered(*FOUR, camera=INSIDE[:1])) > 26
+        assert psnr(page.picture(), rendered(*FOUR, camera=INSIDE[:1])) > 23
         assert page.failures() == []
 
 
@@ -449,6 +449,41 @@ def test_the_overview_is_drawn_before_any_tree(made):
         assert not any(path.endswith(".glb") for path in served.asked)
         page.wait("gsmap.state.frames > 3", 10)
         assert page.picture().std() > 0.05
+
+
+def test_rooms_are_first_seen_from_within(made):
+    """Not their ceilings: from where one of the captures was made, level, towards most of the others."""
+    folder, served = made
+    with opened(folder, served) as page:
+        seen = Seen(page, served)
+        seen.show()
+        page.wait("Math.abs(gsmap.stage.standpoint().position[1] + 1.2) < 1e-3", 10)
+        at = seen.page.value("gsmap.stage.standpoint()")
+        assert np.allclose(at["position"], [-1, -1.2, 0], atol=1e-3) or np.allclose(
+            at["position"], [1, -1.2, 0], atol=1e-3
+        )
+        assert abs(at["target"][1] - at["position"][1]) < 0.05
+        seen.do("fit()")  # from then on, all of it
+        assert seen.page.value("gsmap.stage.standpoint().position[1]") < -5
+
+
+def test_the_overview_stays_until_a_new_one_is_there(made):
+    folder, served = made
+    served.slow_s["later.spz"] = 2.0
+    (folder / "later.spz").write_bytes((folder / "overview.spz").read_bytes())
+    away = cameras(np.array([[7.5, -30.0, -0.1]]), np.array([[7.5, 0.0, 0.0]]))
+    with opened(folder, served, {"errorPx": 1e9}) as page:
+        seen = Seen(page, served)
+        seen.show()
+        plain = seen.stand(away)
+        assert plain.std() > 0.02
+        turned = "map.components[0].overview.uri = 'later.spz'; map.scenes[0].S_map_scene[0][3] = 3"
+        page.value(f"fetch('map.json').then((r) => r.json()).then((map) => {{ {turned}; gsmap.stage.show(map, 0); }})")
+        page.value("new Promise((rest) => setTimeout(rest, 800))")
+        assert psnr(page.picture()[:, 120:], plain[:, 120:]) > 40
+        seen.settle()
+        assert sum("later.spz" in path for path in served.asked) == 1
+        assert page.value("gsmap.errors") == []
 
 
 def test_trees_that_are_still_made_are_asked_for_again(made):

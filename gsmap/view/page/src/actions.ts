@@ -423,7 +423,11 @@ const isStatic = (map: MapSummary) => map.history === null;
 /** Looks every few seconds whether others changed the map, and whether the server is there. */
 export async function watch(every_ms = 4000): Promise<void> {
   for (;;) {
-    await new Promise((rest) => setTimeout(rest, every_ms));
+    // What a scene looks like from afar comes in the seconds after a map was opened for the first time.
+    const isComing = page.state.map?.components.some(
+      (one) => one.component === page.state.component && one.overview?.pending,
+    );
+    await new Promise((rest) => setTimeout(rest, isComing ? every_ms / 8 : every_ms));
     const { map, busy, phase } = page.state;
     if (!map || busy || phase !== "ready" || document.hidden || isStatic(map)) continue;
     try {

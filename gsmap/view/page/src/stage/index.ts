@@ -342,6 +342,7 @@ class View3D implements Stage {
     const eye = apexes[best] as Vector3;
     const distance = Math.max(eye.distanceTo(middle), this.view.controls.minDistance * 5);
     const target = eye.clone().addScaledVector(looks[best] as Vector3, distance);
+    this.hasStood = true;
     this.view.stand({ position: eye.toArray(), target: target.toArray() }, false);
   }
 

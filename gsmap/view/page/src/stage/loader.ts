@@ -73,8 +73,8 @@ export class Loader {
    * @param onChange something is there, or is to be asked for again
    */
   constructor(
-    map: MapSummary,
-    component: number,
+    private readonly map: MapSummary,
+    private readonly component: number,
     private readonly group: Object3D,
     private readonly budget: Budget,
     private readonly onChange: () => void,
@@ -98,31 +98,38 @@ export class Loader {
     this.asWritten = scenes.map((scene) => new Matrix4().set(...(scene.S_map_scene.flat() as Sixteen)));
     this.placed = scenes.map((_, i) => ({ pose: (this.asWritten[i] as Matrix4).clone(), sides: 0 }));
     const next = map.components.find((one) => one.component === component)?.overview;
-    const kept = before?.keepOverview(map, next ?? null) ?? null;
+    const kept = next ? before?.keepOverview(map, component) : null;
     if (kept) {
       kept.tile?.move(this.table, null);
-      this.overview = kept;
       this.bytesHeld += kept.tile?.bytes ?? 0;
-    } else if (next?.scenes.length) {
-      const ids = next.scenes.map((index) => scenes[index]?.id ?? "");
-      this.overview = { tile: null, of: next, ids, written: this.asWritten };
+      this.share(kept);
     }
     before?.dispose();
-    const { of } = this.overview ?? {};
-    of?.scenes.forEach((index, k) => {
-      const scene = scenes[index];
+    if (next?.scenes.length && !(kept && serves(kept.of, next))) {
+      const ids = next.scenes.map((index) => scenes[index]?.id ?? "");
+      const overview = { tile: null, of: next, ids, written: this.asWritten };
+      if (!kept) this.share(overview);
+      this.fetchOverview(overview); // until it is there, the one that was kept is drawn
+    }
+  }
+
+  /** Begins every tree with its scene's share of an overview. */
+  private share(overview: DrawnOverview): void {
+    this.overview = overview;
+    this.shares.clear();
+    overview.of.scenes.forEach((index, k) => {
+      const scene = this.map.scenes[index];
       const tree = this.trees[index];
-      const count = of.counts[k] ?? 0;
+      const count = overview.of.counts[k] ?? 0;
       if (!scene || !tree || !count) return;
       const box = new Box3(new Vector3(...scene.box[0]), new Vector3(...scene.box[1]));
       // How far apart its splats are, on surfaces that fill the box's largest side.
       const spacing = box.getSize(new Vector3()).length() / Math.sqrt(count);
       const finer = tree.root ? [tree.root] : tree.state === "failed" ? [] : null;
       const share = new Tile(tree, box, spacing, null, new Matrix4(), count, finer);
-      if (kept) share.state = "ready";
+      if (overview.tile) share.state = "ready";
       this.shares.set(tree, share);
     });
-    if (this.overview && !kept) this.fetchOverview(this.overview);
   }
 
   get pending(): number {
@@ -276,26 +283,25 @@ export class Loader {
         }));
         const tile = new SplatTile(await unpack(bytes, shares), new Matrix4(), this.table, null);
         if (this.aborter.signal.aborted) return tile.dispose();
+        const before = this.overview?.tile;
+        this.bytesHeld += tile.bytes - (before?.bytes ?? 0);
+        before?.dispose();
         overview.tile = tile;
         this.bytesUploaded += tile.bytes;
-        this.bytesHeld += tile.bytes;
         this.group.add(tile);
-        for (const share of this.shares.values()) share.state = "ready";
+        this.share(overview);
       } catch (error) {
-        this.shares.clear(); // the trees show what they have
+        if (!this.overview?.tile) this.shares.clear(); // the trees show what they have
         throw error;
       }
     });
   }
 
-  /** Hands the overview on where it still serves; where few scenes have come since, the one that is there does. */
-  private keepOverview(map: MapSummary, next: Overview | null): DrawnOverview | null {
+  /** Hands the overview on where its scenes are still in their places. */
+  private keepOverview(map: MapSummary, component: number): DrawnOverview | null {
     const { overview } = this;
-    if (!overview?.tile || !next) return null;
-    const isPlaced = overview.of.scenes.every((index, k) => map.scenes[index]?.id === overview.ids[k]);
-    const total = (of: Overview) => of.counts.reduce((sum, count) => sum + count, 0);
-    const isEnough = next.pending > 0 && total(next) < WORTH_FETCHING * total(overview.of);
-    if (!isPlaced || (next.uri !== overview.of.uri && !isEnough)) return null;
+    if (!overview?.tile || component !== this.component) return null;
+    if (!overview.of.scenes.every((index, k) => map.scenes[index]?.id === overview.ids[k])) return null;
     this.overview = null;
     return overview;
   }
@@ -416,6 +422,12 @@ export class Loader {
     this.overview?.tile?.dispose();
     this.table.dispose();
   }
+}
+
+/** Whether an overview that is there does for a new one: it is the same, or few scenes have come since. */
+function serves(there: Overview, next: Overview): boolean {
+  const total = (of: Overview) => of.counts.reduce((sum, count) => sum + count, 0);
+  return next.uri === there.uri || (next.pending > 0 && total(next) < WORTH_FETCHING * total(there));
 }
 
 /** For tiles that do not say how many splats they have: what the coarsest level of their scene lets expect. */

@@ -26,13 +26,13 @@ export const COLOURS = {
   unused: 0x8a8f98,
   camera: 0x7fb2ff,
   photo: 0xffd166,
-  node: 0xffffff,
-  box: 0xb8c0cc,
+  node: 0xff8a5c,
+  box: 0x97a3b6,
   ellipsoid: 0xc792ea,
   object: 0x5ad1e6,
   relation: 0x3c8ea0,
   correspondence: 0x9be564,
-  clip: 0xffffff,
+  clip: 0x4f9dff,
 };
 export const CHANGE_COLOURS: Record<ChangeEntry["kind"], number> = {
   appeared: 0x2fbf83,
