@@ -164,4 +164,3 @@ export class Page {
 }
 
 export const page = new Page();
-
