@@ -39,13 +39,13 @@ class Params:
         refine_views: ... from so many of the scene's cameras.
     """
 
-    features_share: float = 0.25
+    features_share: float = 0.35
     min_features: int = 40
     min_gaussians: float = 0.15
     pictures: int = 32
     longest_side_px: int = 240
     min_weight: float = 0.01
-    refine_steps: int = 250
+    refine_steps: int = 150
     refine_views: int = 32
 
 
