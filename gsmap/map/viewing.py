@@ -16,6 +16,7 @@ from gsmap.map.changes import change_row, changes_report, named
 from gsmap.map.metres import map_metres
 from gsmap.map.objects import Known, history_report, known_objects, objects_report
 from gsmap.map.one_state import of_one_state
+from gsmap.map.photos import photo_rows
 from gsmap.map.pictures import pair_as_seen, picture_of_change
 from gsmap.map.stages.change import wanted
 from gsmap.map.stages.optimize import pose_basis
@@ -340,7 +341,7 @@ def _note_of(store: Store, change: str) -> str:
 
 
 def _photos(store: Store, placed: PoseGraph | None, living: set[str]) -> list[ViewPhoto]:
-    """Photographs that were localised because somebody saw control points in them; others are not kept."""
+    """Photographs that the map keeps, and those that were localised since somebody saw control points in them."""
     found: dict[tuple[str, str], ImagePoint] = {}
     for one in store.world.survey().images:
         if one.camera_covariance is not None and one.scene in living and placed and one.scene in placed.poses:
@@ -354,6 +355,11 @@ def _photos(store: Store, placed: PoseGraph | None, living: set[str]) -> list[Vi
         T[:3, 3] = pose.S_map_scene.apply(one.T_scene_camera[None, :3, 3])[0]
         width, height = np.maximum(1, np.round(2 * one.intrinsics_px[2:])).astype(int).tolist()
         out.append(ViewPhoto(one.image, pose.component, T, one.intrinsics_px, (width, height)))
+    for row in photo_rows(store):
+        if row.component is not None and row.T_map_camera is not None and row.scene in living:
+            out.append(
+                ViewPhoto(row.file, row.component, row.T_map_camera, row.intrinsics_px, row.size_px, row.captured_at)
+            )
     return out
 
 
