@@ -4,7 +4,7 @@
 
 The commands of docs/start.md (blocks marked ``sh``) are run in a folder, in their order, as a newcomer would; the
 notebook runs on the map that they leave; pictures are of that map, those of the page from a headless Chromium. Then
-Sphinx builds, and any warning is an error. Needs the extra ``docs``.
+Sphinx builds, and any warning is an error. Needs what `tools/setup.sh test` installs.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 #
 #   tools/setup.sh            what running gsmap needs
 #   tools/setup.sh test       what working on it needs: installed editable, so that tests test this checkout as it lies,
-#                             with what tests and linters need
+#                             with what tests, linters and documents need
 #
 # PYTHON=/path/to/python3.12     another interpreter (3.11 to 3.13)
 # GSMAP_VENV=/path/to/venv       another place for the environment
@@ -44,6 +44,10 @@ may_install() { command -v apt-get >/dev/null && { [ "$(id -u)" = 0 ] || command
 if [ -n "$node" ] && may_install; then packages="$packages $node"; elif [ -n "$node" ]; then
     say "no Node.js with npm here: gsmap view will be left out; install them and run this again to have it"
 fi
+# The page's tests are run in a browser; they are skipped, with a reason, where there is none.
+if [ "${1:-}" = test ] && ! command -v chromium >/dev/null && ! command -v google-chrome >/dev/null; then
+    if may_install; then packages="$packages chromium"; else say "no Chromium here: tests of the page will be skipped"; fi
+fi
 if [ -n "$packages" ]; then
     command -v apt-get >/dev/null || die "please install the equivalents of:$packages, then run this again"
     if [ "$(id -u)" = 0 ]; then as_root=""; elif command -v sudo >/dev/null; then as_root=sudo; else
@@ -70,7 +74,7 @@ pip install -q -c constraints.txt torch
 if [ "${1:-}" = test ]; then
     # Without isolation: the module is built by the tools that stay in the environment, again and again.
     pip install -q -c constraints.txt scikit-build-core nanobind cmake ninja
-    pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint]" -e synthetic
+    pip install -q -c constraints.txt --no-build-isolation -e ".[test,lint,docs]" -e synthetic
     # Leave plain path files: the import hooks beside them would stand before PYTHONPATH, and tools/planted_faults.py
     # tests a copy that PYTHONPATH names.
     purelib=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
