@@ -104,7 +104,7 @@ RUNS = {
 }
 SILENT = {
     *("init", "prior", "convert", "models add", "branch", "tag", "remove", "check", "migrate", "view", "report"),
-    *("backup", "restore", "clone"),
+    *("backup", "restore", "clone", "remove --photo"),
 }
 """Verbs whose table mode writes nothing on stdout: they have nothing to show, and say on stderr what they did."""
 
