@@ -24,7 +24,7 @@ from gsmap.geometry.voxels import axis_deviations, merge_groups, optical_depths,
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
 
-VERSION = 2
+VERSION = 3
 """Of what is made: another one makes all trees and sketches anew."""
 
 FILE_NAME = "tileset.json"
@@ -116,10 +116,17 @@ class _Extent:
         weight = np.concatenate([self.weight[bright], self.weight[some] * share])
         return _Extent(self.low[rows], self.high[rows], weight)
 
-    def box(self, outside: float) -> np.ndarray:
-        """(2, 3) around all but a share of the light on every side."""
-        low, high = (robust_box(corners, self.weight, outside) for corners in (self.low, self.high))
+    def core(self) -> np.ndarray:
+        """(2, 3) around all but the strays: a share of the light on every side."""
+        low, high = (robust_box(corners, self.weight, _STRAYS) for corners in (self.low, self.high))
         return np.stack([low[0], high[1]])
+
+    def said(self, content: Gaussians) -> dict[str, float]:
+        """What a tile says of itself: how many Gaussians it draws, so that a viewer knows its cost before it asks for
+        it, and the box of what matters, from which its distance is taken."""
+        low, high = self.core().round(4).tolist()
+        corners = zip(("core_x0", "core_y0", "core_z0", "core_x1", "core_y1", "core_z1"), (*low, *high), strict=True)
+        return {"num_gaussians": len(content), **dict(corners)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +230,8 @@ class _Builder:
             if not len(content):
                 return None
             extent = _Extent.of(content)
-            node = TileNode(extent.box(_STRAYS), 0.0, self._write(content, name), extras=_said(content))
+            box = tiles3d.box_of(content)
+            node = TileNode(box, 0.0, self._write(content, name), extras=extent.said(content))
             return _Made(node, content, extent)
         below = [self.build(child, f"{name}{i}") for i, child in enumerate(cell.children)]
         made = [one for one in below if one is not None]
@@ -235,10 +243,12 @@ class _Builder:
         level, error = _merged(finer, max(least, len(finer) // self.params.coarsening))
         extent = _Extent.joined([one.extent for one in below])
         error += max(one.node.error_m for one in below)
-        box = extent.box(_STRAYS)
+        # Whole, strays too: what is left out of a picture because its box is not in sight must not be missed.
+        boxes = np.stack([tiles3d.box_of(level), *(one.node.box for one in below)])
+        box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level that nothing was merged for must still count as coarser than what it stands for.
         error = max(error, 1e-6 * float(np.linalg.norm(box[1] - box[0])))
-        node = TileNode(box, error, self._write(level, name), tuple(one.node for one in below), _said(level))
+        node = TileNode(box, error, self._write(level, name), tuple(one.node for one in below), extent.said(level))
         return _Made(node, level, extent)
 
     def _write(self, content: Gaussians, name: str) -> str:
@@ -249,11 +259,6 @@ class _Builder:
         uri = f"{CONTENT_FOLDER}/{name}-{digest[:16]}.glb"
         staged.rename(self.folder / uri)
         return uri
-
-
-def _said(content: Gaussians) -> dict[str, float]:
-    """What a tile says of itself, so that a viewer knows its cost before it asks for it."""
-    return {"num_gaussians": len(content)}
 
 
 def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:

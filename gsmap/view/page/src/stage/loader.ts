@@ -126,7 +126,7 @@ export class Loader {
       // How far apart its splats are, on surfaces that fill the box's largest side.
       const spacing = box.getSize(new Vector3()).length() / Math.sqrt(count);
       const finer = tree.root ? [tree.root] : tree.state === "failed" ? [] : null;
-      const share = new Tile(tree, box, spacing, null, new Matrix4(), count, finer);
+      const share = new Tile(tree, box, box, spacing, null, new Matrix4(), count, finer);
       if (overview.tile) share.state = "ready";
       this.shares.set(tree, share);
     });

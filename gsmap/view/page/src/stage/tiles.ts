@@ -35,7 +35,8 @@ export class Tile implements Choice<Tile> {
 
   constructor(
     readonly tree: Tree,
-    readonly box: Box3, // frame of the tree
+    readonly box: Box3, // frame of the tree; around all that it draws
+    readonly core: Box3, // around what matters of that, strays left out: distances are from it
     readonly error: number, // frame of the tree; infinite where it draws nothing
     readonly uri: string | null, // absolute
     readonly matrix: Matrix4, // of the tile in the tree
@@ -51,6 +52,8 @@ export class Tile implements Choice<Tile> {
 }
 /** Splats of a tile that does not say how many it has, until it is there. */
 const ASSUMED_COUNT = 50_000;
+
+const STRAYS_WEIGHT = 0.25;
 
 /** A tileset and where it lies. */
 export class Tree {
@@ -89,7 +92,9 @@ export class Tree {
   /** Pixels that an error of the tree's unit has on the screen. */
   errorPx(tile: Tile, focalPx: number, nearest: number): number {
     if (!this.isInSight(tile.box)) return -1;
-    return (tile.error * this.scale * focalPx) / Math.max(this.distance(tile.box), nearest);
+    // Of what shows nothing but strays, coarser levels will do.
+    const weight = this.isInSight(tile.core) ? 1 : STRAYS_WEIGHT;
+    return (weight * tile.error * this.scale * focalPx) / Math.max(this.distance(tile.core), nearest);
   }
 }
 
@@ -113,6 +118,13 @@ function boxOf(volume: TileJson["boundingVolume"], matrix: Matrix4): Box3 {
   return out.applyMatrix4(matrix);
 }
 
+/** The box of what matters of a tile, where it says one. */
+function coreOf(extras: TileJson["extras"], matrix: Matrix4): Box3 | null {
+  const [x0, y0, z0, x1, y1, z1] = ["x0", "y0", "z0", "x1", "y1", "z1"].map((name) => Number(extras?.[`core_${name}`]));
+  const out = new Box3(new Vector3(x0, y0, z0), new Vector3(x1, y1, z1));
+  return out.min.lengthSq() + out.max.lengthSq() < Infinity && !out.isEmpty() ? out.applyMatrix4(matrix) : null;
+}
+
 /** A tileset's JSON as tiles; the root's own transform is left out: the frame is the root's. */
 export function readTileset(tree: Tree, json: unknown, url: string, outer: Matrix4 | null = null): Tile {
   const root = (json as { root?: TileJson }).root;
@@ -128,9 +140,11 @@ export function readTileset(tree: Tree, json: unknown, url: string, outer: Matri
     const external = uris.find(isJson) ?? null;
     const scale = matrix.getMaxScaleOnAxis();
     const count = Number(tile.extras?.["num_gaussians"] ?? tile.extras?.["gaussians"]);
+    const box = boxOf(tile.boundingVolume, matrix);
     return new Tile(
       tree,
-      boxOf(tile.boundingVolume, matrix),
+      box,
+      coreOf(tile.extras, matrix) ?? box,
       content ? (tile.geometricError ?? 0) * scale : Infinity,
       content && new URL(content, url).href,
       matrix,
