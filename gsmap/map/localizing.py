@@ -13,8 +13,8 @@ from gsmap.ingest.dates import CaptureDate, given_date, photo_date
 from gsmap.localize import Lens, read_clip, read_photo
 from gsmap.map.localizing_scans import scan_rows
 from gsmap.map.metres import metre_notes, metres_at
-from gsmap.map.photo_changes import Teller, Told, write_picture
-from gsmap.map.photos import sighting_of, small_jpeg
+from gsmap.map.photo_changes import Teller, write_picture
+from gsmap.map.photos import Told, sighting_of, small_jpeg
 from gsmap.map.stages.localize import Localizer, localize, localize_all, parse_near
 from gsmap.store import Store
 from gsmap.types.localization import Photo, Placement

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -13,10 +12,10 @@ from PIL import Image, ImageDraw
 
 from gsmap.durable import make_folder, write_whole
 from gsmap.errors import NotFoundError
-from gsmap.localize import Differences, Region, compare_photo
+from gsmap.localize import Region, compare_photo
 from gsmap.localize.localizing import prepared
 from gsmap.map.objects import Known, known_objects
-from gsmap.map.photos import things_in
+from gsmap.map.photos import Told, things_in
 from gsmap.map.stages.localize import Localizer
 from gsmap.methods import text_digest
 from gsmap.types import MapObject, SceneGraph
@@ -28,21 +27,6 @@ from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow
 _NEAR_M = 0.3  # of an object's box, for a part of a photo to concern it
 _COLOURS = {"appeared": (30, 160, 60), "disappeared": (215, 50, 40), "recoloured": (150, 60, 200)}
 _OTHER = (235, 140, 20)
-
-
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What one placed photo tells.
-
-    Args:
-        found: where it differs.
-        rows: of that, for people.
-        notes: what they should know.
-    """
-
-    found: Differences
-    rows: tuple[PhotoChangeRow, ...]
-    notes: tuple[str, ...]
 
 
 class Teller:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from io import BytesIO
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
 from gsmap.geometry.projection import in_image, project
+from gsmap.localize import Differences
 from gsmap.map.dates import parsed
 from gsmap.map.placed_photos import placed_photo
 from gsmap.store import Store
@@ -21,16 +21,28 @@ from gsmap.store.photos import MAX_BYTES, StoredPhoto
 from gsmap.types import MapObject, Scene, SceneGraph, Sighting, Sim3
 from gsmap.types.localization import Photo
 from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
-from gsmap.types.rows.localize import LocalizeRow, PhotoRow
-
-if TYPE_CHECKING:
-    from gsmap.map.photo_changes import Told
+from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow, PhotoRow
 
 _SIDE_PX = 640  # of the picture that is kept: to be shown
 _ON_M = 0.12  # a surface so near to a thing's sample is the thing's
 _FEWEST, _LEAST = 8, 0.1  # samples, and share of them, that must be in sight to say anything of a thing
 _SEEN, _GONE = 0.6, 0.5  # share of what is in sight that agrees, or lies in a region that differs
 _SAME_PLACE_M = 0.15  # a thing that was spoken of stands so near to an object's box
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What one placed photo tells.
+
+    Args:
+        found: where it differs.
+        rows: of that, for people.
+        notes: what they should know.
+    """
+
+    found: Differences
+    rows: tuple[PhotoChangeRow, ...]
+    notes: tuple[str, ...]
 
 
 def sighting_of(
