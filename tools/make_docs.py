@@ -86,7 +86,10 @@ def page_pictures(path: Path) -> None:
         with Page(server.url, Path(profile) / "desk", 1280, 800) as page:
             hands = Hands(page)
             settled(hands)
+            hands.press("h", "f")  # rooms from above
+            settled(hands)
             _save(page, "page")
+            hands.press("h")
             hands.press("2")
             hands.click("button", "All")
             hands.click("button.choose", "capture_b")

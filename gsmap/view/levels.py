@@ -19,7 +19,7 @@ from gsmap.formats import spz
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
-from gsmap.view.content import ViewMap, ViewOverview, ViewScene
+from gsmap.view.content import ViewMap, ViewOverview, ViewScene, up_of
 from gsmap.view.doors import Doors
 from gsmap.view.making import Maker, Waiting
 from gsmap.view.params import Params
@@ -32,6 +32,7 @@ _LEAST = 16
 _FIRST = -1.0  # rank of what everybody waits for: before any tree
 _ISLANDS_KEPT = 8  # whose sketches are in memory
 _TRIES = 3
+_STRAYS = 0.02  # share of an overview below its floor, and above its ceiling
 _FILES_KEPT = 4  # overviews as bytes
 
 _T = TypeVar("_T")
@@ -52,6 +53,13 @@ def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
     return spz.pack("overview.spz", Gaussians.concatenate(placed))
 
 
+def heights_of(parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]) -> tuple[float, float]:
+    """Where floor and ceiling of some scenes are along a direction of the map, a few strays left out on either side."""
+    heights = [entry.S_map_scene.apply(one.gaussians.means) @ np.asarray(up) for entry, one in parts]
+    low, high = np.quantile(np.concatenate(heights), (_STRAYS, 1 - _STRAYS)).tolist()
+    return low, high
+
+
 @dataclass(eq=False)
 class _Island:
     """The sketches of one component that are at hand, and those of them that the page was told of."""
@@ -60,6 +68,7 @@ class _Island:
     sketches: dict[str, Sketch] = field(default_factory=dict)
     told: frozenset[str] = frozenset()
     looked: set[str] = field(default_factory=set)
+    heights: dict[str, tuple[float, float]] = field(default_factory=dict)  # by the name of the overview
 
 
 class Levels:
@@ -219,7 +228,8 @@ class Levels:
         if not parts:
             raise InputError("nothing of it can be seen")
         counts = tuple(len(one.gaussians) for _, one in parts)
-        return overview_file(parts), ViewOverview("", tuple(places), counts), boxes
+        heights = heights_of(parts, up_of(list(inside.values())))
+        return overview_file(parts), ViewOverview("", tuple(places), counts, heights=heights), boxes
 
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
         """What is known of one island; what is not is asked for."""
@@ -257,7 +267,9 @@ class Levels:
                 self._files.popitem(last=False)
         places = tuple(place for place, entry in inside.items() if entry.key in island.told)
         counts = tuple(len(one.gaussians) for _, one in parts)
-        return ViewOverview(f"overviews/{component}/{name}.spz", places, counts, pending)
+        if name not in island.heights:
+            island.heights = {name: heights_of(parts, up_of(list(inside.values())))}
+        return ViewOverview(f"overviews/{component}/{name}.spz", places, counts, pending, island.heights[name])
 
     def _tell(self, island: _Island, num_scenes: int) -> None:
         """Have the page ask again once all are there, and whenever twice as many are: not for every one of hundreds."""

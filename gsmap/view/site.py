@@ -13,7 +13,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -107,7 +107,7 @@ class _Maker:
                 continue
             data, overview, more = made
             uri = f"overviews/{component}/{hashlib.sha256(data).hexdigest()[:24]}.spz"
-            overviews[component] = ViewOverview(uri, overview.scenes, overview.counts)
+            overviews[component] = replace(overview, uri=uri)
             boxes |= more
             yield uri, data
         for entry in view.scenes:

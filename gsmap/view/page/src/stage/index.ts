@@ -273,16 +273,18 @@ class View3D implements Stage {
     let ceiling: Vector4 | null = null;
     if (!this.isCeilingShown && this.map) {
       const up = this.view.camera.up;
-      let [low, high] = [Infinity, -Infinity];
-      this.map.scenes.forEach((scene, i) => {
-        if (!this.isOfIsland(i) || !this.visible.has(i)) return;
-        const pose = this.poseOf(i);
-        for (let k = 0; k < 8; k++) {
-          const corner = new Vector3(...([0, 1, 2].map((a) => scene.box[(k >> a) & 1]?.[a] ?? 0) as Vector));
-          const height = corner.applyMatrix4(pose).dot(up);
-          [low, high] = [Math.min(low, height), Math.max(high, height)];
-        }
-      });
+      const known = this.map.components.find((one) => one.component === this.component)?.overview?.heights;
+      let [low, high] = known ?? [Infinity, -Infinity];
+      if (!known)
+        this.map.scenes.forEach((scene, i) => {
+          if (!this.isOfIsland(i) || !this.visible.has(i)) return;
+          const pose = this.poseOf(i);
+          for (let k = 0; k < 8; k++) {
+            const corner = new Vector3(...([0, 1, 2].map((a) => scene.box[(k >> a) & 1]?.[a] ?? 0) as Vector));
+            const height = corner.applyMatrix4(pose).dot(up);
+            [low, high] = [Math.min(low, height), Math.max(high, height)];
+          }
+        });
       if (high > low) ceiling = new Vector4(up.x, up.y, up.z, low + CEILING_AT * (high - low));
     }
     this.painter.setCuts(clip, ceiling);
