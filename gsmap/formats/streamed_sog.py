@@ -28,6 +28,7 @@ from gsmap.formats import sog
 from gsmap.formats.inside import file_inside
 from gsmap.formats.quantise import require_writable
 from gsmap.formats.tiles3d import box_of, coarser
+from gsmap.geometry.boxes import cube_around, octants
 from gsmap.geometry.morton import morton_codes
 from gsmap.types import FileInfo, Gaussians
 
@@ -121,9 +122,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians, *, max_per_leaf: i
     if max_per_leaf < 1:
         raise ConfigError(f"max_per_leaf must be at least 1, got {max_per_leaf}")
     require_writable(path, gaussians)
-    low, high = gaussians.means.min(0).astype(np.float64), gaussians.means.max(0).astype(np.float64)
-    side = float(max((high - low).max(), 1e-6))
-    write_tree(path, _octree(path, gaussians, (low + high) / 2, side, max_per_leaf, "0").node(()))
+    write_tree(path, _octree(path, gaussians, *cube_around(gaussians.means), max_per_leaf, "0").node(()))
 
 
 def write_tree(path: str | os.PathLike[str], root: LodNode) -> None:
@@ -216,10 +215,8 @@ def _octree(path: Path, gaussians: Gaussians, center: np.ndarray, side: float, m
     """The cell of a cube, written with all below it."""
     children = []
     if len(gaussians) > max_per_leaf and len(name) < _MAX_DEPTH // 2:
-        octant = ((gaussians.means >= center) @ [1, 2, 4]).astype(int)
-        for i in np.unique(octant):
-            sub_center = center + side / 4 * np.where([i & 1, i & 2, i & 4], 1, -1)
-            children.append(_octree(path, gaussians[octant == i], sub_center, side / 2, max_per_leaf, f"{name}{i}"))
+        for i, inside, middle in octants(gaussians.means, center, side):
+            children.append(_octree(path, gaussians[inside], middle, side / 2, max_per_leaf, f"{name}{i}"))
     drawn, error_m = gaussians, 0.0
     if children:
         drawn, error_m = coarser(Gaussians.concatenate([child.drawn for child in children]), max(1, max_per_leaf // 4))

@@ -25,6 +25,7 @@ from gsmap.errors import MALFORMED, ConfigError, InputError
 from gsmap.formats import glb
 from gsmap.formats.inside import file_inside
 from gsmap.formats.quantise import require_writable
+from gsmap.geometry.boxes import cube_around, octants
 from gsmap.geometry.decimate import decimate
 from gsmap.geometry.voxels import axis_deviations
 from gsmap.types import Gaussians
@@ -105,9 +106,7 @@ def write(
     if max_per_tile < 1:
         raise ConfigError(f"max_per_tile must be at least 1, got {max_per_tile}")
     require_writable(path, gaussians)
-    low, high = gaussians.means.min(0).astype(np.float64), gaussians.means.max(0).astype(np.float64)
-    side = float(max((high - low).max(), 1e-6))
-    root, _ = _octree(path, gaussians, (low + high) / 2, side, max_per_tile, "0", compressed)
+    root, _ = _octree(path, gaussians, *cube_around(gaussians.means), max_per_tile, "0", compressed)
     write_tileset(path, root, transform=transform, compressed=compressed)
 
 
@@ -176,11 +175,9 @@ def _octree(
     """The tile of a cube, written with all below it; and what it draws, from which its parent's level is made."""
     children, levels = [], []
     if len(gaussians) > max_per_tile and len(name) < _MAX_DEPTH // 2:
-        octant = ((gaussians.means >= center) @ [1, 2, 4]).astype(int)
-        for i in np.unique(octant):
-            sub_center = center + side / 4 * np.where([i & 1, i & 2, i & 4], 1, -1)
-            inside, below = gaussians[octant == i], f"{name}{i}"
-            node, level = _octree(path, inside, sub_center, side / 2, max_per_tile, below, compressed)
+        for i, inside, middle in octants(gaussians.means, center, side):
+            part, below = gaussians[inside], f"{name}{i}"
+            node, level = _octree(path, part, middle, side / 2, max_per_tile, below, compressed)
             children.append(node)
             levels.append(level)
     if not children:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from gsmap.types import Sim3
@@ -38,3 +40,16 @@ def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: f
         at = np.searchsorted(share, [outside * share[-1], (1 - outside) * share[-1]])
         out[:, axis] = points[order[np.minimum(at, len(order) - 1)], axis]
     return out
+
+
+def cube_around(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Middle (3,) and edge of the smallest cube around points (N, 3), of which there is one at least."""
+    low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
+    return (low + high) / 2, float(max((high - low).max(), 1e-6))
+
+
+def octants(points: np.ndarray, center: np.ndarray, side: float) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """The eighths of a cube that hold any of the points (N, 3): number, mask (N,) of what is inside, middle (3,)."""
+    octant = ((points >= center) @ [1, 2, 4]).astype(int)
+    for i in np.unique(octant).tolist():
+        yield i, octant == i, center + side / 4 * np.where([i & 1, i & 2, i & 4], 1, -1)

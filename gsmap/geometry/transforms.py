@@ -31,10 +31,16 @@ def transform_gaussians(gaussians: Gaussians, S_a_b: Sim3) -> Gaussians:
 
 def transform_cameras(cameras: Cameras, S_a_b: Sim3) -> Cameras:
     """The cameras of frame b in frame a; images and intrinsics stay, depths grow by the scale."""
-    T_a_camera = cameras.T_frame_camera.copy()
-    T_a_camera[:, :3, :3] = S_a_b.rotation @ cameras.T_frame_camera[:, :3, :3]
-    T_a_camera[:, :3, 3] = S_a_b.apply(cameras.centers)
+    T_a_camera = transform_poses(cameras.T_frame_camera, S_a_b)
     return Cameras(T_a_camera, cameras.intrinsics_px, cameras.sizes_px, cameras.names, cameras.synthesised)
+
+
+def transform_poses(T_b_c: np.ndarray, S_a_b: Sim3) -> np.ndarray:
+    """Poses (..., 4, 4) of frame b in frame a, each rigid: turned and moved, in the unit of a."""
+    T_a_c = np.array(T_b_c, np.float64)
+    T_a_c[..., :3, :3] = S_a_b.rotation @ T_a_c[..., :3, :3]
+    T_a_c[..., :3, 3] = S_a_b.apply(T_a_c[..., :3, 3])
+    return T_a_c
 
 
 def rotate_sh(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:

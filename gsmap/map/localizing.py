@@ -15,7 +15,7 @@ from gsmap.map.localizing_scans import scan_rows
 from gsmap.map.metres import metre_notes, metres_at
 from gsmap.map.photo_changes import Teller, write_picture
 from gsmap.map.photos import Told, sighting_of, small_jpeg
-from gsmap.map.stages.localize import Localizer, localize, localize_all, parse_near
+from gsmap.map.stages.localize import Localizer, Near, localize, localize_all, parse_near
 from gsmap.store import Store
 from gsmap.types.localization import Photo, Placement
 from gsmap.types.progress import StageProgress
@@ -82,14 +82,11 @@ def localize_files(
     tells = tells or Tells()
     if tells.add and not store.catalog.writable:
         raise ReadOnlyError(f"{store.location} is open to be read only: photographs can be placed in it, but not kept")
-    if bool(files) == (video is not None):
-        raise ConfigError("name the photographs to localise, or one clip by --video")
+    check_named(files, video)
     lens = parse_lens(intrinsics, focal)
     if video is not None:
-        clip = read_clip(video, lens, settings.localize.clips)
-        frames = [(f"{os.fspath(video)}#{at:.2f}", photo) for at, photo in clip]
-        return _of_pictures(store, settings, frames, near, True, progress, tells)
-    pictures = [(os.fspath(path), read_photo(path, lens)) for path in files if depth is None and not is_scan(path)]
+        return _of_pictures(store, settings, frames_of(video, lens, settings), near, True, progress, tells)
+    pictures = photos_of([path for path in files if depth is None and not is_scan(path)], lens)
     of_scans, notes = scan_rows(store, settings, files, depth, depth_scale, lens, near, progress)
     report = LocalizeReport(results=())
     if pictures:
@@ -97,6 +94,37 @@ def localize_files(
     told = iter(report.results)
     rows = tuple(of_scans[number] if number in of_scans else next(told) for number in range(len(files)))
     return LocalizeReport(results=rows, notes=(*notes, *report.notes))
+
+
+def check_named(files: Sequence[str | os.PathLike[str]], video: str | os.PathLike[str] | None) -> None:
+    """Refuse photographs beside a clip, and neither."""
+    if bool(files) == (video is not None):
+        raise ConfigError("name the photographs to localise, or one clip by --video")
+
+
+def photos_of(files: Sequence[str | os.PathLike[str]], lens: Lens) -> list[tuple[str, Photo]]:
+    """Photographs by name."""
+    return [(os.fspath(path), read_photo(path, lens)) for path in files]
+
+
+def frames_of(video: str | os.PathLike[str], lens: Lens, settings: Settings) -> list[tuple[str, Photo]]:
+    """Frames of a clip, each named by its second."""
+    clip = read_clip(video, lens, settings.localize.clips)
+    return [(f"{os.fspath(video)}#{at:.2f}", photo) for at, photo in clip]
+
+
+def find_all(
+    localizer: Localizer,
+    named: Sequence[tuple[str, Photo]],
+    where: Near | None,
+    together: bool,
+    progress: StageProgress,
+) -> list[tuple[Placement, float]]:
+    """Where photographs were taken, each with the seconds it took."""
+    photos = [photo for _, photo in named]
+    if together:
+        return list(localize_all(localizer, photos, where))
+    return list(localize(localizer, photos, where, progress))
 
 
 def _of_pictures(
@@ -111,11 +139,7 @@ def _of_pictures(
     """What is told of photographs, by name."""
     where = None if near is None else parse_near(store, near)
     localizer = Localizer(store, settings, progress)
-    photos = [photo for _, photo in named]
-    if together:
-        found = list(localize_all(localizer, photos, where))
-    else:
-        found = list(localize(localizer, photos, where, progress))
+    found = find_all(localizer, named, where, together, progress)
     names = {scene.id: scene.name for scene in store.scenes.list()}
     rows = [row_of(names, name, *one) for (name, _), one in zip(named, found, strict=True)]
     notes: list[str] = []

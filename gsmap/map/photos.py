@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.transforms import transform_poses
 from gsmap.localize import Differences
 from gsmap.map.dates import parsed
 from gsmap.map.placed_photos import placed_photo
@@ -232,9 +233,7 @@ def photo_rows(store: Store) -> list[PhotoRow]:
         pose, known = None, None
         if placed is not None:
             S = placed.S_map_scene
-            pose = np.eye(4)
-            pose[:3, :3] = S.rotation @ one.T_scene_camera[:3, :3]
-            pose[:3, 3] = S.apply(one.T_scene_camera[:3, 3])
+            pose = transform_poses(one.T_scene_camera, S)
             unit = np.r_[np.ones(3), np.full(3, S.scale)]
             known = one.covariance * np.outer(unit, unit)
         rows.append(

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from gsmap.errors import NotFoundError
+from gsmap.geometry.transforms import transform_poses
 from gsmap.map.stages.georeference import Localise, PlacedPhoto
 from gsmap.store import Store
 from gsmap.types import ScenePose
@@ -78,9 +79,7 @@ def placed_photo(
     if scene is None:
         return None
     S_scene_map = poses[scene].S_map_scene.inverse()
-    pose = np.eye(4)
-    pose[:3, :3] = S_scene_map.rotation @ row.T_map_camera[:3, :3]
-    pose[:3, 3] = S_scene_map.apply(row.T_map_camera[:3, 3])
+    pose = transform_poses(row.T_map_camera, S_scene_map)
     # Both covariances are on the camera's side; lengths become the scene's.
     unit = np.diag([1.0] * 3 + [S_scene_map.scale] * 3)
     return PlacedPhoto(scene, pose, np.asarray(row.intrinsics_px), size_px, unit @ row.covariance @ unit)

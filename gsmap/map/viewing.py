@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmap.errors import ConfigError, NotFoundError
+from gsmap.geometry.transforms import transform_poses
 from gsmap.map import reports
 from gsmap.map.changes import change_row, changes_report, named
 from gsmap.map.metres import map_metres
@@ -30,7 +31,7 @@ from gsmap.types.world import ImagePoint
 from gsmap.view import ViewChange, ViewEdge, ViewMap, ViewPhoto, ViewRevision, ViewScene
 from gsmap.view.doors import Action, PairPictures
 from gsmap.view.pair_picture import looks_at
-from gsmap.view.trees import VERSION
+from gsmap.view.trees import VERSION, TreeParams
 
 if TYPE_CHECKING:
     from gsmap.map.settings import Settings
@@ -232,7 +233,7 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
         pose = poses.get(prior.scene)
         metre = None if pose is None else metres.get(pose.component)
         told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit)
-    scenes = [_scene(scene, poses, ups, told) for scene in store.scenes.list()]
+    scenes = [_scene(scene, content_key(scene, settings.view.tree), poses, ups, told) for scene in store.scenes.list()]
     living = {entry.scene.id for entry in scenes}
     newest, given = store.revisions.newest(), pose_basis(store, settings)
     found = ViewMap(
@@ -266,18 +267,20 @@ def prior_words(prior: Prior, metres_per_unit: float) -> str:
     return ", ".join([what, *filter(None, known)])
 
 
-def _scene(scene: Scene, poses: Mapping[str, Any], ups: Mapping[str, np.ndarray], told: Mapping[str, str]) -> ViewScene:
+def _scene(
+    scene: Scene, key: str, poses: Mapping[str, Any], ups: Mapping[str, np.ndarray], told: Mapping[str, str]
+) -> ViewScene:
     up = ups.get(scene.id)
     if up is None and scene.thinning is not None and scene.thinning.up is not None:
         up = np.array(scene.thinning.up, np.float64)
-    return ViewScene(scene, content_key(scene), poses.get(scene.id), up, told.get(scene.id))
+    return ViewScene(scene, key, poses.get(scene.id), up, told.get(scene.id))
 
 
-def content_key(scene: Scene) -> str:
-    """Names what a scene's levels of detail are made of: it begins with the scene's id, and changes when it is thinned
-    or when they are made otherwise."""
+def content_key(scene: Scene, tree: TreeParams) -> str:
+    """Names what a scene's levels of detail are made of, and how: it begins with the scene's id, and changes when it is
+    thinned or when they are made otherwise."""
     thinned = "" if scene.thinning is None else f"-t{text_digest(scene.thinning.thinned_at)[:8]}"
-    return f"{scene.id}{thinned}-v{VERSION}"
+    return f"{scene.id}{thinned}-v{VERSION}-{text_digest(canonical(tree))[:8]}"
 
 
 def _edges(store: Store, placed: PoseGraph | None) -> list[ViewEdge]:
@@ -350,9 +353,7 @@ def _photos(store: Store, placed: PoseGraph | None, living: set[str]) -> list[Vi
     for one in found.values():
         assert placed is not None
         pose = placed.poses[one.scene]
-        T = np.eye(4)
-        T[:3, :3] = pose.S_map_scene.rotation @ one.T_scene_camera[:3, :3]
-        T[:3, 3] = pose.S_map_scene.apply(one.T_scene_camera[None, :3, 3])[0]
+        T = transform_poses(one.T_scene_camera, pose.S_map_scene)
         width, height = np.maximum(1, np.round(2 * one.intrinsics_px[2:])).astype(int).tolist()
         out.append(ViewPhoto(one.image, pose.component, T, one.intrinsics_px, (width, height)))
     for row in photo_rows(store):

@@ -161,14 +161,14 @@ class ViewOverview:
         scenes: by their place in the map's list.
         counts: Gaussians of each.
         pending: scenes that are not in it yet.
-        heights: of floor and ceiling along the component's up: nearly all of it lies between; None where nothing does.
+        heights: of floor and ceiling of each, along the component's up: nearly all of it lies between.
     """
 
     uri: str
     scenes: tuple[int, ...] = ()
     counts: tuple[int, ...] = ()
     pending: int = 0
-    heights: tuple[float, float] | None = None
+    heights: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,7 +333,7 @@ def _overview(one: ViewOverview | None) -> dict[str, Any] | None:
     if one is None:
         return None
     told = {"uri": one.uri, "pending": one.pending, "scenes": list(one.scenes), "counts": list(one.counts)}
-    return told | {"heights": None if one.heights is None else list(one.heights)}
+    return told | {"heights": [list(pair) for pair in one.heights]}
 
 
 def _number(value: float | None) -> float | None:

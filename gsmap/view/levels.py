@@ -32,7 +32,7 @@ _LEAST = 16
 _FIRST = -1.0  # rank of what everybody waits for: before any tree
 _ISLANDS_KEPT = 8  # whose sketches are in memory
 _TRIES = 3
-_STRAYS = 0.02  # share of an overview below its floor, and above its ceiling
+_STRAYS = 0.02  # share of a sketch below the floor of its scene, and above the ceiling
 _FILES_KEPT = 4  # overviews as bytes
 
 _T = TypeVar("_T")
@@ -53,11 +53,14 @@ def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
     return spz.pack("overview.spz", Gaussians.concatenate(placed))
 
 
-def heights_of(parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]) -> tuple[float, float]:
-    """Where floor and ceiling of some scenes are along a direction of the map, a few strays left out on either side."""
-    heights = [entry.S_map_scene.apply(one.gaussians.means) @ np.asarray(up) for entry, one in parts]
-    low, high = np.quantile(np.concatenate(heights), (_STRAYS, 1 - _STRAYS)).tolist()
-    return low, high
+def heights_of(parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]) -> tuple[tuple[float, float], ...]:
+    """Where floor and ceiling of each scene are along a direction of the map, a few strays left out on either side."""
+    out = []
+    for entry, one in parts:
+        heights = entry.S_map_scene.apply(one.gaussians.means) @ np.asarray(up)
+        low, high = np.quantile(heights, (_STRAYS, 1 - _STRAYS)).tolist()
+        out.append((low, high))
+    return tuple(out)
 
 
 @dataclass(eq=False)
@@ -68,7 +71,7 @@ class _Island:
     sketches: dict[str, Sketch] = field(default_factory=dict)
     told: frozenset[str] = frozenset()
     looked: set[str] = field(default_factory=set)
-    heights: dict[str, tuple[float, float]] = field(default_factory=dict)  # by the name of the overview
+    heights: dict[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # by the name of the overview
 
 
 class Levels:

@@ -230,8 +230,8 @@ class _Builder:
             if not len(content):
                 return None
             extent = _Extent.of(content)
-            box = tiles3d.box_of(content)
-            node = TileNode(box, 0.0, self._write(content, name), extras=extent.said(content))
+            uri, box = self._write(content, name)
+            node = TileNode(box, 0.0, uri, extras=extent.said(content))
             return _Made(node, content, extent)
         below = [self.build(child, f"{name}{i}") for i, child in enumerate(cell.children)]
         made = [one for one in below if one is not None]
@@ -244,21 +244,23 @@ class _Builder:
         extent = _Extent.joined([one.extent for one in below])
         error += max(one.node.error_m for one in below)
         # Whole, strays too: what is left out of a picture because its box is not in sight must not be missed.
-        boxes = np.stack([tiles3d.box_of(level), *(one.node.box for one in below)])
+        uri, own = self._write(level, name)
+        boxes = np.stack([own, *(one.node.box for one in below)])
         box = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
         # A level that nothing was merged for must still count as coarser than what it stands for.
         error = max(error, 1e-6 * float(np.linalg.norm(box[1] - box[0])))
-        node = TileNode(box, error, self._write(level, name), tuple(one.node for one in below), extent.said(level))
+        node = TileNode(box, error, uri, tuple(one.node for one in below), extent.said(level))
         return _Made(node, level, extent)
 
-    def _write(self, content: Gaussians, name: str) -> str:
+    def _write(self, content: Gaussians, name: str) -> tuple[str, np.ndarray]:
+        """Write the file of a tile; its uri, and the box (2, 3) of what it draws."""
         staged = self.folder / CONTENT_FOLDER / f"{name}.glb"
-        tiles3d.write_content(staged, content)
+        box = tiles3d.write_content(staged, content)
         with open(staged, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         uri = f"{CONTENT_FOLDER}/{name}-{digest[:16]}.glb"
         staged.rename(self.folder / uri)
-        return uri
+        return uri, box
 
 
 def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:

@@ -5,6 +5,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import gsmap
 from gsmap import formats
 from gsmap.errors import ConfigError, GsmapError, NotFoundError
 from gsmap.map import create
-from gsmap.map.viewing import MapDoors, cache_folder, content_key
+from gsmap.map.viewing import MapDoors, cache_folder, content_key, view_of
 from gsmap.types import Gaussians, Sim3
 from gsmap.view.built import built_page
 from gsmap.view.tree_cache import TreeCache
@@ -199,12 +200,17 @@ def test_nothing_is_changed_where_a_map_is_only_looked_at(folder):
 def test_a_thinned_scene_has_other_levels_of_detail(folder):
     with gsmap.open(folder) as m:
         scene = m.store.scenes.get("yard")
-        before = content_key(scene)
+        tree = m.settings.view.tree
+        before = content_key(scene, tree)
         shown = np.ones(scene.num_gaussians, bool)
         shown[::2] = False
         after = m.store.scenes.thin("yard", shown)
-        assert content_key(after) != before
-        assert content_key(after).startswith(scene.id)
+        assert content_key(after, tree) != before
+        assert content_key(after, tree).startswith(scene.id)
+        # So do other settings of theirs: what was kept by those is not taken for it.
+        assert content_key(scene, replace(tree, leaf_gaussians=tree.leaf_gaussians // 2)) != before
+        finer = m.with_settings({"view.tree.coarsening": 4})
+        assert view_of(finer.store, finer.settings).scenes[0].key != view_of(m.store, m.settings).scenes[0].key
         source = MapDoors(m.store, m.settings).source(scene.id)
         whole = m.store.scenes.gaussians(scene.id)
         assert source.num_gaussians == len(whole) == shown.sum()

@@ -107,7 +107,7 @@ def test_floor_and_ceiling_are_found_whatever_the_frame_is_turned(tmp_path):
     up = turn @ [0, 0, 1.0]
     g = replace(blob(0, len(room)), means=(room @ turn.T).astype(np.float32))
     scene = Scene("0" * 32, "room", len(g), 0, 0, np.stack([g.means.min(0), g.means.max(0)]))
-    floor, ceiling = heights_of([(ViewScene(scene, "k", None, up), Sketch(g, scene.bounds))], up)
+    ((floor, ceiling),) = heights_of([(ViewScene(scene, "k", None, up), Sketch(g, scene.bounds))], up)
     assert abs(floor) < 0.01
     assert abs(ceiling - 2.5) < 0.01
 

@@ -52,7 +52,7 @@ export interface Overview {
   pending: number; // scenes that are not in it yet
   scenes: number[]; // indices into MapSummary.scenes
   counts: number[]; // Gaussians of each
-  heights: [number, number] | null; // of floor and ceiling along `up`: nearly all of it lies between
+  heights: [number, number][]; // of floor and ceiling of each along `up`: nearly all of it lies between
 }
 
 export interface SceneEntry {

@@ -10,7 +10,7 @@ import { shared } from "./css";
 import { heading } from "./heading";
 import { icon } from "./icons";
 import "./kind";
-import "./verdict";
+import { verdictBelow } from "./verdict";
 
 const STANDS: Record<string, string> = { open: "warn", confirmed: "good", rejected: "bad" };
 
@@ -19,16 +19,8 @@ export class ChangeDetail extends Panel {
   static override styles = [
     shared,
     heading.styles,
+    verdictBelow,
     css`
-      :host {
-        display: flex;
-        flex-direction: column;
-        min-height: 100%;
-      }
-      .body {
-        flex: 1;
-        padding: 0 16px 16px;
-      }
       img {
         display: block;
         width: 100%;

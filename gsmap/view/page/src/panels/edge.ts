@@ -13,23 +13,15 @@ import { heading } from "./heading";
 import { icon } from "./icons";
 import { markOf } from "./review";
 import { waiting } from "./waiting";
-import "./verdict";
+import { verdictBelow } from "./verdict";
 
 @customElement("gs-edge")
 export class Edge extends Panel {
   static override styles = [
     shared,
     heading.styles,
+    verdictBelow,
     css`
-      :host {
-        display: flex;
-        flex-direction: column;
-        min-height: 100%;
-      }
-      .body {
-        flex: 1;
-        padding: 0 16px 16px;
-      }
       .reason {
         margin-bottom: 10px;
       }

@@ -23,7 +23,11 @@ export function heading(name: TemplateResult | string, facts: TemplateResult | s
   </div>`;
 }
 
+/** What all details share: the heading stays, the rest scrolls below it. */
 heading.styles = css`
+  .body {
+    padding: 0 16px 16px;
+  }
   .heading {
     position: sticky;
     top: 0;

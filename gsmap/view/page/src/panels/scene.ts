@@ -21,9 +21,6 @@ export class SceneDetail extends Panel {
     shared,
     heading.styles,
     css`
-      .body {
-        padding: 0 16px 16px;
-      }
       .edges li button {
         width: 100%;
         justify-content: space-between;
@@ -133,30 +130,8 @@ export class SceneDetail extends Panel {
       </p>
       <form class="stack" @submit=${this.save}>
         <div class="sigmas">
-          <label
-            ><span>Sure to, metres</span
-            ><input
-              name="sigma_m"
-              type="number"
-              min="0.001"
-              max="1000"
-              step="any"
-              required
-              .value=${this.sigmaM}
-              @input=${(event: Event) => (this.sigmaM = (event.target as HTMLInputElement).value)}
-          /></label>
-          <label
-            ><span>Sure to, degrees</span
-            ><input
-              name="sigma_deg"
-              type="number"
-              min="0.01"
-              max="180"
-              step="any"
-              required
-              .value=${this.sigmaDeg}
-              @input=${(event: Event) => (this.sigmaDeg = (event.target as HTMLInputElement).value)}
-          /></label>
+          ${sure("metres", "sigma_m", 0.001, 1000, this.sigmaM, (value) => (this.sigmaM = value))}
+          ${sure("degrees", "sigma_deg", 0.01, 180, this.sigmaDeg, (value) => (this.sigmaDeg = value))}
         </div>
         ${
           scene.prior
@@ -204,4 +179,20 @@ export class SceneDetail extends Panel {
       }
     </section>`;
   }
+}
+
+/** How surely a scene lies where it was put. */
+function sure(unit: string, name: string, min: number, max: number, value: string, set: (value: string) => void) {
+  return html`<label
+    ><span>Sure to, ${unit}</span
+    ><input
+      name=${name}
+      type="number"
+      min=${min}
+      max=${max}
+      step="any"
+      required
+      .value=${value}
+      @input=${(event: Event) => set((event.target as HTMLInputElement).value)}
+  /></label>`;
 }

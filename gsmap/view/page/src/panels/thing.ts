@@ -1,5 +1,5 @@
 // One object or one localised photograph.
-import { css, html, nothing } from "lit";
+import { html, nothing } from "lit";
 import { customElement } from "lit/decorators.js";
 import * as actions from "../actions";
 import type { GraphEntry, ObjectEntry, PhotoEntry } from "../contract";
@@ -14,15 +14,7 @@ import type { Vector } from "../contract";
 
 @customElement("gs-thing")
 export class Thing extends Panel {
-  static override styles = [
-    shared,
-    heading.styles,
-    css`
-      .body {
-        padding: 0 16px 16px;
-      }
-    `,
-  ];
+  static override styles = [shared, heading.styles];
 
   protected override render() {
     const { state } = this;

@@ -8,6 +8,18 @@ import { Panel } from "./base";
 import { shared } from "./css";
 import { icon } from "./icons";
 
+/** Of details that end with a word: it keeps to the bottom, however little stands above it. */
+export const verdictBelow = css`
+  :host {
+    display: flex;
+    flex-direction: column;
+    min-height: 100%;
+  }
+  .body {
+    flex: 1;
+  }
+`;
+
 @customElement("gs-verdict")
 export class VerdictForm extends Panel {
   static override styles = [

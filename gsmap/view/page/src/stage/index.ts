@@ -10,6 +10,7 @@ import type {
   ObjectEntry,
   PhotoEntry,
   RevisionPoses,
+  SceneEntry,
   SceneExtras,
   Vector,
 } from "../contract";
@@ -273,21 +274,28 @@ class View3D implements Stage {
     let ceiling: Vector4 | null = null;
     if (!this.isCeilingShown && this.map) {
       const up = this.view.camera.up;
-      const known = this.map.components.find((one) => one.component === this.component)?.overview?.heights;
-      let [low, high] = known ?? [Infinity, -Infinity];
-      if (!known)
-        this.map.scenes.forEach((scene, i) => {
-          if (!this.isOfIsland(i) || !this.visible.has(i)) return;
-          const pose = this.poseOf(i);
-          for (let k = 0; k < 8; k++) {
-            const corner = new Vector3(...([0, 1, 2].map((a) => scene.box[(k >> a) & 1]?.[a] ?? 0) as Vector));
-            const height = corner.applyMatrix4(pose).dot(up);
-            [low, high] = [Math.min(low, height), Math.max(high, height)];
-          }
-        });
+      let [low, high] = [Infinity, -Infinity];
+      this.map.scenes.forEach((scene, i) => {
+        if (!this.isOfIsland(i) || !this.visible.has(i)) return;
+        const [floor, top] = this.heights(scene, i, up);
+        [low, high] = [Math.min(low, floor), Math.max(high, top)];
+      });
       if (high > low) ceiling = new Vector4(up.x, up.y, up.z, low + CEILING_AT * (high - low));
     }
     this.painter.setCuts(clip, ceiling);
+  }
+
+  /** Where floor and ceiling of a scene are along a direction; by its box, which a turned frame makes too high, where
+   * nobody has looked for them. */
+  private heights(scene: SceneEntry, index: number, up: Vector3): [number, number] {
+    const overview = this.map?.components.find((one) => one.component === scene.component)?.overview;
+    const known = this.revision ? undefined : overview?.heights?.[overview.scenes.indexOf(index)];
+    if (known) return known;
+    const pose = this.poseOf(index);
+    const heights = Array.from({ length: 8 }, (_, k) =>
+      new Vector3(...([0, 1, 2].map((a) => scene.box[(k >> a) & 1]?.[a] ?? 0) as Vector)).applyMatrix4(pose).dot(up),
+    );
+    return [Math.min(...heights), Math.max(...heights)];
   }
 
   // ---- the view ---------------------------------------------------------------------------------------------------
