@@ -209,8 +209,9 @@ def test_a_thinned_scene_has_other_levels_of_detail(folder):
         assert content_key(after, tree).startswith(scene.id)
         # So do other settings of theirs: what was kept by those is not taken for it.
         assert content_key(scene, replace(tree, leaf_gaussians=tree.leaf_gaussians // 2)) != before
-        finer = m.with_settings({"view.tree.coarsening": 4})
-        assert view_of(finer.store, finer.settings).scenes[0].key != view_of(m.store, m.settings).scenes[0].key
+        shown_before = view_of(m.store, m.settings).scenes[0].key
+        m.with_settings({"view.tree.coarsening": 4})
+        assert view_of(m.store, m.settings).scenes[0].key != shown_before
         source = MapDoors(m.store, m.settings).source(scene.id)
         whole = m.store.scenes.gaussians(scene.id)
         assert source.num_gaussians == len(whole) == shown.sum()
