@@ -8,6 +8,8 @@ import numpy as np
 
 from gsmap.types import Sim3
 
+_SIZED = 20_000  # points are enough to measure a place by
+
 
 def box_corners(bounds: np.ndarray) -> np.ndarray:
     """(8, 3) corners of a box; bit 0 of a corner's index tells whether its x is the high one, bit 1 y, bit 2 z."""
@@ -40,6 +42,27 @@ def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: f
         at = np.searchsorted(share, [outside * share[-1], (1 - outside) * share[-1]])
         out[:, axis] = points[order[np.minimum(at, len(order) - 1)], axis]
     return out
+
+
+def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> tuple[float, float, float]:
+    """Length, width and height of points (N, 3), N > 0, in the upright box of the smallest floor, whatever way their
+    frame is turned.
+
+    Args:
+        up: (3,) unit vector.
+        outside: share of them that may lie beyond each side.
+    """
+    points = points[np.linspace(0, len(points) - 1, min(len(points), _SIZED)).astype(int)]
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    turns = np.radians(np.arange(90))
+    along = np.cos(turns)[:, None] * first + np.sin(turns)[:, None] * second
+    across = np.cos(turns)[:, None] * second - np.sin(turns)[:, None] * first
+    low, high = np.quantile(points @ np.concatenate([along, across, [up]]).T, [outside, 1 - outside], axis=0)
+    sides = (high - low)[:-1].reshape(2, -1)
+    width, length = np.sort(sides[:, sides.prod(0).argmin()])
+    return float(length), float(width), float((high - low)[-1])
 
 
 def cube_around(points: np.ndarray) -> tuple[np.ndarray, float]:

@@ -228,11 +228,12 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
     graphs = store.graphs.list()
     ups = {one.scene: np.array(one.up, np.float64) for one in graphs if one.up is not None}
     metres = map_metres(store, settings, placed)
-    told = {}
+    told, numbers = {}, store.priors.numbers()
     for prior in store.priors.list():
         pose = poses.get(prior.scene)
         metre = None if pose is None else metres.get(pose.component)
-        told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit)
+        words = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit)
+        told[prior.scene] = (words, numbers[prior.scene])
     scenes = [_scene(scene, content_key(scene, settings.view.tree), poses, ups, told) for scene in store.scenes.list()]
     living = {entry.scene.id for entry in scenes}
     newest, given = store.revisions.newest(), pose_basis(store, settings)
@@ -268,12 +269,16 @@ def prior_words(prior: Prior, metres_per_unit: float) -> str:
 
 
 def _scene(
-    scene: Scene, key: str, poses: Mapping[str, Any], ups: Mapping[str, np.ndarray], told: Mapping[str, str]
+    scene: Scene,
+    key: str,
+    poses: Mapping[str, Any],
+    ups: Mapping[str, np.ndarray],
+    told: Mapping[str, tuple[str, int]],
 ) -> ViewScene:
     up = ups.get(scene.id)
     if up is None and scene.thinning is not None and scene.thinning.up is not None:
         up = np.array(scene.thinning.up, np.float64)
-    return ViewScene(scene, key, poses.get(scene.id), up, told.get(scene.id))
+    return ViewScene(scene, key, poses.get(scene.id), up, *told.get(scene.id, (None, None)))
 
 
 def content_key(scene: Scene, tree: TreeParams) -> str:

@@ -39,6 +39,7 @@ def actions_of(opened: Opened) -> dict[str, Action]:
         "reject": partial(_review, opened.reject),
         "withdraw": partial(_review, partial(opened.confirm, withdraw=True)),
         "prior": partial(_prior, opened),
+        "earlier_prior": partial(_earlier_prior, opened),
         "remove_prior": lambda said: opened.remove_prior(_text(said, "scene")),
         "optimize": lambda said: (opened.optimize(), None)[1],
     }
@@ -69,6 +70,13 @@ def _prior(opened: Opened, said: Mapping[str, Any]) -> None:
     # The residual of a position is in the scene's unit (`gsmap.types.Prior`).
     sigma = sigma_m / (metres_per_unit * S.scale)
     opened.set_prior(Prior(scene.id, S, np.array([math.radians(sigma_deg)] * 3 + [sigma] * 3 + [math.inf])))
+
+
+def _earlier_prior(opened: Opened, said: Mapping[str, Any]) -> None:
+    scene, number = _text(said, "scene"), said.get("number")
+    if not isinstance(number, int) or isinstance(number, bool):
+        raise InputError("number must be a whole number")
+    opened.set_prior(opened.store.priors.earlier(scene, number))
 
 
 def _text(said: Mapping[str, Any], name: str, *, may_be_empty: bool = False) -> str:

@@ -53,6 +53,26 @@ class Priors:
             rows = connection.execute(query).all()
         return _prior(rows[-1]) if rows else None
 
+    def numbers(self) -> dict[str, int]:
+        """Which of all that was ever told the standing prior of each scene (id) is."""
+        query = select(priors.c.scene, priors.c.number).where(priors.c.removed_at.is_(None)).order_by(priors.c.number)
+        with self._catalog.read() as connection:
+            return {row.scene: row.number for row in connection.execute(query)}
+
+    def earlier(self, ref: str, number: int) -> Prior:
+        """What was told of a scene once, by its number.
+
+        Raises:
+            NotFoundError: no such prior of that scene.
+        """
+        with self._catalog.read() as connection:
+            scene = resolve(connection, ref)
+            query = select(priors).where(priors.c.scene == scene, priors.c.number == number)
+            row = connection.execute(query).one_or_none()
+        if row is None:
+            raise NotFoundError(f"scene {ref!r} has no prior of number {number}")
+        return _prior(row)
+
     def remove(self, ref: str) -> None:
         """Take a scene's prior back.
 

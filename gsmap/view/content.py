@@ -30,6 +30,7 @@ class ViewScene:
         pose: None where nothing placed it; it is then a component of its own.
         up: (3,) against gravity in its frame; None where nobody knows.
         prior: what was told of where it lies, in words; None where nothing was.
+        prior_number: which of what was ever told that is.
     """
 
     scene: Scene
@@ -37,6 +38,7 @@ class ViewScene:
     pose: ScenePose | None
     up: np.ndarray | None = None
     prior: str | None = None
+    prior_number: int | None = None
 
     @property
     def S_map_scene(self) -> Sim3:
@@ -162,6 +164,7 @@ class ViewOverview:
         counts: Gaussians of each.
         pending: scenes that are not in it yet.
         heights: of floor and ceiling of each, along the component's up: nearly all of it lies between.
+        size: length, width and height of it all, map units; None while nothing is in it.
     """
 
     uri: str
@@ -169,6 +172,7 @@ class ViewOverview:
     counts: tuple[int, ...] = ()
     pending: int = 0
     heights: tuple[tuple[float, float], ...] = ()
+    size: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,6 +312,7 @@ def _scene(
         "extras": f"scenes/{scene.id}/extras.json",
         "tags": list(scene.tags),
         "prior": entry.prior,
+        "prior_number": entry.prior_number,
     }
 
 
@@ -333,7 +338,8 @@ def _overview(one: ViewOverview | None) -> dict[str, Any] | None:
     if one is None:
         return None
     told = {"uri": one.uri, "pending": one.pending, "scenes": list(one.scenes), "counts": list(one.counts)}
-    return told | {"heights": [list(pair) for pair in one.heights]}
+    size = None if one.size is None else list(one.size)
+    return told | {"heights": [list(pair) for pair in one.heights], "size": size}
 
 
 def _number(value: float | None) -> float | None:

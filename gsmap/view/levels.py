@@ -7,7 +7,7 @@ import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -16,6 +16,7 @@ import numpy as np
 
 from gsmap.errors import GsmapError, InputError, NotFoundError
 from gsmap.formats import spz
+from gsmap.geometry.boxes import upright_size
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
@@ -53,14 +54,14 @@ def overview_file(parts: Sequence[tuple[ViewScene, Sketch]]) -> bytes:
     return spz.pack("overview.spz", Gaussians.concatenate(placed))
 
 
-def heights_of(parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]) -> tuple[tuple[float, float], ...]:
-    """Where floor and ceiling of each scene are along a direction of the map, a few strays left out on either side."""
-    out = []
-    for entry, one in parts:
-        heights = entry.S_map_scene.apply(one.gaussians.means) @ np.asarray(up)
-        low, high = np.quantile(heights, (_STRAYS, 1 - _STRAYS)).tolist()
-        out.append((low, high))
-    return tuple(out)
+def extent_of(
+    parts: Sequence[tuple[ViewScene, Sketch]], up: Sequence[float]
+) -> tuple[tuple[tuple[float, float], ...], tuple[float, float, float]]:
+    """Where floor and ceiling of each scene are along a direction of the map, and length, width and height of them all;
+    a few strays left out on every side."""
+    points = [entry.S_map_scene.apply(one.gaussians.means) for entry, one in parts]
+    ends = [np.quantile(one @ np.asarray(up), (_STRAYS, 1 - _STRAYS)).tolist() for one in points]
+    return tuple((low, high) for low, high in ends), upright_size(np.concatenate(points), np.asarray(up), _STRAYS)
 
 
 @dataclass(eq=False)
@@ -71,7 +72,7 @@ class _Island:
     sketches: dict[str, Sketch] = field(default_factory=dict)
     told: frozenset[str] = frozenset()
     looked: set[str] = field(default_factory=set)
-    heights: dict[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # by the name of the overview
+    told_of: ViewOverview | None = None
 
 
 class Levels:
@@ -231,8 +232,8 @@ class Levels:
         if not parts:
             raise InputError("nothing of it can be seen")
         counts = tuple(len(one.gaussians) for _, one in parts)
-        heights = heights_of(parts, up_of(list(inside.values())))
-        return overview_file(parts), ViewOverview("", tuple(places), counts, heights=heights), boxes
+        heights, size = extent_of(parts, up_of(list(inside.values())))
+        return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, size), boxes
 
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
         """What is known of one island; what is not is asked for."""
@@ -270,9 +271,12 @@ class Levels:
                 self._files.popitem(last=False)
         places = tuple(place for place, entry in inside.items() if entry.key in island.told)
         counts = tuple(len(one.gaussians) for _, one in parts)
-        if name not in island.heights:
-            island.heights = {name: heights_of(parts, up_of(list(inside.values())))}
-        return ViewOverview(f"overviews/{component}/{name}.spz", places, counts, pending, island.heights[name])
+        uri = f"overviews/{component}/{name}.spz"
+        if island.told_of is None or island.told_of.uri != uri:
+            heights, size = extent_of(parts, up_of(list(inside.values())))
+            island.told_of = ViewOverview(uri, places, counts, pending, heights, size)
+        island.told_of = replace(island.told_of, scenes=places, pending=pending)
+        return island.told_of
 
     def _tell(self, island: _Island, num_scenes: int) -> None:
         """Have the page ask again once all are there, and whenever twice as many are: not for every one of hundreds."""

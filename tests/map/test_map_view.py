@@ -144,6 +144,13 @@ def test_what_a_person_does_is_done_by_the_maps_own_doors(folder):
         np.testing.assert_allclose(kept.sigmas, [np.radians(2.0)] * 3 + [0.1 / metres / 2.0] * 3 + [np.inf])
         page.told("actions/remove_prior", {"scene": ids[1]})
         assert list(m.store.priors.list()) == []
+        # What was told before holds again, to the bit.
+        number = after["scenes"][1]["prior_number"]
+        after = page.told("actions/earlier_prior", {"scene": ids[1], "number": number})["map"]
+        assert after["scenes"][1]["prior"] == "pose, 0.1 m, 2°"
+        (again,) = m.store.priors.list()
+        assert again.S_map_scene.matrix().tolist() == kept.S_map_scene.matrix().tolist()
+        assert again.sigmas.tolist() == kept.sigmas.tolist()
         before = page.told("state.json")
         refused = [
             ("confirm", {"what": f"{ids[0]}:{'f' * 32}", "note": ""}, 404),
@@ -159,6 +166,8 @@ def test_what_a_person_does_is_done_by_the_maps_own_doors(folder):
             ("prior", prior | {"S_map_scene": [["x"] * 4] * 4}, 400),
             ("prior", prior | {"S_map_scene": [[0] * 4] * 4}, 400),
             ("remove_prior", {}, 400),
+            ("earlier_prior", {"scene": ids[0], "number": number}, 404),
+            ("earlier_prior", {"scene": ids[1], "number": "1"}, 400),
         ]
         for name, asked, expected in refused:
             status, body = page.ask(f"actions/{name}", asked)

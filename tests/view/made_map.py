@@ -52,6 +52,7 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
                 "extras": f"scenes/{i:012x}/extras.json",
                 "tags": ["ground", "north"] if i % 2 else ["ground"],
                 "prior": "position, 0.30 m" if i == 4 else None,
+                "prior_number": 1 if i == 4 else None,
             }
         )
     states = ("used", "tentative", "used", "undecided", "rejected", "used", "no_match")
@@ -89,7 +90,14 @@ def made_map(scenes: int = 12, second_island: int = 2, hostile: bool = False) ->
                 "up": [0, 0, 1],
                 "metres_per_unit": (1.0, 0.5)[k],
                 "box": [[-1, -1, 0], [3.0 * (scenes, second_island)[k] - 2, 1, 2]],
-                "overview": None,
+                "overview": {
+                    "uri": f"overviews/{k}/none.spz",
+                    "pending": 0,
+                    "scenes": [],
+                    "counts": [],
+                    "heights": [],
+                    "size": [3.0 * (scenes, second_island)[k] - 1, 2, 2],
+                },
                 "merged": "merged/tileset.json" if k == 0 else None,
             }
             for k in range(2 if second_island else 1)
@@ -157,6 +165,7 @@ class MadeServer:
     def __init__(self, built: Path, summary: dict[str, Any]) -> None:
         self.built, self.map, self.log = built, summary, []
         self.events: dict[str, list[dict[str, str]]] = {}
+        self.priors = ["position, 0.30 m"]  # that were ever told; numbered from one
         self.refuse: str | None = None  # what the next action is answered with
         self.delay_s = 0.0
         self._http: http.server.ThreadingHTTPServer | None = None
@@ -188,9 +197,12 @@ class MadeServer:
         self.map["state"] = f"s{len(self.log)}"
         if name in ("confirm", "reject", "withdraw"):
             self._review(name, body["what"], body["note"])
-        elif name in ("prior", "remove_prior"):
+        elif name in ("prior", "remove_prior", "earlier_prior"):
             scene = next(row for row in self.map["scenes"] if row["id"] == body["scene"])
-            scene["prior"] = f"pose, {body['sigma_m']} m, {body['sigma_deg']}°" if name == "prior" else None
+            if name == "prior":
+                self.priors.append(f"pose, {body['sigma_m']} m, {body['sigma_deg']}°")
+            number = {"prior": len(self.priors), "remove_prior": None}.get(name, body.get("number"))
+            scene |= {"prior": None if number is None else self.priors[number - 1], "prior_number": number}
         elif name == "optimize":
             self.map["revision"] += 1
             last = self.map["revisions"][-1]

@@ -91,7 +91,7 @@ def site(
              "component": 0, "status": "placed", "S_map_scene": S.tolist(), "box": box.tolist(),
              "corners": ends.tolist(), "sigma_m": 0.1, "ellipsoid": np.diag([0.04, 0.01, 0.09]).tolist(),
              "middle": ends.mean(0).tolist(), "tileset": f"scene{i}/tileset.json", "extras": f"scene{i}/extras.json",
-             "tags": [], "prior": None}
+             "tags": [], "prior": None, "prior_number": None}
         )  # fmt: skip
     (folder / "overview.spz").write_bytes(spz.pack("overview", Gaussians.concatenate(shares)))
     every = np.concatenate(corners)

@@ -354,6 +354,16 @@ def test_a_scene_is_dragged_and_becomes_a_prior(hands, server):
     hands.click("button", "Remove the prior")
     hands.says("Removed")
     assert server.map["scenes"][4]["prior"] is None
+    hands.press("u")
+    hands.says("position, 0.30 m", "gs-scene")
+    assert server.log[-1] == ("earlier_prior", {"scene": "000000000004", "number": 1})
+    hands.click("button", "Move by hand")
+    hands.says("It takes the place of what was told before: position, 0.30 m", "gs-scene")
+    hands.click("button", "Save as prior")
+    hands.wait("find('button', 'Remove the prior')")
+    hands.press("u")
+    hands.says("position, 0.30 m", "gs-scene")
+    assert server.log[-1] == ("earlier_prior", {"scene": "000000000004", "number": 1})
     hands.click("button", "Move by hand")
     hands.press("Escape")
     assert told(hands, "drag") == [None]

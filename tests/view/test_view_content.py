@@ -54,12 +54,13 @@ def test_what_is_up_is_what_most_scenes_say():
 
 def test_a_static_page_promises_nothing_that_is_computed_when_asked():
     view = replace(MadeDoors().view, has_objects=True, merged=frozenset([0]))
-    overviews = {0: ViewOverview("o.spz", (0,), (9,), 1, ((0.0, 2.5),))}
+    overviews = {0: ViewOverview("o.spz", (0,), (9,), 1, ((0.0, 2.5),), (6.0, 5.0, 2.5))}
     live, still = (summary(view, Served(live=live, overviews=overviews)) for live in (True, False))
     assert (live["graph"], live["history"]) == ("graph.json", "history.json")
     assert (still["graph"], still["history"], still["actions"]) == ("graph.json", None, False)
     assert still["components"][0]["merged"] == "merged/0/tileset.json"
     told = {"uri": "o.spz", "pending": 1, "scenes": [0], "counts": [9], "heights": [[0.0, 2.5]]}
+    told["size"] = [6.0, 5.0, 2.5]
     assert still["components"][0]["overview"] == told
     assert still["components"][1]["overview"] is None
 

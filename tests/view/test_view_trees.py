@@ -19,7 +19,7 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.voxels import optical_depths, projected_areas
 from gsmap.types import Gaussians, Scene
 from gsmap.view import ViewScene
-from gsmap.view.levels import heights_of
+from gsmap.view.levels import extent_of
 from gsmap.view.tree_cache import TreeCache
 from gsmap.view.trees import Sketch, TreeParams, shown, sketch, write_tree
 
@@ -98,18 +98,19 @@ def test_a_few_strays_widen_the_box_of_a_tile_and_not_its_core(tmp_path):
     assert robust_box(points, weights)[1].tolist() == [50, 50, 50]
 
 
-def test_floor_and_ceiling_are_found_whatever_the_frame_is_turned(tmp_path):
-    """A room 2.5 m high in a map whose up is no axis, with a few strays far above it."""
+def test_a_room_is_measured_whatever_its_frame_is_turned(tmp_path):
+    """One of 6 x 3 x 2.5 m in a map whose up is no axis, with a few strays far above it."""
     rng = np.random.default_rng(0)
-    flat = rng.uniform(0, 6, (2000, 2))
-    room = np.concatenate([np.c_[flat, np.repeat([0, 2.5], 1000)], [[3, 3, 40.0]] * 20])
-    turn = exp_so3(np.array([0.5, -0.7, 0.2]))
+    flat = rng.uniform(0, (6, 3), (2000, 2))
+    room = np.concatenate([np.c_[flat, np.repeat([0, 2.5], 1000)], [[3, 1, 40.0]] * 20])
+    turn = exp_so3(np.array([0.5, -0.7, 0.2])) @ exp_so3(np.array([0, 0, 0.6]))
     up = turn @ [0, 0, 1.0]
     g = replace(blob(0, len(room)), means=(room @ turn.T).astype(np.float32))
     scene = Scene("0" * 32, "room", len(g), 0, 0, np.stack([g.means.min(0), g.means.max(0)]))
-    ((floor, ceiling),) = heights_of([(ViewScene(scene, "k", None, up), Sketch(g, scene.bounds))], up)
+    ((floor, ceiling),), size = extent_of([(ViewScene(scene, "k", None, up), Sketch(g, scene.bounds))], up)
     assert abs(floor) < 0.01
     assert abs(ceiling - 2.5) < 0.01
+    np.testing.assert_allclose(size, (6, 3, 2.5), rtol=0.05)  # 2 % are left out on every side
 
 
 def test_what_cannot_be_seen_is_left_out_and_nothing_at_all_is_said(tmp_path):

@@ -1,7 +1,7 @@
 // Everything that a person can do on the page, one function each. What changes the map goes through `send`.
 import { act, getEdge, getGraph, getHistory, getMap, getRevision, getState, Gone } from "./api";
 import { fits } from "./address";
-import type { Actions, Box, GraphEntry, MapSummary, Matrix, RevisionPoses, Vector } from "./contract";
+import type { Actions, Box, GraphEntry, MapSummary, Matrix, RevisionPoses, SceneEntry, Vector } from "./contract";
 import * as derive from "./derive";
 import { Resources } from "./resources";
 import type { Resource } from "./resources";
@@ -548,19 +548,32 @@ export async function savePrior(sigma_m: number, sigma_deg: number): Promise<voi
   const { drag, map } = page.state;
   const scene = drag && map && derive.sceneOf(map, drag.scene);
   if (!scene) return;
-  const { name, id, prior } = scene;
-  // One that was there cannot be said again by the page, which knows it in words only: it is not offered to undo.
-  const inverse: Undo = {
-    label: `prior of ${name}`,
-    run: () => send("remove_prior", { scene: id }, { doing: "removing the prior", done: `Undone: prior of ${name}` }),
-  };
+  const { name, id } = scene;
   const isDone = await send(
     "prior",
     { scene: id, S_map_scene: drag.now, sigma_m, sigma_deg },
-    { doing: `saving where ${name} lies`, done: `Saved: where ${name} lies`, undo: prior ? undefined : inverse },
+    { doing: `saving where ${name} lies`, done: `Saved: where ${name} lies`, undo: priorAsBefore(scene) },
   );
   if (isDone) endDrag();
 }
 
-export const removePrior = (id: string, name: string) =>
-  send("remove_prior", { scene: id }, { doing: `removing the prior of ${name}`, done: `Removed: prior of ${name}` });
+export const removePrior = (scene: SceneEntry) =>
+  send(
+    "remove_prior",
+    { scene: scene.id },
+    {
+      doing: `removing the prior of ${scene.name}`,
+      done: `Removed: prior of ${scene.name}`,
+      undo: priorAsBefore(scene),
+    },
+  );
+
+/** What is told of a scene now holds again, or nothing where nothing is. */
+function priorAsBefore({ id, name, prior_number: number }: SceneEntry): Undo {
+  const said = { doing: `undoing: prior of ${name}`, done: `Undone: prior of ${name}` };
+  return {
+    label: `prior of ${name}`,
+    run: () =>
+      number === null ? send("remove_prior", { scene: id }, said) : send("earlier_prior", { scene: id, number }, said),
+  };
+}

@@ -53,6 +53,7 @@ export interface Overview {
   scenes: number[]; // indices into MapSummary.scenes
   counts: number[]; // Gaussians of each
   heights: [number, number][]; // of floor and ceiling of each along `up`: nearly all of it lies between
+  size: Vector | null; // length, width and height of it all, map units
 }
 
 export interface SceneEntry {
@@ -78,6 +79,7 @@ export interface SceneEntry {
   extras: string; // GET: SceneExtras
   tags: string[];
   prior: string | null; // what people or receivers told of where it lies, in words: "pose, 0.05 m, 2°"
+  prior_number: number | null; // which of what was ever told that is
 }
 /** 202 of a tileset that is not there yet. */
 export interface TreeProgress {
@@ -196,6 +198,7 @@ export interface Actions {
   reject: { what: string; note: string };
   withdraw: { what: string; note: string };
   prior: { scene: string; S_map_scene: Matrix; sigma_m: number; sigma_deg: number };
+  earlier_prior: { scene: string; number: number }; // what was told of it before, by its number, holds again
   remove_prior: { scene: string };
   optimize: Record<string, never>;
 }

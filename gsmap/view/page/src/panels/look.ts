@@ -125,12 +125,17 @@ export class Look extends Panel {
     const { map } = this.state;
     const scenes = map?.scenes.filter((scene) => scene.component === component.component) ?? [];
     const gaussians = scenes.reduce((sum, scene) => sum + scene.num_gaussians, 0);
-    const sides = component.box[1].map((v, i) => (v - (component.box[0][i] ?? v)) * component.metres_per_unit);
-    const size = sides.map((v) => Number(v.toPrecision(3))).join("\u00a0×\u00a0");
     const unit = component.metres_per_unit;
+    const sides = component.overview?.size?.map((side) => Number((side * unit).toPrecision(3)));
     return html`<dl class="facts">
-      <dt>Size</dt>
-      <dd>${`${size}\u00a0m`}</dd>
+      ${
+        sides
+          ? html`<dt>Size</dt>
+              <dd title="length × width × height, a few strays left out">
+                ${`${sides.join("\u00a0×\u00a0")}\u00a0m`}
+              </dd>`
+          : nothing
+      }
       <dt>Unit</dt>
       <dd>${Math.abs(unit - 1) < 5e-4 ? "1 m" : metres(unit)}</dd>
       <dt>Gaussians</dt>

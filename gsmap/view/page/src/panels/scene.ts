@@ -107,7 +107,7 @@ export class SceneDetail extends Panel {
           ? html`<button
               ?disabled=${state.busy !== null}
               title="Forget: ${scene.prior}"
-              @click=${() => void actions.removePrior(scene.id, scene.name)}
+              @click=${() => void actions.removePrior(scene)}
             >
               ${icon("close")} Remove the prior
             </button>`
@@ -133,13 +133,7 @@ export class SceneDetail extends Panel {
           ${sure("metres", "sigma_m", 0.001, 1000, this.sigmaM, (value) => (this.sigmaM = value))}
           ${sure("degrees", "sigma_deg", 0.01, 180, this.sigmaDeg, (value) => (this.sigmaDeg = value))}
         </div>
-        ${
-          scene.prior
-            ? html`<p class="small muted">
-                It takes the place of what was told before (${scene.prior}), which the page cannot bring back.
-              </p>`
-            : nothing
-        }
+        ${scene.prior ? html`<p class="small muted">It takes the place of what was told before: ${scene.prior}.</p>` : nothing}
         <div class="row">
           <button class="main" ?disabled=${this.state.busy !== null}>Save as prior</button>
           <button type="button" @click=${actions.endDrag}>Cancel</button>
