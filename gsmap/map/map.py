@@ -44,6 +44,7 @@ from gsmap.types.rows import (
     MeasureReport,
     MergeReport,
     ModelRow,
+    ObjectRow,
     ObjectsReport,
     PairReport,
     PhotoRow,
@@ -465,7 +466,7 @@ class Map(AbstractContextManager["Map"]):
         """What stood at a place, when it was seen, and when it was gone.
 
         Args:
-            place: an object by its id, or a point ``X,Y,Z`` of the map.
+            place: an object by its id or name, or a point ``X,Y,Z`` of the map.
             box: six numbers, its lowest and highest corner.
 
         Raises:
@@ -475,6 +476,41 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import history_report, known_objects
 
         return history_report(known_objects(self.store, self.settings, self._progress), place, box)
+
+    def is_object(self, ref: str) -> bool:
+        """Whether a text names an object (``o12``) and no scene."""
+        from gsmap.store.objects import number_of
+
+        return number_of(ref) is not None and ref not in {scene.name for scene in self.scenes()}
+
+    def edit_object(
+        self,
+        ref: str,
+        *,
+        name: str | None = None,
+        label: str | None = None,
+        note: str | None = None,
+        same_as: str | None = None,
+        author: str = "",
+    ) -> ObjectRow:
+        """``gsmap edit MAP o12``: what people call an object; what was said before stays in its history.
+
+        Args:
+            ref: its id or its name.
+            name: no other object's; ``none`` takes it back.
+            label: what kind of thing it is; ``none`` takes it back.
+            note: added to those that there are.
+            same_as: the object that it is one with, which is told for both from then on; ``none`` takes that back.
+            author: who says so.
+
+        Raises:
+            NotFoundError: no such object.
+            InputError: a name that is taken, or two that a capture shows apart; nothing is written.
+        """
+        from gsmap.map.objects import edit_object
+
+        words = {"name": name, "label": label, "note": note, "same_as": same_as}
+        return edit_object(self.store, self.settings, ref, self._progress, author=author, **words)
 
     # --- localize ----------------------------------------------------------------------------------------------------
 

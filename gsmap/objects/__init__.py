@@ -3,12 +3,13 @@
 from gsmap.objects.changed import changed_thing
 from gsmap.objects.fuse import Node, Placed, fuse
 from gsmap.objects.graph import graphml, object_graph
-from gsmap.objects.looks import Eyes, Glance, glance, judge, open_eyes
-from gsmap.objects.make import Capture, Params, make_objects
+from gsmap.objects.looks import Eyes, Glance, glance, in_view, judge, open_eyes
+from gsmap.objects.make import VERSION, Capture, Params, make_objects, recipe_key
 from gsmap.objects.permanence import Permanence, permanence
 from gsmap.objects.relations import Relation, relations
 
 __all__ = [
+    "VERSION",
     "Capture",
     "Eyes",
     "Glance",
@@ -21,10 +22,12 @@ __all__ = [
     "fuse",
     "glance",
     "graphml",
+    "in_view",
     "judge",
     "make_objects",
     "object_graph",
     "open_eyes",
     "permanence",
+    "recipe_key",
     "relations",
 ]

@@ -17,7 +17,8 @@ def object_graph(
     """A `networkx.MultiDiGraph`: a node per object, an edge per relation, whose attributes GraphML can say.
 
     Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
-    ``seen``, ``looks``, ``half_life_days`` (absent where unknown), ``there`` (the newest look shows it). Edges:
+    ``seen``, ``looks``, ``half_life_days`` (absent where unknown), ``there`` (the newest look shows it), ``name`` and
+    ``label`` (absent where nobody gave any). Edges:
     ``kind`` (on, in, next to).
 
     Args:
@@ -36,6 +37,7 @@ def object_graph(
         facts |= {"seen": stays.seen, "looks": stays.looks, "there": thing.there}
         if stays.half_life_days is not None:
             facts["half_life_days"] = stays.half_life_days
+        facts |= {word: value for word in ("name", "label") if (value := getattr(thing.words, word))}
         graph.add_node(thing.id, **facts)
     for relation in relations(objects, metres):
         graph.add_edge(relation.source, relation.target, kind=relation.kind)

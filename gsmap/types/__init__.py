@@ -4,7 +4,7 @@ from gsmap.types.cameras import Cameras
 from gsmap.types.change import CHANGE_KINDS, Change, ChangeKind, ChangeReport
 from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
-from gsmap.types.map_object import SIGHTING_STATES, MapObject, Sighting, SightingState
+from gsmap.types.map_object import SIGHTING_STATES, MapObject, ObjectWords, Sighting, SightingState
 from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
@@ -30,6 +30,7 @@ __all__ = [
     "MapObject",
     "MergeResult",
     "NodeLayer",
+    "ObjectWords",
     "PlacedScene",
     "PoseChange",
     "PoseGraph",

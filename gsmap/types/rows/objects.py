@@ -16,7 +16,11 @@ class ObjectRow(Row):
     """One thing of the map, over all captures that show it.
 
     Args:
-        id: 8 hex digits; captures that come later do not change it.
+        id: what it is called (``o12``), also after objects were made again; 8 hex digits while it has no number, in a
+            map that is open for reading only.
+        name: what people call it; null where they do not.
+        label: what kind of thing they say it is.
+        note: the last one on it.
         component: of the map, whose frame everything is in.
         position: mean of its Gaussians, where it was last seen as a thing of its own.
         size: of the box around it where it was last seen, along the map's axes.
@@ -32,6 +36,8 @@ class ObjectRow(Row):
 
     columns: ClassVar[Mapping[str, str]] = {
         "id": "object",
+        "name": "name",
+        "label": "label",
         "position": "position",
         "size": "size",
         "seen": "seen",
@@ -53,6 +59,9 @@ class ObjectRow(Row):
     first_seen: str | None
     last_seen: str | None
     half_life_days: float | None
+    name: str | None = None
+    label: str | None = None
+    note: str | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,12 +134,40 @@ class SightingRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ObjectFactRow(Row):
+    """One thing that was said of an object.
+
+    Args:
+        object: id of it.
+        at: when it was said, ISO 8601.
+        fact: ``name``, ``label``, ``note`` or ``same_as``.
+        value: the text; empty where what was said before was taken back.
+        author: who said it; empty where a person did and was not named.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "object": "object",
+        "at": "said at",
+        "fact": "fact",
+        "value": "value",
+        "author": "by",
+    }
+
+    object: str
+    at: str
+    fact: str
+    value: str
+    author: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class HistoryReport(Row):
     """What stood at a place, and when.
 
     Args:
         objects: what was ever seen there.
         sightings: what each capture says of each of them, oldest first.
+        words: what people said of each of them, oldest first.
         notes: what a person should know, such as captures that tell nothing.
     """
 
@@ -138,4 +175,5 @@ class HistoryReport(Row):
 
     objects: tuple[ObjectRow, ...]
     sightings: tuple[SightingRow, ...]
+    words: tuple[ObjectFactRow, ...] = ()
     notes: tuple[str, ...] = ()
