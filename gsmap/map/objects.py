@@ -92,7 +92,12 @@ class Known:
 
 
 def known_objects(
-    store: Store, settings: Settings, progress: StageProgress, graphs: Mapping[str, SceneGraph] | None = None
+    store: Store,
+    settings: Settings,
+    progress: StageProgress,
+    graphs: Mapping[str, SceneGraph] | None = None,
+    *,
+    make: bool = True,
 ) -> Known:
     """The objects of every component by the newest poses, with what people and photographs say of them.
 
@@ -101,11 +106,12 @@ def known_objects(
     Args:
         graphs: by scene, what the captures are taken to show; no capture is then asked whether it looked where others
             show something, and nothing is kept. By default the newest graph of each, and all are asked.
+        make: those that are out of date.
 
     Raises:
-        NotFoundError: the map has no poses yet.
+        NotFoundError: the map has no poses yet, or what is kept is out of date and is not to be made.
     """
-    placed, scenes, metres, parts, notes = objects_of_components(store, settings, progress, graphs)
+    placed, scenes, metres, parts, notes = objects_of_components(store, settings, progress, graphs, make=make)
     objects: list[MapObject] = []
     for part in parts:
         if part.key is not None and part.places is not None and store.catalog.writable:
@@ -129,6 +135,15 @@ def known_objects(
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
     return Known(objects, scenes, (*notes, *said), metres, photos, joined, store.objects.facts())
+
+
+def kept_objects(store: Store, settings: Settings) -> Known:
+    """The objects of the map as they are kept; only the catalog is read.
+
+    Raises:
+        NotFoundError: they are out of date.
+    """
+    return known_objects(store, settings, lambda *_: None, make=False)
 
 
 # --- what people say ------------------------------------------------------------------------------------------------

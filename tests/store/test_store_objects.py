@@ -44,8 +44,8 @@ def test_numbers_stay_and_new_things_get_new_ones(store, scenes):
 def test_a_picture_on_a_wall_is_known_again(store, scenes):
     picture = [[0, 0, 1], [0.5, 0.001, 1.5]]
     keep_objects(store, {scenes[0]: picture})
-    assert store.objects.numbers([{scenes[0]: [*np.array(picture), 0, 0.004, 0]}]) == [1]
-    assert store.objects.numbers([{scenes[0]: [*np.array(picture), 0.6, 0, 0]}]) == [None]
+    assert store.objects.numbers([{scenes[0]: np.array(picture) + np.array([0, 0.004, 0])}]) == [1]
+    assert store.objects.numbers([{scenes[0]: np.array(picture) + np.array([0.6, 0, 0])}]) == [None]
 
 
 def test_two_that_become_one_and_part_again_have_their_numbers(store, scenes):

@@ -41,7 +41,12 @@ class Part:
 
 @of_one_state
 def objects_of_components(
-    store: Store, settings: Settings, progress: StageProgress, graphs: Mapping[str, SceneGraph] | None
+    store: Store,
+    settings: Settings,
+    progress: StageProgress,
+    graphs: Mapping[str, SceneGraph] | None,
+    *,
+    make: bool = True,
 ) -> tuple[PoseGraph, dict[str, Scene], dict[int, float], list[Part], list[str]]:
     """The newest poses, the placed captures, metres, the objects of each component, and who tells nothing."""
     placed = store.revisions.get()
@@ -71,6 +76,8 @@ def objects_of_components(
         still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit, settings)
         if kept is not None and still.keys() == poses.keys():
             parts.append(Part(component, kept, None, None))
+        elif not make:
+            raise NotFoundError("the objects of the map are out of date: gsmap graph MAP makes them")
         else:
             read = (
                 graphs if graphs is not None else {scene.id: store.graphs.load(scene.id) for scene in mine[component]}
