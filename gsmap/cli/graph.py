@@ -41,6 +41,10 @@ def command(
         print_rows("graph", report, json)
         return
     if out is None:
-        print_table("objects", ObjectRow.columns, report.objects)
+        columns = dict(ObjectRow.columns)
+        for word in ("name", "label"):
+            if not any(getattr(row, word) for row in report.objects):
+                del columns[word]
+        print_table("objects", columns, report.objects)
         print_table("relations", RelationRow.columns, report.relations)
     say(f"{len(report.objects)} objects, {len(report.relations)} relations")

@@ -699,11 +699,11 @@ class Map(AbstractContextManager["Map"]):
         def progress(fraction: float, text: str) -> None:
             self._progress("export", fraction, text)
 
-        known, told = self._what_stays() if static else (None, ())
+        known, told = self.what_stays() if static else (None, ())
         made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait, known=known)
         return reports.export_report(self.store, Path(out), made, (*told, *notes))
 
-    def _what_stays(self) -> tuple[Known, tuple[str, ...]]:
+    def what_stays(self) -> tuple[Known, tuple[str, ...]]:
         """The objects of the map after all visits were compared, and who takes no part in that."""
         from gsmap.map.objects import known_objects
         from gsmap.map.stages.change import compare, lacking, wanted
@@ -730,7 +730,7 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.small_map import export_small
 
-        known = self._what_stays()[0] if static else None
+        known = self.what_stays()[0] if static else None
         with at_work(self.store, "export"):
             return export_small(self.store, Path(out), budget_bytes, self.settings, self._progress, known)
 

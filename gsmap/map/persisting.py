@@ -15,6 +15,7 @@ import numpy as np
 from gsmap.errors import NotFoundError
 from gsmap.map.objects import Known
 from gsmap.methods import text_digest
+from gsmap.objects.changed import CHANGED
 from gsmap.store import Store
 from gsmap.types import MapObject
 from gsmap.types.plain import canonical
@@ -30,7 +31,7 @@ class Passing:
     """What of one capture does not persist, as the catalog tells it; `rows` reads which Gaussians these are.
 
     Args:
-        graph: key of the graph whose things it names; empty where it names none.
+        graph: key of the graph that knows its things; empty where nothing is left out, or nobody described it.
         things: of that graph.
         changes: number of a comparison, place of a change in it, and whether the capture is its ``before`` or
             ``after``.
@@ -91,7 +92,7 @@ def what_passes(store: Store, known: Known) -> dict[str, Passing]:
                     told.setdefault(scene, []).append(f"{one.key} {one.created_at}")
     return {
         scene: Passing(
-            graphs.get(scene, "") if scene in things else "",
+            graphs.get(scene, "") if scene in things or scene in changes else "",
             tuple(sorted(things.get(scene, ()))),
             tuple(changes.get(scene, ())),
             tuple(dict.fromkeys(told.get(scene, ()))),
@@ -107,15 +108,19 @@ def rows(store: Store, scene: str, passing: Passing) -> np.ndarray:
         NotFoundError: what it was told from was pruned meanwhile.
     """
     out = np.zeros(store.scenes.get(scene).num_gaussians, bool)
-    if passing.things:
-        graph = store.graphs.load(scene, passing.graph)
-        if graph is None or graph.things is None:
-            raise NotFoundError(f"the things of scene {scene[:12]} were dropped meanwhile: run the same export again")
-        out |= np.isin(graph.things.members, passing.things)
     for number in dict.fromkeys(change[0] for change in passing.changes):
         found = store.changes.load(number).changes
         for _, place, side in (change for change in passing.changes if change[0] == number):
             out[found[place].before if side == "before" else found[place].after] = True
+    graph = store.graphs.load(scene, passing.graph) if passing.graph else None
+    if passing.graph and graph is None:
+        raise NotFoundError(f"the things of scene {scene[:12]} were dropped meanwhile: run the same export again")
+    if graph is not None and graph.things is not None and len(graph.things):
+        members = graph.things.members
+        of = np.bincount(members[members >= 0], minlength=len(graph.things))
+        changed = np.bincount(members[out & (members >= 0)], minlength=len(graph.things))
+        whole = np.flatnonzero(changed >= CHANGED * np.maximum(of, 1))  # else it is of a part, or of what stands by it
+        out |= np.isin(members, np.union1d(whole, np.array(passing.things, np.int64)))
     return out
 
 

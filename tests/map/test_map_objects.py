@@ -17,15 +17,18 @@ from made_room import Room, looking_about
 from sqlalchemy import delete
 
 import gsmap.map
+from gsmap import formats
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
+from gsmap.map.persisting import has_passed
+from gsmap.map.small_map import SmallLocalizer
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, schema
 from gsmap.store.graphs import Graphs
 from gsmap.store.scenes import Scenes
-from gsmap.types import Change, ChangeReport, PoseGraph, ScenePose, Sim3, Things
+from gsmap.types import Change, ChangeReport, MapObject, PoseGraph, ScenePose, Sighting, Sim3, Things
 
 FRAMES = {
     "may": Sim3(exp_so3(np.array([0, 0, 0.4])), np.array([3.0, 1, 0.2])),
@@ -360,6 +363,72 @@ def test_a_name_of_what_is_found_no_more_is_told_of(site: Map) -> None:
     assert any(stool.id in note and "milking stool" in note for note in report.notes)
     assert [one.id for one in site.history("milking stool").objects] == [stool.id]
     site.edit_object(stool.id, name="none")
+
+
+# --- what persists ---------------------------------------------------------------------------------------------------
+
+
+def num_near(means: np.ndarray, low: list[float], high: list[float]) -> int:
+    return int(((means > np.array(low) - 0.05) & (means < np.array(high) + 0.05)).all(1).sum())
+
+
+PLACES = {
+    "cupboard": ([0.1, 0.5, 0.1], [0.5, 1.5, 1.8]),
+    "table": ([2.0, 0.1, 0.2], [3.2, 0.7, 0.75]),
+    "stool": ([2.3, 2.1, 0.2], [2.7, 2.5, 0.45]),
+}
+
+
+def exported(m: Map, out: Path, **options: object) -> dict[str, int]:
+    """How many Gaussians an export has in each of the places."""
+    m.export(out, merge="union", tile_size_m=0, **options)
+    means = formats.read(out / "component_0" / "map.ply").means
+    return {name: num_near(means, *box) for name, box in PLACES.items()}
+
+
+def test_static_leaves_out_what_came_and_went_and_keeps_the_rest(site: Map, tmp_path: Path) -> None:
+    whole, static = exported(site, tmp_path / "all"), exported(site, tmp_path / "static", static=True)
+    assert static["cupboard"] > 0.9 * whole["cupboard"] > 0
+    assert whole["table"] > 200
+    assert static["table"] < 0.02 * whole["table"]
+    assert static["stool"] < 0.02 * whole["stool"]
+    report = site.export(tmp_path / "static", merge="union", tile_size_m=0, static=True)
+    assert report.reused == 1, "nothing changed since"
+    assert any("2 of 3 objects are left out" in note for note in report.notes)
+    assert site.export(tmp_path / "static", merge="union", tile_size_m=0).recomputed == 1, "another content"
+
+
+@pytest.mark.parametrize(
+    ("states", "shift", "passed"),
+    [
+        ("seen", 0.0, False),
+        ("seen unseen unseen", 0.0, False),
+        ("seen unseen seen", 0.0, False),
+        ("seen absent", 0.0, True),
+        ("absent unseen seen", 0.0, True),
+        ("seen seen", 0.2, False),
+        ("seen seen", 3.0, True),
+    ],
+)
+def test_what_persists_is_told_by_the_looks_that_there_were(states: str, shift: float, passed: bool) -> None:
+    """What nobody looked at again is kept, and so is what another capture shows a part of."""
+    box = np.array([[0.0, 0, 0], [1, 0.5, 0.8]])
+    sightings = tuple(
+        Sighting(str(i), state, i, box + [shift * i, 0, 0]) if state == "seen" else Sighting(str(i), state)
+        for i, state in enumerate(states.split())
+    )
+    assert has_passed(MapObject("o1", 0, box, box.mean(0), np.zeros(3, np.float32), sightings)) is passed
+
+
+def test_a_small_map_is_without_what_came_and_went(site: Map, tmp_path: Path) -> None:
+    site.export_small(tmp_path / "small", 4_000_000, static=True)
+    small = SmallLocalizer(tmp_path / "small", site.settings)
+    frame = {s: FRAMES[one.name].inverse() for s, one in small.small.items()}
+    for scene, held in small.placed.items():
+        for points in (held.gaussians.means, held.features.points):
+            at = frame[scene].apply(points)
+            assert num_near(at, *PLACES["table"]) <= 2
+            assert num_near(at, *PLACES["stool"]) <= 2
 
 
 def test_captures_without_things_are_named(site: Map) -> None:
