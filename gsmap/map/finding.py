@@ -17,6 +17,7 @@ from gsmap.map import models
 from gsmap.map.objects import Known, known_objects
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
+from gsmap.map.stages.thin import THINGS
 from gsmap.store import Store
 from gsmap.types import MapObject, PoseGraph, Scene, SceneGraph, Sighting
 from gsmap.types.progress import StageProgress
@@ -217,7 +218,7 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
     now = next(iter(keys.values())).recipe if keys else ""
     made: dict[str, dict[str, str]] = {}
     for stored in store.graphs.list():  # oldest first
-        if stored.scene in scenes and stored.recipe is not None:
+        if stored.scene in scenes and stored.recipe not in (None, THINGS.recipe):
             made.setdefault(stored.recipe, {})[stored.scene] = stored.key
     # What a scene is described under names its scale, too: of the present recipe only what is of use now counts.
     mine = {scene: key for scene, key in made.get(now, {}).items() if keys[scene].digest == key}

@@ -414,7 +414,7 @@ def test_what_persists_is_told_by_the_looks_that_there_were(states: str, shift: 
     """What nobody looked at again is kept, and so is what another capture shows a part of."""
     box = np.array([[0.0, 0, 0], [1, 0.5, 0.8]])
     sightings = tuple(
-        Sighting(str(i), state, i, box + [shift * i, 0, 0]) if state == "seen" else Sighting(str(i), state)
+        Sighting(str(i), state, i, box + np.array([shift * i, 0, 0])) if state == "seen" else Sighting(str(i), state)
         for i, state in enumerate(states.split())
     )
     assert has_passed(MapObject("o1", 0, box, box.mean(0), np.zeros(3, np.float32), sightings)) is passed
@@ -429,6 +429,21 @@ def test_a_small_map_is_without_what_came_and_went(site: Map, tmp_path: Path) ->
             at = frame[scene].apply(points)
             assert num_near(at, *PLACES["table"]) <= 2
             assert num_near(at, *PLACES["stool"]) <= 2
+
+
+def test_a_thinned_capture_still_tells_what_stood_there(site: Map, tmp_path: Path) -> None:
+    """May is kept compact: its table, and that it had no stool, are known still."""
+    with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
+        m.with_settings({"thin.min_seen_again": 0.2, "thin.min_fidelity_db": 0.0})
+        before = m.history(at(TABLE)), m.history(at(STOOL))
+        report = m.thin(keep_days=1, now="2026-07-01T00:00:00+00:00")
+        assert [row.scene_name for row in report.scenes if row.thinned] == ["may"]
+        after = m.history(at(TABLE)), m.history(at(STOOL))
+        for one, other in zip(before, after, strict=True):
+            assert [row.id for row in other.objects] == [row.id for row in one.objects]
+            assert [row.state for row in other.sightings] == [row.state for row in one.sightings]
+        assert any("may is thinned" in note for note in after[0].notes)
+        assert m.find(at=CUPBOARD).described == 2, "graphs of whole captures answer"
 
 
 def test_captures_without_things_are_named(site: Map) -> None:

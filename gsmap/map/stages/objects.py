@@ -90,6 +90,12 @@ def objects_of_components(
             f"nobody knows the things of {few(without)}: gsmap describe MAP SCENE tells them, where describe.things "
             "is on"
         )
+    thinned = [scene.name for scene in scenes.values() if scene.thinning is not None]
+    if thinned:
+        notes.append(
+            f"{few(thinned)} {'is' if len(thinned) == 1 else 'are'} thinned: the things they showed are told, and what "
+            "they were found to show of others before; they are asked no more"
+        )
     undated = [scene.name for scene in scenes.values() if scene.captured_at is None]
     if undated and len(scenes) > 1:
         notes.append(
