@@ -26,7 +26,8 @@ import numpy as np
 from change_truth import Truth
 
 import gsmap_synthetic as synthetic
-from gsmap.objects.rooms import Room, find_rooms
+from gsmap.objects import find_rooms
+from gsmap.types import Room
 from gsmap_synthetic.capture import default_routes, unused_doors
 from gsmap_synthetic.initialise import from_depth
 

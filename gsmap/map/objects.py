@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from gsmap.durable import write_text_whole
 from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.geometry.directions import level_frame
 from gsmap.map.object_words import apart, with_words
 from gsmap.map.photos import with_photos
 from gsmap.map.settings import Settings
@@ -21,7 +23,7 @@ from gsmap.map.stages.objects import objects_of_components
 from gsmap.objects import graphml, object_graph, permanence, relations
 from gsmap.store import Store
 from gsmap.store.objects import ObjectFact, number_of
-from gsmap.types import MapObject, Scene, SceneGraph
+from gsmap.types import MapObject, Room, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import (
     SCHEMA,
@@ -30,6 +32,7 @@ from gsmap.types.rows import (
     ObjectRow,
     ObjectsReport,
     RelationRow,
+    RoomRow,
     SightingRow,
 )
 
@@ -52,6 +55,7 @@ class Known:
         photos: photographs that the map keeps, by digest: (file, date).
         joined: id of the object that each is told as one with, where a person said so.
         facts: all that people ever said of objects, by id.
+        rooms: of each component the rotation (3, 3) from its frame to a level one, and its rooms in that, in metres.
     """
 
     objects: list[MapObject]
@@ -61,6 +65,7 @@ class Known:
     photos: Mapping[str, tuple[str, str | None]] = field(default_factory=dict)
     joined: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, Sequence[ObjectFact]] = field(default_factory=dict)
+    rooms: Mapping[int, tuple[np.ndarray, tuple[Room, ...]]] = field(default_factory=dict)
 
     @property
     def dates(self) -> dict[str, str | None]:
@@ -71,6 +76,43 @@ class Known:
     def name_of(self, who: str) -> str:
         """Of a capture or a photograph."""
         return self.scenes[who].name if who in self.scenes else self.photos[who][0]
+
+    @cached_property
+    def rooms_of(self) -> dict[str, str]:
+        """Id of the room that each object stands in, by id; those of which that is not known are left out."""
+        out = {}
+        for thing in self.objects:
+            level, mine = self.rooms.get(thing.component, (np.eye(3), ()))
+            at = level @ thing.position * self.metres[thing.component]
+            for i, room in enumerate(mine):
+                if room.holds(at):
+                    out[thing.id] = self._room_id(thing.component, i)
+                    break
+        return out
+
+    def _room_id(self, component: int, number: int) -> str:
+        before = sum(len(mine) for other, (_, mine) in self.rooms.items() if other < component)
+        return f"r{before + number + 1}"
+
+    def room_rows(self) -> tuple[RoomRow, ...]:
+        """The rooms of all components; of each the largest first."""
+        rows = []
+        for component, (level, mine) in sorted(self.rooms.items()):
+            unit = self.metres[component]
+            for i, room in enumerate(mine):
+                name = self._room_id(component, i)
+                rows.append(
+                    RoomRow(
+                        id=name,
+                        component=component,
+                        position=level.T @ room.middle / unit,
+                        size_m=room.box[1] - room.box[0],
+                        area_m2=round(room.area_m2, 2),
+                        doors=tuple(self._room_id(component, other) for other in room.doors),
+                        objects=tuple(thing for thing, where in self.rooms_of.items() if where == name),
+                    )
+                )
+        return tuple(rows)
 
     def named(self, text: str) -> MapObject:
         """The object of an id (``o12``), of the id of one that is told as one with it, or of a name.
@@ -125,6 +167,7 @@ def known_objects(
             ]
         else:
             objects += [replace(thing, component=part.component) for thing in part.made.objects]
+    rooms = {part.component: (level_frame(part.made.up), part.made.rooms) for part in parts}
     objects, joined, said = with_words(store, objects, scenes)
     kept = store.photos.list() if graphs is None else []
     if kept:
@@ -134,7 +177,7 @@ def known_objects(
         )
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
-    return Known(objects, scenes, (*notes, *said), metres, photos, joined, store.objects.facts())
+    return Known(objects, scenes, (*notes, *said), metres, photos, joined, store.objects.facts(), rooms)
 
 
 def kept_objects(store: Store, settings: Settings) -> Known:
@@ -213,6 +256,7 @@ def objects_report(known: Known) -> ObjectsReport:
             RelationRow(subject=one.source, relation=one.kind, other=one.target)
             for one in relations(known.objects, known.metres)
         ),
+        rooms=known.room_rows(),
         notes=known.notes,
     )
 
@@ -303,6 +347,7 @@ def object_row(thing: MapObject, known: Known) -> ObjectRow:
         name=thing.words.name or None,
         label=thing.words.label or None,
         note=thing.words.note or None,
+        room=known.rooms_of.get(thing.id),
     )
 
 
@@ -311,7 +356,7 @@ def object_row(thing: MapObject, known: Known) -> ObjectRow:
 
 def as_networkx(known: Known) -> Any:
     """A `networkx.MultiDiGraph`, see `gsmap.objects.object_graph`."""
-    return object_graph(known.objects, known.dates, known.metres)
+    return object_graph(known.objects, known.dates, known.metres, known.room_rows())
 
 
 def write_graph(known: Known, out: str | os.PathLike[str], format: str) -> Path:

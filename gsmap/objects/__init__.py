@@ -7,6 +7,7 @@ from gsmap.objects.looks import Eyes, Glance, glance, in_view, judge, open_eyes
 from gsmap.objects.make import VERSION, Capture, Params, make_objects, recipe_key
 from gsmap.objects.permanence import Permanence, permanence
 from gsmap.objects.relations import Relation, relations
+from gsmap.objects.rooms import find_rooms
 
 __all__ = [
     "VERSION",
@@ -19,6 +20,7 @@ __all__ = [
     "Placed",
     "Relation",
     "changed_thing",
+    "find_rooms",
     "fuse",
     "glance",
     "graphml",

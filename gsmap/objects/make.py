@@ -13,6 +13,7 @@ from gsmap.objects.fuse import Node, Placed, fuse
 from gsmap.objects.fuse import Params as FuseParams
 from gsmap.objects.looks import Eyes, glance, judge
 from gsmap.objects.looks import Params as LookParams
+from gsmap.objects.rooms import Params as RoomParams
 from gsmap.types import MapObject, Sighting, SightingState, Sim3, Things
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
@@ -27,11 +28,13 @@ class Params:
     Args:
         fuse: when things of two captures are one.
         look: how captures look for the things of others.
+        rooms: how the place is cut into rooms.
         min_points: a thing of fewer points makes no object by itself.
     """
 
     fuse: FuseParams = field(default_factory=FuseParams)
     look: LookParams = field(default_factory=LookParams)
+    rooms: RoomParams = field(default_factory=RoomParams)
     min_points: int = 40
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from gsmap.geometry.rotations import quats_to_matrices
-from gsmap.types import Gaussians
+from gsmap.types import Gaussians, Room
 
 _BIN_M = 0.05  # of heights
 
@@ -26,6 +26,7 @@ class Params:
 
     Args:
         cell_m: edge of the cells of the plan.
+        max_gaussians: of a capture, evenly; of more their neighbours fill the gaps.
         min_opacity: Gaussians that are less opaque are no surface.
         above_m: nothing but walls and lintels stands higher above the floor than this,
         below_m: and lower below the ceiling.
@@ -39,6 +40,7 @@ class Params:
     """
 
     cell_m: float = 0.1
+    max_gaussians: int = 150_000
     min_opacity: float = 0.5
     above_m: float = 2.12
     below_m: float = 0.1
@@ -49,49 +51,6 @@ class Params:
     min_area_m2: float = 1.5
     storey_m: float = 1.5
     min_door_m: float = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Room:
-    """A room, in a level frame in metres (z up).
-
-    Args:
-        low: (2,) corner of its cells.
-        cells: (X, Y) bool, which of them are of it.
-        cell_m: their edge.
-        floor_m, ceiling_m: heights; a ceiling that nobody saw lies `Params.no_ceiling_m` above the floor.
-        doors: numbers of the rooms that one can walk to from it.
-    """
-
-    low: np.ndarray
-    cells: np.ndarray
-    cell_m: float
-    floor_m: float
-    ceiling_m: float
-    doors: tuple[int, ...] = ()
-
-    @property
-    def area_m2(self) -> float:
-        return float(self.cells.sum()) * self.cell_m**2
-
-    @property
-    def box(self) -> np.ndarray:
-        """(2, 3) around it."""
-        high = self.low + np.array(self.cells.shape) * self.cell_m
-        return np.array([[*self.low, self.floor_m], [*high, self.ceiling_m]])
-
-    @property
-    def middle(self) -> np.ndarray:
-        """(3,) the middle of its floor."""
-        at = np.argwhere(self.cells).mean(0) + 0.5
-        return np.array([*(self.low + at * self.cell_m), self.floor_m])
-
-    def holds(self, point: np.ndarray) -> bool:
-        """Whether a point (3,) lies in it."""
-        if not self.floor_m - 0.3 <= point[2] <= self.ceiling_m + 0.3:
-            return False
-        cell = np.floor((point[:2] - self.low) / self.cell_m).astype(int)
-        return bool((cell >= 0).all() and (cell < self.cells.shape).all() and self.cells[tuple(cell)])
 
 
 def find_rooms(captures: Sequence[Gaussians], eyes: np.ndarray, params: Params | None = None) -> list[Room]:
@@ -127,7 +86,8 @@ def _surface(gaussians: Gaussians, params: Params) -> tuple[np.ndarray, np.ndarr
     Blank walls are made of few wide Gaussians, whose means alone would leave holes.
     """
     opaque = gaussians.logit_opacities > np.log(params.min_opacity / (1 - params.min_opacity))
-    kept = gaussians[np.flatnonzero(opaque)]
+    rows = np.flatnonzero(opaque)
+    kept = gaussians[rows[:: -(-len(rows) // params.max_gaussians) or 1]]
     scales, axes = kept.scales.astype(np.float64), quats_to_matrices(kept.quats)
     order = np.argsort(-scales, axis=1)
     rows = np.arange(len(kept))

@@ -7,9 +7,11 @@ the next one replaces.
 
 from __future__ import annotations
 
+import base64
 import re
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +23,7 @@ from gsmap.store import facts, recipes
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.matrices import from_array, from_pose, to_pose
 from gsmap.store.schema import object_facts, object_places, object_sets, objects
-from gsmap.types import MapObject, ObjectWords, Sighting, Sim3
+from gsmap.types import MapObject, ObjectWords, Room, Sighting, Sim3
 from gsmap.types.map_object import SIGHTING_STATES
 from gsmap.types.plain import plain
 
@@ -32,6 +34,8 @@ Places = Mapping[str, np.ndarray]
 # a share of the larger one's diagonal: that of a picture on a wall has no thickness to speak of.
 _SAME_SHARE = 0.1
 _PAD = 0.03
+
+_MAX_CELLS = 1 << 24  # of a room: hundreds of metres wide
 
 _NUMBER = re.compile(r"o([1-9][0-9]{0,8})")
 _NO_NAME = re.compile(r"o[0-9]+|[0-9a-f]{8}|[-+0-9.eE,\s]+")  # these are ids and points
@@ -65,6 +69,8 @@ class ObjectSet:
         poses: ``S_map_scene`` of its captures by scene id, as it was made with.
         things: digest of what each of them shows, by scene id.
         objects: with numbers for ids; without photographs and without what people say. The frame is that of ``poses``.
+        up: (3,) against gravity in that frame.
+        rooms: in the level frame of ``up`` (`gsmap.geometry.directions.level_frame`), the largest first.
     """
 
     key: str
@@ -73,6 +79,8 @@ class ObjectSet:
     poses: dict[str, Sim3]
     things: dict[str, str]
     objects: tuple[MapObject, ...]
+    up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0, 1]))
+    rooms: tuple[Room, ...] = ()
 
 
 def number_of(text: str) -> int | None:
@@ -352,6 +360,18 @@ def _value(made: ObjectSet) -> dict[str, Any]:
     at = {scene: i for i, scene in enumerate(scenes)}
     return {
         "metres": made.metres,
+        "up": plain(made.up),
+        "rooms": [
+            {
+                "low": plain(room.low),
+                "shape": list(room.cells.shape),
+                "cells": base64.b64encode(zlib.compress(np.packbits(room.cells).tobytes())).decode(),
+                "cell_m": room.cell_m,
+                "heights_m": [room.floor_m, room.ceiling_m],
+                "doors": list(room.doors),
+            }
+            for room in made.rooms
+        ],
         "scenes": scenes,
         "things": [made.things.get(scene, "") for scene in scenes],
         "objects": [
@@ -387,8 +407,10 @@ def _read(row: Row[Any]) -> ObjectSet:
             {scene: to_pose(pose) for scene, pose in row.poses.items()},
             things,
             tuple(_object(one, scenes) for one in value["objects"]),
+            _numbers(value["up"], (3,)),
+            tuple(_room(one, len(value["rooms"])) for one in value["rooms"]),
         )
-    except (GsmapError, TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+    except (GsmapError, TypeError, ValueError, KeyError, IndexError, AttributeError, zlib.error) as error:
         raise CorruptError(
             f"the catalog holds objects, in object_sets row {row.number}, that make no sense ({error}): gsmap did not "
             "write that; restore the catalog from a backup"
@@ -409,6 +431,19 @@ def _object(one: Mapping[str, Any], scenes: Sequence[str]) -> MapObject:
     colour = _numbers(one["colour"], (3,)).astype(np.float32)
     box, position = _numbers(one["box"], (2, 3)), _numbers(one["position"], (3,))
     return MapObject(str(one["id"]), int(one["component"]), box, position, colour, every)
+
+
+def _room(one: Mapping[str, Any], count: int) -> Room:
+    width, depth = (int(n) for n in one["shape"])
+    if not (0 < width * depth <= _MAX_CELLS and width > 0):
+        raise InputError(f"a room of {width} x {depth} cells")
+    packed = zlib.decompressobj().decompress(base64.b64decode(one["cells"], validate=True), -(-width * depth // 8))
+    cells = np.unpackbits(np.frombuffer(packed, np.uint8), count=width * depth).astype(bool).reshape(width, depth)
+    floor, ceiling = _numbers(one["heights_m"], (2,)).tolist()
+    doors = tuple(int(other) for other in one["doors"])
+    if not cells.any() or not float(one["cell_m"]) > 0 or not all(0 <= other < count for other in doors):
+        raise InputError("a room without floor, or with a door to nowhere")
+    return Room(_numbers(one["low"], (2,)), cells, float(one["cell_m"]), floor, ceiling, doors)
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:

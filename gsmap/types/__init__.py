@@ -8,6 +8,7 @@ from gsmap.types.map_object import SIGHTING_STATES, MapObject, ObjectWords, Sigh
 from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
+from gsmap.types.room import Room
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph, Things
 from gsmap.types.sim3 import Sim3
@@ -38,6 +39,7 @@ __all__ = [
     "Proposal",
     "Provenance",
     "Registration",
+    "Room",
     "Scene",
     "SceneGraph",
     "ScenePose",

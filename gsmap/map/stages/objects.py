@@ -9,17 +9,19 @@ import numpy as np
 
 from gsmap.errors import NotFoundError
 from gsmap.geometry.boxes import box_corners
+from gsmap.geometry.directions import level_frame
+from gsmap.geometry.transforms import transform_gaussians
 from gsmap.map.dates import parsed
 from gsmap.map.metres import map_metres
 from gsmap.map.one_state import of_one_state
 from gsmap.map.settings import Settings
 from gsmap.methods import RecipeKey, text_digest
-from gsmap.objects import Capture, Eyes, changed_thing, in_view, make_objects, open_eyes, recipe_key
+from gsmap.objects import Capture, Eyes, changed_thing, find_rooms, in_view, make_objects, open_eyes, recipe_key
 from gsmap.objects.fuse import Node
 from gsmap.store import Store
 from gsmap.store.objects import ObjectSet, Places
 from gsmap.texts import few
-from gsmap.types import PoseGraph, Scene, SceneGraph, SightingState, Sim3, Things
+from gsmap.types import Gaussians, PoseGraph, Room, Scene, SceneGraph, SightingState, Sim3, Things
 from gsmap.types.progress import Progress, StageProgress
 
 
@@ -196,8 +198,37 @@ def _made(
         {one.scene: things[one.scene].extents[one.thing] for one in thing.sightings if one.thing >= 0}
         for thing in objects
     ]
+    up, rooms = np.array([0.0, 0, 1]), list[Room]()
+    if key is not None:
+        known = {scene: graph for scene in poses if (graph := graphs[scene]) is not None}
+        ups = [poses[scene].rotation @ graph.up for scene, graph in known.items() if graph.up is not None]
+        up = np.sum(ups, axis=0) / np.linalg.norm(np.sum(ups, axis=0)) if ups else up
+        told(1.0, "rooms")
+        rooms = _rooms(store, settings, poses, up, unit)
     names = ("", "") if key is None else (key.digest, key.recipe)
-    return Part(component, ObjectSet(*names, unit, dict(poses), digests, tuple(objects)), places, key)
+    return Part(component, ObjectSet(*names, unit, dict(poses), digests, tuple(objects), up, tuple(rooms)), places, key)
+
+
+_SHAPE = ("means", "quats", "log_scales", "logit_opacities")
+
+
+def _rooms(store: Store, settings: Settings, poses: Mapping[str, Sim3], up: np.ndarray, unit: float) -> list[Room]:
+    """The rooms that captures show, in the level frame of ``up`` and in metres; nothing is rendered.
+
+    Args:
+        unit: metres per unit of the map.
+    """
+    S_level_map = Sim3(level_frame(up), np.zeros(3), unit)
+    captures, eyes = [], [np.zeros((0, 3))]
+    for scene, pose in poses.items():
+        S = S_level_map @ pose
+        source, cameras = store.scenes.source(scene), store.scenes.cameras(scene)
+        columns = {name: np.concatenate(list(source.columns(name))) for name in _SHAPE}
+        sh = np.zeros((len(columns["means"]), 1, 3), np.float32)
+        captures.append(transform_gaussians(Gaussians(**columns, sh=sh), S))
+        if not cameras.synthesised:
+            eyes.append(S.apply(cameras.centers))
+    return find_rooms(captures, np.concatenate(eyes), settings.objects.rooms)
 
 
 def _digest(things: Things) -> str:

@@ -21,6 +21,7 @@ class ObjectRow(Row):
         name: what people call it; null where they do not.
         label: what kind of thing they say it is.
         note: the last one on it.
+        room: id of the room that it stands in; null where that is not known.
         component: of the map, whose frame everything is in.
         position: mean of its Gaussians, where it was last seen as a thing of its own.
         size: of the box around it where it was last seen, along the map's axes.
@@ -38,6 +39,7 @@ class ObjectRow(Row):
         "id": "object",
         "name": "name",
         "label": "label",
+        "room": "room",
         "position": "position",
         "size": "size",
         "seen": "seen",
@@ -62,6 +64,7 @@ class ObjectRow(Row):
     name: str | None = None
     label: str | None = None
     note: str | None = None
+    room: str | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,12 +85,45 @@ class RelationRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class RoomRow(Row):
+    """A room of the map, as its captures show it.
+
+    Args:
+        id: ``r1`` is the largest of the first component; another capture may change it.
+        component: of the map.
+        position: the middle of its floor, map frame and unit.
+        size_m: of the box around it, metres; the last number is its height.
+        area_m2: of its floor.
+        doors: ids of the rooms that one can walk to from it.
+        objects: ids of the objects in it, those that are gone included.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "id": "room",
+        "position": "position",
+        "size_m": "size (m)",
+        "area_m2": "m2",
+        "doors": "doors to",
+        "objects": "objects",
+    }
+
+    id: str
+    component: int
+    position: np.ndarray
+    size_m: np.ndarray
+    area_m2: float
+    doors: tuple[str, ...]
+    objects: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ObjectsReport(Row):
     """The scene graph of the map.
 
     Args:
         objects: its nodes; of each component the largest first.
         relations: its edges.
+        rooms: where its nodes stand.
         notes: what a person should know, such as captures that tell nothing.
     """
 
@@ -95,6 +131,7 @@ class ObjectsReport(Row):
 
     objects: tuple[ObjectRow, ...]
     relations: tuple[RelationRow, ...]
+    rooms: tuple[RoomRow, ...] = ()
     notes: tuple[str, ...] = ()
 
 
