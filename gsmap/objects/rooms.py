@@ -119,7 +119,7 @@ def _storeys(eyes: np.ndarray, points: np.ndarray, params: Params) -> list[float
 
 def _floor_and_ceiling(heights: np.ndarray, eye: float, params: Params) -> tuple[float, float]:
     """Where most of what is level lies below and above the eyes."""
-    floor = _mode(heights[(heights > eye - 2.2) & (heights < eye - 0.6)], eye - 1.5)
+    floor = _mode(heights[(heights > eye - 2.0) & (heights < eye - 0.6)], eye - 1.5)
     above = heights[(heights > floor + params.above_m) & (heights < floor + 4.0)]
     below = np.count_nonzero(np.abs(heights - floor) < _BIN_M)
     ceiling = _mode(above, floor + params.no_ceiling_m)
