@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 # Cc, Cs: escape sequences, line breaks, halves of characters. Zl, Zp: line breaks of another kind.
@@ -57,3 +57,8 @@ def shown(value: Any, *, lines: bool = False) -> str:
 
 def _steers(c: str) -> bool:
     return c in _TURNING or unicodedata.category(c) in _CATEGORIES
+
+
+def few(names: Sequence[str], most: int = 5) -> str:
+    """The first of some names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -80,6 +80,8 @@ def write(path: Path) -> None:
             compare(m)
         if hasattr(m.store, "photos"):  # younger than this script
             keep_photo(m)
+        if hasattr(m.store, "objects"):  # younger than this script
+            keep_objects(m)
         m.remove("shed")
         m.optimize()
         m.prune(keep_revisions=3)
@@ -164,6 +166,30 @@ def compare(m: Map) -> None:
             key = recipe.of(a, b)
         m.store.changes.save(report, key, older=a, newer=b, **where)
     m.confirm("c1", "I moved it")
+
+
+def keep_objects(m: Map) -> None:
+    """Two objects, one of them seen in two captures and named; a room."""
+    from gsmap.objects import recipe_key as object_recipe
+    from gsmap.store.objects import ObjectSet
+    from gsmap.types import MapObject, Room, Sighting
+
+    placed = m.pose_graph().poses
+    a, b = (m.store.scenes.get(name).id for name in ("hall", "stairwell"))
+    box = np.array([[0.0, 0, 0], [1.0, 0.5, 0.75]])
+    seen, none = Sighting(a, "seen", 0, box), Sighting(b, "absent", -1, None, 0.75, a)
+    grey = np.array([50.0, 0, 0], np.float32)
+    sofa = MapObject("0" * 8, 0, box, box.mean(0), grey, (seen, Sighting(b, "seen", 1, box)))
+    lamp = MapObject("1" * 8, 0, box + 2, box.mean(0) + 2, grey, (Sighting(a, "seen", 1, box + 2), none))
+    cells = np.ones((20, 30), bool)
+    cells[:5, :5] = False
+    room = Room(np.array([-1.0, -1.5]), cells, 0.125, 0.0, 2.5)
+    key = object_recipe(m.settings.objects).of(a, b)
+    poses = {scene: placed[scene].S_map_scene for scene in (a, b)}
+    made = ObjectSet(key.digest, key.recipe, 1.0, poses, dict.fromkeys((a, b), "0" * 32), (sofa, lamp), rooms=(room,))
+    m.store.objects.save(made, [{a: box, b: box}, {a: box + 2}], key)
+    m.store.objects.edit(1, name="grandmother's sofa", label="sofa", note="oak")
+    m.store.objects.edit(2, same_as=1, author="ann")
 
 
 def keep_photo(m: Map) -> None:

@@ -1,4 +1,4 @@
-"""gsmap edit: a scene's name, date, note, tags and unit."""
+"""gsmap edit: a scene's name, date, note, tags and unit; an object's name, label and note."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmap.cli.console import AsJson, MapPath, opened, print_rows
 
 def command(
     map: MapPath,
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name or id.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE|OBJECT", help="A scene's name or id, or an object (`o12`).")],
     name: Annotated[str | None, typer.Option("--name", help="Call it this.")] = None,
     captured_at: Annotated[
         str | None, typer.Option("--captured-at", help="When it was captured, ISO 8601; `none` takes its date back.")
@@ -28,19 +28,37 @@ def command(
             "`none` takes it back.",
         ),
     ] = None,
+    label: Annotated[
+        str | None, typer.Option("--label", help="Of an object: what kind of thing it is; `none` takes it back.")
+    ] = None,
+    same_as: Annotated[
+        str | None,
+        typer.Option("--same-as", metavar="OBJECT", help="Of an object: it is one with this one; `none`: it is not."),
+    ] = None,
     json: AsJson = False,
 ) -> None:
-    """Change what is said of a scene; what was said before stays in its history.
+    """Change what is said of a scene, or of an object (`gsmap graph`); what was said before stays in its history.
 
-    Example: `gsmap edit site.gsmap monday --captured-at 2024-05-31 --tag ground-floor`
+    Example: `gsmap edit site.gsmap monday --captured-at 2024-05-31 --tag ground-floor`, or
+    `gsmap edit site.gsmap o12 --name "grandmother's sofa" --label sofa`
     """
     from gsmap.errors import ConfigError
 
-    said = (name, captured_at, note, metres_per_unit)
-    if all(one is None for one in said) and not tag and not untag:
-        raise ConfigError("say what to change: --name, --captured-at, --note, --tag, --untag or --metres-per-unit")
+    of_scene = captured_at is not None or metres_per_unit is not None or bool(tag) or bool(untag)
+    of_object = label is not None or same_as is not None
+    if name is None and note is None and not of_scene and not of_object:
+        raise ConfigError(
+            "say what to change: --name, --note, of a scene --captured-at, --tag, --untag or --metres-per-unit, of an "
+            "object --label or --same-as"
+        )
     metres = None if metres_per_unit is None else _metres(metres_per_unit)
-    with opened(map) as m:
+    with opened(map, bars=True) as m:
+        if m.is_object(scene) or of_object:
+            if of_scene:
+                raise ConfigError(f"{scene} is an object: dates, tags and metres are of scenes")
+            done = m.edit_object(scene, name=name, label=label, note=note, same_as=same_as)
+            print_rows("edit OBJECT", done, json, "object")
+            return
         row = m.edit(
             scene,
             name=name,

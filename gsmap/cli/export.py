@@ -84,6 +84,9 @@ def command(
         typer.Option("--prefer", help="Where captures disagree: newest, best (who saw it best) or both; newest else."),
     ] = None,
     as_of: AsOf = None,
+    static: Annotated[
+        bool, typer.Option("--static", help="Only what persists: without things that moved, or came and went.")
+    ] = False,
     wait: Annotated[
         bool, typer.Option("--wait", help="If another export is at work in OUT, wait for it; refused else.")
     ] = False,
@@ -119,13 +122,14 @@ def command(
                 "--uncompressed": uncompressed or None,
                 "--prefer": prefer,
                 "--as-of": as_of,
+                "--static": static or None,
                 "--tile-size": None if tile_size == _TILE_SIZE_M else tile_size,
             },
         )
         return
     with opened(map, bars=True, sets=sets, preset=preset, executor=executor, scheduler=scheduler) as m:
         if purpose is Purpose.localize:
-            small = m.export_small(out, parse_size(budget or "50MB"))
+            small = m.export_small(out, parse_size(budget or "50MB"), static=static)
             if json:
                 print_rows("export --for", small, json)
                 return
@@ -146,6 +150,7 @@ def command(
             uncompressed=uncompressed,
             prefer=prefer,
             as_of=as_of,
+            static=static,
             wait=wait,
         )
     for note in report.notes:

@@ -13,7 +13,8 @@ from gsmap.errors import ConfigError
 def command(
     map: MapPath,
     text: Annotated[
-        str | None, typer.Argument(metavar="[TEXT]", help="Words; the map's image encoder needs its text tower.")
+        str | None,
+        typer.Argument(metavar="[TEXT]", help="A name or label that people gave, or words for `clip-text`."),
     ] = None,
     picture: Annotated[
         str | None, typer.Option("--picture", metavar="FILE", help="A picture that shows such a thing.")
@@ -31,7 +32,7 @@ def command(
     preset: Preset = None,
     json: AsJson = False,
 ) -> None:
-    """Find things in all captures: by one of them, a point, a picture, or words. Ranked, with place, object and dates.
+    """Find things in all captures: by name, one of them, a point, a picture, or words. Ranked, with place and dates.
 
     Example: `gsmap find site.gsmap --like monday:12 --pictures found`
     """
@@ -45,7 +46,8 @@ def command(
         print_rows("find", report, json)
         return
     known = f"{report.described} of {report.placed} captures"
-    say(f"{report.query}: by {report.by} of things, embedder {report.embedder}, {known}")
+    by = "name" if report.by == "name" else f"{report.by} of things, embedder {report.embedder}"
+    say(f"{report.query}: by {by}, {known}")
     columns = dict(FindHit.columns)
     if pictures is None:
         del columns["picture"]

@@ -25,7 +25,7 @@ def command(
     Example: `gsmap graph site.gsmap site.graphml`
     """
     from gsmap.errors import ConfigError
-    from gsmap.types.rows import ObjectRow, RelationRow
+    from gsmap.types.rows import ObjectRow, RelationRow, RoomRow
 
     if format is not None and out is None:
         raise ConfigError(f"name a file to write as {format}: gsmap graph {map} OUT --format {format}")
@@ -41,6 +41,11 @@ def command(
         print_rows("graph", report, json)
         return
     if out is None:
-        print_table("objects", ObjectRow.columns, report.objects)
+        columns = dict(ObjectRow.columns)
+        for word in ("name", "label", "room"):
+            if not any(getattr(row, word) for row in report.objects):
+                del columns[word]
+        print_table("objects", columns, report.objects)
         print_table("relations", RelationRow.columns, report.relations)
-    say(f"{len(report.objects)} objects, {len(report.relations)} relations")
+        print_table("rooms", RoomRow.columns, report.rooms)
+    say(f"{len(report.objects)} objects, {len(report.relations)} relations, {len(report.rooms)} rooms")

@@ -15,7 +15,7 @@ def command(
     map: MapPath,
     place: Annotated[
         str | None,
-        typer.Argument(metavar="[OBJECT|X,Y,Z]", help="An object's id (gsmap graph lists them), or a point."),
+        typer.Argument(metavar="[OBJECT|X,Y,Z]", help="An object's id or name (gsmap graph), or a point."),
     ] = None,
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
@@ -29,7 +29,7 @@ def command(
 
     Example: `gsmap history site.gsmap 1.5,0.2,0.8`
     """
-    from gsmap.types.rows import ObjectRow, SightingRow
+    from gsmap.types.rows import ObjectFactRow, ObjectRow, SightingRow
 
     with opened(map, bars=True, sets=sets, preset=preset) as m:
         report = m.history(place, box=box)
@@ -40,3 +40,5 @@ def command(
         return
     print_table("objects", ObjectRow.columns, report.objects)
     print_table("sightings", SightingRow.columns, report.sightings)
+    if report.words:
+        print_table("words", ObjectFactRow.columns, report.words)

@@ -53,6 +53,7 @@ OBJECTS: dict[str, Object] = {
     "localize": One(rows.LocalizeReport),
     "find": One(rows.FindReport),
     "edit": One(rows.SceneRow),
+    "edit OBJECT": One(rows.ObjectRow),
     "export": One(rows.ExportReport),
     "export --for": One(rows.SmallMapReport),
     "list scenes": Many("scenes", rows.SceneRow),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ class TileRecipe:
         budget_s: ceiling on the seconds that merging one tile may take, None for none.
         uncompressed: whether the content of ``3dtiles`` is float32 rather than SPZ.
         dates: when each scene was captured, by scene id, if the merger uses dates; None if it does not.
+        without: names what of each scene is left out, by scene id, where something is.
 
     Raises:
         ConfigError: a format that cannot be written, or one that cannot be had with provenance or uncompressed.
@@ -46,6 +47,7 @@ class TileRecipe:
     budget_s: float | None = None
     uncompressed: bool = False
     dates: Mapping[str, str | None] | None = None
+    without: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.format not in _TREES and f".{self.format}" not in formats.known("write"):
@@ -93,6 +95,7 @@ class TileRecipe:
             inputs.append(f"metres_per_unit {planned.metres_per_unit!r}")
         if self.dates is not None:
             inputs += [f"captured_at {scene} {self.dates.get(scene)}" for scene in scenes]
+        inputs += [f"without {scene} {self.without[scene]}" for scene in scenes if self.without.get(scene)]
         return self.merge.of(*inputs).digest
 
 

@@ -77,6 +77,22 @@ def fewer(features: SceneFeatures, most: int) -> SceneFeatures:
     )
 
 
+def without(features: SceneFeatures, means: np.ndarray, left_out: np.ndarray) -> SceneFeatures:
+    """Features but those on Gaussians that are left out: whose nearest one (of means (N, 3)) is among these (N,)."""
+    from scipy.spatial import cKDTree
+
+    _, nearest = cKDTree(means).query(features.points)
+    keep = ~left_out[nearest]
+    before = np.r_[0, np.cumsum(keep)]
+    return replace(
+        features,
+        starts=before[features.starts].astype(np.int64),
+        points=features.points[keep],
+        descriptors=features.descriptors[keep],
+        angles=features.angles[keep],
+    )
+
+
 def without_direction(gaussians: Gaussians) -> Gaussians:
     """Gaussians of one colour each."""
     return replace(gaussians, sh=gaussians.sh[:, :1])

@@ -17,6 +17,7 @@ from gsmap.map import models
 from gsmap.map.objects import Known, known_objects
 from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys
+from gsmap.map.stages.thin import THINGS
 from gsmap.store import Store
 from gsmap.types import MapObject, PoseGraph, Scene, SceneGraph, Sighting
 from gsmap.types.progress import StageProgress
@@ -109,11 +110,14 @@ def find_places(
 
     Nothing is written. Every capture that answers was described by one recipe: while a map moves to another embedder,
     the old one answers until it has been described anew as a whole; words and pictures are asked of the present one.
+    Words that people gave objects as names or labels are answered by these, and no embedder is asked.
 
     Raises:
         NotFoundError: no poses yet, no such scene, node or object, or nothing stands at a point.
         ConfigError: words or a picture that the map's embedder cannot read; what to add is said.
     """
+    if request.text is not None and (called := _called(store, request, settings, progress)) is not None:
+        return called
     shown = _shown(store, request, settings)
     index = _index(store, settings, progress, present=shown is not None)
     if shown is not None:
@@ -140,6 +144,63 @@ def find_places(
     return report, [_box(index, hit, thing) for hit, thing in zip(hits, things, strict=True)]
 
 
+# --- names that people gave ------------------------------------------------------------------------------------------
+
+
+def _called(
+    store: Store, request: Request, settings: Settings, progress: StageProgress
+) -> tuple[FindReport, list[np.ndarray]] | None:
+    """The objects whose name or label has all the words that are asked for; None where none has.
+
+    Of several those come first whose name is just what was asked for, then those that are there still.
+    """
+    if not store.objects.words():
+        return None
+    known = known_objects(store, settings, progress)
+    asked = str(request.text).casefold().split()
+    found = []
+    for thing in known.objects:
+        name, label = (text.casefold().split() for text in (thing.words.name, thing.words.label))
+        if set(asked) <= {*name, *label}:
+            score = 1.0 if asked in (name, label) else len(set(asked)) / len({*name, *label})
+            found.append((asked != name, -score, not thing.there, thing))
+    if not found:
+        return None
+    found.sort(key=lambda one: one[:3])
+    hits = []
+    for rank, (_, score, _, thing) in enumerate(found[: request.top], 1):
+        seen = [s.scene for s in thing.sightings if s.state == "seen" and s.scene in known.scenes]
+        metres = known.metres.get(thing.component, 1.0)
+        hits.append(
+            FindHit(
+                rank=rank,
+                score=round(-score, 4),
+                object=thing.id,
+                name=thing.words.name or None,
+                scene=seen[-1],
+                scene_name=known.name_of(seen[-1]),
+                node=None,
+                component=thing.component,
+                position=thing.position,
+                position_m=thing.position * metres,
+                size_m=(thing.box[1] - thing.box[0]) * metres,
+                dates=tuple(known.dates[scene] for scene in seen),
+            )
+        )
+    described = {s.scene for thing in known.objects for s in thing.sightings if s.thing >= 0}
+    report = FindReport(
+        query=request.words,
+        by="name",
+        recipe="",
+        embedder="",
+        described=len(described),
+        placed=len(known.scenes),
+        hits=tuple(hits),
+        notes=known.notes,
+    )
+    return report, [thing.box for *_, thing in found[: request.top]]
+
+
 # --- one recipe -------------------------------------------------------------------------------------------------------
 
 
@@ -157,7 +218,7 @@ def _index(store: Store, settings: Settings, progress: StageProgress, *, present
     now = next(iter(keys.values())).recipe if keys else ""
     made: dict[str, dict[str, str]] = {}
     for stored in store.graphs.list():  # oldest first
-        if stored.scene in scenes and stored.recipe is not None:
+        if stored.scene in scenes and stored.recipe not in (None, THINGS.recipe):
             made.setdefault(stored.recipe, {})[stored.scene] = stored.key
     # What a scene is described under names its scale, too: of the present recipe only what is of use now counts.
     mine = {scene: key for scene, key in made.get(now, {}).items() if keys[scene].digest == key}
@@ -210,7 +271,12 @@ def _shown(store: Store, request: Request, settings: Settings) -> _Vector | None
     """The vector of words or of a picture; None where a thing of the map is asked for."""
     params, specs = settings.describe.object, models.specs(store)
     if request.text is not None:
-        features = embedded_text(request.text, params, specs)
+        try:
+            features = embedded_text(request.text, params, specs)
+        except ConfigError as error:
+            raise ConfigError(
+                f"no object is called {request.text!r} (gsmap edit MAP o12 --name), and {error}"
+            ) from error
         return _Vector(features, np.ones(len(features), bool))
     return None if request.picture is None else _Vector(*embedded_picture(request.picture, params, specs))
 
@@ -227,7 +293,8 @@ def _asked(store: Store, request: Request, index: _Index) -> Sequence[Sighting] 
             )
         return thing.sightings
     assert request.like is not None
-    named = next((thing for thing in index.objects if thing.id == request.like), None)
+    wanted = index.known.joined.get(request.like, request.like)
+    named = next((thing for thing in index.objects if wanted in (thing.id, thing.words.name)), None)
     if named is not None:
         return named.sightings
     ref, _, number = request.like.rpartition(":")
@@ -393,6 +460,7 @@ def _hit(
         rank=rank,
         score=round(score, 4),
         object=None if thing is None else thing.id,
+        name=(thing.words.name or None) if thing is not None else None,
         scene=scene,
         scene_name=index.name(scene),
         node=node,

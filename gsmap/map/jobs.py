@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
+
+import numpy as np
 
 from gsmap import change as changing
 from gsmap import describe as describing
@@ -15,13 +17,15 @@ from gsmap import register as registering
 from gsmap.export import PlannedTile
 from gsmap.geometry.metres import in_metres, resized
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.map import persisting
+from gsmap.map.persisting import Passing
 from gsmap.merge.placed import pulled_inside
 from gsmap.merge.sights import SightStore
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.methods import family
 from gsmap.register import SceneView
 from gsmap.store import Store, branches, homes, sqlite
-from gsmap.types import ChangeReport, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
+from gsmap.types import ChangeReport, Gaussians, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
 from gsmap.types.localization import SceneFeatures
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress
@@ -98,6 +102,18 @@ def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> Pl
     )
 
 
+def _read(path: str, scene_id: str, passing: Passing | None, bounds: np.ndarray | None) -> Gaussians:
+    """Those Gaussians of a scene that lie in a box of its frame, without those that do not persist."""
+    without = None if passing is None or not passing.digest else _without(path, scene_id, passing)
+    return _store(path).scenes.gaussians(scene_id, bounds, without)
+
+
+@lru_cache(maxsize=8)
+def _without(path: str, scene_id: str, passing: Passing) -> np.ndarray:
+    """Tiles of one place ask for the same captures."""
+    return persisting.rows(_store(path), scene_id, passing)
+
+
 @dataclass(frozen=True, eq=False)
 class TileMaker:
     """Makes the content of a tile, wherever it is called.
@@ -110,6 +126,7 @@ class TileMaker:
         budget_s: ceiling on the wall seconds that it may take.
         captured_at: the date of each of its scenes.
         store: where what views show is kept for other tiles.
+        passing: what of each of its scenes is left out, by scene id.
     """
 
     location: str
@@ -120,6 +137,7 @@ class TileMaker:
     budget_s: float | None
     captured_at: Mapping[str, str | None]
     store: SightStore
+    passing: Mapping[str, Passing] = field(default_factory=dict)
 
     def __call__(self, progress: Progress) -> MergeResult:
         """Merged in metres, in the map's unit when it is done."""
@@ -128,10 +146,11 @@ class TileMaker:
             LazyScene(
                 scene,
                 in_metres(pose, metres),
-                partial(scenes.gaussians, scene),
+                partial(_read, self.location, scene, self.passing.get(scene)),
                 scenes.cameras(scene),
                 self.captured_at[scene],
                 self.store,
+                "" if (left := self.passing.get(scene)) is None else left.digest,
             )
             for scene, pose in self.tile.poses.items()
         ]

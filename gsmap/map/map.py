@@ -44,6 +44,7 @@ from gsmap.types.rows import (
     MeasureReport,
     MergeReport,
     ModelRow,
+    ObjectRow,
     ObjectsReport,
     PairReport,
     PhotoRow,
@@ -72,6 +73,7 @@ from gsmap.types.rows import (
 from gsmap.types.rows.localize_scan import ScanRow
 
 if TYPE_CHECKING:
+    from gsmap.map.objects import Known
     from gsmap.map.settings import Settings
     from gsmap.map.stages.georeference import Localise, Request
     from gsmap.map.stages.register import Pairs
@@ -465,7 +467,7 @@ class Map(AbstractContextManager["Map"]):
         """What stood at a place, when it was seen, and when it was gone.
 
         Args:
-            place: an object by its id, or a point ``X,Y,Z`` of the map.
+            place: an object by its id or name, or a point ``X,Y,Z`` of the map.
             box: six numbers, its lowest and highest corner.
 
         Raises:
@@ -475,6 +477,41 @@ class Map(AbstractContextManager["Map"]):
         from gsmap.map.objects import history_report, known_objects
 
         return history_report(known_objects(self.store, self.settings, self._progress), place, box)
+
+    def is_object(self, ref: str) -> bool:
+        """Whether a text names an object (``o12``) and no scene."""
+        from gsmap.store.objects import number_of
+
+        return number_of(ref) is not None and ref not in {scene.name for scene in self.scenes()}
+
+    def edit_object(
+        self,
+        ref: str,
+        *,
+        name: str | None = None,
+        label: str | None = None,
+        note: str | None = None,
+        same_as: str | None = None,
+        author: str = "",
+    ) -> ObjectRow:
+        """``gsmap edit MAP o12``: what people call an object; what was said before stays in its history.
+
+        Args:
+            ref: its id or its name.
+            name: no other object's; ``none`` takes it back.
+            label: what kind of thing it is; ``none`` takes it back.
+            note: added to those that there are.
+            same_as: the object that it is one with, which is told for both from then on; ``none`` takes that back.
+            author: who says so.
+
+        Raises:
+            NotFoundError: no such object.
+            InputError: a name that is taken, or two that a capture shows apart; nothing is written.
+        """
+        from gsmap.map.objects import edit_object
+
+        words = {"name": name, "label": label, "note": note, "same_as": same_as}
+        return edit_object(self.store, self.settings, ref, self._progress, author=author, **words)
 
     # --- localize ----------------------------------------------------------------------------------------------------
 
@@ -612,6 +649,7 @@ class Map(AbstractContextManager["Map"]):
         uncompressed: bool = False,
         prefer: str | None = None,
         as_of: str | None = None,
+        static: bool = False,
         wait: bool = False,
     ) -> ExportReport:
         """Write merged tiles to a folder; only those that changed since it was last exported to are made.
@@ -632,6 +670,8 @@ class Map(AbstractContextManager["Map"]):
                 default what the merger's settings say.
             as_of: only captures dated at or before this (ISO 8601; of a day, its end) take part, those without a date
                 left out; poses are those of the revision all the same.
+            static: only what persists: without things that moved, or that a look at their place did not show; what was
+                looked at once is kept. Visits that were not compared are compared first.
             wait: where another export is at work in the folder, until it has ended.
 
         Raises:
@@ -653,16 +693,35 @@ class Map(AbstractContextManager["Map"]):
             uncompressed=uncompressed,
             prefer=prefer,
             as_of=as_of,
+            static=static,
         )
 
         def progress(fraction: float, text: str) -> None:
             self._progress("export", fraction, text)
 
-        made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait)
-        return reports.export_report(self.store, Path(out), made, notes)
+        known, told = self.what_stays() if static else (None, ())
+        made, notes = export(self.store, Path(out), request, self.settings, progress, wait=wait, known=known)
+        return reports.export_report(self.store, Path(out), made, (*told, *notes))
 
-    def export_small(self, out: str | os.PathLike[str], budget_bytes: int) -> SmallMapReport:
+    def what_stays(self) -> tuple[Known, tuple[str, ...]]:
+        """The objects of the map after all visits were compared, and who takes no part in that."""
+        from gsmap.map.objects import known_objects
+        from gsmap.map.stages.change import compare, lacking, wanted
+
+        asked = wanted(self.store, self.settings)
+        told = asked.notes
+        if self.store.catalog.writable:
+            with at_work(self.store, "changes"):
+                compare(self.store, asked, self.settings, self._progress)
+        elif missing := len(lacking(self.store, asked, self.settings)):
+            told += (f"{missing} pairs of visits are not compared, and the map is open for reading only",)
+        return known_objects(self.store, self.settings, self._progress), told
+
+    def export_small(self, out: str | os.PathLike[str], budget_bytes: int, *, static: bool = False) -> SmallMapReport:
         """``gsmap export MAP OUT --for localize``: a small map by which photographs are placed, and no more.
+
+        Args:
+            static: only what persists, see `export`.
 
         Raises:
             StoreError: the folder is not empty.
@@ -671,8 +730,9 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.small_map import export_small
 
+        known = self.what_stays()[0] if static else None
         with at_work(self.store, "export"):
-            return export_small(self.store, Path(out), budget_bytes, self.settings, self._progress)
+            return export_small(self.store, Path(out), budget_bytes, self.settings, self._progress, known)
 
     def _repr_html_(self) -> str:
         return reports.map_html(self.store, self.status(), self.scene_rows())

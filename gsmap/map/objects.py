@@ -6,39 +6,40 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmap.durable import write_text_whole
-from gsmap.errors import ConfigError, NotFoundError
-from gsmap.map.dates import parsed
-from gsmap.map.metres import map_metres
-from gsmap.map.one_state import of_one_state
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.geometry.directions import level_frame
+from gsmap.map.object_words import apart, with_words
 from gsmap.map.photos import with_photos
 from gsmap.map.settings import Settings
-from gsmap.objects import (
-    Capture,
-    Eyes,
-    changed_thing,
-    graphml,
-    make_objects,
-    object_graph,
-    open_eyes,
-    permanence,
-    relations,
-)
-from gsmap.objects.fuse import Node
+from gsmap.map.stages.objects import objects_of_components
+from gsmap.objects import graphml, object_graph, permanence, relations
 from gsmap.store import Store
-from gsmap.types import MapObject, Scene, SceneGraph
+from gsmap.store.objects import ObjectFact, number_of
+from gsmap.types import MapObject, Room, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import SCHEMA, HistoryReport, ObjectRow, ObjectsReport, RelationRow, SightingRow
+from gsmap.types.rows import (
+    SCHEMA,
+    HistoryReport,
+    ObjectFactRow,
+    ObjectRow,
+    ObjectsReport,
+    RelationRow,
+    RoomRow,
+    SightingRow,
+)
 
 FORMATS = ("json", "graphml")
 
-_ID = re.compile(r"[0-9a-f]{4,8}")
+_HEX = re.compile(r"[0-9a-f]{4,8}")
+_POINT = re.compile(r"[-+0-9.eE,\s]+")
 _NEAR_M = 0.1  # a point so near to a box is in it: it was read off a picture
 
 
@@ -52,6 +53,9 @@ class Known:
         notes: who tells nothing, and why.
         metres: per unit of the map, by component.
         photos: photographs that the map keeps, by digest: (file, date).
+        joined: id of the object that each is told as one with, where a person said so.
+        facts: all that people ever said of objects, by id.
+        rooms: of each component the rotation (3, 3) from its frame to a level one, and its rooms in that, in metres.
     """
 
     objects: list[MapObject]
@@ -59,6 +63,9 @@ class Known:
     notes: tuple[str, ...]
     metres: dict[int, float]
     photos: Mapping[str, tuple[str, str | None]] = field(default_factory=dict)
+    joined: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Sequence[ObjectFact]] = field(default_factory=dict)
+    rooms: Mapping[int, tuple[np.ndarray, tuple[Room, ...]]] = field(default_factory=dict)
 
     @property
     def dates(self) -> dict[str, str | None]:
@@ -70,74 +77,98 @@ class Known:
         """Of a capture or a photograph."""
         return self.scenes[who].name if who in self.scenes else self.photos[who][0]
 
+    @cached_property
+    def rooms_of(self) -> dict[str, str]:
+        """Id of the room that each object stands in, by id; those of which that is not known are left out."""
+        out = {}
+        for thing in self.objects:
+            level, mine = self.rooms.get(thing.component, (np.eye(3), ()))
+            at = level @ thing.position * self.metres[thing.component]
+            for i, room in enumerate(mine):
+                if room.holds(at):
+                    out[thing.id] = self._room_id(thing.component, i)
+                    break
+        return out
 
-@of_one_state
+    def _room_id(self, component: int, number: int) -> str:
+        before = sum(len(mine) for other, (_, mine) in self.rooms.items() if other < component)
+        return f"r{before + number + 1}"
+
+    def room_rows(self) -> tuple[RoomRow, ...]:
+        """The rooms of all components; of each the largest first."""
+        rows = []
+        for component, (level, mine) in sorted(self.rooms.items()):
+            unit = self.metres[component]
+            for i, room in enumerate(mine):
+                name = self._room_id(component, i)
+                rows.append(
+                    RoomRow(
+                        id=name,
+                        component=component,
+                        position=level.T @ room.middle / unit,
+                        size_m=room.box[1] - room.box[0],
+                        area_m2=round(room.area_m2, 2),
+                        doors=tuple(self._room_id(component, other) for other in room.doors),
+                        objects=tuple(thing for thing, where in self.rooms_of.items() if where == name),
+                    )
+                )
+        return tuple(rows)
+
+    def named(self, text: str) -> MapObject:
+        """The object of an id (``o12``), of the id of one that is told as one with it, or of a name.
+
+        Raises:
+            NotFoundError: none, or several.
+        """
+        ids = {self.joined.get(text, text)}
+        found = [one for one in self.objects if one.id in ids]
+        found = found or [one for one in self.objects if one.words.name.casefold() == text.casefold()]
+        if not found and _HEX.fullmatch(text):
+            found = [one for one in self.objects if one.id.startswith(text)]
+        if len(found) != 1:
+            why = (
+                f"{', '.join(one.id for one in found)} are called so" if found else "no object of the map is called so"
+            )
+            raise NotFoundError(f"{text}: {why}; gsmap graph MAP lists them")
+        return found[0]
+
+
 def known_objects(
-    store: Store, settings: Settings, progress: StageProgress, graphs: Mapping[str, SceneGraph] | None = None
+    store: Store,
+    settings: Settings,
+    progress: StageProgress,
+    graphs: Mapping[str, SceneGraph] | None = None,
+    *,
+    make: bool = True,
 ) -> Known:
-    """The objects of every component by the newest poses; nothing is written.
+    """The objects of every component by the newest poses, with what people and photographs say of them.
+
+    They are made where what is kept of them is out of date, and then kept, unless the map is open for reading only.
 
     Args:
         graphs: by scene, what the captures are taken to show; no capture is then asked whether it looked where others
-            show something. By default the newest graph of each, and all are asked.
+            show something, and nothing is kept. By default the newest graph of each, and all are asked.
+        make: those that are out of date.
 
     Raises:
-        NotFoundError: the map has no poses yet.
+        NotFoundError: the map has no poses yet, or what is kept is out of date and is not to be made.
     """
-    placed = store.revisions.get()
-    if placed is None:
-        raise NotFoundError(
-            "the map has no poses yet, so that things of captures are not known to be one: run gsmap update"
-        )
-    scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in placed.poses}
-    captures: dict[int, list[Capture]] = {}
-    without = []
-    for scene in sorted(scenes.values(), key=_when):
-        graph = store.graphs.load(scene.id) if graphs is None else graphs.get(scene.id)
-        pose = placed.poses[scene.id]
-        if graph is None and graphs is not None:
-            continue  # whoever chose them says why
-        if graph is None or graph.things is None:
-            without.append(scene.name)
-        else:
-            captures.setdefault(pose.component, []).append(Capture(scene.id, pose.S_map_scene, graph.things))
-    notes = []
-    if without:
-        shown = ", ".join(without[:5]) + (f" and {len(without) - 5} more" if len(without) > 5 else "")
-        notes.append(
-            f"nobody knows the things of {shown}: gsmap describe MAP SCENE tells them, where describe.things is on"
-        )
-    undated = [scene.name for scene in scenes.values() if scene.captured_at is None]
-    if undated and len(scenes) > 1:
-        notes.append(
-            f"{len(undated)} of {len(scenes)} captures have no date: they come last, and half-lives leave them out"
-        )
-
-    def eyes(capture: Capture) -> Eyes:
-        if graphs is not None or scenes[capture.scene].thinning is not None:
-            return Eyes((), (), ())  # what is left of it does not show what it looked at
-        gaussians, cameras = store.scenes.gaussians(capture.scene), store.scenes.cameras(capture.scene)
-        return open_eyes(gaussians, cameras, settings.objects.look)
-
-    metres = {component: one.metres_per_unit for component, one in map_metres(store, settings, placed).items()}
+    placed, scenes, metres, parts, notes = objects_of_components(store, settings, progress, graphs, make=make)
     objects: list[MapObject] = []
-    for i, component in enumerate(sorted(captures)):
-
-        def told(fraction: float, text: str, part: int = i) -> None:
-            progress("objects", (part + fraction) / len(captures), text)
-
-        mine = captures[component]
-        moved, parted = _told(store, mine)
-        objects += make_objects(
-            mine,
-            component,
-            eyes,
-            metres=metres[component],
-            moved=moved,
-            parted=parted,
-            params=settings.objects,
-            progress=told,
-        )
+    for part in parts:
+        if part.key is not None and part.places is not None and store.catalog.writable:
+            made = store.objects.save(part.made, part.places, part.key)
+            objects += made.objects
+        elif part.places is not None:
+            numbers = store.objects.numbers(part.places)
+            objects += [
+                thing if number is None else replace(thing, id=f"o{number}")
+                for thing, number in zip(part.made.objects, numbers, strict=True)
+            ]
+        else:
+            objects += [replace(thing, component=part.component) for thing in part.made.objects]
+    rooms = {part.component: (level_frame(part.made.up), part.made.rooms) for part in parts}
+    objects, joined, said = with_words(store, objects, scenes)
     kept = store.photos.list() if graphs is None else []
     if kept:
         at = {scene: pose.S_map_scene for scene, pose in placed.poses.items()}
@@ -146,42 +177,72 @@ def known_objects(
         )
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
-    return Known(objects, scenes, tuple(notes), metres, photos)
+    return Known(objects, scenes, (*notes, *said), metres, photos, joined, store.objects.facts(), rooms)
 
 
-def _when(scene: Scene) -> tuple[bool, float, str]:
-    """Dated captures by their date; then the others, as they came."""
-    if scene.captured_at is None:
-        return True, 0.0, scene.ingested_at or ""
-    return False, parsed(scene.captured_at).timestamp(), scene.ingested_at or ""
+def kept_objects(store: Store, settings: Settings) -> Known:
+    """The objects of the map as they are kept; only the catalog is read.
 
-
-def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, Node]], list[tuple[Node, int]]]:
-    """What changes say of things, but for those that a person rejected.
-
-    Returns:
-        Things that are one though they moved; and things, each with a capture that does not show it where it stood.
+    Raises:
+        NotFoundError: they are out of date.
     """
-    at = {capture.scene: i for i, capture in enumerate(captures)}
-    moved: list[tuple[Node, Node]] = []
-    parted: list[tuple[Node, int]] = []
-    for comparison in store.changes.current():
-        if comparison.older not in at or comparison.newer not in at or not comparison.changes:
-            continue
-        older, newer = at[comparison.older], at[comparison.newer]
-        found = store.changes.load(comparison.number).changes
-        for change, kept in zip(found, comparison.changes, strict=True):
-            if kept.status == "rejected" or kept.kind not in ("appeared", "disappeared", "replaced", "moved"):
-                continue
-            before = older, changed_thing(captures[older].things.members, change.before)
-            after = newer, changed_thing(captures[newer].things.members, change.after)
-            if before[1] >= 0:
-                parted.append((before, newer))
-            if after[1] >= 0:
-                parted.append((after, older))
-            if kept.kind == "moved" and before[1] >= 0 and after[1] >= 0:
-                moved.append((before, after))
-    return moved, parted
+    return known_objects(store, settings, lambda *_: None, make=False)
+
+
+# --- what people say ------------------------------------------------------------------------------------------------
+
+
+def edit_object(
+    store: Store,
+    settings: Settings,
+    ref: str,
+    progress: StageProgress,
+    *,
+    name: str | None = None,
+    label: str | None = None,
+    note: str | None = None,
+    same_as: str | None = None,
+    author: str = "",
+) -> ObjectRow:
+    """Say something of an object, and what it is then.
+
+    Args:
+        ref: its id or name.
+        name, label, same_as: ``none`` takes back what was said before.
+
+    Raises:
+        NotFoundError: no such object.
+        InputError: a name that is taken, two that one capture shows apart; nothing is written.
+    """
+    known = known_objects(store, settings, progress)
+    if name is not None and _none(name):
+        name = ""
+    thing = next((one for one in known.objects if one.id == ref), None)
+    number = number_of(ref) if ref in known.joined or thing is not None else None
+    if number is None:
+        number = number_of(known.named(ref).id)
+    if number is None:
+        raise NotFoundError(f"{ref} has no number yet: the map is open for reading only")
+    other = None if same_as is None else 0
+    if same_as is not None and not _none(same_as):
+        target, mine = known.named(same_as), known.named(f"o{number}")
+        other = number_of(target.id)
+        if why := apart(mine, target, known.scenes):
+            raise InputError(f"o{number} and {target.id} cannot be one: {why}")
+    store.objects.edit(
+        number,
+        name=name,
+        label="" if label is not None and _none(label) else label,
+        note=note,
+        same_as=other,
+        author=author,
+    )
+    known = known_objects(store, settings, progress)
+    return object_row(known.named(f"o{number}"), known)
+
+
+def _none(text: str) -> bool:
+    return text.strip().lower() == "none"
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
@@ -190,17 +251,18 @@ def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, N
 def objects_report(known: Known) -> ObjectsReport:
     """The scene graph of the map."""
     return ObjectsReport(
-        objects=tuple(_row(thing, known) for thing in known.objects),
+        objects=tuple(object_row(thing, known) for thing in known.objects),
         relations=tuple(
             RelationRow(subject=one.source, relation=one.kind, other=one.target)
             for one in relations(known.objects, known.metres)
         ),
+        rooms=known.room_rows(),
         notes=known.notes,
     )
 
 
 def history_report(known: Known, place: str | None, box: Sequence[float] | None) -> HistoryReport:
-    """What stood at a place: an object by its id (or how it begins), a point ``X,Y,Z``, or a box of six numbers.
+    """What stood at a place: an object by its id or name, a point ``X,Y,Z``, or a box of six numbers.
 
     Raises:
         ConfigError: neither, both, or not what these look like.
@@ -208,15 +270,8 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
     """
     if (place is None) == (box is None):
         raise ConfigError("say which place: an object's id, a point X,Y,Z, or --box with six numbers")
-    if place is not None and "," not in place:
-        if not _ID.fullmatch(place):
-            raise ConfigError(
-                f"{place!r} is neither an object's id (gsmap graph lists them) nor a point such as 1.5,0,2"
-            )
-        chosen = [thing for thing in known.objects if thing.id.startswith(place)]
-        if len(chosen) != 1:
-            many = "several objects begin so" if chosen else "no object of the map is called so"
-            raise NotFoundError(f"{place}: {many}; gsmap graph MAP lists them")
+    if place is not None and not ("," in place and _POINT.fullmatch(place)):
+        chosen = [known.named(place)]
     else:
         area = _area(place, box)
         chosen = [
@@ -239,7 +294,18 @@ def history_report(known: Known, place: str | None, box: Sequence[float] | None)
         for sighting in thing.sightings
     ]
     notes = known.notes if chosen else (*known.notes, "no thing was ever told apart there")
-    return HistoryReport(objects=tuple(_row(thing, known) for thing in chosen), sightings=tuple(rows), notes=notes)
+    words = [
+        ObjectFactRow(object=thing.id, at=fact.created_at, fact=fact.kind, value=fact.value, author=fact.author)
+        for thing in chosen
+        for one in (thing.id, *(other for other, to in known.joined.items() if to == thing.id))
+        for fact in known.facts.get(one, ())
+    ]
+    return HistoryReport(
+        objects=tuple(object_row(thing, known) for thing in chosen),
+        sightings=tuple(rows),
+        words=tuple(words),
+        notes=notes,
+    )
 
 
 def _area(place: str | None, box: Sequence[float] | None) -> np.ndarray:
@@ -262,7 +328,8 @@ def _meets(box: np.ndarray | None, area: np.ndarray, near: float) -> bool:
     return box is not None and bool((box[0] <= area[1] + near).all() and (box[1] >= area[0] - near).all())
 
 
-def _row(thing: MapObject, known: Known) -> ObjectRow:
+def object_row(thing: MapObject, known: Known) -> ObjectRow:
+    """One object."""
     stays = permanence(thing, known.dates)
     seen = [known.dates[sighting.scene] for sighting in thing.sightings if sighting.state == "seen"]
     return ObjectRow(
@@ -277,6 +344,10 @@ def _row(thing: MapObject, known: Known) -> ObjectRow:
         first_seen=seen[0],
         last_seen=seen[-1],
         half_life_days=stays.half_life_days,
+        name=thing.words.name or None,
+        label=thing.words.label or None,
+        note=thing.words.note or None,
+        room=known.rooms_of.get(thing.id),
     )
 
 
@@ -285,7 +356,7 @@ def _row(thing: MapObject, known: Known) -> ObjectRow:
 
 def as_networkx(known: Known) -> Any:
     """A `networkx.MultiDiGraph`, see `gsmap.objects.object_graph`."""
-    return object_graph(known.objects, known.dates, known.metres)
+    return object_graph(known.objects, known.dates, known.metres, known.room_rows())
 
 
 def write_graph(known: Known, out: str | os.PathLike[str], format: str) -> Path:

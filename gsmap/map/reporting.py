@@ -23,6 +23,7 @@ from gsmap.map import reports
 from gsmap.map.changes import changes_report, within
 from gsmap.map.dates import is_after, parsed
 from gsmap.map.metres import map_metres
+from gsmap.map.objects import kept_objects, objects_report
 from gsmap.map.one_state import of_one_state
 from gsmap.map.pictures import Drawer, note_target, picture_of_pair
 from gsmap.map.settings import Settings
@@ -57,7 +58,7 @@ from gsmap.store.sizes import scene_sizes, sizes
 from gsmap.types import Gaussians, PoseGraph, Scene, ScenePose
 from gsmap.types.metre import Metre
 from gsmap.types.progress import StageProgress
-from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, RevisionRow, WrittenReport
+from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, RevisionRow, WrittenReport
 from gsmap.version import __version__
 
 _SUFFIXES = (".html", ".htm")
@@ -115,6 +116,14 @@ def check_target(path: Path) -> None:
         raise NotFoundError(f"cannot write {path}: {path.parent} does not exist")
     if path.exists() and owner_of(path) is None:
         raise ConfigError(f"{path} is there and was not written by gsmap report: choose another name, or delete it")
+
+
+def _known_objects(store: Store, settings: Settings) -> ObjectsReport | None:
+    """What is kept of objects: a report makes none."""
+    try:
+        return objects_report(kept_objects(store, settings))
+    except NotFoundError:
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,6 +405,7 @@ def _state(store: Store, settings: Settings, since: str | None) -> _State:
         moved=tuple(_moved(store, settings, revisions, params.moves)),
         moved_since=None if when is None else _moved_since(store, settings, revisions, when),
         changes=changes,
+        objects=None if graph is None else _known_objects(store, settings),
         storage=tuple(StorageEntry(_KINDS.get(one.kind, one.kind), one.count, one.num_bytes) for one in sizes(store)),
         seconds=_seconds(stored.values()),
         news=None if when is None or since is None else _news(since, when, scenes, edges),

@@ -24,6 +24,9 @@ from gsmap.export.levels import make_level
 from gsmap.geometry.metres import in_metres
 from gsmap.geometry.morton import morton_order
 from gsmap.localize import PlacedFeatures, ViewIndex, packing
+from gsmap.map import persisting
+from gsmap.map.objects import Known
+from gsmap.map.persisting import what_passes
 from gsmap.map.settings import Settings, settings_of
 from gsmap.map.stages.localize import Localizer, Near
 from gsmap.methods import family
@@ -69,12 +72,18 @@ class SmallScene:
 
 
 def export_small(
-    store: Store, out: Path, budget_bytes: int, settings: Settings, progress: StageProgress
+    store: Store,
+    out: Path,
+    budget_bytes: int,
+    settings: Settings,
+    progress: StageProgress,
+    known: Known | None = None,
 ) -> SmallMapReport:
     """Write a small map; it appears whole or not at all.
 
     Args:
         budget_bytes: of all its files together.
+        known: the objects of the map, to leave out what of it does not persist; by default what changes say is gone.
 
     Raises:
         StoreError: the folder is not empty.
@@ -92,14 +101,16 @@ def export_small(
     scenes = sorted(localizer.placed)
     weights: dict[str, np.ndarray] = {}
     own: dict[str, Cameras | None] = {}
+    left_out: dict[str, np.ndarray | bool] = {}
+    passing = {} if known is None else what_passes(store, known)
     for number, scene in enumerate(scenes):
         progress("export", 0.5 * number / len(scenes), f"what of {localizer.scenes[scene].name} shows")
         placed = localizer.placed[scene]
         held = store.scenes.cameras(scene)
         own[scene] = None if held is None or held.synthesised else held
-        weights[scene] = np.where(_gone(store, scene), 0, packing.weights(placed, own[scene], params)).astype(
-            np.float32
-        )
+        gone = persisting.rows(store, scene, passing[scene]) if scene in passing else _gone(store, scene)
+        left_out[scene] = gone if scene in passing else False
+        weights[scene] = np.where(gone, 0, packing.weights(placed, own[scene], params)).astype(np.float32)
     shown = {scene: int((weights[scene] >= params.min_weight).sum()) for scene in scenes}
     share = {scene: shown[scene] / max(sum(shown.values()), 1) for scene in scenes}
     free = budget_bytes - _HEADER_BYTES * len(scenes) - 500
@@ -111,7 +122,8 @@ def export_small(
         files, rows = {}, []
         for number, scene in enumerate(scenes):
             progress("export", 0.5 + 0.4 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
-            content, row = _packed(localizer, scene, weights[scene], own[scene], factor * free * share[scene], params)
+            size = factor * free * share[scene]
+            content, row = _packed(localizer, scene, weights[scene], left_out[scene], own[scene], size, params)
             files[scene] = content
             rows.append(row)
         total = sum(map(len, files.values())) + _HEADER_BYTES * len(scenes) + 500
@@ -154,6 +166,7 @@ def _packed(
     localizer: Localizer,
     scene: str,
     weight: np.ndarray,
+    left_out: np.ndarray | bool,
     cameras: Cameras | None,
     num_bytes: float,
     params: packing.Params,
@@ -161,6 +174,8 @@ def _packed(
     """A scene's file of about so many bytes."""
     placed = localizer.placed[scene]
     features, gaussians = placed.features, placed.gaussians
+    if np.any(left_out):
+        features = packing.without(features, gaussians.means, np.asarray(left_out))
     per_feature = features.descriptors.shape[1] / 2 + 7
     most = int(params.features_share * num_bytes / per_feature / max(features.num_views, 1))
     kept = packing.fewer(features, max(most, 1))

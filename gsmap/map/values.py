@@ -54,6 +54,8 @@ def merge(store: Store, source: str | os.PathLike[str]) -> MergeReport:
         num_models=merged.models,
         num_comparisons=merged.comparisons,
         num_change_reviews=merged.change_reviews,
+        num_objects=merged.objects,
+        num_object_facts=merged.object_facts,
         num_revisions=merged.revisions,
         renamed=dict(merged.renamed),
         revision=merged.revision,

@@ -63,7 +63,7 @@ class MapDoors:
         self.actions: Mapping[str, Action] = actions or {}
         self._lock = threading.Lock()
         self._read: tuple[str | None, ViewMap] | None = None
-        self._objects: tuple[str, Known] | None = None
+        self._objects: tuple[str | None, Known] | None = None
         self._objects_lock = threading.Lock()
         self._tiles = tiles
         self._merged = {} if tiles is None else merged_tilesets(store, tiles)
@@ -169,7 +169,7 @@ class MapDoors:
             "objects": [
                 {
                     "id": row.id,
-                    "name": _called(row.size * known.metres[row.component]),
+                    "name": row.name or row.label or _called(row.size * known.metres[row.component]),
                     "component": row.component,
                     "position": row.position.tolist(),
                     "box": boxes[row.id].tolist(),
@@ -203,11 +203,12 @@ class MapDoors:
     # -----------------------------------------------------------------------------------------------------------------
 
     def _known(self) -> Known:
-        """The objects of the map; they are put together once for a state of it."""
-        state = self.state()
+        """The objects of the map with what people call them; they are read once for a state of the catalog."""
         with self._objects_lock:
-            if self._objects is None or self._objects[0] != state:
-                self._objects = state, known_objects(self._store, self._settings, lambda stage, fraction, text: None)
+            signature = self._store.catalog.signature()
+            if self._objects is None or signature is None or self._objects[0] != signature:
+                known = known_objects(self._store, self._settings, lambda stage, fraction, text: None)
+                self._objects = self._store.catalog.signature(), known
             return self._objects[1]
 
     def _places(self) -> dict[str, int]:

@@ -30,6 +30,7 @@ class LazyScene:
         cameras: its cameras, scene frame.
         captured_at: ISO 8601 time with zone, or None.
         store: where what its views show is kept for other tiles.
+        without: names what ``load`` leaves out of it; empty where that is nothing.
     """
 
     scene_id: str
@@ -38,6 +39,7 @@ class LazyScene:
     cameras: Cameras | None = None
     captured_at: str | None = None
     store: SightStore = field(default_factory=SightStore)
+    without: str = ""
 
     def centroid(self) -> np.ndarray | None:
         """(3,) mean of all of its means, map frame; None where it holds nothing."""
@@ -126,7 +128,7 @@ def _sights(
 ) -> PlacedSights:
     assert scene.cameras is not None
     around = around_m / scene.S_map_scene.scale
-    sights = Sights(scene.scene_id, scene.load, scene.cameras, around, longest_side_px, scene.store)
+    sights = Sights(scene.scene_id + scene.without, scene.load, scene.cameras, around, longest_side_px, scene.store)
     return PlacedSights(sights, scene.S_map_scene, rows, keys, np.argsort(keys, kind="stable"))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_CHANGED = 0.4  # a change of less of a thing is of a part of it, or of what stands against it
+CHANGED = 0.4  # a change of less of a thing is of a part of it, or of what stands against it
 
 
 def changed_thing(members: np.ndarray, rows: np.ndarray) -> int:
@@ -16,4 +16,4 @@ def changed_thing(members: np.ndarray, rows: np.ndarray) -> int:
     if not len(counts) or 2 * counts.max() <= len(mine):
         return -1
     thing = int(things[np.argmax(counts)])
-    return thing if counts.max() >= _CHANGED * np.count_nonzero(members == thing) else -1
+    return thing if counts.max() >= CHANGED * np.count_nonzero(members == thing) else -1

@@ -9,20 +9,27 @@ from typing import Any
 from gsmap.objects.permanence import permanence
 from gsmap.objects.relations import relations
 from gsmap.types import MapObject
+from gsmap.types.rows import RoomRow
 
 
 def object_graph(
-    objects: Sequence[MapObject], dates: Mapping[str, str | None], metres: float | Mapping[int, float] = 1.0
+    objects: Sequence[MapObject],
+    dates: Mapping[str, str | None],
+    metres: float | Mapping[int, float] = 1.0,
+    rooms: Sequence[RoomRow] = (),
 ) -> Any:
     """A `networkx.MultiDiGraph`: a node per object, an edge per relation, whose attributes GraphML can say.
 
     Nodes: ``kind`` (object), ``component``, ``x y z`` (map frame), ``size_x size_y size_z``, ``L a b``,
-    ``seen``, ``looks``, ``half_life_days`` (absent where unknown), ``there`` (the newest look shows it). Edges:
-    ``kind`` (on, in, next to).
+    ``seen``, ``looks``, ``half_life_days`` (absent where unknown), ``there`` (the newest look shows it), ``name`` and
+    ``label`` (absent where nobody gave any). Edges: ``kind`` (on, in, next to). Rooms are nodes, too: ``kind`` (room),
+    ``component``, ``x y z`` (the middle of the floor), ``area_m2``; an object has an edge ``in room`` to the one it
+    stands in, and rooms have one ``door`` each way.
 
     Args:
         dates: as for `permanence`.
         metres: per unit of the map; by component, or for all.
+        rooms: the map's.
     """
     import networkx as nx
 
@@ -36,9 +43,16 @@ def object_graph(
         facts |= {"seen": stays.seen, "looks": stays.looks, "there": thing.there}
         if stays.half_life_days is not None:
             facts["half_life_days"] = stays.half_life_days
+        facts |= {word: value for word in ("name", "label") if (value := getattr(thing.words, word))}
         graph.add_node(thing.id, **facts)
     for relation in relations(objects, metres):
         graph.add_edge(relation.source, relation.target, kind=relation.kind)
+    for room in rooms:
+        at = {axis: float(value) for axis, value in zip("xyz", room.position, strict=True)}
+        graph.add_node(room.id, kind="room", component=room.component, area_m2=room.area_m2, **at)
+    for room in rooms:
+        graph.add_edges_from((thing, room.id, {"kind": "in room"}) for thing in room.objects)
+        graph.add_edges_from((room.id, other, {"kind": "door"}) for other in room.doors)
     return graph
 
 

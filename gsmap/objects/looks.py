@@ -85,6 +85,20 @@ def open_eyes(gaussians: Gaussians, cameras: Cameras | None, params: Params | No
     )
 
 
+def in_view(cameras: Cameras | None, points: np.ndarray, params: Params | None = None) -> bool:
+    """Whether any camera that a capture looks with has one of the points (K, 3) in its picture, whatever stands before
+    it; its frame and unit."""
+    params = params or Params()
+    if cameras is None or not len(cameras) or cameras.synthesised:
+        return False
+    some = cameras.evenly(params.max_views)
+    for view in (some[i] for i in range(len(some))):
+        pixels, z = project(points, view.T_camera_frame[0], view.intrinsics_px[0])
+        if in_image(pixels, z, view.sizes_px[0]).any():
+            return True
+    return False
+
+
 def glance(eyes: Eyes, points: np.ndarray, unit_m: float, params: Params | None = None) -> Glance:
     """What a capture saw at points (K, 3), its frame and unit; ``unit_m`` is metres per unit."""
     params = params or Params()

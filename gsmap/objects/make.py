@@ -7,13 +7,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsmap.methods import text_digest
+from gsmap import render
+from gsmap.methods import RecipeKey, text_digest
 from gsmap.objects.fuse import Node, Placed, fuse
 from gsmap.objects.fuse import Params as FuseParams
 from gsmap.objects.looks import Eyes, glance, judge
 from gsmap.objects.looks import Params as LookParams
-from gsmap.types import MapObject, Sighting, Sim3, Things
+from gsmap.objects.rooms import Params as RoomParams
+from gsmap.types import MapObject, Sighting, SightingState, Sim3, Things
+from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
+
+VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -23,12 +28,19 @@ class Params:
     Args:
         fuse: when things of two captures are one.
         look: how captures look for the things of others.
+        rooms: how the place is cut into rooms.
         min_points: a thing of fewer points makes no object by itself.
     """
 
     fuse: FuseParams = field(default_factory=FuseParams)
     look: LookParams = field(default_factory=LookParams)
+    rooms: RoomParams = field(default_factory=RoomParams)
     min_points: int = 40
+
+
+def recipe_key(params: Params | None = None) -> RecipeKey:
+    """What names the objects of a component; what they are made of is added by whoever knows it."""
+    return RecipeKey("objects", "fused", {"objects": VERSION}, plain(params or Params()), render.backend())
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,20 +66,25 @@ def make_objects(
     metres: float = 1.0,
     moved: Sequence[tuple[Node, Node]] = (),
     parted: Sequence[tuple[Node, int]] = (),
+    looked: Callable[[int, Node], tuple[SightingState, float] | None] = lambda capture, node: None,
+    could_see: Callable[[Capture, np.ndarray], bool] = lambda capture, points: True,
     params: Params | None = None,
     progress: Progress = silent,
 ) -> list[MapObject]:
     """The objects of one component of the map, the largest first.
 
-    Every capture is opened once, whatever the number of others: its cost is that of its own things and of the objects
-    at its place.
+    A capture is opened once, whatever the number of others, and only where it has to be asked for an object that others
+    show at a place that its cameras can see: its cost is that of its own things and of the objects at its place.
 
     Args:
         captures: of the component, oldest first.
-        eyes: what a capture sees; asked once for each capture that lacks an object of others.
+        eyes: what a capture sees; asked at most once for each.
         metres: per unit of the map.
         moved: things (capture and thing by index) that are one though they stood elsewhere.
         parted: things, each with the index of a capture that is known not to show it where it stood.
+        looked: state and share of what a capture (by index) was found to show of a thing of another when it was asked
+            before; None where it has to be asked.
+        could_see: whether any camera of a capture can see some of these points, its frame and unit; without rendering.
     """
     params = params or Params()
     placed = [_placed(capture, metres) for capture in captures]
@@ -86,29 +103,41 @@ def make_objects(
     ]
     for c, capture in enumerate(captures):
         progress(c / max(len(captures), 1), f"looking for {len(kept)} objects in capture {c + 1} of {len(captures)}")
-        if all(c in mine for mine in sightings):
-            continue
-        seen = eyes(capture)
+        # Of which capture each is known where it stood when it is looked for: the nearest in time.
+        of = [min((o for o in at if o != c), key=lambda o: (abs(o - c), o), default=c) for _, at in kept]
+        points = [places[o][0] for (_, places), o in zip(kept, of, strict=True)]
         S_scene_map, unit = capture.S_map_scene.inverse(), metres * capture.S_map_scene.scale
-        glances, own = [], []
-        for _, places in kept:
-            others = [other for other in places if other != c] or [c]
-            nearest = min(others, key=lambda other: (abs(other - c), other))
-            at, lab = places[nearest]
-            glances.append(glance(seen, S_scene_map.apply(at), unit, params.look))
-            own.append((at, lab))
-        # The exposure: by what is certainly there, else by all that has a surface where it should.
-        sure = [i for i, mine in enumerate(sightings) if c in mine] or list(range(len(kept)))
-        off = np.concatenate([(glances[i].colours - own[i][1])[glances[i].on] for i in sure])
-        shift = np.median(off, axis=0) if len(off) else np.zeros(3)
+        said: dict[int, tuple[SightingState, float]] = {}
+        asking = []
         for i, mine in enumerate(sightings):
-            if c not in mine:
-                at, lab = own[i]
-                state, looked = judge(glances[i], at * metres, lab, shift, params.look)
-                if any((node, c) in gone for node in kept[i][0]):
-                    state = "absent"
-                box = np.array([at.min(0), at.max(0)]) if state == "seen" else None
-                mine[c] = Sighting(capture.scene, state, -1, box, looked)
+            if c in mine:
+                continue
+            before = looked(c, (of[i], sightings[i][of[i]].thing))
+            if before is not None:
+                said[i] = before
+            elif could_see(capture, S_scene_map.apply(points[i])):
+                asking.append(i)
+            else:
+                sightings[i][c] = Sighting(capture.scene, "unseen", -1, None, 0.0)
+        if asking:
+            seen = eyes(capture)
+            own = [places[o][1] for (_, places), o in zip(kept, of, strict=True)]
+            # The exposure: by what is certainly there, else by all that has a surface where it should.
+            sure = [i for i, mine in enumerate(sightings) if c in mine] or asking
+            glances = {
+                i: glance(seen, S_scene_map.apply(points[i]), unit, params.look)
+                for i in dict.fromkeys([*sure, *asking])
+            }
+            off = np.concatenate([(glances[i].colours - own[i])[glances[i].on] for i in sure])
+            shift = np.median(off, axis=0) if len(off) else np.zeros(3)
+            for i in asking:
+                said[i] = judge(glances[i], points[i] * metres, own[i], shift, params.look)
+        for i, (state, share) in said.items():
+            asked = captures[of[i]].scene
+            if any((node, c) in gone for node in kept[i][0]):
+                state, asked = "absent", ""  # a person may take that back, so that it is not what was looked for
+            box = np.array([points[i].min(0), points[i].max(0)]) if state == "seen" else None
+            sightings[i][c] = Sighting(capture.scene, state, -1, box, share, asked)
     objects = []
     for (group, _), mine in zip(kept, sightings, strict=True):
         first, last = group[0], group[-1]

@@ -10,7 +10,7 @@ import numpy as np
 from gsmap.report.params import Params
 from gsmap.report.plan import Plan
 from gsmap.types.metre import Metre
-from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, PoseChangeRow, RevisionRow, SceneRow
+from gsmap.types.rows import ChangesReport, EdgeRow, MapStatus, ObjectsReport, PoseChangeRow, RevisionRow, SceneRow
 
 CHI2_DOF = 7
 """Degrees of freedom of an edge: rotation, translation, scale."""
@@ -182,6 +182,7 @@ class Report:
         moved_since: between the newest revision and the last one made before the date of ``news``; None where nobody
             asked, or there is none.
         changes: None before the first poses.
+        objects: things and rooms of the map as they are kept; None where none are.
         pair_pictures, change_pictures: those that were drawn.
         storage: by kind, most bytes first.
         seconds: wall seconds that registering took, by step, as far as they are kept.
@@ -203,6 +204,7 @@ class Report:
     moved: tuple[Moved, ...] = ()
     moved_since: Moved | None = None
     changes: ChangesReport | None = None
+    objects: ObjectsReport | None = None
     pair_pictures: tuple[PairPicture, ...] = ()
     change_pictures: tuple[ChangePicture, ...] = ()
     storage: tuple[StorageEntry, ...] = ()

@@ -509,6 +509,38 @@ def _changes(report: Report) -> Markup | None:
     return joined(parts) or None
 
 
+def _things(report: Report) -> Markup | None:
+    """Rooms, and objects: those that people named first."""
+    known = report.objects
+    if known is None or not known.objects:
+        return None
+    there = sum(row.there for row in known.objects)
+    parts: list[Part] = [tag("p", f"{count(len(known.objects), 'object')}, {there:,} of them there still.")]
+    if known.rooms:
+        rooms = [
+            (row.id, f"{row.area_m2:.1f}", ", ".join(row.doors), f"{len(row.objects):,}") for row in known.rooms[:_FEW]
+        ]
+        parts += [tag("h3", "Rooms"), _table(("room", "m²", "doors to", "objects"), rooms, (1, 3))]
+    ordered = sorted(known.objects, key=lambda row: (row.name is None, row.label is None))[: report.params.changes]
+    rows = [
+        (
+            row.id,
+            cut(row.name or row.label or ""),
+            row.room or "",
+            "there" if row.there else "gone",
+            f"{row.seen} of {row.looks}",
+            day(row.first_seen),
+            day(row.last_seen),
+        )
+        for row in ordered
+    ]
+    parts.append(tag("h3", "Objects"))
+    parts.append(_folded(("object", "called", "room", "", "seen in looks", "first seen", "last seen"), rows, ()))
+    if len(known.objects) > len(rows):
+        parts.append(_more(len(known.objects) - len(rows), "objects", "gsmap graph MAP"))
+    return joined(parts)
+
+
 def _history(report: Report) -> Markup | None:
     if not report.revisions:
         return None
@@ -699,6 +731,7 @@ SECTIONS: dict[str, tuple[str, Callable[[Report], Markup | None]]] = {
     "edges": ("Edges and residuals", _edges),
     "scenes": ("Scenes", _scenes),
     "changes": ("Changes", _changes),
+    "things": ("Things", _things),
     "history": ("History", _history),
     "cost": ("Storage and cost", _cost),
     "reading": ("How to read this page", _reading),

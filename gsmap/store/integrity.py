@@ -26,6 +26,7 @@ from gsmap.store.groups import manifest
 from gsmap.store.indexes import KIND as INDEXES
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.models import FOLDER, model_path, open_model
+from gsmap.store.objects import forget_sets
 from gsmap.store.photos import KIND as PHOTOS
 from gsmap.store.photos import claimed_groups
 from gsmap.store.revisions import forget_dropped, named_by_kept
@@ -265,12 +266,14 @@ class _Waste:
         revisions: numbers of those that are not kept.
         scenes: names and numbers of removed scenes that no kept revision names.
         graphs: keys of their graphs.
+        lost: ids of all scenes that are removed and that no kept revision names.
         doomed: kinds and names of the groups that nothing claims then.
     """
 
     revisions: list[int]
     scenes: list[tuple[str, int]]
     graphs: list[str]
+    lost: set[str]
     doomed: list[tuple[str, str]]
 
 
@@ -295,6 +298,7 @@ def _waste(connection: Connection, keep_revisions: int | None) -> _Waste:
         dropped,
         [(row.name, row.number) for row in dead],
         list(keys),
+        lost,
         sorted(group for group in known if group[1] not in claimed),
     )
 
@@ -305,6 +309,7 @@ def _drop_rows(catalog: Catalog, waste: _Waste) -> None:
         connection.execute(update(revisions).where(revisions.c.number.in_(waste.revisions)).values(dropped_at=now()))
         forget_dropped(connection)
         connection.execute(delete(graphs).where(graphs.c.key.in_(waste.graphs)))
+        forget_sets(connection, waste.lost)
         connection.execute(delete(view_features).where(view_features.c.group_id.in_(ids)))
         for table in (scenes, comparisons, photo_sightings):
             connection.execute(update(table).where(table.c.group_id.in_(ids)).values(group_id=None))

@@ -19,6 +19,7 @@ from gsmap.store.schema import about, revisions, scenes
 from gsmap.store.store import Store
 from gsmap.store.transfer import Transfer, between
 from gsmap.store.transfer_changes import comparisons_of
+from gsmap.store.transfer_objects import objects_of
 
 Identity = tuple[str, int, str | None]
 
@@ -30,7 +31,7 @@ class Merged:
     Args:
         scenes, removed, known: scenes that are new here and live, that are new or now removed, and that both maps had.
         graphs, registrations, reviews, facts, priors, observations, photos, models, recipes, revisions, comparisons,
-            change_reviews: rows that are new here.
+            change_reviews, objects, object_facts: rows that are new here.
         renamed: (old, new) names of scenes whose name was taken.
         revision: number of the joint revision; None where none was needed.
         num_bytes: of the arrays that are new here, linked or copied.
@@ -52,6 +53,8 @@ class Merged:
     revisions: int = 0
     comparisons: int = 0
     change_reviews: int = 0
+    objects: int = 0
+    object_facts: int = 0
     renamed: tuple[tuple[str, str], ...] = ()
     revision: int | None = None
     num_bytes: int = 0
@@ -74,6 +77,7 @@ def merge(into: Store, source: Store) -> Merged:
         transfer.graphs()
         transfer.pairs()
         comparisons_of(transfer)
+        objects_of(transfer)
         transfer.priors()
         transfer.observations()
         transfer.photos()
@@ -96,6 +100,7 @@ def split(source: Store, out: Store, chosen: Collection[str]) -> Merged:
         transfer.graphs()
         transfer.pairs()
         comparisons_of(transfer)
+        objects_of(transfer)
         transfer.priors()
         transfer.observations()
         transfer.photos()
@@ -133,6 +138,7 @@ def bring_scene(into: Store, source: Store, scene: str) -> Merged:
         transfer.graphs()
         transfer.pairs()
         comparisons_of(transfer)
+        objects_of(transfer)
         transfer.priors()
         transfer.observations()
         transfer.photos()

@@ -18,7 +18,7 @@ from sqlalchemy import Connection, Row, Table, delete, exists, func, insert, sel
 
 from gsmap.durable import files_below, is_file, is_folder, remove_file, sync_folder
 from gsmap.errors import BusyError
-from gsmap.store import integrity, sqlite
+from gsmap.store import integrity, objects, sqlite
 from gsmap.store.branches import Others, Place
 from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import KINDS
@@ -37,6 +37,7 @@ from gsmap.store.schema import (
     index_segments,
     leases,
     lookups,
+    object_facts,
     observations,
     photo_sightings,
     poses,
@@ -68,6 +69,7 @@ _WORDS: tuple[tuple[Table, str, str], ...] = (
     (scene_facts, "value", "scene"),
     (reviews, "note", "pair"),
     (change_reviews, "note", "change"),
+    (object_facts, "value", "object"),
     (revisions, "note", "number"),
 )
 
@@ -260,6 +262,7 @@ def _delete_rows(connection: Connection, row: Row[Any]) -> tuple[Counter[str], d
     drop("graphs", graphs, graphs.c.scene == scene)
     drop("view_features", view_features, view_features.c.scene == scene)
     drop("photos", photo_sightings, photo_sightings.c.scene == scene)
+    counts.update(objects.forget_scene(connection, scene))
     connection.execute(text(f"DELETE FROM {CHUNK_BOXES} WHERE s0 = :s AND s1 = :s"), {"s": row.number})
     drop("scenes", scenes, scenes.c.id == scene)
     claimed = set(connection.execute(select(scenes.c.group_id)).scalars())

@@ -231,12 +231,13 @@ class Scenes:
             when: str | None = find(connection, ref).removed_at
             return when
 
-    def gaussians(self, ref: str, bounds: np.ndarray | None = None) -> Gaussians:
+    def gaussians(self, ref: str, bounds: np.ndarray | None = None, without: np.ndarray | None = None) -> Gaussians:
         """Read a scene's Gaussians (Morton order).
 
         Args:
             bounds: (2, 3) lowest and highest corner in the scene's frame: only Gaussians within three standard
                 deviations (the largest) of it are returned, and only the chunks that touch it are read.
+            without: (N,) bool, those that are left out.
 
         Raises:
             CorruptError: bytes on disk are missing or differ.
@@ -249,6 +250,9 @@ class Scenes:
         rows = None if chunks is None else row_ranges(chunks, row.num_gaussians)
         with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
             out = self._read(row, files, rows)
+        if without is not None:
+            spans = [(0, row.num_gaussians)] if rows is None else rows
+            out = out[~np.concatenate([np.zeros(0, bool), *(without[start:stop] for start, stop in spans)])]
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)

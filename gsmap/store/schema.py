@@ -55,9 +55,10 @@ from gsmap.store.matrices import (
     pose_of_bytes,
 )
 from gsmap.types.change import CHANGE_KINDS, SYMMETRIES
+from gsmap.types.map_object import OBJECT_FACTS
 from gsmap.types.world import OBSERVATION_KINDS
 
-HEAD = "0009"  # the newest migration; numbered, so that older and newer can be told apart without alembic
+HEAD = "0010"  # the newest migration; numbered, so that older and newer can be told apart without alembic
 
 REVISION_COUNTS = (
     "num_scenes",
@@ -384,6 +385,39 @@ photo_sightings = _table(
     Column("group_id", Digest, ForeignKey("groups.id")),  # of its small JPEG; null once it was taken back and pruned
     Column("created_at", Text, nullable=False),
     Column("removed_at", Text),
+)
+
+# Things of the map over all captures, by the number they are called by (`o12`): where each capture shows one, and what
+# people said of it. What was computed of them (`object_sets`) is made anew where it is lost or out of date.
+objects = _table(
+    "objects",
+    Column("number", Integer, primary_key=True),
+    Column("created_at", Text, nullable=False),
+)
+object_places = _table(
+    "object_places",
+    Column("object", Integer, ForeignKey("objects.number"), primary_key=True),
+    _scene("scene", primary_key=True, index=True),
+    Column("box", Json(a_box), nullable=False),  # around it, the scene's own frame
+)
+object_facts = _table(
+    "object_facts",
+    Column("number", Integer, primary_key=True),
+    Column("object", Integer, ForeignKey("objects.number"), nullable=False, index=True),
+    Column("kind", Word(OBJECT_FACTS), nullable=False),
+    Column("value", Lines, nullable=False),  # empty: what was said before is taken back
+    Column("author", Line, nullable=False),
+    Column("created_at", Text, nullable=False),
+    CheckConstraint("kind in ('name', 'label', 'note', 'same_as')", name="kind"),
+)
+object_sets = _table(
+    "object_sets",
+    Column("number", Integer, primary_key=True),
+    Column("key", Key, nullable=False, index=True),  # RecipeKey.digest
+    _recipe(),
+    Column("poses", Json(poses_by_scene), nullable=False),  # S_map_scene of its captures, as it was made with
+    Column("value", Json(an_object), nullable=False),  # as of `gsmap.store.objects`
+    Column("created_at", Text, nullable=False),
 )
 
 models = _table(

@@ -32,6 +32,7 @@ from gsmap.store.integrity import Check, Pruned
 from gsmap.store.leases import Leases
 from gsmap.store.models import Models
 from gsmap.store.object_arrays import ObjectArrays
+from gsmap.store.objects import Objects
 from gsmap.store.photos import Photos
 from gsmap.store.priors import Priors
 from gsmap.store.recipes import Recipes
@@ -86,6 +87,7 @@ class Store:
         self.photos = Photos(catalog, self.arrays)
         self.registrations = Registrations(catalog)
         self.changes = Changes(catalog, self.arrays)
+        self.objects = Objects(catalog)
         self.revisions = Revisions(catalog)
         self.priors = Priors(catalog)
         self.world = World(catalog)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from sqlalchemy import Connection, delete, insert, select, update
 
-from gsmap.store import facts, photos, world
+from gsmap.store import facts, objects, photos, world
 from gsmap.store.change_rows import pair_of
 from gsmap.store.schema import comparisons, priors, scene_facts
 from gsmap.store.store import Store
@@ -31,6 +31,7 @@ def inherit(store: Store, old: str, new: str) -> None:
         _inherit_comparisons(connection, old, new)
         world.inherit(connection, old, new)
         photos.inherit(connection, old, new)
+        objects.inherit(connection, old, new)
         graph = store.revisions.get()
         if graph is not None and old in graph.poses:
             name = store.scenes.get(old).name

@@ -4,10 +4,11 @@ from gsmap.types.cameras import Cameras
 from gsmap.types.change import CHANGE_KINDS, Change, ChangeKind, ChangeReport
 from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
-from gsmap.types.map_object import SIGHTING_STATES, MapObject, Sighting, SightingState
+from gsmap.types.map_object import SIGHTING_STATES, MapObject, ObjectWords, Sighting, SightingState
 from gsmap.types.merging import MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
+from gsmap.types.room import Room
 from gsmap.types.scene import Scene
 from gsmap.types.scene_graph import NodeLayer, SceneGraph, Things
 from gsmap.types.sim3 import Sim3
@@ -30,6 +31,7 @@ __all__ = [
     "MapObject",
     "MergeResult",
     "NodeLayer",
+    "ObjectWords",
     "PlacedScene",
     "PoseChange",
     "PoseGraph",
@@ -37,6 +39,7 @@ __all__ = [
     "Proposal",
     "Provenance",
     "Registration",
+    "Room",
     "Scene",
     "SceneGraph",
     "ScenePose",

@@ -60,6 +60,7 @@ RUNS = {
     "history": "history MAP 0.5,0.5,0.5",
     "find": "find MAP --like left:0",
     "localize": "localize MAP TMP/photo.png --focal auto",
+    "edit OBJECT": "edit MAP o1 --name sofa --label seat",
     "edit": "edit MAP left --captured-at 2024-05-31 --note wet --tag hall",
     "export --for": "export MAP TMP/small --for localize --budget 50MB",
     "export": "export MAP TMP/out --tile-size 0 --merge voxel",

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import gsmap
-from gsmap import change, describe, localize, merge, optimize, register
+from gsmap import change, describe, localize, merge, objects, optimize, register
 from gsmap.errors import ConfigError
 from gsmap.export import PlannedTile, TileRecipe
 from gsmap.map.settings import PRESETS, Settings, settings_of
@@ -24,7 +24,7 @@ from gsmap.methods import families
 from gsmap.settings import changed, leaves, load, parse, save
 from gsmap.types import Sim3
 
-GRAPH, EDGE, POSES, CHANGES, VIEWS = "graph", "edge", "poses", "changes", "views"
+GRAPH, EDGE, POSES, CHANGES, VIEWS, THINGS = "graph", "edge", "poses", "changes", "views", "objects"
 MERGERS = families()["merger"].names()
 TILE = PlannedTile(0, "map", np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), {"scene": Sim3.identity()}, "all")
 
@@ -56,7 +56,6 @@ JUDGING = tuple(
 """What photographs are judged by; what is kept is what views show."""
 
 NAMES_NOTHING = (
-    "objects.",  # made whenever they are asked for, and not kept
     "retrieve.",
     "by_shape.",  # nothing of it is kept
     "scan.",  # nothing of it is kept
@@ -114,7 +113,8 @@ def keys(settings: Settings) -> dict[str, str]:
     tiles = {f"tile {m}": TileRecipe(merge.recipe_key(m, settings.merge.mergers[m])).key(TILE) for m in MERGERS}
     changes = change.recipe_key(settings.change).of("older", "newer")
     views = localize.recipe_key(settings.localize).of("scene", "")
-    named = {GRAPH: graph, EDGE: edge, POSES: poses, CHANGES: changes, VIEWS: views}
+    things = objects.recipe_key(settings.objects).of(f"scene {graph.digest}")
+    named = {GRAPH: graph, EDGE: edge, POSES: poses, CHANGES: changes, VIEWS: views, THINGS: things}
     return {kind: key.digest for kind, key in named.items()} | tiles
 
 
@@ -127,7 +127,8 @@ def expected(name: str) -> set[str]:
         return {f"tile {name.split('.')[2]}"}
     # An edge is made from graphs, and poses from edges: what changes the one changes the other.
     return {
-        "describe": {GRAPH, EDGE, POSES},
+        "describe": {GRAPH, EDGE, POSES, THINGS},
+        "objects": {THINGS},
         "register": {EDGE, POSES},
         "optimize": {POSES},
         "change": {CHANGES},

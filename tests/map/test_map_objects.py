@@ -14,13 +14,21 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "describe"))
 from made_room import Room, looking_about
+from sqlalchemy import delete
 
 import gsmap.map
-from gsmap.errors import ConfigError, NotFoundError
+from gsmap import formats
+from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
-from gsmap.types import Change, ChangeReport, PoseGraph, ScenePose, Sim3
+from gsmap.map.persisting import has_passed
+from gsmap.map.small_map import SmallLocalizer
+from gsmap.methods import RecipeKey
+from gsmap.store import Store, schema
+from gsmap.store.graphs import Graphs
+from gsmap.store.scenes import Scenes
+from gsmap.types import Change, ChangeReport, MapObject, PoseGraph, ScenePose, Sighting, Sim3, Things
 
 FRAMES = {
     "may": Sim3(exp_so3(np.array([0, 0, 0.4])), np.array([3.0, 1, 0.2])),
@@ -95,17 +103,17 @@ def test_a_thing_is_seen_then_gone_and_unseen_is_said(site: Map) -> None:
 def test_places_are_told_by_object_by_point_and_by_box(site: Map) -> None:
     (table,) = site.history(at(TABLE)).objects
     assert [row.id for row in site.history(table.id).objects] == [table.id]
-    assert [row.id for row in site.history(table.id[:5]).objects] == [table.id]
     everything = site.history(box=[-1, -1, -1, 5, 5, 3])
     assert len(everything.objects) == len(site.objects().objects) == 3
     nothing = site.history("2,1.5,1.5")
     assert nothing.objects == ()
     assert "no thing" in nothing.notes[-1]
-    for place, box in ((None, None), ("abcd1234", [0] * 6), ("here", None), ("1,2", None), (None, [1, 0, 0, 0, 1, 1])):
+    for place, box in ((None, None), ("abcd1234", [0] * 6), ("1,2", None), (None, [1, 0, 0, 0, 1, 1])):
         with pytest.raises(ConfigError):
             site.history(place, box=box)
-    with pytest.raises(NotFoundError):
-        site.history("00000000")
+    for nobody in ("o99", "00000000", "here"):
+        with pytest.raises(NotFoundError):
+            site.history(nobody)
 
 
 def test_the_graph_is_written_and_is_what_networkx_gets(site: Map, tmp_path: Path) -> None:
@@ -193,6 +201,249 @@ def test_objects_are_the_same_whatever_the_unit_of_the_map(site: Map) -> None:
         np.testing.assert_allclose(10 * b.position, a.position, atol=1e-5)
     assert seen == states(site, CUPBOARD)
     np.testing.assert_allclose(box_m, 10 * box)
+
+
+def counted(patched: pytest.MonkeyPatch) -> list[str]:
+    """What captures are opened from here on."""
+    opened: list[str] = []
+    gaussians = Scenes.gaussians
+
+    def reading(self: Scenes, ref: str, *rest: object) -> object:
+        opened.append(ref)
+        return gaussians(self, ref, *rest)
+
+    patched.setattr(Scenes, "gaussians", reading)
+    return opened
+
+
+def test_objects_are_answered_from_the_catalog(site: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = site.objects()
+    opened = counted(monkeypatch)
+    monkeypatch.setattr(Graphs, "load", lambda *_: pytest.fail("a graph was read"))
+    assert site.objects() == before
+    assert opened == []
+    assert {row.id for row in before.objects} == {f"o{number}" for number in range(1, 4)}
+    with gsmap.map.Map(Store.open(site.store.home, "r")) as reading:
+        assert reading.objects() == before
+
+
+def test_a_capture_that_comes_asks_only_what_was_not_asked(site: Map) -> None:
+    """The objects of two captures are kept; then the third gets its place.
+
+    June brings a stool, which may has to be asked for; the cameras of july cannot see what it does not show.
+    """
+    placed = site.store.revisions.get()
+    assert placed is not None
+    ids = {name: site.store.scenes.get(name).id for name in FRAMES}
+    before = {row.id: row.position for row in site.objects().objects}
+    for last, asked in (("july", []), ("june", [ids["may"], ids["june"]])):
+        site.store.revisions.save(PoseGraph({s: pose for s, pose in placed.poses.items() if s != ids[last]}))
+        two = site.objects()
+        with pytest.MonkeyPatch.context() as patched:
+            opened = counted(patched)
+            site.store.revisions.save(placed)
+            whole = site.objects()
+        assert opened == asked, last
+        assert {row.id for row in two.objects} <= {row.id for row in whole.objects} == set(before)
+    forget(site)
+    scratch = site.objects()
+    assert [(r.id, r.seen, r.looks, r.there) for r in scratch.objects] == [
+        (r.id, r.seen, r.looks, r.there) for r in whole.objects
+    ]
+
+
+def forget(m: Map) -> None:
+    """What was computed, not the numbers."""
+    with m.store.catalog.write() as connection:
+        connection.execute(delete(schema.object_sets))
+
+
+def test_a_number_stays_when_captures_are_described_otherwise(site: Map) -> None:
+    before = {row.id: row.position for row in site.objects().objects}
+    forget(site)
+    may = site.store.scenes.get("may").id
+    graph = site.store.graphs.load(may)
+    assert graph is not None
+    assert graph.things is not None
+    order = np.arange(len(graph.things))[::-1]
+    other = reordered(graph.things, order)
+    site.store.graphs.save(replace(graph, things=other), RecipeKey("describe", "other", {"it": 1}).of(may))
+    try:
+        after = {row.id: row.position for row in site.objects().objects}
+    finally:
+        site.store.graphs.forget([RecipeKey("describe", "other", {"it": 1}).of(may)])
+    assert after.keys() == before.keys()
+    for name, position in before.items():
+        np.testing.assert_allclose(after[name], position, atol=0.1)
+
+
+def reordered(things: Things, order: np.ndarray) -> Things:
+    """The same with other numbers, each a few centimetres larger."""
+    place = np.append(np.argsort(order), -1)
+    starts = np.concatenate([[0], np.cumsum(things.sample_counts)])
+    rows = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in order])
+    return Things(
+        place[things.members],
+        things.positions[order],
+        things.extents[order] + np.array([[-0.03], [0.03]]),
+        things.colours[order],
+        things.samples[rows],
+        things.sample_colours[rows],
+        things.sample_counts[order],
+        things.unit_m,
+    )
+
+
+def test_people_name_things_and_find_them_by_name(site: Map) -> None:
+    (cupboard,), (table,) = site.history(at(CUPBOARD)).objects, site.history(at(TABLE)).objects
+    row = site.edit_object(cupboard.id, name="grandmother's cupboard", label="cupboard", note="oak", author="ann")
+    assert (row.id, row.name, row.label, row.note) == (cupboard.id, "grandmother's cupboard", "cupboard", "oak")
+    assert [one.id for one in site.history("Grandmother's Cupboard").objects] == [cupboard.id]
+    for words in ("grandmother's cupboard", "Cupboard", "grandmother's"):
+        found = site.find(words)
+        assert found.by == "name"
+        assert [hit.object for hit in found.hits] == [cupboard.id], words
+        assert found.hits[0].name == "grandmother's cupboard"
+    with pytest.raises(ConfigError, match="no object is called 'piano'"):
+        site.find("piano")
+    assert site.graph().nodes[cupboard.id]["label"] == "cupboard"
+    with pytest.raises(InputError, match=f"{cupboard.id} is called"):
+        site.edit_object(table.id, name="GRANDMOTHER'S cupboard")
+    for bad in ("o3", "1.5,2,3", "abcdef01", " "):
+        with pytest.raises(InputError):
+            site.edit_object(table.id, name=bad)
+    with pytest.raises(NotFoundError):
+        site.edit_object("o99", name="x")
+    site.edit_object(cupboard.id, name="wardrobe")
+    assert [(one.fact, one.value, one.author) for one in site.history(cupboard.id).words] == [
+        ("name", "grandmother's cupboard", "ann"),
+        ("label", "cupboard", "ann"),
+        ("note", "oak", "ann"),
+        ("name", "wardrobe", ""),
+    ]
+    site.edit_object("wardrobe", name="none", label="none")
+    assert site.history(cupboard.id).objects[0].name is None
+    assert site.history(cupboard.id).objects[0].note == "oak"
+
+
+def test_two_that_a_person_says_are_one_are_told_as_one_until_that_is_taken_back(site: Map) -> None:
+    (table,), (stool,) = site.history(at(TABLE)).objects, site.history(at(STOOL)).objects
+    (cupboard,) = site.history(at(CUPBOARD)).objects
+    with pytest.raises(InputError, match="shows both"):
+        site.edit_object(stool.id, same_as=cupboard.id)
+    with pytest.raises(InputError, match="same object"):
+        site.edit_object(stool.id, same_as=stool.id)
+    row = site.edit_object(stool.id, same_as=table.id)
+    assert row.id == table.id
+    np.testing.assert_allclose(row.position, stool.position)
+    assert row.seen == 2
+    report = site.history(stool.id)
+    assert [one.id for one in report.objects] == [table.id]
+    assert [one.state for one in report.sightings][:2] == ["seen", "seen"]
+    assert len(site.objects().objects) == 2
+    assert [one.id for one in site.history(at(STOOL)).objects] == [table.id]
+    row = site.edit_object(stool.id, same_as="none")
+    assert row.id == stool.id
+    assert {one.id for one in site.objects().objects} >= {stool.id, table.id}
+
+
+def test_a_name_of_what_is_found_no_more_is_told_of(site: Map) -> None:
+    (stool,) = site.history(at(STOOL)).objects
+    site.edit_object(stool.id, name="milking stool")
+    june = site.store.scenes.get("june").id
+    graph = site.store.graphs.load(june)
+    assert graph is not None
+    assert graph.things is not None
+    key = RecipeKey("describe", "blind", {"it": 1}).of(june)
+    site.store.graphs.save(replace(graph, things=None), key)
+    try:
+        report = site.objects()
+    finally:
+        site.store.graphs.forget([key])
+    assert any(stool.id in note and "milking stool" in note for note in report.notes)
+    assert [one.id for one in site.history("milking stool").objects] == [stool.id]
+    site.edit_object(stool.id, name="none")
+
+
+# --- what persists ---------------------------------------------------------------------------------------------------
+
+
+def num_near(means: np.ndarray, low: list[float], high: list[float]) -> int:
+    return int(((means > np.array(low) - 0.05) & (means < np.array(high) + 0.05)).all(1).sum())
+
+
+PLACES = {
+    "cupboard": ([0.1, 0.5, 0.1], [0.5, 1.5, 1.8]),
+    "table": ([2.0, 0.1, 0.2], [3.2, 0.7, 0.75]),
+    "stool": ([2.3, 2.1, 0.2], [2.7, 2.5, 0.45]),
+}
+
+
+def exported(m: Map, out: Path, **options: object) -> dict[str, int]:
+    """How many Gaussians an export has in each of the places."""
+    m.export(out, merge="union", tile_size_m=0, **options)
+    means = formats.read(out / "component_0" / "map.ply").means
+    return {name: num_near(means, *box) for name, box in PLACES.items()}
+
+
+def test_static_leaves_out_what_came_and_went_and_keeps_the_rest(site: Map, tmp_path: Path) -> None:
+    whole, static = exported(site, tmp_path / "all"), exported(site, tmp_path / "static", static=True)
+    assert static["cupboard"] > 0.9 * whole["cupboard"] > 0
+    assert whole["table"] > 200
+    assert static["table"] < 0.02 * whole["table"]
+    assert static["stool"] < 0.02 * whole["stool"]
+    report = site.export(tmp_path / "static", merge="union", tile_size_m=0, static=True)
+    assert report.reused == 1, "nothing changed since"
+    assert any("2 of 3 objects are left out" in note for note in report.notes)
+    assert site.export(tmp_path / "static", merge="union", tile_size_m=0).recomputed == 1, "another content"
+
+
+@pytest.mark.parametrize(
+    ("states", "shift", "passed"),
+    [
+        ("seen", 0.0, False),
+        ("seen unseen unseen", 0.0, False),
+        ("seen unseen seen", 0.0, False),
+        ("seen absent", 0.0, True),
+        ("absent unseen seen", 0.0, True),
+        ("seen seen", 0.2, False),
+        ("seen seen", 3.0, True),
+    ],
+)
+def test_what_persists_is_told_by_the_looks_that_there_were(states: str, shift: float, passed: bool) -> None:
+    """What nobody looked at again is kept, and so is what another capture shows a part of."""
+    box = np.array([[0.0, 0, 0], [1, 0.5, 0.8]])
+    sightings = tuple(
+        Sighting(str(i), state, i, box + np.array([shift * i, 0, 0])) if state == "seen" else Sighting(str(i), state)
+        for i, state in enumerate(states.split())
+    )
+    assert has_passed(MapObject("o1", 0, box, box.mean(0), np.zeros(3, np.float32), sightings)) is passed
+
+
+def test_a_small_map_is_without_what_came_and_went(site: Map, tmp_path: Path) -> None:
+    site.export_small(tmp_path / "small", 4_000_000, static=True)
+    small = SmallLocalizer(tmp_path / "small", site.settings)
+    frame = {s: FRAMES[one.name].inverse() for s, one in small.small.items()}
+    for scene, held in small.placed.items():
+        for points in (held.gaussians.means, held.features.points):
+            at = frame[scene].apply(points)
+            assert num_near(at, *PLACES["table"]) <= 2
+            assert num_near(at, *PLACES["stool"]) <= 2
+
+
+def test_a_thinned_capture_still_tells_what_stood_there(site: Map, tmp_path: Path) -> None:
+    """May is kept compact: its table, and that it had no stool, are known still."""
+    with gsmap.map.open(site.clone(tmp_path / "clone.gsmap").path) as m:
+        m.with_settings({"thin.min_seen_again": 0.2, "thin.min_fidelity_db": 0.0})
+        before = m.history(at(TABLE)), m.history(at(STOOL))
+        report = m.thin(keep_days=1, now="2026-07-01T00:00:00+00:00")
+        assert [row.scene_name for row in report.scenes if row.thinned] == ["may"]
+        after = m.history(at(TABLE)), m.history(at(STOOL))
+        for one, other in zip(before, after, strict=True):
+            assert [row.id for row in other.objects] == [row.id for row in one.objects]
+            assert [row.state for row in other.sightings] == [row.state for row in one.sightings]
+        assert any("may is thinned" in note for note in after[0].notes)
+        assert m.find(at=CUPBOARD).described == 2, "graphs of whole captures answer"
 
 
 def test_captures_without_things_are_named(site: Map) -> None:

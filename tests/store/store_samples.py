@@ -3,7 +3,8 @@
 import numpy as np
 
 from gsmap.methods import RecipeKey
-from gsmap.types import Cameras, Change, ChangeReport, Gaussians, Sim3
+from gsmap.store.objects import ObjectSet
+from gsmap.types import Cameras, Change, ChangeReport, Gaussians, MapObject, Sighting, Sim3
 from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
 
 
@@ -67,3 +68,27 @@ def kept_photo(scene: str, number: int = 0, **values) -> PhotoSighting:
         things=things,
         **told | values,
     )
+
+
+def keep_objects(store, *places, seed="", **poses) -> list[str]:
+    """Keep objects that captures show in these boxes of their own frames; their ids."""
+    boxes = [{scene: np.array(box, np.float64) for scene, box in one.items()} for one in places]
+    scenes = list(dict.fromkeys(scene for one in boxes for scene in one))
+    found = [
+        MapObject(
+            "f" * 8,
+            0,
+            next(iter(one.values())),
+            np.zeros(3),
+            np.zeros(3, np.float32),
+            tuple(
+                Sighting(scene, "seen", i, one[scene]) if scene in one else Sighting(scene, "absent", -1, None, 0.75)
+                for scene in scenes
+            ),
+        )
+        for i, one in enumerate(boxes)
+    ]
+    recipe = key("objects", *scenes, seed)
+    known = {scene: poses.get(scene, Sim3.identity()) for scene in scenes}
+    made = ObjectSet(recipe.digest, recipe.recipe, 1.0, known, dict.fromkeys(scenes, "0"), tuple(found))
+    return [thing.id for thing in store.objects.save(made, boxes, recipe).objects]

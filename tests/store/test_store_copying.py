@@ -5,7 +5,16 @@ import threading
 import numpy as np
 import pytest
 from sqlalchemy import func, insert, select, text
-from store_samples import JPEG, kept_photo, key, made_change, make_cameras, make_gaussians, save_comparison
+from store_samples import (
+    JPEG,
+    keep_objects,
+    kept_photo,
+    key,
+    made_change,
+    make_cameras,
+    make_gaussians,
+    save_comparison,
+)
 from test_store_nouns import graph_of, layer, registration, tile
 
 from gsmap.errors import StoreError
@@ -44,6 +53,8 @@ def fill(store):
     views = SceneFeatures(a.id, cameras, starts, np.zeros((0, 3), np.float32), shown, angles, summaries)
     store.view_features.save(views, key("localize", a.id))
     store.photos.add(kept_photo(a.id), JPEG)
+    keep_objects(store, {a.id: [[0, 0, 0], [1, 1, 1]]})
+    store.objects.edit(1, name="sofa")
     with store.transaction(), store.catalog.read() as connection:
         blank = {"name": "m", "kind": "clip", "path": "/m.onnx", "copied": 0, "sha256": "0" * 64, "size_bytes": 2**40}
         connection.execute(insert(schema.models), blank | {"options": {"x": 0.1}, "created_at": now()})

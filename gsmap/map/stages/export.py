@@ -24,6 +24,9 @@ from gsmap.geometry.transforms import transform_cameras
 from gsmap.map.dates import is_until, last_of, undated_note
 from gsmap.map.jobs import TileMaker
 from gsmap.map.metres import map_metres, metre_notes
+from gsmap.map.objects import Known, kept_objects
+from gsmap.map.persisting import Passing, what_passes
+from gsmap.map.persisting import notes as persisting_notes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.map.world import InWorld, in_world, world_notes
@@ -48,6 +51,7 @@ class Request:
         steps: optimisation steps per tile; None takes what the merger's settings say.
         prefer: whom to believe where captures disagree; None takes what the merger's settings say.
         as_of: only captures dated at or before this take part.
+        static: without what moved, or came and went.
     """
 
     format: str = "ply"
@@ -62,6 +66,7 @@ class Request:
     uncompressed: bool = False
     prefer: str | None = None
     as_of: str | None = None
+    static: bool = False
 
     def options(self) -> list[str]:
         """The options of ``gsmap export`` that ask for the same."""
@@ -88,6 +93,7 @@ _OPTIONS = {
     "uncompressed": "--uncompressed",
     "prefer": "--prefer",
     "as_of": "--as-of",
+    "static": "--static",
 }
 
 
@@ -104,6 +110,7 @@ class Planned:
         notes: what a person should know of what takes part.
         metres: how long a metre is in the frame of each component of the poses.
         world: where those lie that are tied to the world.
+        passing: what of each scene is left out.
     """
 
     revision: int | None
@@ -115,10 +122,15 @@ class Planned:
     notes: tuple[str, ...] = ()
     metres: Mapping[int, Metre] = field(default_factory=dict)
     world: Mapping[int, InWorld] = field(default_factory=dict)
+    passing: Mapping[str, Passing] = field(default_factory=dict)
 
 
-def plan(store: Store, request: Request, settings: Settings) -> Planned:
-    """Which tiles an export consists of; nothing is read but the catalog."""
+def plan(store: Store, request: Request, settings: Settings, known: Known | None = None) -> Planned:
+    """Which tiles an export consists of; nothing is read but the catalog.
+
+    Args:
+        known: the objects of the map, for what persists; what is kept of them by default.
+    """
     method = request.merge or settings.merge.method
     params = settings.merge.mergers[method]
     if request.steps is not None:
@@ -140,6 +152,12 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         placed = {scene: placed[scene] for scene in scenes}
     if uses_dates(method, params):
         recipe = recipe.with_dates({scene: found.captured_at for scene, found in scenes.items()})
+    passing: dict[str, Passing] = {}
+    if request.static:
+        known = kept_objects(store, settings) if known is None else known
+        passing = {scene: one for scene, one in what_passes(store, known).items() if scene in scenes}
+        recipe = replace(recipe, without={scene: one.digest for scene, one in passing.items() if one.digest})
+        notes += tuple(persisting_notes(known, passing))
     exported = {pose.component for pose in placed.values()}
     metres = {component: metre for component, metre in metres.items() if component in exported}
     notes += metre_notes(metres)
@@ -155,11 +173,18 @@ def plan(store: Store, request: Request, settings: Settings) -> Planned:
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         max_tiles=settings.export.max_tiles,
     )
-    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres, world)
+    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing)
 
 
 def export(
-    store: Store, out: Path, request: Request, settings: Settings, progress: Progress, *, wait: bool = False
+    store: Store,
+    out: Path,
+    request: Request,
+    settings: Settings,
+    progress: Progress,
+    *,
+    wait: bool = False,
+    known: Known | None = None,
 ) -> tuple[ExportResult, tuple[str, ...]]:
     """Plan the tiles, make the dirty ones, write them, and note in the store what was made from what.
 
@@ -168,6 +193,7 @@ def export(
 
     Args:
         wait: where another export is at work in the folder, until it has ended.
+        known: see `plan`.
 
     Returns:
         What was made, and what a person should know of what took part.
@@ -175,7 +201,7 @@ def export(
     Raises:
         BusyError: another export is at work in the folder.
     """
-    planned = plan(store, request, settings)
+    planned = plan(store, request, settings, known)
     waited = False
 
     def waiting(text: str) -> None:
@@ -185,7 +211,7 @@ def export(
 
     with folder_lock(out, wait=wait, waiting=waiting), store.leases.attend("export", f"export {out.resolve()}"):
         if waited:
-            planned = plan(store, request, settings)  # the map may have other poses now
+            planned = plan(store, request, settings, known)  # the map may have other poses now
         return _export(store, out, request, planned, settings, progress), planned.notes
 
 
@@ -268,6 +294,7 @@ def _maker(
         budget_s=request.budget_s,
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
         store=SightStore(folder, settings.export.shared_bytes),
+        passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
     )
 
 

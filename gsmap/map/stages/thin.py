@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+
+import numpy as np
 
 from gsmap.compare import Looks
 from gsmap.errors import ConfigError, NotFoundError
@@ -13,9 +15,10 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
+from gsmap.methods import RecipeKey
 from gsmap.store import Store, compact
 from gsmap.thin import fidelity_db, look, seen_again, shown
-from gsmap.types import PlacedScene, PoseGraph, Scene
+from gsmap.types import PlacedScene, PoseGraph, Scene, SceneGraph
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows import ThinReport, ThinRow
 
@@ -86,7 +89,9 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
             after = compact.num_bytes(own.gaussians[stays])
             if not request.dry_run:
                 up = next((g.up for g in reversed(store.graphs.list()) if g.scene == scene.id), None)
+                described = store.graphs.load(scene.id)
                 store.scenes.thin(scene.id, stays, up=up)
+                _keep_things(store, described, stays)
                 after = _num_bytes(store, scene.id)
             rows.append(_row(scene, sizes[scene.id], after, share, "", fidelity))
             sizes[scene.id] = after
@@ -100,6 +105,19 @@ def thin(store: Store, request: Request, settings: Settings, progress: StageProg
         num_bytes_freed=freed,
         fits=request.budget_bytes is None or sum(sizes.values()) <= request.budget_bytes,
     )
+
+
+THINGS = RecipeKey("thin", "things", {"things": 1})
+"""Recipe of the graph of a thinned capture: the things that it showed when it was whole, and no layer."""
+
+
+def _keep_things(store: Store, graph: SceneGraph | None, stays: np.ndarray) -> None:
+    """Let a thinned capture still tell what stood there: its Gaussians are others now, its things are not."""
+    if graph is None or graph.things is None:
+        return
+    things = replace(graph.things, members=graph.things.members[stays])
+    known = SceneGraph(graph.scene_id, {}, graph.up, graph.unit_m, graph.notes, things, graph.working_m)
+    store.graphs.save(known, THINGS.of(graph.scene_id))
 
 
 def _superseded(

@@ -30,7 +30,15 @@ from gsmap.types.rows.maps import (
     TodoRow,
     ViewReport,
 )
-from gsmap.types.rows.objects import HistoryReport, ObjectRow, ObjectsReport, RelationRow, SightingRow
+from gsmap.types.rows.objects import (
+    HistoryReport,
+    ObjectFactRow,
+    ObjectRow,
+    ObjectsReport,
+    RelationRow,
+    RoomRow,
+    SightingRow,
+)
 from gsmap.types.rows.pairs import EdgeRow, PairEventRow, PairRef, PairReport, WhyReport, WhyStep
 from gsmap.types.rows.reports import WrittenReport
 from gsmap.types.rows.revisions import PoseChangeRow, RevisionRow, UpdateReport
@@ -100,6 +108,7 @@ __all__ = [
     "ModelRow",
     "NeesRow",
     "NodeRow",
+    "ObjectFactRow",
     "ObjectRow",
     "ObjectsReport",
     "PairEventRow",
@@ -119,6 +128,7 @@ __all__ = [
     "Row",
     "SceneEdgeRow",
     "SceneRef",
+    "RoomRow",
     "SceneReport",
     "SceneRow",
     "SettingRow",

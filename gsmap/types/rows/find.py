@@ -17,8 +17,10 @@ class FindHit(Row):
 
     Args:
         rank: from 1.
-        score: what it is ranked by: of likeness a probability, of embeddings a cosine; see ``by`` of the report.
+        score: what it is ranked by: of likeness a probability, of embeddings a cosine, of names the share of its words
+            that were asked for; see ``by`` of the report.
         object: id of the object there (`gsmap graph`); null where nothing was told apart from the building.
+        name: what people call it; null where they do not.
         scene: id of the capture that shows what matched best.
         scene_name: its name.
         node: of its layer of objects, the one that matched best; null where things were compared.
@@ -34,6 +36,7 @@ class FindHit(Row):
         "rank": "rank",
         "score": "score",
         "object": "object",
+        "name": "name",
         "scene_name": "scene",
         "position": "position",
         "size_m": "size (m)",
@@ -52,6 +55,7 @@ class FindHit(Row):
     position_m: np.ndarray
     size_m: np.ndarray | None
     dates: tuple[str | None, ...]
+    name: str | None = None
     picture: str | None = None
 
 
@@ -61,8 +65,8 @@ class FindReport(Row):
 
     Args:
         query: what was asked for, in words.
-        by: ``likeness`` (size, shape and colour of things) or ``embedding``.
-        recipe: digest of the one recipe whose graphs answered.
+        by: ``name`` (what people call objects), ``likeness`` (size, shape and colour of things) or ``embedding``.
+        recipe: digest of the one recipe whose graphs answered; empty where names did.
         embedder: of that recipe.
         described: how many placed captures it has described ...
         placed: ... of so many; the others took no part.

@@ -16,7 +16,12 @@ class ObjectRow(Row):
     """One thing of the map, over all captures that show it.
 
     Args:
-        id: 8 hex digits; captures that come later do not change it.
+        id: what it is called (``o12``), also after objects were made again; 8 hex digits while it has no number, in a
+            map that is open for reading only.
+        name: what people call it; null where they do not.
+        label: what kind of thing they say it is.
+        note: the last one on it.
+        room: id of the room that it stands in; null where that is not known.
         component: of the map, whose frame everything is in.
         position: mean of its Gaussians, where it was last seen as a thing of its own.
         size: of the box around it where it was last seen, along the map's axes.
@@ -32,6 +37,9 @@ class ObjectRow(Row):
 
     columns: ClassVar[Mapping[str, str]] = {
         "id": "object",
+        "name": "name",
+        "label": "label",
+        "room": "room",
         "position": "position",
         "size": "size",
         "seen": "seen",
@@ -53,6 +61,10 @@ class ObjectRow(Row):
     first_seen: str | None
     last_seen: str | None
     half_life_days: float | None
+    name: str | None = None
+    label: str | None = None
+    note: str | None = None
+    room: str | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -73,12 +85,45 @@ class RelationRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class RoomRow(Row):
+    """A room of the map, as its captures show it.
+
+    Args:
+        id: ``r1`` is the largest of the first component; another capture may change it.
+        component: of the map.
+        position: the middle of its floor, map frame and unit.
+        size_m: of the box around it, metres; the last number is its height.
+        area_m2: of its floor.
+        doors: ids of the rooms that one can walk to from it.
+        objects: ids of the objects in it, those that are gone included.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "id": "room",
+        "position": "position",
+        "size_m": "size (m)",
+        "area_m2": "m2",
+        "doors": "doors to",
+        "objects": "objects",
+    }
+
+    id: str
+    component: int
+    position: np.ndarray
+    size_m: np.ndarray
+    area_m2: float
+    doors: tuple[str, ...]
+    objects: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ObjectsReport(Row):
     """The scene graph of the map.
 
     Args:
         objects: its nodes; of each component the largest first.
         relations: its edges.
+        rooms: where its nodes stand.
         notes: what a person should know, such as captures that tell nothing.
     """
 
@@ -86,6 +131,7 @@ class ObjectsReport(Row):
 
     objects: tuple[ObjectRow, ...]
     relations: tuple[RelationRow, ...]
+    rooms: tuple[RoomRow, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -125,12 +171,40 @@ class SightingRow(Row):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ObjectFactRow(Row):
+    """One thing that was said of an object.
+
+    Args:
+        object: id of it.
+        at: when it was said, ISO 8601.
+        fact: ``name``, ``label``, ``note`` or ``same_as``.
+        value: the text; empty where what was said before was taken back.
+        author: who said it; empty where a person did and was not named.
+    """
+
+    columns: ClassVar[Mapping[str, str]] = {
+        "object": "object",
+        "at": "said at",
+        "fact": "fact",
+        "value": "value",
+        "author": "by",
+    }
+
+    object: str
+    at: str
+    fact: str
+    value: str
+    author: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class HistoryReport(Row):
     """What stood at a place, and when.
 
     Args:
         objects: what was ever seen there.
         sightings: what each capture says of each of them, oldest first.
+        words: what people said of each of them, oldest first.
         notes: what a person should know, such as captures that tell nothing.
     """
 
@@ -138,4 +212,5 @@ class HistoryReport(Row):
 
     objects: tuple[ObjectRow, ...]
     sightings: tuple[SightingRow, ...]
+    words: tuple[ObjectFactRow, ...] = ()
     notes: tuple[str, ...] = ()

@@ -63,6 +63,8 @@ class MergeReport(Row):
         num_models: models.
         num_comparisons: pairs that were looked at for changes.
         num_change_reviews: reviews of changes.
+        num_objects: objects that were not known here.
+        num_object_facts: names, labels and notes of objects.
         num_revisions: revisions, as history.
         renamed: scenes whose name was taken here, the new name by the old one.
         revision: the revision that holds the newest poses of both; null where none was needed.
@@ -95,6 +97,8 @@ class MergeReport(Row):
     num_models: int
     num_comparisons: int
     num_change_reviews: int
+    num_objects: int
+    num_object_facts: int
     num_revisions: int
     renamed: Mapping[str, str]
     revision: int | None

@@ -168,8 +168,8 @@ export interface EdgeView {
 }
 
 export interface ObjectEntry {
-  id: string; // 8 hex digits
-  name: string; // a few words: what it is, or its size and colour
+  id: string; // "o12"; 8 hex digits in a map that nobody may write
+  name: string; // what people call it, or its size
   component: number;
   position: Vector; // map frame
   box: Box;

@@ -1,0 +1,141 @@
+"""What of the map persists: captures without the Gaussians of things that moved, or came and went.
+
+A thing persists as far as it was looked for: one that was seen in every look is kept, whether there were ten or one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from gsmap.errors import NotFoundError
+from gsmap.map.objects import Known
+from gsmap.methods import text_digest
+from gsmap.objects.changed import CHANGED
+from gsmap.store import Store
+from gsmap.types import MapObject
+from gsmap.types.plain import canonical
+
+_OF_THINGS = ("appeared", "disappeared", "moved", "replaced")
+"""Kinds of changes that are of things; what was repainted stays, and so does what is lit otherwise."""
+
+_SAME_PLACE = 0.1  # of a thing that stayed, the box that one capture shows holds this much of that of the next
+
+
+@dataclass(frozen=True)
+class Passing:
+    """What of one capture does not persist, as the catalog tells it; `rows` reads which Gaussians these are.
+
+    Args:
+        graph: key of the graph that knows its things; empty where nothing is left out, or nobody described it.
+        things: of that graph.
+        changes: number of a comparison, place of a change in it, and whether the capture is its ``before`` or
+            ``after``.
+        told: what names these comparisons in any map.
+    """
+
+    graph: str
+    things: tuple[int, ...]
+    changes: tuple[tuple[int, int, str], ...]
+    told: tuple[str, ...]
+
+    @cached_property
+    def digest(self) -> str:
+        """Names what is left out; empty where nothing is."""
+        if not self.things and not self.changes:
+            return ""
+        return text_digest(canonical([self.graph, self.things, [change[1:] for change in self.changes], self.told]))
+
+
+def has_passed(thing: MapObject) -> bool:
+    """Whether an object moved, or was gone in a look at its place."""
+    if any(sighting.state == "absent" for sighting in thing.sightings):
+        return True
+    boxes = [sighting.box for sighting in thing.sightings if sighting.thing >= 0 and sighting.box is not None]
+    return any(_shared(a, b) < _SAME_PLACE for a, b in pairwise(boxes))
+
+
+def _shared(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of the smaller of two boxes (2, 3) that the other holds; what has no thickness counts by its faces."""
+    thin = 1e-3 * np.maximum(a[1] - a[0], b[1] - b[0]).max()
+    a, b = (np.array([box[0] - thin, box[1] + thin]) for box in (a, b))
+    both = np.clip(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0, None).prod()
+    return float(both / min((a[1] - a[0]).prod(), (b[1] - b[0]).prod()))
+
+
+def what_passes(store: Store, known: Known) -> dict[str, Passing]:
+    """What of each placed capture does not persist, by scene id; nothing is read but the catalog."""
+    graphs = {graph.scene: graph.key for graph in store.graphs.list()}
+    things: dict[str, set[int]] = {}
+    for thing in known.objects:
+        if has_passed(thing):
+            for sighting in thing.sightings:
+                if sighting.thing >= 0:
+                    things.setdefault(sighting.scene, set()).add(sighting.thing)
+    changes: dict[str, list[tuple[int, int, str]]] = {}
+    told: dict[str, list[str]] = {}
+    for one in store.changes.current():
+        for change in one.changes:
+            if change.status == "rejected" or change.kind not in _OF_THINGS:
+                continue
+            for scene, side, count in (
+                (one.older, "before", change.num_before),
+                (one.newer, "after", change.num_after),
+            ):
+                thinning = known.scenes[scene].thinning if scene in known.scenes else None
+                if count and scene in known.scenes and thinning is None:  # rows of what was thinned are of what it was
+                    changes.setdefault(scene, []).append((one.number, change.place, side))
+                    told.setdefault(scene, []).append(f"{one.key} {one.created_at}")
+    return {
+        scene: Passing(
+            graphs.get(scene, "") if scene in things or scene in changes else "",
+            tuple(sorted(things.get(scene, ()))),
+            tuple(changes.get(scene, ())),
+            tuple(dict.fromkeys(told.get(scene, ()))),
+        )
+        for scene in known.scenes
+    }
+
+
+def rows(store: Store, scene: str, passing: Passing) -> np.ndarray:
+    """(N,) bool, the Gaussians of a capture that do not persist.
+
+    Raises:
+        NotFoundError: what it was told from was pruned meanwhile.
+    """
+    out = np.zeros(store.scenes.get(scene).num_gaussians, bool)
+    for number in dict.fromkeys(change[0] for change in passing.changes):
+        found = store.changes.load(number).changes
+        for _, place, side in (change for change in passing.changes if change[0] == number):
+            out[found[place].before if side == "before" else found[place].after] = True
+    graph = store.graphs.load(scene, passing.graph) if passing.graph else None
+    if passing.graph and graph is None:
+        raise NotFoundError(f"the things of scene {scene[:12]} were dropped meanwhile: run the same export again")
+    if graph is not None and graph.things is not None and len(graph.things):
+        members = graph.things.members
+        of = np.bincount(members[members >= 0], minlength=len(graph.things))
+        changed = np.bincount(members[out & (members >= 0)], minlength=len(graph.things))
+        whole = np.flatnonzero(changed >= CHANGED * np.maximum(of, 1))  # else it is of a part, or of what stands by it
+        out |= np.isin(members, np.union1d(whole, np.array(passing.things, np.int64)))
+    return out
+
+
+def notes(known: Known, passing: Mapping[str, Passing]) -> list[str]:
+    """What people should know of what is left out."""
+    gone = [thing for thing in known.objects if has_passed(thing)]
+    once = sum(thing.looks < 2 for thing in known.objects)
+    called = [thing.words.name or thing.words.label or thing.id for thing in gone]
+    told = sum(len(one.changes) for one in passing.values())
+    said = [
+        f"{len(gone)} of {len(known.objects)} objects are left out, since they moved or were gone in a look at their "
+        f"place{': ' + ', '.join(called[:8]) if gone else ''}{' ...' if len(gone) > 8 else ''}"
+    ]
+    if told:
+        said.append(f"so is what {told} sides of changes say")
+    if once:
+        said.append(f"{once} objects were looked at once: they are kept, and nobody knows whether they stay")
+    return said

@@ -1,0 +1,270 @@
+"""Objects: what is kept of each component of the map, or what is made of it now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.errors import NotFoundError
+from gsmap.geometry.boxes import box_corners
+from gsmap.geometry.directions import level_frame
+from gsmap.geometry.transforms import transform_gaussians
+from gsmap.map.dates import parsed
+from gsmap.map.metres import map_metres
+from gsmap.map.one_state import of_one_state
+from gsmap.map.settings import Settings
+from gsmap.methods import RecipeKey, text_digest
+from gsmap.objects import Capture, Eyes, changed_thing, find_rooms, in_view, make_objects, open_eyes, recipe_key
+from gsmap.objects.fuse import Node
+from gsmap.store import Store
+from gsmap.store.objects import ObjectSet, Places
+from gsmap.texts import few
+from gsmap.types import Gaussians, PoseGraph, Room, Scene, SceneGraph, SightingState, Sim3, Things
+from gsmap.types.progress import Progress, StageProgress
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The objects of one component.
+
+    Args:
+        made: what was made now, ids without numbers; or what is kept.
+        places: where captures show each object, of what was made now; None of what is kept.
+        key: of what was made now, to be kept under; None where it is not to be kept.
+    """
+
+    component: int
+    made: ObjectSet
+    places: Sequence[Places] | None
+    key: RecipeKey | None
+
+
+@of_one_state
+def objects_of_components(
+    store: Store,
+    settings: Settings,
+    progress: StageProgress,
+    graphs: Mapping[str, SceneGraph] | None,
+    *,
+    make: bool = True,
+) -> tuple[PoseGraph, dict[str, Scene], dict[int, float], list[Part], list[str]]:
+    """The newest poses, the placed captures, metres, the objects of each component, and who tells nothing."""
+    placed = store.revisions.get()
+    if placed is None:
+        raise NotFoundError(
+            "the map has no poses yet, so that things of captures are not known to be one: run gsmap update"
+        )
+    scenes = {scene.id: scene for scene in store.scenes.list() if scene.id in placed.poses}
+    metres = {component: one.metres_per_unit for component, one in map_metres(store, settings, placed).items()}
+    described = {graph.scene: graph.key for graph in store.graphs.list()}  # the newest of each
+    without = [scene.name for scene in scenes.values() if scene.id not in described] if graphs is None else []
+    mine: dict[int, list[Scene]] = {}
+    for scene in sorted(scenes.values(), key=_when):
+        if scene.id in (described if graphs is None else graphs):
+            mine.setdefault(placed.poses[scene.id].component, []).append(scene)
+    sets = store.objects.sets() if graphs is None else []
+    parts = []
+    for i, component in enumerate(sorted(mine)):
+
+        def told(fraction: float, text: str, part: int = i) -> None:
+            progress("objects", (part + fraction) / len(mine), text)
+
+        unit = metres[component]
+        key = _key(store, settings, mine[component], described, unit) if graphs is None else None
+        poses = {scene.id: placed.poses[scene.id].S_map_scene for scene in mine[component]}
+        kept = None if key is None else next((one for one in sets if one.key == key.digest), None)
+        still = {} if kept is None else _unmoved(kept.poses, poses, scenes, unit, settings)
+        if kept is not None and still.keys() == poses.keys():
+            parts.append(Part(component, kept, None, None))
+        elif not make:
+            raise NotFoundError("the objects of the map are out of date: gsmap graph MAP makes them")
+        else:
+            read = (
+                graphs if graphs is not None else {scene.id: store.graphs.load(scene.id) for scene in mine[component]}
+            )
+            parts.append(_made(store, settings, component, poses, scenes, read, unit, key, sets, told))
+        without += [scenes[scene].name for scene, digest in parts[-1].made.things.items() if not digest]
+    notes = []
+    if without:
+        notes.append(
+            f"nobody knows the things of {few(without)}: gsmap describe MAP SCENE tells them, where describe.things "
+            "is on"
+        )
+    thinned = [scene.name for scene in scenes.values() if scene.thinning is not None]
+    if thinned:
+        notes.append(
+            f"{few(thinned)} {'is' if len(thinned) == 1 else 'are'} thinned: the things they showed are told, and what "
+            "they were found to show of others before; they are asked no more"
+        )
+    undated = [scene.name for scene in scenes.values() if scene.captured_at is None]
+    if undated and len(scenes) > 1:
+        notes.append(
+            f"{len(undated)} of {len(scenes)} captures have no date: they come last, and half-lives leave them out"
+        )
+    return placed, scenes, metres, parts, notes
+
+
+def _key(
+    store: Store, settings: Settings, captures: Sequence[Scene], described: Mapping[str, str], unit: float
+) -> RecipeKey:
+    """What names the objects of a component; what was rejected of its changes takes part, and no array is read."""
+    ids = {scene.id for scene in captures}
+    told = [
+        f"{one.key} {one.created_at} {[change.status == 'rejected' for change in one.changes]}"
+        for one in store.changes.current()
+        if one.changes and {one.older, one.newer} <= ids
+    ]
+    seen = [f"{scene.id} {described[scene.id]}" for scene in captures]
+    return recipe_key(settings.objects).of(*seen, f"metres {unit!r}", *told)
+
+
+def _unmoved(
+    then: Mapping[str, Sim3], now: Mapping[str, Sim3], scenes: Mapping[str, Scene], unit: float, settings: Settings
+) -> dict[str, Sim3]:
+    """The captures of now that lie where they lay, within what visits are taken to be unmoved by."""
+    out = {}
+    for scene, pose in now.items():
+        if scene in then:
+            corners = box_corners(scenes[scene].bounds)
+            off = np.linalg.norm(pose.apply(corners) - then[scene].apply(corners), axis=1).max() * unit
+            if off <= settings.visits.moved_m:
+                out[scene] = pose
+    return out
+
+
+def _made(
+    store: Store,
+    settings: Settings,
+    component: int,
+    poses: Mapping[str, Sim3],
+    scenes: Mapping[str, Scene],
+    graphs: Mapping[str, SceneGraph | None],
+    unit: float,
+    key: RecipeKey | None,
+    sets: Sequence[ObjectSet],
+    told: Progress,
+) -> Part:
+    """The objects of a component, made now; what captures were found to show when they were asked before holds.
+
+    Args:
+        poses: ``S_map_scene`` of its captures, oldest first.
+        key: None where captures are not asked what they saw.
+    """
+    things = {
+        scene: graph.things for scene in poses if (graph := graphs[scene]) is not None and graph.things is not None
+    }
+    captures = [Capture(scene, poses[scene], mine) for scene, mine in things.items()]
+    digests = {scene: _digest(things[scene]) if scene in things else "" for scene in poses}
+    before: dict[tuple[str, str, int], tuple[SightingState, float]] = {}
+    for old in sets:
+        if key is None or old.recipe != key.recipe or old.metres != unit:
+            continue
+        still = _unmoved(old.poses, poses, scenes, unit, settings)
+        for thing in old.objects:
+            shown = {sighting.scene: sighting.thing for sighting in thing.sightings}
+            for one in thing.sightings:
+                same = old.things.get(one.asked, "") == digests.get(one.asked)
+                if one.asked in still and one.scene in still and same:
+                    before[one.scene, one.asked, shown[one.asked]] = one.state, one.looked
+
+    def looked(capture: int, node: Node) -> tuple[SightingState, float] | None:
+        return before.get((captures[capture].scene, captures[node[0]].scene, node[1]))
+
+    def could_see(capture: Capture, points: np.ndarray) -> bool:
+        if key is None or scenes[capture.scene].thinning is not None:
+            return False  # what is left of it does not show what it looked at
+        return in_view(store.scenes.cameras(capture.scene), points, settings.objects.look)
+
+    def eyes(capture: Capture) -> Eyes:
+        gaussians, cameras = store.scenes.gaussians(capture.scene), store.scenes.cameras(capture.scene)
+        return open_eyes(gaussians, cameras, settings.objects.look)
+
+    moved, parted = _told(store, captures)
+    objects = make_objects(
+        captures,
+        component,
+        eyes,
+        metres=unit,
+        moved=moved,
+        parted=parted,
+        looked=looked,
+        could_see=could_see,
+        params=settings.objects,
+        progress=told,
+    )
+    places = [
+        {one.scene: things[one.scene].extents[one.thing] for one in thing.sightings if one.thing >= 0}
+        for thing in objects
+    ]
+    up, rooms = np.array([0.0, 0, 1]), list[Room]()
+    if key is not None:
+        known = {scene: graph for scene in poses if (graph := graphs[scene]) is not None}
+        ups = [poses[scene].rotation @ graph.up for scene, graph in known.items() if graph.up is not None]
+        up = np.sum(ups, axis=0) / np.linalg.norm(np.sum(ups, axis=0)) if ups else up
+        told(1.0, "rooms")
+        rooms = _rooms(store, settings, poses, up, unit)
+    names = ("", "") if key is None else (key.digest, key.recipe)
+    return Part(component, ObjectSet(*names, unit, dict(poses), digests, tuple(objects), up, tuple(rooms)), places, key)
+
+
+_SHAPE = ("means", "quats", "log_scales", "logit_opacities")
+
+
+def _rooms(store: Store, settings: Settings, poses: Mapping[str, Sim3], up: np.ndarray, unit: float) -> list[Room]:
+    """The rooms that captures show, in the level frame of ``up`` and in metres; nothing is rendered.
+
+    Args:
+        unit: metres per unit of the map.
+    """
+    S_level_map = Sim3(level_frame(up), np.zeros(3), unit)
+    captures, eyes = [], [np.zeros((0, 3))]
+    for scene, pose in poses.items():
+        S = S_level_map @ pose
+        source, cameras = store.scenes.source(scene), store.scenes.cameras(scene)
+        columns = {name: np.concatenate(list(source.columns(name))) for name in _SHAPE}
+        sh = np.zeros((len(columns["means"]), 1, 3), np.float32)
+        captures.append(transform_gaussians(Gaussians(**columns, sh=sh), S))
+        if not cameras.synthesised:
+            eyes.append(S.apply(cameras.centers))
+    return find_rooms(captures, np.concatenate(eyes), settings.objects.rooms)
+
+
+def _digest(things: Things) -> str:
+    return text_digest(things.extents.tobytes().hex())
+
+
+def _when(scene: Scene) -> tuple[bool, float, str]:
+    """Dated captures by their date; then the others, as they came."""
+    if scene.captured_at is None:
+        return True, 0.0, scene.ingested_at or ""
+    return False, parsed(scene.captured_at).timestamp(), scene.ingested_at or ""
+
+
+def _told(store: Store, captures: Sequence[Capture]) -> tuple[list[tuple[Node, Node]], list[tuple[Node, int]]]:
+    """What changes say of things, but for those that a person rejected.
+
+    Returns:
+        Things that are one though they moved; and things, each with a capture that does not show it where it stood.
+    """
+    at = {capture.scene: i for i, capture in enumerate(captures)}
+    moved: list[tuple[Node, Node]] = []
+    parted: list[tuple[Node, int]] = []
+    for comparison in store.changes.current():
+        if comparison.older not in at or comparison.newer not in at or not comparison.changes:
+            continue
+        older, newer = at[comparison.older], at[comparison.newer]
+        found = store.changes.load(comparison.number).changes
+        for change, kept in zip(found, comparison.changes, strict=True):
+            if kept.status == "rejected" or kept.kind not in ("appeared", "disappeared", "replaced", "moved"):
+                continue
+            before = older, changed_thing(captures[older].things.members, change.before)
+            after = newer, changed_thing(captures[newer].things.members, change.after)
+            if before[1] >= 0:
+                parted.append((before, newer))
+            if after[1] >= 0:
+                parted.append((after, older))
+            if kept.kind == "moved" and before[1] >= 0 and after[1] >= 0:
+                moved.append((before, after))
+    return moved, parted

@@ -1,0 +1,53 @@
+"""A room of the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A room, in a level frame in metres (z up).
+
+    Args:
+        low: (2,) corner of its cells.
+        cells: (X, Y) bool, which of them are of it.
+        cell_m: their edge.
+        floor_m, ceiling_m: heights; of a ceiling that nobody saw a guess.
+        doors: numbers, in the list of rooms, of those that one can walk to from it.
+    """
+
+    low: np.ndarray
+    cells: np.ndarray
+    cell_m: float
+    floor_m: float
+    ceiling_m: float
+    doors: tuple[int, ...] = ()
+
+    @property
+    def area_m2(self) -> float:
+        return float(self.cells.sum()) * self.cell_m**2
+
+    @property
+    def box(self) -> np.ndarray:
+        """(2, 3) around it."""
+        high = self.low + np.array(self.cells.shape) * self.cell_m
+        return np.array([[*self.low, self.floor_m], [*high, self.ceiling_m]])
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(3,) the middle of its floor."""
+        at = np.argwhere(self.cells).mean(0) + 0.5
+        return np.array([*(self.low + at * self.cell_m), self.floor_m])
+
+    def holds(self, point: np.ndarray) -> bool:
+        """Whether a point (3,) lies in it, or in its floor or ceiling."""
+        if not self.floor_m - _SLACK_M <= point[2] <= self.ceiling_m + _SLACK_M:
+            return False
+        cell = np.floor((point[:2] - self.low) / self.cell_m).astype(int)
+        return bool((cell >= 0).all() and (cell < self.cells.shape).all() and self.cells[tuple(cell)])
+
+
+_SLACK_M = 0.3
