@@ -81,6 +81,17 @@ TESTED = {
     0.7: (642, 671, 673, 675),
     1.0: (603, 681, 683, 685),
 }
+DRAWN = {
+    TRAINED: (507, 508),
+    COURT: (404,),
+    WANDERED: (725, 726),
+    FILMED: (745, 746, 747),
+    0.25: (656,),
+    0.5: (666,),
+    0.7: (676,),
+    1.0: (686, 687),
+}
+"""Drawn after the model's form was chosen."""
 LEAST_OVERLAP = 0.08
 WANDER_KNOTS, WANDER_TURN_PER_M = 6, 0.4
 START_DEG, START_M = 1.5, 0.05
@@ -93,11 +104,11 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, required=True, help="keep made places and their errors here")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="print the honesty in these folders, too")
     options = parser.parse_args()
-    fitted, tested = collect(FITTED, options.cache), collect(TESTED, options.cache)
+    fitted, tested, drawn = (collect(places, options.cache) for places in (FITTED, TESTED, DRAWN))
     model = fit([pair for pairs in fitted.values() for pair in pairs])
     for name in (*SCALE, *MOTION):
         print(f"{name} = {getattr(model, name):.5f}")
-    for title, groups in (("fitted", fitted), ("tested", tested)):
+    for title, groups in (("fitted", fitted), ("tested", tested), ("drawn since", drawn)):
         for level, pairs in groups.items():
             report(f"{title}, " + KINDS.get(level, f"bent x {level:g}"), pairs, model)
         report(f"{title}, all", [pair for pairs in groups.values() for pair in pairs], model)
@@ -320,6 +331,21 @@ def report(title: str, pairs: list[Pair], hidden: Hidden) -> None:
                         f"({chi2.ppf(0.95, dof):.1f}), most {max(values):.0f}, beyond 3 sigma {out}, "
                         f"cost {cost:.2f}")  # fmt: skip
     print(f"{title}, {len(pairs)} pairs: NEES " + "; ".join(said))
+    if len(pairs) > 2:
+        print("    correlated with how far poses are shifted: " + ", ".join(
+            f"{name} {value:.2f}" for name, value in foretold(pairs).items()
+        ))  # fmt: skip
+
+
+def foretold(pairs: list[Pair]) -> dict[str, float]:
+    """Correlations of the logarithms of true shifts of rigid poses with those of what tells of them."""
+    shift = np.log([np.linalg.norm(pair.rigid[3:]) for pair in pairs])
+    told = {
+        "field": [pair.conditioned.field_m for pair in pairs],
+        "swell": [abs(np.log(pair.scale)) * pair.conditioned.radius_m for pair in pairs],
+        "sway": [np.nan if pair.sway is None else np.linalg.norm(pair.sway[3:6]) for pair in pairs],
+    }
+    return {name: float(np.corrcoef(shift, np.log(np.array(v) + 1e-6))[0, 1]) for name, v in told.items()}
 
 
 if __name__ == "__main__":
