@@ -3,14 +3,15 @@
 A trainer's bias, or a sensor whose depths are a percent off, bends a capture so that the pose takes most of it up and
 the residuals show little. Made captures know the truth: places are filmed, their depths bent as depth cameras bend them
 (a scale, a term in the depth's square, a lens, colour and depth some pixels apart, noise; each drawn for each capture,
-times a level), and laid out as Gaussians; others are trained on perfect frames. Two models are of largest likelihood,
-errors taken for normally distributed: of the measured scale, and then, that scale known, of the rigid pose. Places that
-are only tested on are not fitted. No given capture takes part.
+times a level), and laid out as Gaussians, in part under poses that wander, and trained on such frames; others are
+trained on perfect frames. Two models are of largest likelihood, errors taken for normally distributed: of the measured
+scale, and then, that scale known, of the rigid pose. Places that are only tested on are not fitted. No given capture
+takes part.
 
     python tools/fit_covariance.py --cache FOLDER
     python tools/fit_covariance.py --cache FOLDER --test house kitchen_splats
 
-Making the places takes some twenty CPU minutes, once.
+Making the places takes some fifteen CPU minutes, once.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -41,8 +42,8 @@ from gsmap.describe.unit import estimate_unit_m, working_unit_m
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.ingest import read_captures
-from gsmap.register import Params, covariance
-from gsmap.register.covariance import Conditioning, condition
+from gsmap.register import Params
+from gsmap.register.covariance import Conditioning, Hidden, condition, swayed
 from gsmap.register.metres import believe
 from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import Surface
@@ -55,10 +56,14 @@ from gsmap_synthetic.place import make_place
 
 TRAINED = -1.0  # on perfect frames; other levels lay Gaussians on bent depths
 COURT = -2.0  # the same, outdoors and seen from far
-KINDS = {TRAINED: "trained", COURT: "court"}
+WANDERED = -3.0  # half as bent, by cameras that are a centimetre off along the way
+FILMED = -4.0  # the same, trained on these frames, as people's captures are
+KINDS = {TRAINED: "trained", COURT: "court", WANDERED: "wandered", FILMED: "filmed"}
 FITTED = {
     TRAINED: (501, 502, 503),
     COURT: (401, 402),
+    WANDERED: (711, 712, 713, 714),
+    FILMED: (731, 732, 733, 734),
     0.0: (631,),
     0.25: (621, 650, 652, 654),
     0.5: (611, 612, 660, 662, 664),
@@ -68,15 +73,30 @@ FITTED = {
 TESTED = {
     TRAINED: (504, 505, 506),
     COURT: (403,),
+    WANDERED: (721, 722, 723, 724),
+    FILMED: (741, 742, 743, 744),
     0.0: (632,),
     0.25: (622, 651, 653, 655),
     0.5: (613, 661, 663, 665),
     0.7: (642, 671, 673, 675),
     1.0: (603, 681, 683, 685),
 }
+DRAWN = {
+    TRAINED: (507, 508),
+    COURT: (404,),
+    WANDERED: (725, 726),
+    FILMED: (745, 746, 747),
+    0.25: (656,),
+    0.5: (666,),
+    0.7: (676,),
+    1.0: (686, 687),
+}
+"""Drawn after the model's form was chosen."""
 LEAST_OVERLAP = 0.08
+WANDER_KNOTS, WANDER_TURN_PER_M = 6, 0.4
 START_DEG, START_M = 1.5, 0.05
 RIGHT_M = 0.3
+THREE_SIGMA = 0.9973
 
 
 def main() -> None:
@@ -84,11 +104,11 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, required=True, help="keep made places and their errors here")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="print the honesty in these folders, too")
     options = parser.parse_args()
-    fitted, tested = collect(FITTED, options.cache), collect(TESTED, options.cache)
+    fitted, tested, drawn = (collect(places, options.cache) for places in (FITTED, TESTED, DRAWN))
     model = fit([pair for pairs in fitted.values() for pair in pairs])
-    for name in (*SCALE, *MOTION, "field_m"):
+    for name in (*SCALE, *MOTION):
         print(f"{name} = {getattr(model, name):.5f}")
-    for title, groups in (("fitted", fitted), ("tested", tested)):
+    for title, groups in (("fitted", fitted), ("tested", tested), ("drawn since", drawn)):
         for level, pairs in groups.items():
             report(f"{title}, " + KINDS.get(level, f"bent x {level:g}"), pairs, model)
         report(f"{title}, all", [pair for pairs in groups.values() for pair in pairs], model)
@@ -110,19 +130,24 @@ def made(cache: Path, level: float, seed: int) -> Path:
         elif level == COURT:
             sizes = {"num_gaussians": 60_000, "size_px": (240, 180)}
             write_captures(folder, court_captures(seed, 6, steps=150, vary_exposure=True, **sizes))
+        elif level in (WANDERED, FILMED):
+            write_captures(folder, bent_captures(0.5, seed, wander_m=0.01, steps=150 * (level == FILMED)))
         else:
             write_captures(folder, bent_captures(level, seed))
     return folder
 
 
-def bent_captures(level: float, seed: int) -> list:
-    """Three captures of one place, each by a depth camera of its own."""
+def bent_captures(level: float, seed: int, wander_m: float = 0.0, steps: int = 0) -> list:
+    """Three captures of one place, each by a depth camera of its own, whose poses are so far off along its way."""
     place, out = make_place(seed, rooms=3), []
     for i, route in enumerate(default_routes(place, 3)):
         rng, name = np.random.default_rng([seed, i, 77]), f"capture_{chr(97 + i)}"
         shut = unused_doors(place, route)
         frames = film(place, walk(place, route, 40, seed=i), size_px=(160, 120), shut=shut, name=name)
-        gaussians = fit_frames(bent(frames, rng, level), steps=0, num_gaussians=30_000, seed=i)
+        frames = bent(frames, rng, level)
+        if wander_m:
+            frames = replace(frames, cameras=wandered(frames.cameras, rng, wander_m))
+        gaussians = fit_frames(frames, steps=steps, num_gaussians=30_000, seed=i)
         out.append(put_in_own_frame(gaussians, frames, name, rng))
     return out
 
@@ -142,6 +167,17 @@ def bent(frames: Frames, rng: np.random.Generator, level: float) -> Frames:
     return replace(frames, depths_m=np.roll(depths, (dy, dx), (1, 2)).astype(np.float32))
 
 
+def wandered(cameras: Cameras, rng: np.random.Generator, wander_m: float) -> Cameras:
+    """The cameras as one that finds its way alone takes them to be: off by smooth motions that are none on average."""
+    ways, knots = np.linspace(0, 1, len(cameras)), np.linspace(0, 1, WANDER_KNOTS)
+    off = np.stack([np.interp(ways, knots, rng.normal(size=WANDER_KNOTS)) for _ in range(6)], axis=1)
+    off = (off - off.mean(0)) * wander_m * np.r_[np.full(3, WANDER_TURN_PER_M), np.ones(3)]
+    poses = cameras.T_frame_camera.copy()
+    poses[:, :3, :3] = exp_so3(off[:, :3]) @ poses[:, :3, :3]
+    poses[:, :3, 3] += off[:, 3:]
+    return replace(cameras, T_frame_camera=poses)
+
+
 # --- true errors ---------------------------------------------------------------------------------------------------
 
 
@@ -153,18 +189,24 @@ class Pair:
         scaled, rigid: (7,) and (6,) errors about the overlap's centroid of the pose with its scale, and without.
         scale: of the first pose.
         conditioned: of that.
+        sway: (7,) by which colours would move the second.
     """
 
     scaled: np.ndarray
     rigid: np.ndarray
     scale: float
     conditioned: Conditioning
+    sway: np.ndarray | None
 
-    def under(self, params: covariance.Params) -> tuple[np.ndarray, np.ndarray]:
+    def told(self, hidden: Hidden) -> Conditioning:
+        """The conditioning, so much thought to be hidden."""
+        return replace(self.conditioned, params=replace(self.conditioned.params, hidden=hidden))
+
+    def under(self, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
         """(7, 7) and (6, 6) covariances of the two poses."""
-        told = replace(self.conditioned, params=params)
+        told = self.told(hidden)
         belief = believe(float(np.log(self.scale)), told.log_scale_sigma, told=True)
-        rigid = told.of_rigid(1.0, belief.log_scale, belief.log_scale_sigma)
+        rigid = told.of_rigid(1.0, belief.log_scale, belief.log_scale_sigma, self.sway)
         return told.of_scaled(self.scale), rigid[:6, :6]
 
 
@@ -226,63 +268,84 @@ def _pair(target: Surface, S_target: Sim3, source: Surface, S_source: Sim3, righ
     errors = [(Similarities.stack([p @ centroid]).inverse() @ inverse).log()[0] for p in (scaled, rigid)]
     if np.linalg.norm(errors[1][3:6]) > right_m:
         return None
-    return Pair(errors[0], errors[1][:6], scaled.scale, conditioned)
+    sway = swayed(target, source, rigid, conditioned.centroid, with_scale=False)
+    return Pair(errors[0], errors[1][:6], scaled.scale, conditioned, sway)
 
 
 # --- the models ----------------------------------------------------------------------------------------------------
 
-SCALE = ("hidden_swell_m", "field_power")
+SCALE = ("swell_m", "field_power", "swell_by_colour")
 """Fitted to the scales that were measured."""
-MOTION = ("hidden_shift_m", "shift_by_swell", "turn_by_shift")
+MOTION = ("shown", "by_colour", "shift_by_swell")
 """Fitted to the rigid poses, their scale known."""
+ROUNDS = 2  # each of the two fits knows the other's outcome
 
 
-def fit(pairs: list[Pair]) -> covariance.Params:
-    """The parameters of largest likelihood."""
+def fit(pairs: list[Pair]) -> Hidden:
+    """The model of largest likelihood."""
 
-    def scale_cost(params: covariance.Params) -> float:
-        sigmas = np.array([replace(p.conditioned, params=params).log_scale_sigma for p in pairs])
+    def scale_cost(hidden: Hidden) -> float:
+        sigmas = np.array([pair.told(hidden).log_scale_sigma for pair in pairs])
         return float((2 * np.log(sigmas) + (np.array([p.scaled[6] for p in pairs]) / sigmas) ** 2).sum())
 
-    def motion_cost(params: covariance.Params) -> float:
+    def motion_cost(hidden: Hidden) -> float:
         total = 0.0
         for pair in pairs:
-            matrix = pair.under(params)[1]
+            matrix = pair.under(hidden)[1]
             total += np.linalg.slogdet(matrix)[1] + pair.rigid @ np.linalg.solve(matrix, pair.rigid)
         return total
 
-    params = Params().covariance
-    for names, cost in ((SCALE, scale_cost), (MOTION, motion_cost)):
-        params = _largest(params, names, cost)
-    return params
+    hidden = Hidden()
+    for names, cost in ((SCALE, scale_cost), (MOTION, motion_cost)) * ROUNDS:
+        hidden = _largest(hidden, names, cost)
+    return hidden
 
 
-def _largest(
-    params: covariance.Params, names: tuple[str, ...], cost: Callable[[covariance.Params], float]
-) -> covariance.Params:
-    """The parameters with those of these names, all positive, at which a cost is least."""
+def _largest(hidden: Hidden, names: tuple[str, ...], cost: Callable[[Hidden], float]) -> Hidden:
+    """The model with those of these parameters, all positive, at which a cost is least."""
 
-    def at(x: np.ndarray) -> covariance.Params:
-        return replace(params, **dict(zip(names, np.exp(x).tolist(), strict=True)))
+    def at(x: np.ndarray) -> Hidden:
+        return replace(hidden, **dict(zip(names, np.exp(x).tolist(), strict=True)))
 
-    start = np.log([getattr(params, name) for name in names])
+    start = np.log([getattr(hidden, name) for name in names])
     options = {"maxiter": 4000, "maxfev": 4000}
     found = [minimize(lambda x: cost(at(x)), start + off, method="Nelder-Mead", options=options) for off in (0.0, 0.7)]
     return at(min(found, key=lambda f: f.fun).x)
 
 
-def report(title: str, pairs: list[Pair], params: covariance.Params) -> None:
-    """Normalised squared errors of poses with their scale, and of rigid ones."""
-    both = [pair.under(params) for pair in pairs]
+def report(title: str, pairs: list[Pair], hidden: Hidden) -> None:
+    """Normalised squared errors (NEES) of poses with their scale, and of rigid ones.
+
+    "Beyond 3 sigma" are those that a chi-square would exceed as rarely as a normal variable three standard deviations;
+    "cost" is minus the mean log likelihood, less what no covariance changes.
+    """
+    both = [pair.under(hidden) for pair in pairs]
     said = []
     for dof, errors, k in ((7, [p.scaled for p in pairs], 0), (6, [p.rigid for p in pairs], 1)):
         values = [e @ np.linalg.solve(b[k], e) for e, b in zip(errors, both, strict=True)]
         if values:
             middle, high = np.percentile(values, [50, 95])
+            out = int((np.array(values) > chi2.ppf(THREE_SIGMA, dof)).sum())
+            cost = 0.5 * np.mean([np.linalg.slogdet(b[k])[1] + v for b, v in zip(both, values, strict=True)])
             said.append(f"{dof} dof: median {middle:.1f} ({chi2.ppf(0.5, dof):.1f}), 95 % {high:.1f} "
-                        f"({chi2.ppf(0.95, dof):.1f}), most {max(values):.0f}")  # fmt: skip
-    field = 1000 * np.median([p.conditioned.field_m for p in pairs]) if pairs else np.nan
-    print(f"{title}, {len(pairs)} pairs, field {field:.1f} mm: NEES " + "; ".join(said))
+                        f"({chi2.ppf(0.95, dof):.1f}), most {max(values):.0f}, beyond 3 sigma {out}, "
+                        f"cost {cost:.2f}")  # fmt: skip
+    print(f"{title}, {len(pairs)} pairs: NEES " + "; ".join(said))
+    if len(pairs) > 2:
+        print("    correlated with how far poses are shifted: " + ", ".join(
+            f"{name} {value:.2f}" for name, value in foretold(pairs).items()
+        ))  # fmt: skip
+
+
+def foretold(pairs: list[Pair]) -> dict[str, float]:
+    """Correlations of the logarithms of true shifts of rigid poses with those of what tells of them."""
+    shift = np.log([np.linalg.norm(pair.rigid[3:]) for pair in pairs])
+    told = {
+        "field": [pair.conditioned.field_m for pair in pairs],
+        "swell": [abs(np.log(pair.scale)) * pair.conditioned.radius_m for pair in pairs],
+        "sway": [np.nan if pair.sway is None else np.linalg.norm(pair.sway[3:6]) for pair in pairs],
+    }
+    return {name: float(np.corrcoef(shift, np.log(np.array(v) + 1e-6))[0, 1]) for name, v in told.items()}
 
 
 if __name__ == "__main__":

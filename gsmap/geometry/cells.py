@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap._native import ranks
+
 
 def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which rows of integer cell coordinates (N, 3) are equal.
@@ -21,8 +23,8 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         return label.reshape(-1), counts
     key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-    _, label, counts = np.unique(key, return_inverse=True, return_counts=True)
-    return label.reshape(-1), counts
+    labels, counts = ranks(np.ascontiguousarray(key))
+    return labels, counts
 
 
 def group_means(values: np.ndarray, labels: np.ndarray, counts: np.ndarray) -> np.ndarray:

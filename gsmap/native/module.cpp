@@ -6,6 +6,7 @@
 namespace nb = nanobind;
 
 namespace gsmap {
+void bind_cells(nb::module_ &);
 void bind_correspondences(nb::module_ &);
 void bind_fit(nb::module_ &);
 void bind_landmarks(nb::module_ &);
@@ -20,6 +21,7 @@ NB_MODULE(_native, m) {
     m.doc() = "Kernels that decide gsmap's speed: rasteriser, consistency graphs, maximum clique and surfaces.";
     bind_clique(m);
     nb::set_leak_warnings(false);  // a view kept alive by an autograd graph at exit is no leak
+    gsmap::bind_cells(m);
     gsmap::bind_correspondences(m);
     gsmap::bind_fit(m);
     gsmap::bind_landmarks(m);

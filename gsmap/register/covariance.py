@@ -8,8 +8,10 @@ import numpy as np
 
 from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import retract, skew
+from gsmap.geometry.similarities import Similarities
 from gsmap.register import error_field
 from gsmap.register.metres import Belief
+from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import Surface
 from gsmap.types import Sim3
 
@@ -25,6 +27,48 @@ _CLIP = 3.0  # standard deviations: what moved between captures is no error of t
 
 
 @dataclass(frozen=True)
+class Hidden:
+    """How far poses are off by what leaves no residual (a trainer's bias, a sensor that bends what it measures).
+
+    A model, fitted on made places by ``tools/fit_covariance.py``. All are standard deviations.
+
+    Args:
+        shown: what residuals show of a pose's errors counts this many times (less than once where colours tell more).
+        by_colour: rotations and translations are off by this share of what colours would move them by ...
+        swell_by_colour: ... and the logarithm of the scale by this share.
+        shift_m: translations are off by this, where ``field_m`` is the errors that residuals show beyond a block ...
+        swell_m: ... and the logarithm of the scale, over the overlap's radius, by this, before it is measured ...
+        field_m: ... of errors that residuals show, from which both ...
+        field_power: ... grow with this power of them.
+        shift_by_swell: a sensor that swells what it measures also bends it: translations are off by this share of the
+            swelling over the overlap's radius ...
+        turn_by_shift: ... and rotations, over that radius, by this many times as much as those translations.
+        most_swell: no sensor's metre is off by more than about this (logarithm of a scale).
+    """
+
+    shown: float = 0.655
+    by_colour: float = 0.904
+    swell_by_colour: float = 1.64
+    shift_m: float = 0.0
+    swell_m: float = 0.0021
+    field_m: float = 0.002
+    field_power: float = 2.68
+    shift_by_swell: float = 0.104
+    turn_by_shift: float = 1.0
+    most_swell: float = 0.02
+
+
+def _grey() -> Hidden:
+    """Where there are no colours residuals and the scale alone tell (fitted with nothing else, to fewer places)."""
+    return Hidden(1.0, 0.0, 0.0, 0.0009, 0.0034, field_power=2.16, shift_by_swell=0.58, turn_by_shift=0.91)
+
+
+def _swayed() -> colored_icp.Params:
+    """One radius, near enough for colours; a tenth of a pair's cost."""
+    return colored_icp.Params((0.06,), colour_weight=3.0, max_points=(10_000,), last_tolerance=0.01)
+
+
+@dataclass(frozen=True)
 class Params:
     """How well a refined pose is known.
 
@@ -36,18 +80,10 @@ class Params:
         probe_m: the pose is moved by so much each way (rotation and scale: over the overlap's radius), to see how much
             of it the residuals pull back ...
         probe_points: ... of this many cells.
+        colours: how a pose is refined once more by what colours say of it, ten times as loud as in refining.
+        hidden: how much is thought to leave no residual where both surfaces have colours ...
+        hidden_grey: ... and where they have not.
         field: which errors of the surfaces are thought possible.
-        hidden_shift_m: standard deviation of translations by what leaves no residual (a trainer's bias, a sensor that
-            bends what it measures), where ``field_m`` is the errors that residuals do show beyond a block. This and the
-            next three are a model, fitted on made places by ``tools/fit_covariance.py``.
-        hidden_swell_m: the same of the logarithm of the scale, over the overlap's radius, before it is measured.
-        shift_by_swell: a sensor that swells what it measures also bends it: translations are off by this share of the
-            swelling over the overlap's radius, besides ``hidden_shift_m`` ...
-        turn_by_shift: ... and rotations, over that radius, by this many times as much as translations.
-        field_m: errors that residuals show, at which ``hidden_shift_m`` and ``hidden_swell_m`` hold ...
-        field_power: ... and they grow with this power of them.
-        most_swell: no sensor's metre is off by more than about this (logarithm of a scale): what is hidden of the scale
-            is bounded by it.
     """
 
     radius_m: float = 0.08
@@ -55,14 +91,10 @@ class Params:
     max_blocks: int = 200
     probe_m: float = 0.01
     probe_points: int = 6000
-    field: error_field.Params = field(default_factory=error_field.Params)
-    hidden_shift_m: float = 0.0009
-    hidden_swell_m: float = 0.0034
-    shift_by_swell: float = 0.58
-    turn_by_shift: float = 0.91
-    field_m: float = 0.002
-    field_power: float = 2.16
-    most_swell: float = 0.02
+    colours: colored_icp.Params = field(default_factory=_swayed)
+    hidden: Hidden = field(default_factory=Hidden)
+    hidden_grey: Hidden = field(default_factory=_grey)
+    field: error_field.Params = field(default_factory=error_field.Params)  # last: it hides dataclasses.field
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +123,7 @@ class Conditioning:
         centroid: (3,) of the overlap, in the source's frame, metres.
         field_m: standard deviation of the surfaces' errors that are alike beyond a block.
         radius_m: of the overlap.
+        sway: (7,) motion about the centroid by which colours would move the pose; None where there are none.
         params: what is thought to be hidden.
     """
 
@@ -100,37 +133,47 @@ class Conditioning:
     centroid: np.ndarray
     field_m: float
     radius_m: float
+    sway: np.ndarray | None
     params: Params
+
+    @property
+    def hidden(self) -> Hidden:
+        """The model that holds for this pair."""
+        return self.params.hidden_grey if self.sway is None else self.params.hidden
 
     @property
     def log_scale_sigma(self) -> float:
         """Standard deviation of the scale that was refined along."""
-        return float(np.hypot(np.sqrt(self.scaled[6, 6]), hidden_log_scale(self.field_m, self.radius_m, self.params)))
+        return float(np.sqrt(self.of_scaled(1.0)[6, 6]))
 
     def of_scaled(self, scale: float) -> np.ndarray:
         """(7, 7) covariance about the overlap's centroid of the pose with the scale that was refined along."""
-        swell = hidden_log_scale(self.field_m, self.radius_m, self.params)
-        return self.scaled + np.diag(np.r_[self._hidden(swell, scale), swell] ** 2)
+        swell = hidden_log_scale(self.field_m, self.radius_m, self.sway, self.hidden)
+        hidden = np.r_[self._hidden(swell, scale, self.sway), swell]
+        return self.hidden.shown**2 * self.scaled + np.diag(hidden**2)
 
-    def of_rigid(self, scale: float, swell: float, log_scale_sigma: float) -> np.ndarray:
+    def of_rigid(self, scale: float, swell: float, log_scale_sigma: float, sway: np.ndarray | None) -> np.ndarray:
         """(7, 7) the same of a pose whose scale is known otherwise.
 
         Args:
             swell: logarithm of the scale that the surfaces were measured to have over the true one: so much do their
                 errors hide, or more.
             log_scale_sigma: how well the scale is known.
+            sway: by which colours would move this pose; None where there are none.
         """
         out = np.zeros((7, 7))
-        out[:6, :6] = self.rigid + np.diag(self._hidden(abs(swell), scale) ** 2)
+        hidden = self._hidden(abs(swell), scale, sway)
+        out[:6, :6] = self.hidden.shown**2 * self.rigid + np.diag(hidden**2)
         out += np.outer(self.tied, self.tied) * max(log_scale_sigma, _LEAST_LOG_SCALE_SIGMA) ** 2
         return out
 
-    def known(self, pose: Sim3, belief: Belief | None = None) -> Known:
-        """How well a pose (metres) is known: the scaled one, or one whose scale is believed to be something else."""
+    def known(self, pose: Sim3, belief: Belief | None = None, sway: np.ndarray | None = None) -> Known:
+        """How well a pose (metres) is known: the scaled one, or one whose scale is believed to be something else and
+        that colours would move by ``sway``."""
         if belief is None or not belief.rigid:
             covariance = self.of_scaled(pose.scale)
         else:
-            covariance = self.of_rigid(pose.scale, belief.log_scale, belief.log_scale_sigma)
+            covariance = self.of_rigid(pose.scale, belief.log_scale, belief.log_scale_sigma, sway)
         sigmas = (
             float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
             float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])) * pose.scale,
@@ -146,10 +189,15 @@ class Conditioning:
         centre = Sim3(np.eye(3), self.centroid)
         return retract(pose @ centre, step) @ centre.inverse()
 
-    def _hidden(self, swell: float, scale: float) -> np.ndarray:
-        """(6,) of rotation and translation (the source's), by how much scale the surfaces' errors hide."""
-        turn, shift = hidden_motion(self.field_m, self.radius_m, swell, self.params)
-        return np.r_[np.full(3, turn), np.full(3, shift / scale)]
+    def _hidden(self, swell: float, scale: float, sway: np.ndarray | None) -> np.ndarray:
+        """(6,) of rotation and translation (the source's), by how much scale the surfaces' errors hide, and by what
+        colours say."""
+        turn, shift = hidden_motion(self.field_m, self.radius_m, swell, self.hidden)
+        out = np.r_[np.full(3, turn), np.full(3, shift / scale)]
+        if sway is None:
+            return out
+        told = np.sqrt([(sway[:3] ** 2).mean(), (sway[3:6] ** 2).mean()])
+        return np.hypot(out, self.hidden.by_colour * np.repeat(told, 3))
 
 
 def condition(target: Surface, source: Surface, pose: Sim3, params: Params | None = None) -> Conditioning | None:
@@ -179,29 +227,55 @@ def condition(target: Surface, source: Surface, pose: Sim3, params: Params | Non
         centroid=blocks.centroid,
         field_m=errors.field_m,
         radius_m=blocks.radius_m,
+        sway=swayed(target, source, pose, blocks.centroid, params, with_scale=True),
         params=params,
     )
 
 
-def hidden_log_scale(field_m: float, radius_m: float, params: Params) -> float:
+def swayed(
+    target: Surface,
+    source: Surface,
+    pose: Sim3,
+    centroid: np.ndarray,
+    params: Params | None = None,
+    *,
+    with_scale: bool,
+) -> np.ndarray | None:
+    """(7,) motion about the overlap's centroid by which colours would move a refined pose; None where there are none.
+
+    A sensor that bends what it measures, or whose colours and depths do not belong together, moves textures otherwise
+    than planes. So the pose that colours prefer lies about as far from that of the planes as both lie from the truth,
+    where the planes' own residuals show nothing.
+    """
+    params = params or Params()
+    if not all(np.ptp(surface.lightness) > 0 for surface in (target, source)):
+        return None
+    other = colored_icp.refine(target, source, pose, params.colours, with_scale=with_scale)
+    centre = Sim3(np.eye(3), centroid)
+    there, here = (Similarities.stack([p @ centre]) for p in (other, pose))
+    motion: np.ndarray = (here.inverse() @ there).log()[0]
+    return motion
+
+
+def hidden_log_scale(field_m: float, radius_m: float, sway: np.ndarray | None, hidden: Hidden) -> float:
     """Standard deviation of the scale's logarithm by what leaves no residual."""
-    swell = params.hidden_swell_m * (field_m / params.field_m) ** params.field_power
-    return float(swell / np.hypot(radius_m, swell / params.most_swell))
+    told = 0.0 if sway is None else hidden.swell_by_colour * sway[6] * radius_m
+    swell = np.hypot(hidden.swell_m * (field_m / hidden.field_m) ** hidden.field_power, told)
+    return float(swell / np.hypot(radius_m, swell / hidden.most_swell))
 
 
-def hidden_motion(field_m: float, radius_m: float, swell: float, params: Params) -> tuple[float, float]:
-    """Standard deviations (rad, metres) about the overlap's centroid by what leaves no residual.
+def hidden_motion(field_m: float, radius_m: float, swell: float, hidden: Hidden) -> tuple[float, float]:
+    """Standard deviations (rad, metres) about the overlap's centroid by what leaves no residual, colours apart.
 
     Errors that leave none still show where the scale is known: a sensor whose depths are a percent off swells its
-    surfaces by as much, and its bend turns and shifts them in proportion. Without this one model has to serve sensors
-    of all kinds, too wide for most and too narrow for the worst.
+    surfaces by as much, and its bend turns and shifts them in proportion.
 
     Args:
         swell: logarithm of the scale that such errors make, measured, or its standard deviation.
     """
-    own = params.hidden_shift_m * (field_m / params.field_m) ** params.field_power
-    shift = float(np.hypot(own, params.shift_by_swell * swell * radius_m))
-    return params.turn_by_shift * shift / radius_m, shift
+    own = hidden.shift_m * (field_m / hidden.field_m) ** hidden.field_power
+    shift = float(np.hypot(own, hidden.shift_by_swell * swell * radius_m))
+    return hidden.turn_by_shift * shift / radius_m, shift
 
 
 def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks, params: Params) -> np.ndarray:

@@ -12,7 +12,7 @@ from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
-VERSION = 9
+VERSION = 10
 
 _RENDER_BACKEND = "native"  # the one that all renders of this room are pinned to
 
@@ -40,7 +40,8 @@ def recipe_key(params: Params | None = None) -> RecipeKey:
     if params.scale_refiner not in coarse | fine:
         del settings["scale_refiner"]
     versions = {"register": VERSION, "probability": probability.VERSION}
-    for kind, names in (("proposer", proposers), ("refiner", coarse | fine)):
+    refiners = coarse | fine | {"colored_icp"}  # by which covariances ask what colours say
+    for kind, names in (("proposer", proposers), ("refiner", refiners)):
         for name in sorted(names):
             versions |= family(kind).version(name)
     packages = sorted({package for name in proposers for package in family("proposer").get(name).PACKAGES})

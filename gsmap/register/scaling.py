@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmap.register import refinement
-from gsmap.register.covariance import Known, condition
+from gsmap.register.covariance import Known, condition, swayed
 from gsmap.register.metres import Belief, believe, bending
 from gsmap.register.metric import MetricPair
 from gsmap.register.params import Params
@@ -47,4 +47,5 @@ def scaled_or_rigid(
     bends = bending(belief, residual_sigma, extent_m, params.metres)
     belief = replace(belief, note=belief.note or bends)
     rigid = refinement.fine(pair, conditioned.rescaled(scaled, 1.0 / pair.scale), params, with_scale=False)
-    return rigid, conditioned.known(rigid, belief), belief
+    sway = swayed(*surfaces, rigid, conditioned.centroid, params.covariance, with_scale=False)
+    return rigid, conditioned.known(rigid, belief, sway), belief

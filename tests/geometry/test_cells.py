@@ -1,7 +1,9 @@
 """Which rows share a cell, against a dictionary; and means, against numpy's."""
 
 import numpy as np
+import pytest
 
+from gsmap._native import ranks
 from gsmap.geometry.cells import cell_labels, group_means
 
 
@@ -44,3 +46,19 @@ def test_nothing_has_no_cells():
     labels, counts = cell_labels(np.zeros((0, 3), int))
     assert len(labels) == len(counts) == 0
     assert group_means(np.zeros((0, 4)), labels, counts).shape == (0, 4)
+
+
+@pytest.mark.parametrize("most", [1, 2047, 2048, 2**40, 2**62], ids=str)
+def test_ranks_are_numpys_however_large_keys_are(most):
+    keys = np.random.default_rng(most).integers(0, most, 4000, endpoint=True)
+    keys[1000:2000] = keys[:1000]
+    labels, counts = ranks(keys)
+    _, expected, times = np.unique(keys, return_inverse=True, return_counts=True)
+    np.testing.assert_array_equal(labels, expected)
+    np.testing.assert_array_equal(counts, times)
+    assert [len(a) for a in ranks(keys[:0])] == [0, 0]
+
+
+def test_ranks_of_negative_keys_are_refused():
+    with pytest.raises(ValueError, match="negative"):
+        ranks(np.array([0, -1]))

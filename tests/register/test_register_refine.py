@@ -13,8 +13,8 @@ from gsmap.geometry.similarities import Similarities
 from gsmap.register import Params, error_field, metres
 from gsmap.register.a_contrario import BackgroundModel, _log10_binomial_tail, agreeing
 from gsmap.register.correspondences import Correspondences
+from gsmap.register.covariance import Hidden, condition, in_scene_units, point_to_plane_jacobian, swayed
 from gsmap.register.covariance import Params as CovarianceParams
-from gsmap.register.covariance import condition, in_scene_units, point_to_plane_jacobian
 from gsmap.register.metric import MetricPair
 from gsmap.register.refiners import colored_icp, gicp, icp
 from gsmap.register.scale import vote_scales
@@ -23,7 +23,8 @@ from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Proposal, Sim3
 
-NOTHING_HIDDEN = CovarianceParams(hidden_shift_m=0.0, hidden_swell_m=0.0, shift_by_swell=0.0)
+_NONE = Hidden(shown=1.0, by_colour=0.0, swell_by_colour=0.0, shift_m=0.0, swell_m=0.0, shift_by_swell=0.0)
+NOTHING_HIDDEN = CovarianceParams(hidden=_NONE, hidden_grey=_NONE)
 
 
 def believed(log_scale: float, sigma: float) -> metres.Belief:
@@ -261,29 +262,78 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
     """Over the overlap's radius, as the square of the errors that residuals show, and in proportion to the swelling."""
     target, source = surfaces
     pose = world.S_target_source
-    params = CovarianceParams(
-        hidden_shift_m=0.02,
-        hidden_swell_m=0.03,
+    hidden = Hidden(
+        shown=1.0,
+        by_colour=0.0,
+        swell_by_colour=0.0,
+        shift_m=0.02,
+        swell_m=0.03,
         shift_by_swell=0.4,
         turn_by_shift=0.5,
         field_m=0.004,
         field_power=2.0,
     )
-    bare, found = condition(target, source, pose, NOTHING_HIDDEN), condition(target, source, pose, params)
+    bare, found = (condition(target, source, pose, p) for p in (NOTHING_HIDDEN, CovarianceParams(hidden=hidden)))
     growth = (bare.field_m / 0.004) ** 2
-    near = np.isfinite(target.nearest(pose.apply(source.coarse[0]), params.radius_m)[0])
+    near = np.isfinite(target.nearest(pose.apply(source.coarse[0]), found.params.radius_m)[0])
     inside = source.coarse[0][near]
     radius = np.sqrt(((inside - inside.mean(0)) ** 2).sum(1).mean())
     swell = growth * 0.03 / radius
     swell = 1 / np.sqrt(1 / swell**2 + 1 / 0.02**2)  # no sensor is off by much more than 2 percent
     for told, added in (
         (swell, found.of_scaled(1.0) - bare.of_scaled(1.0)),
-        (0.01, found.of_rigid(1.0, -0.01, 0.0) - bare.of_rigid(1.0, -0.01, 0.0)),
+        (0.01, found.of_rigid(1.0, -0.01, 0.0, None) - bare.of_rigid(1.0, -0.01, 0.0, None)),
     ):
         shift = np.hypot(growth * 0.02, 0.4 * told * radius)
         assert np.allclose(np.sqrt(np.diag(added)[:6]), np.r_[np.full(3, 0.5 * shift / radius), np.full(3, shift)])
     assert found.log_scale_sigma == pytest.approx(np.hypot(bare.log_scale_sigma, swell))
     assert np.sqrt(found.of_scaled(1.0)[6, 6]) == pytest.approx(found.log_scale_sigma)
+
+
+def _textured(surface: Surface, into: Sim3, shift_m: float = 0.0) -> Surface:
+    """The surface with a smooth texture that lies fixed in the target's frame, but for a shift along its x axis."""
+    at = into.apply(surface.points) - [shift_m, 0.0, 0.0]
+    waves = np.stack([np.sin(at @ k) for k in ((9.0, 5.0, 3.0), (-4.0, 10.0, 6.0), (5.0, -6.0, 11.0))], axis=1)
+    return Surface(surface.points, (0.5 + 0.2 * waves).astype(np.float32), surface.resolution_m)
+
+
+def test_colours_that_lie_otherwise_than_planes_widen_the_pose(world, surfaces):
+    """Textures that lie 2 cm off on their surfaces, as where colours and depths do not belong together: planes fit as
+    before, and nothing of their residuals tells."""
+    pose = world.S_target_source
+    told = replace(_NONE, by_colour=0.5, swell_by_colour=0.7)
+    params = CovarianceParams(hidden=told, hidden_grey=_NONE)
+    target = _textured(surfaces[0], Sim3.identity())
+    right, off = (_textured(surfaces[1], pose, shift_m) for shift_m in (0.0, 0.02))
+    bare, found = condition(target, off, pose, NOTHING_HIDDEN), condition(target, off, pose, params)
+    still = swayed(target, right, pose, bare.centroid, with_scale=False)
+    sway = swayed(target, off, pose, bare.centroid, with_scale=False)
+    assert np.linalg.norm(still[3:6]) < 0.002 < 0.005 < np.linalg.norm(sway[3:6]) < 0.025
+    assert (pose.rotation @ sway[3:6])[0] < -0.9 * np.linalg.norm(sway[3:6])
+    assert sway[6] == 0.0
+    # As much as they would move it, on average over axes, the pose is more uncertain about the overlap's middle.
+    rigid = [c.of_rigid(1.0, 0.0, 0.0, sway) for c in (found, bare)]
+    added = np.diag(rigid[0] - rigid[1])
+    assert np.allclose(added[:3], 0.25 * (sway[:3] ** 2).mean())
+    assert np.allclose(added[3:6], 0.25 * (sway[3:6] ** 2).mean())
+    added = np.diag(found.of_scaled(1.0) - bare.of_scaled(1.0))
+    assert np.allclose(added[3:6], 0.25 * (found.sway[3:6] ** 2).mean())
+    told_swell = 0.7 * abs(found.sway[6])
+    assert added[6] == pytest.approx(1 / (1 / told_swell**2 + 1 / 0.02**2))
+    # What the pair itself is said to know of the rigid pose rests on the motion of that pose.
+    wide, narrow = (found.known(pose, believed(0.0, 0.0), s).sigmas for s in (sway, still))
+    assert wide[1] > 1.5 * narrow[1]
+
+
+def test_where_a_surface_has_no_colours_the_model_for_grey_ones_holds(world, surfaces):
+    grey = [Surface(s.points, np.full(s.points.shape, 0.5, np.float32), s.resolution_m) for s in surfaces]
+    pose = world.S_target_source
+    told = replace(_NONE, shift_m=0.02, field_power=0.0)
+    found = condition(*grey, pose, CovarianceParams(hidden=_NONE, hidden_grey=told))
+    bare = condition(*grey, pose, NOTHING_HIDDEN)
+    assert found.sway is None
+    assert swayed(grey[0], surfaces[1], pose, found.centroid, with_scale=False) is None
+    assert np.allclose(np.diag(found.of_scaled(1.0) - bare.of_scaled(1.0))[3:6], 0.02**2)
 
 
 def test_what_a_known_scale_reveals_of_the_sensors_widens_the_pose(world, surfaces):
@@ -293,9 +343,9 @@ def test_what_a_known_scale_reveals_of_the_sensors_widens_the_pose(world, surfac
     pose = world.S_target_source
     found = condition(target, source, pose)
     fits, swells = (found.known(pose, believed(off, 0.0)).sigmas for off in (0.0, 0.01))
-    assert swells[1] ** 2 - fits[1] ** 2 == pytest.approx((found.params.shift_by_swell * 0.01 * found.radius_m) ** 2)
+    assert swells[1] ** 2 - fits[1] ** 2 == pytest.approx((found.hidden.shift_by_swell * 0.01 * found.radius_m) ** 2)
     assert swells[0] > fits[0]
-    hidden = [found.of_rigid(scale, 0.01, 0.0) - found.of_rigid(scale, 0.0, 0.0) for scale in (1.0, 4.0)]
+    hidden = [found.of_rigid(s, 0.01, 0.0, None) - found.of_rigid(s, 0.0, 0.0, None) for s in (1.0, 4.0)]
     assert np.allclose(hidden[1][3:6, 3:6], hidden[0][3:6, 3:6] / 16)
 
 
@@ -338,6 +388,24 @@ def test_a_scale_some_percent_off_is_reached_from_a_pose_that_it_put_off(factor)
     assert not belief.rigid
     assert known.sigmas[2] == pytest.approx(belief.measured_sigma)
     assert belief.measured_sigma == belief.log_scale_sigma
+
+
+def test_an_edge_is_as_wide_as_its_colours_say():
+    """The whole way of a pair: colours of this world are off point by point, so they would move the pose a little."""
+    world = splat_world(3)
+    pair = MetricPair.of(world.target, world.source, Proposal("test", world.S_target_source, False, 50), Params())
+    sigmas = []
+    for share in (0.0, 50.0):
+        hidden = replace(NOTHING_HIDDEN, hidden=replace(_NONE, by_colour=share))
+        params = replace(Params(), covariance=hidden)
+        pose, known, belief = scaled_or_rigid(pair, world.S_target_source, params, with_scale=False)
+        assert belief.rigid
+        sigmas.append(known.sigmas)
+    surfaces = pair.target.surface(), pair.source.surface()
+    centroid = condition(*surfaces, pose, NOTHING_HIDDEN).centroid
+    sway = swayed(*surfaces, pose, centroid, with_scale=False)
+    told = 50 * np.sqrt((sway[3:6] ** 2).mean())
+    assert np.sqrt(sigmas[1][1] ** 2 - sigmas[0][1] ** 2) == pytest.approx(told, rel=0.1)
 
 
 def test_covariance_in_scene_units_scales_translations_only():
