@@ -117,7 +117,7 @@ class Params:
     cell_m: float = 0.5
     cover_m: float = 0.1
     ssim_weight: float = 0.2
-    passes: float = 4.0
+    passes: float = 5.0
     steps: int | None = None
     halo_m: float = 0.5
     reach_m: float = 10.0
