@@ -1,7 +1,7 @@
 """How levels of detail look from where they are meant to be seen, beside voxels and others' decimation.
 
     python tools/bench_levels.py CAPTURE.ply... [--splat-transform "node .../splat-transform -g cpu"]
-    python tools/bench_levels.py --tree COUNT
+    python tools/bench_levels.py --tree COUNT [--fit VIEWS STEPS]
 
 A level of a quarter of the Gaussians has half the detail of a surface: it is seen from twice as far, which is a picture
 of half the size; one of a sixteenth (6 %) from four times as far. PSNR against the capture's own render at that size,
@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmap import formats
-from gsmap.export.levels import make_level
+from gsmap.export.levels import Params, make_level
 from gsmap.export.tileset import write_tilesets
 from gsmap.formats import tiles3d
 from gsmap.geometry.decimate import decimate
@@ -45,9 +45,11 @@ def main() -> None:
     parser.add_argument("--tree", type=int, metavar="COUNT")
     parser.add_argument("--splat-transform", default="", metavar="COMMAND")
     parser.add_argument("--views", type=int, default=15)
+    parser.add_argument("--fit", type=int, nargs=2, metavar=("VIEWS", "STEPS"), help="of levels, other than by default")
     options = parser.parse_args()
+    params = Params(*options.fit) if options.fit else Params()
     if options.tree:
-        tree(options.tree)
+        tree(options.tree, params)
     for path in options.captures:
         g = formats.read(path)
         cameras = formats.read_cameras(path.with_suffix(".cameras.json"))
@@ -58,7 +60,7 @@ def main() -> None:
         for share, smaller in LEVELS:
             seen = cameras.resized(int(cameras.sizes_px[0].max()) // smaller)
             whole, count = pictures(g, seen), int(share * len(g))
-            report(f"{share:.0%} gsmap", lambda: make_level(g, count, others).gaussians, seen, whole)  # noqa: B023
+            report(f"{share:.0%} gsmap", lambda: make_level(g, count, others, params).gaussians, seen, whole)  # noqa: B023
             report(f"{share:.0%} gsmap, merged only", lambda: decimate(g, count)[0], seen, whole)  # noqa: B023
             report(f"{share:.0%} voxels", lambda: voxels(g, count), seen, whole)  # noqa: B023
             if options.splat_transform:
@@ -67,7 +69,7 @@ def main() -> None:
                     report(f"{share:.0%} splat-transform --{way}", made, seen, whole)
 
 
-def tree(count: int) -> None:
+def tree(count: int, params: Params) -> None:
     """The levels above tiles of 10 m, made of tiles that are made one by one."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
@@ -90,7 +92,7 @@ def tree(count: int) -> None:
         all_cameras = Cameras(poses, intrinsics, np.tile([320, 240], (len(poses), 1)))
         print(f"{count:,} Gaussians in {len(tiles)} tiles, {len(poses)} cameras", flush=True)
         before = cpu_s()
-        (file,) = write_tilesets(out, tiles, 10.0, cameras=lambda component: all_cameras)
+        (file,) = write_tilesets(out, tiles, 10.0, cameras=lambda component: all_cameras, levels=params)
         took = cpu_s() - before
         levels = [json.loads(file.read_text())["root"]]
         for node in levels:

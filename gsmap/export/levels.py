@@ -8,7 +8,9 @@ be like enough decides from how far the level is shown: that is its geometric er
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from gsmap.render import render
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Cameras, Gaussians
 
-VERSION = 1
+VERSION = 2
 """Raised whenever levels of the same tiles and cameras come out otherwise: they are then made again."""
 
 _SCREEN_PX = 16.0  # viewers of 3D Tiles refine what is off by more pixels than this, if not told otherwise
@@ -43,7 +45,7 @@ class Params:
     """
 
     views: int = 48
-    steps: int = 200
+    steps: int = 100
     deviation_px: float = 3.0
     least_db: float = 30.0
 
@@ -83,13 +85,25 @@ def make_level(finer: Gaussians, max_count: int, cameras: Cameras | None, params
     if views is None or len(start) == len(finer):
         return Level(start, apart)
     kept = np.arange(len(views)) % 4 == 3
-    depths = _depths(finer, views)
+    depths = _depths(start, views)  # it has the depths of what it stands for, at a fraction of the cost
     footprint = float(np.exp(np.median(start.log_scales.max(1)))) / params.deviation_px
     fitted = _fitted(start, finer, views[~kept], depths[~kept], footprint, params)
-    judged = _seen_at(views[kept], depths[kept], footprint)
-    level = max(fitted, start, key=lambda one: np.median(_decibels(one, finer, judged)))
-    shown, decibels = _measured(level, finer, views[kept], depths[kept], footprint, params.least_db)
+
+    @cache
+    def judges(footprint: float) -> list[_View]:
+        return [_View(camera, _picture(finer, camera)) for camera in _seen_at(views[kept], depths[kept], footprint)]
+
+    level = max(fitted, start, key=lambda one: np.median(_decibels(one, judges(footprint))))
+    shown, decibels = _measured(level, judges, footprint, params.least_db)
     return Level(level, _SCREEN_PX * shown, (float(decibels.min()), float(np.median(decibels))))
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A camera, and the picture (H, W, 3) that a level is to show there."""
+
+    camera: Cameras
+    picture: np.ndarray
 
 
 def _views(gaussians: Gaussians, cameras: Cameras, count: int) -> Cameras | None:
@@ -132,9 +146,9 @@ def _picture(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
     return picture
 
 
-def _decibels(level: Gaussians, finer: Gaussians, cameras: list[Cameras]) -> np.ndarray:
+def _decibels(level: Gaussians, views: list[_View]) -> np.ndarray:
     """(V,) PSNR of a level in each picture."""
-    errors = [np.mean((_picture(level, camera) - _picture(finer, camera)) ** 2) for camera in cameras]
+    errors = [np.mean((_picture(level, view.camera) - view.picture) ** 2) for view in views]
     return -10 * np.log10(np.maximum(errors, 1e-10))
 
 
@@ -158,14 +172,14 @@ def _fitted(
 
 
 def _measured(
-    level: Gaussians, finer: Gaussians, views: Cameras, depths: np.ndarray, footprint: float, least_db: float
+    level: Gaussians, judges: Callable[[float], list[_View]], footprint: float, least_db: float
 ) -> tuple[float, np.ndarray]:
     """The smallest footprint of a pixel at which every second view is like enough, and PSNR (V,) there.
 
     Looked for from half the given one to four times; where none is, the last.
     """
-    for size in footprint * 2.0 ** np.arange(-1, 3):
-        decibels = _decibels(level, finer, _seen_at(views, depths, size))
+    for size in (footprint * 2.0 ** np.arange(-1, 3)).tolist():
+        decibels = _decibels(level, judges(size))
         if np.median(decibels) >= least_db:
             break
-    return float(size), decibels
+    return size, decibels

@@ -348,9 +348,10 @@ class Map(AbstractContextManager["Map"]):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
             describe(self.store, unthinned(self.scenes()), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
+            # Poses may tell of new neighbours, and their edges of new poses.
             while solve(self.store, self.settings, self._progress):
-                # Scenes that now turn out to be neighbours.
-                register(self.store, "auto", self.settings, self._progress)
+                if not register(self.store, "auto", self.settings, self._progress):
+                    break
         return reports.update_report(self.store, ingested, self.metres())
 
     def set_prior(self, prior: Prior) -> PriorRow | None:

@@ -124,18 +124,19 @@ def render_references(
             counts &= ~disputed
         if counts.mean() < params.min_share:  # a weight is at most 1
             continue
+        window = _window(counts, params.margin_px)
         if shared is None and pieces[i] is scenes[i].gaussians:
-            local = seen
+            colour, alpha = seen.colour[0][window], seen.alpha[0][window]
         else:
-            local = render(pieces[i], camera, depth=False, dominant_id=False)
-        weight = local.alpha[0] * counts
-        share = float(weight.mean())
+            local = render(pieces[i], _cropped(camera, window), depth=False, dominant_id=False)
+            colour, alpha = local.colour[0], local.alpha[0]
+        weight = alpha * counts[window]
+        share = float(weight.sum() / counts.size)
         if share < params.min_share:
             continue
-        window = _window(weight, params.margin_px)
         cameras.append(_cropped(camera, window))
-        images.append(np.round(np.clip(local.colour[0][window], 0, 1) * 255).astype(np.uint8))
-        weights.append(np.round(np.clip(weight[window], 0, 1) * 255).astype(np.uint8))
+        images.append(np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8))
+        weights.append(np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8))
         kept.append(i)
         shares.append(share)
     return References(
@@ -194,13 +195,13 @@ def _count(
     np.maximum(largest, seen.max_weight, out=largest)
 
 
-def _window(weight: np.ndarray, margin_px: int) -> tuple[slice, slice]:
+def _window(counts: np.ndarray, margin_px: int) -> tuple[slice, slice]:
     """The part of a picture that counts, with a margin for windows of SSIM."""
     spans = []
     for axis in (1, 0):
-        used = np.flatnonzero(weight.any(axis=axis))
+        used = np.flatnonzero(counts.any(axis=axis))
         low, high = int(used[0]) - margin_px, int(used[-1]) + 1 + margin_px
-        spans.append(slice(max(0, low), min(weight.shape[1 - axis], high)))
+        spans.append(slice(max(0, low), min(counts.shape[1 - axis], high)))
     return spans[0], spans[1]
 
 

@@ -2,7 +2,9 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <stdexcept>
 #include <vector>
 
@@ -12,68 +14,6 @@
 
 namespace gsmap {
 namespace {
-
-constexpr int kTaps = 11, kReach = 5;
-
-// Structural similarity of one channel plane and its gradient with respect to a, both (height, width).
-class Ssim {
-  public:
-    Ssim(int width, int height) : width_(width), height_(height), size_(size_t(width) * height) {
-        for (auto &plane : planes_) plane.resize(size_);
-        spare_.resize(size_);
-    }
-
-    // Returns sum mask * ssim; adds scale * its gradient to g[3 * i].
-    double add(const float *a, const float *b, const float *mask, float scale, float *g) {
-        float *ma = planes_[0].data(), *mb = planes_[1].data(), *aa = planes_[2].data(), *bb = planes_[3].data(),
-              *ab = planes_[4].data();
-        rows([&](int64_t from, int64_t to) {
-            for (int64_t i = from; i < to; i++) {
-                const float x = a[3 * i], y = b[3 * i];
-                ma[i] = x, mb[i] = y, aa[i] = x * x, bb[i] = y * y, ab[i] = x * y;
-            }
-        });
-        for (auto &plane : planes_) blur(plane);
-        std::vector<double> sums(height_);
-        parallel_for(height_, [&](int64_t r) {
-            const int64_t o = r * width_;
-            sums[r] = kernels->ssim(ma + o, mb + o, aa + o, bb + o, ab + o, mask ? mask + o : nullptr, width_);
-        });
-        blur(planes_[0]), blur(planes_[2]), blur(planes_[4]);
-        rows([&](int64_t from, int64_t to) {
-            for (int64_t i = from; i < to; i++)
-                g[3 * i] += scale * (ma[i] + 2.f * a[3 * i] * aa[i] + b[3 * i] * ab[i]);
-        });
-        double sum = 0;
-        for (double s : sums) sum += s;
-        return sum;
-    }
-
-  private:
-    template <class Body> void rows(Body body) {
-        parallel_for(height_, [&](int64_t r) { body(r * width_, (r + 1) * width_); });
-    }
-    void blur(std::vector<float> &plane) {  // zeros outside the image
-        parallel_for(height_, [&](int64_t r) {
-            std::vector<float> padded(width_ + 2 * kReach);
-            std::memcpy(padded.data() + kReach, &plane[r * width_], width_ * sizeof(float));
-            const float *from[kTaps];
-            for (int j = 0; j < kTaps; j++) from[j] = padded.data() + j;
-            kernels->blur(from, &spare_[r * width_], width_);
-        });
-        parallel_for(height_, [&](int64_t r) {
-            const float *from[kTaps];
-            for (int j = 0; j < kTaps; j++) {
-                const int64_t y = r + j - kReach;
-                from[j] = y < 0 || y >= height_ ? nullptr : &spare_[y * width_];
-            }
-            kernels->blur(from, &plane[r * width_], width_);
-        });
-    }
-    int width_, height_;
-    size_t size_;
-    std::vector<float> planes_[5], spare_;
-};
 
 // (1 - s) * L1 + s * (1 - SSIM), means over pixels weighed by mask (H, W); writes the gradient (H, W, 3).
 double image_loss(const Floats &image, const Floats &target, const std::optional<Floats> &mask, float ssim_weight,
@@ -101,9 +41,15 @@ double image_loss(const Floats &image, const Floats &target, const std::optional
     for (double s : sums) l1 += s;
     double loss = (1 - ssim_weight) * l1 * per_value;
     if (ssim_weight > 0) {
-        Ssim ssim(width, height);
+        const int64_t bands = height / 64 < num_threads() ? std::max(height / 64, 1) : num_threads();
+        parallel_for(bands, [&](int64_t band) {
+            static thread_local Buffer<float> scratch;
+            const int from = int(height * band / bands), to = int(height * (band + 1) / bands);
+            kernels->ssim({a, b, m, width, height, from, to, float(-ssim_weight * per_value), g, sums.data()},
+                          scratch.reserve(size_t(ssim_scratch(width))));
+        });
         double similar = 0;
-        for (int c = 0; c < 3; c++) similar += ssim.add(a + c, b + c, m, float(-ssim_weight * per_value), g + c);
+        for (double s : sums) similar += s;
         loss += ssim_weight * (1 - similar * per_value);
     }
     return loss;

@@ -83,6 +83,20 @@ struct AdamStep {
     uint32_t *updates;         // (N,) how often each Gaussian was updated
 };
 
+constexpr int kSsimTaps = 11, kSsimReach = 5, kSsimPad = 16;  // the pad holds the reach of three channels, and a vector
+
+// Rows [from, to) of sum mask * ssim over an image's values: (height, width, 3) a and b, (height, width) mask or null.
+struct SsimTask {
+    const float *a, *b, *mask;
+    int width, height, from, to;
+    float scale;
+    float *gradient;  // with respect to a, times scale: added to
+    double *sums;     // (height,) one for each row
+};
+
+__attribute__((always_inline)) inline int64_t ssim_stride(int width) { return (3 * int64_t(width) + 15) / 16 * 16 + 3 * kSsimPad; }
+__attribute__((always_inline)) inline int64_t ssim_scratch(int width) { return (5 * kSsimTaps + 6) * ssim_stride(width); }
+
 // One set of these per instruction set.
 struct Kernels {
     const char *name;
@@ -101,11 +115,8 @@ struct Kernels {
     void (*adam)(const AdamArrays &, const AdamStep &, int64_t begin, int n, const uint8_t *touched, float *gradient);
     // One row of pixels of weight * sum mask |a - b|: adds its gradient to g, returns the sum. mask may be null.
     float (*l1)(const float *a, const float *b, const float *mask, int pixels, float weight, float *g);
-    // out[i] = sum_j kBlurTaps[j] rows[j][i], 11 rows, null for zeros; n values, which may overlap (a blur along a row).
-    void (*blur)(const float *const *rows, float *out, int n);
-    // Sum of the structural similarity over n values from blurred a, b, aa, bb, ab; overwrites the first three with the
-    // derivatives of that sum with respect to blurred a, aa and ab, times mask[i] (or 1).
-    float (*ssim)(float *a, const float *b, float *aa, const float *bb, float *ab, const float *mask, int n);
+    // Structural similarity of some rows of two images, and its gradient. Scratch: ssim_scratch(width) floats.
+    void (*ssim)(const SsimTask &, float *scratch);
     // One correspondence against those after it: which agree, and which bin of log scales each pair votes for (or -1).
     void (*agree)(const Correspondences &, int i, const AgreeTest &, uint8_t *ok);
     void (*vote)(const Correspondences &, int i, const VoteTest &, int32_t *bin);

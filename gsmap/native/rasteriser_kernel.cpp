@@ -12,6 +12,6 @@
 
 static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend, GSMAP_ISA::blend_limit,
                                      GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
-                                     GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::blur, GSMAP_ISA::ssim, GSMAP_ISA::agree,
+                                     GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::ssim, GSMAP_ISA::agree,
                                      GSMAP_ISA::vote};
 const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;

@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import LargeBinary, Text
@@ -24,6 +25,7 @@ KINDS = ("scenes", "graphs", "changes", "indexes", "views", "photos")
 """Of groups of arrays: the folders below ``arrays``."""
 
 
+@lru_cache(maxsize=1 << 16)  # the same ids are read again and again
 def is_digest(text: str) -> bool:
     """Whether a text is 32 or 64 hex digits."""
     return _DIGEST.fullmatch(text) is not None

@@ -6,15 +6,16 @@ import torch
 import torch.nn.functional as F
 from test_render_parity import random_scene
 
+from gsmap._native import image_loss
 from gsmap.errors import InputError
-from gsmap.render import Fitter, GaussianTensors, LearningRates, render, set_num_threads
+from gsmap.render import Fitter, GaussianTensors, LearningRates, native, render, set_num_threads
 from gsmap.types import Gaussians
 
 
 def structural_similarity(a, b):
     """Wang et al. 2004 with zero padding, mean over pixels and channels."""
     tap = torch.exp(-((torch.arange(11) - 5.0) ** 2) / (2 * 1.5**2))
-    window = (tap[:, None] * tap / tap.sum() ** 2).expand(3, 1, 11, 11)
+    window = (tap[:, None] * tap / tap.sum() ** 2).to(a.dtype).expand(3, 1, 11, 11)
     a, b = a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None]
     blur = lambda x: F.conv2d(x, window, padding=5, groups=3)  # noqa: E731
     ma, mb = blur(a), blur(b)
@@ -59,6 +60,30 @@ def test_steps_equal_torch_adam(ssim_weight):
     assert np.abs(moved.sh - torch.cat([base, rest], 1).detach().numpy())[seen].max() < 1e-5
     # Gaussians behind the camera stay exactly where they were
     assert np.array_equal(moved.means[:20], gaussians.means[:20])
+
+
+@pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 3), (200, 37)])
+def test_the_loss_of_an_image_and_its_gradient_are_torch_s_whatever_cuts_it_into_bands(isa, height, width):
+    if native.use_instruction_set(isa) != isa:
+        pytest.skip(f"this machine has no {isa}")
+    try:
+        rng = np.random.default_rng(width)
+        ours, wanted = rng.uniform(size=(2, height, width, 3)).astype(np.float32)
+        found = []
+        for threads in (1, 3):
+            set_num_threads(threads)
+            gradient = np.empty_like(ours)
+            found.append((image_loss(ours, wanted, None, 1.0, gradient), gradient))
+    finally:
+        set_num_threads()
+        native.use_instruction_set("best")
+    image = torch.from_numpy(ours).double().requires_grad_()
+    loss = 1 - structural_similarity(image, torch.from_numpy(wanted).double())
+    loss.backward()
+    assert found[0][0] == found[1][0] == pytest.approx(loss.item(), abs=1e-5)
+    assert np.array_equal(found[0][1], found[1][1])
+    assert np.abs(found[0][1] - image.grad.numpy()).max() < 1e-4 * image.grad.abs().max().item()
 
 
 def test_fit_brings_back_the_image_and_leaves_frozen_ones_alone():

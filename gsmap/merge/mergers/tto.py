@@ -28,7 +28,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 3
+VERSION = 4
 STEPS: str | None = "steps"
 RENDERS = True
 
@@ -37,7 +37,7 @@ _BESIDE_M = 0.025  # of what changed, within which no other capture's Gaussians 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's first steps, for Gaussians that are nearly right.
+    """Adam's first steps, for Gaussians that are nearly right: as long as pays within the passes (`tools/bench_fit.py`).
 
     Args:
         means: of positions, as a share of the Gaussians' median size.
@@ -49,11 +49,11 @@ class Rates:
         last: the last step as a share of the first, reached exponentially.
     """
 
-    means: float = 0.035
-    quats: float = 2e-3
-    log_scales: float = 1e-2
-    logit_opacities: float = 5e-2
-    sh_base: float = 5e-3
+    means: float = 0.07
+    quats: float = 4e-3
+    log_scales: float = 2e-2
+    logit_opacities: float = 0.25
+    sh_base: float = 4e-2
     sh_rest: float = 5e-3
     last: float = 0.1
 
@@ -117,9 +117,9 @@ class Params:
     cell_m: float = 0.5
     cover_m: float = 0.1
     ssim_weight: float = 0.2
-    passes: float = 6.0
+    passes: float = 5.0
     steps: int | None = None
-    halo_m: float = 1.0
+    halo_m: float = 0.5
     reach_m: float = 10.0
     min_cameras: int = 12
     longest_side_px: int = 960
