@@ -20,6 +20,7 @@ from gsmap.geometry.cells import cell_labels, group_means
 
 _CELL_M = 0.05  # of the surface in which planes are looked for
 _NORMAL_OF = 12  # cells
+_ASKED = 5
 _BESIDE_M = 0.15  # of what changed, within which small pieces are left over
 
 
@@ -111,6 +112,7 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     label = components(doubts.points[weak], params.reach_m, thing[weak])
     tied = np.bincount(label, doubts.changed[weak]) >= params.kin_share * np.bincount(label)
     out[weak[tied[label]]] = True
+    out[_with_most(doubts, of_these, out)] = True
     left = of_these[~out[of_these]]
     if len(left):
         label = components(doubts.points[left], params.link_m, thing[left])
@@ -120,3 +122,16 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
         near = np.isfinite(cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=_BESIDE_M)[0])
         out[left[small[label] & near]] = True
     return out
+
+
+def _with_most(doubts: Doubts, these: np.ndarray, changed: np.ndarray) -> np.ndarray:
+    """Those rows of things that nobody judged, as something new hides them, where most that was judged about them has
+    changed: the inside of what was replaced."""
+    judged, hidden = these[doubts.judged[these]], these[~doubts.judged[these]]
+    if not len(judged) or not len(hidden):
+        return hidden[:0]
+    count = min(_ASKED, len(judged))
+    reach = {"k": count, "distance_upper_bound": _BESIDE_M}
+    near = cKDTree(doubts.points[judged]).query(doubts.points[hidden], **reach)[1].reshape(len(hidden), count)
+    known = np.append(np.where(changed[judged], 1, -1), 0)
+    return hidden[known[near].sum(1) > 0]
