@@ -97,7 +97,7 @@ class Tally:
         painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= params.root_colour) & (differs >= 1)
         # What one can look through is no wall.
         shell = np.where(state == GONE, -1, shell)
-        doubts = Doubts(points, shell, state >= REPAINTED, gone | painted, state >= SAME, differs)
+        doubts = Doubts(points, shell, state >= REPAINTED, gone | painted, state >= SAME, state == HIDDEN, differs)
         _weigh(state, unchanged, doubts, params)
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
@@ -166,4 +166,4 @@ def _weigh(state: np.ndarray, unchanged: np.ndarray, doubts: Doubts, params: Par
     """States after whole things have been weighed; ``unchanged`` (N,) are those of what turns out not to have."""
     stands = rooted(doubts, params)
     state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]
-    state[kin(replace(doubts, changed=stands), params) & ~stands] = REPAINTED
+    state[kin(replace(doubts, changed=stands), params) & (state < REPAINTED)] = REPAINTED

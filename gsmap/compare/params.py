@@ -30,7 +30,8 @@ class Params:
         neighbours: at most so many of them.
         reach_m: changed Gaussians nearer to each other than this, on one wall or on none, are one change,
         min_roots, root_share: which so many of them, and this share, must prove: looked through more than once, or in
-        root_colour: another colour by this multiple of what counts. What proves it itself needs no more than to lie
+        root_colour: another colour by this multiple of what counts. What proves it itself, or differs by
+        alone_colour: that multiple whatever its neighbours do, needs no more than to lie
         about_m: as near to such a change.
         link_m: Gaussians of one thing.
         kin_share: of a thing of which this share has changed,
@@ -59,7 +60,8 @@ class Params:
     min_roots: int = 5
     root_share: float = 0.2
     root_colour: float = 2.0
-    about_m: float = 0.3
+    alone_colour: float = 4.0
+    about_m: float = 0.35
     link_m: float = 0.08
     kin_share: float = 0.2
     kin_colour: float = 0.2

@@ -64,6 +64,7 @@ class Doubts:
         changed: (N,) bool, taken for gone or repainted.
         sure: (N,) bool, those of them that are beyond doubt.
         judged: (N,) bool, seen by the other capture.
+        hidden: (N,) bool, behind what the other capture shows.
         differs: (N,) of the colour, as a multiple of what counts.
     """
 
@@ -72,20 +73,25 @@ class Doubts:
     changed: np.ndarray
     sure: np.ndarray
     judged: np.ndarray
+    hidden: np.ndarray
     differs: np.ndarray
 
 
 def rooted(doubts: Doubts, params: Params) -> np.ndarray:
-    """(N,) bool, which of the changed belong to a change, on one wall or on none, that has roots: enough of it is
-    beyond doubt. Light that a new colour throws on the next wall has none, nor has what is off at an edge."""
+    """(N,) bool, what belongs to a change, on one wall or on none, that has roots: enough of it is beyond doubt.
+
+    Light that a new colour throws on the next wall has none, nor has what is off at an edge. A change ends a few
+    Gaussians beyond what was taken for its wall, loose ones stand about it, and where they are large they have no
+    neighbours to ask: what is beyond doubt alone needs to be near.
+    """
     rows = np.flatnonzero(doubts.changed)
     label = components(doubts.points[rows], params.reach_m, doubts.shell[rows])
     size = np.bincount(label)
     roots = np.bincount(label, doubts.sure[rows])
     out = np.zeros(len(doubts.changed), dtype=bool)
     out[rows] = ((roots >= params.min_roots) & (roots >= params.root_share * size))[label]
-    # A change ends in the corner, a few Gaussians beyond what was taken for its wall, and loose ones stand about it.
-    beyond, found = rows[~out[rows] & doubts.sure[rows]], rows[out[rows]]
+    alone = (doubts.changed & doubts.sure) | (doubts.differs >= params.alone_colour)
+    beyond, found = np.flatnonzero(alone & ~out), np.flatnonzero(out)
     while len(beyond) and len(found):
         near = cKDTree(doubts.points[found]).query(doubts.points[beyond], distance_upper_bound=params.about_m)[0]
         found, beyond = beyond[np.isfinite(near)], beyond[np.isinf(near)]
@@ -102,6 +108,9 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     thing[loose] = components(doubts.points[loose], params.link_m)
     count = int(thing.max(initial=-1)) + 1
     out = doubts.changed.copy()
+    for wall in np.unique(doubts.shell[out & (doubts.shell >= 0)]):
+        on, hidden = doubts.judged & (doubts.shell == wall), doubts.hidden & (doubts.shell == wall)
+        out[_with_most(doubts, on, hidden & ~out, out, params.about_m)] = True
     if not count:
         return out
     judged = np.bincount(thing[loose], doubts.judged[loose], count)
@@ -112,7 +121,9 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     label = components(doubts.points[weak], params.reach_m, thing[weak])
     tied = np.bincount(label, doubts.changed[weak]) >= params.kin_share * np.bincount(label)
     out[weak[tied[label]]] = True
-    out[_with_most(doubts, of_these, out)] = True
+    mine = np.zeros(len(out), dtype=bool)
+    mine[of_these] = True
+    out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, _BESIDE_M)] = True
     left = of_these[~out[of_these]]
     if len(left):
         label = components(doubts.points[left], params.link_m, thing[left])
@@ -124,14 +135,15 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     return out
 
 
-def _with_most(doubts: Doubts, these: np.ndarray, changed: np.ndarray) -> np.ndarray:
-    """Those rows of things that nobody judged, as something new hides them, where most that was judged about them has
-    changed: the inside of what was replaced."""
-    judged, hidden = these[doubts.judged[these]], these[~doubts.judged[these]]
-    if not len(judged) or not len(hidden):
-        return hidden[:0]
-    count = min(_ASKED, len(judged))
-    reach = {"k": count, "distance_upper_bound": _BESIDE_M}
-    near = cKDTree(doubts.points[judged]).query(doubts.points[hidden], **reach)[1].reshape(len(hidden), count)
-    known = np.append(np.where(changed[judged], 1, -1), 0)
-    return hidden[known[near].sum(1) > 0]
+def _with_most(
+    doubts: Doubts, judged: np.ndarray, others: np.ndarray, changed: np.ndarray, reach_m: float
+) -> np.ndarray:
+    """Rows of others, that nobody judged as something new hides them, where most that was judged about them has
+    changed: the inside of what was replaced, the rest of a painted wall. All masks are (N,)."""
+    asked, rows = np.flatnonzero(judged), np.flatnonzero(others)
+    if not len(asked) or not len(rows):
+        return rows[:0]
+    count = min(_ASKED, len(asked))
+    near = cKDTree(doubts.points[asked]).query(doubts.points[rows], count, distance_upper_bound=reach_m)[1]
+    known = np.append(np.where(changed[asked], 1, -1), 0)
+    return rows[known[near.reshape(len(rows), count)].sum(1) > 0]
