@@ -57,13 +57,13 @@ class Params:
     cell_m: float = 0.12
     neighbours: int = 16
     reach_m: float = 0.1
-    min_roots: int = 5
+    min_roots: int = 8
     root_share: float = 0.2
     root_colour: float = 2.0
     alone_colour: float = 4.0
     about_m: float = 0.35
     link_m: float = 0.08
-    kin_share: float = 0.2
+    kin_share: float = 0.1
     kin_colour: float = 0.2
     most_left: float = 0.08
 

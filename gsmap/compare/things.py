@@ -108,9 +108,10 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     thing[loose] = components(doubts.points[loose], params.link_m)
     count = int(thing.max(initial=-1)) + 1
     out = doubts.changed.copy()
-    for wall in np.unique(doubts.shell[out & (doubts.shell >= 0)]):
+    for wall in np.unique(doubts.shell[out & doubts.judged & (doubts.shell >= 0)]):
         on, hidden = doubts.judged & (doubts.shell == wall), doubts.hidden & (doubts.shell == wall)
-        out[_with_most(doubts, on, hidden & ~out, out, params.about_m)] = True
+        if out[on].mean() >= params.kin_share:
+            out[_with_most(doubts, on, hidden & ~out, out, params.about_m)] = True
     if not count:
         return out
     judged = np.bincount(thing[loose], doubts.judged[loose], count)
