@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from change_truth import VOXEL_M, Truth, changed_voxels, looked_through, observed, owners
+from change_truth import VOXEL_M, Truth, changed_voxels, looked_through, observed, owners, projected
 from scipy.spatial import cKDTree
 
 from gsmap.geometry.transforms import transform_gaussians
@@ -241,7 +241,9 @@ def score_drops(truth: Truth, newest: str, older: str, dropped: np.ndarray) -> d
     Returns:
         ``gone``: of those on things that went (disappeared, moved, replaced) where the newest looked, the share
         dropped; ``painted``: of those on what was painted; ``false``: of those on what stayed and more than 10 cm from
-        any thing that changed; and how many each is a share of (``n_gone, n_painted, n_false``).
+        any thing that changed; ``false_unlit``: of these without those that the two captures' photographs show in two
+        colours, as what was painted or taken away near by lights them otherwise; and how many each is a share of
+        (``n_gone, n_painted, n_false, n_false_unlit``).
     """
     means = truth.gaussians(older).means
     owner, seen = owners(truth, older, means), observed(truth, newest, means)
@@ -259,8 +261,40 @@ def score_drops(truth: Truth, newest: str, older: str, dropped: np.ndarray) -> d
         "painted": np.isin(owner, painted) & seen,
         "false": (owner >= 0) & ~near,
     }
+    picks["false_unlit"] = picks["false"].copy()
+    wrong = np.flatnonzero(picks["false"] & dropped)
+    picks["false_unlit"][wrong] = ~lit_otherwise(truth, older, newest, means[wrong])
     out = {name: float(dropped[p].mean()) if p.any() else float("nan") for name, p in picks.items()}
     return out | {f"n_{name}": int(p.sum()) for name, p in picks.items()}
+
+
+_LIT = 0.035  # difference of colour, of [0, 1] and exposure balanced, that photographs of one surface seldom have
+
+
+def lit_otherwise(truth: Truth, older: str, newest: str, points: np.ndarray) -> np.ndarray:
+    """(n,) whether the photographs of two captures show points on surfaces that stayed in two colours."""
+    shown = [photographed(truth, time, points) for time in (older, newest)]
+    seen = np.isfinite(shown[0]).all(1) & np.isfinite(shown[1]).all(1)
+    # Exposure: the median ratio over the capture's own surfaces.
+    sample = truth.gaussians(older).means[::20]
+    a, b = (photographed(truth, time, sample) for time in (older, newest))
+    gain = np.nanmedian(b / np.maximum(a, 0.02), axis=0)
+    out = np.zeros(len(points), bool)
+    out[seen] = np.abs(shown[1][seen] - shown[0][seen] * gain).max(1) > _LIT
+    return out
+
+
+def photographed(truth: Truth, time: str, points: np.ndarray) -> np.ndarray:
+    """(n, 3) mean colour in [0, 1] of points in the photographs of a capture that see them, NaN where none does."""
+    views, photographs = truth.views(time), truth.photographs(time)
+    total, count = np.zeros((len(points), 3)), np.zeros(len(points))
+    for row, pixels, depth in projected(truth.cameras(time), points):
+        at = pixels[:, 1], pixels[:, 0]
+        on = (pixels >= 0).all(1) & (np.abs(depth - views.depths_m[row][at]) < 0.05)
+        total[on] += photographs[row][at][on]
+        count[on] += 1
+    with np.errstate(invalid="ignore"):
+        return np.where(count[:, None] > 0, total / count[:, None], np.nan)
 
 
 def score_ghosts(truth: Truth, newest: str, older: str, merged_means: np.ndarray) -> dict[str, float]:

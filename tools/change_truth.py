@@ -101,7 +101,7 @@ class Truth:
 def observed(truth: Truth, time: str, points: np.ndarray) -> np.ndarray:
     """(n,) whether a capture looked at points or through them."""
     views, seen = truth.views(time), np.zeros(len(points), bool)
-    for row, pixels, depth in _projected(truth.cameras(time), points):
+    for row, pixels, depth in projected(truth.cameras(time), points):
         at = views.depths_m[row][pixels[:, 1], pixels[:, 0]]
         seen |= (depth > 0.05) & (depth < at + _SEEN_M) & (pixels >= 0).all(1)
     return seen
@@ -111,7 +111,7 @@ def looked_through(truth: Truth, time: str, points: np.ndarray) -> np.ndarray:
     """(n,) whether a capture saw a surface clearly behind points, and none at them."""
     views = truth.views(time)
     through, on = np.zeros(len(points), bool), np.zeros(len(points), bool)
-    for row, pixels, depth in _projected(truth.cameras(time), points):
+    for row, pixels, depth in projected(truth.cameras(time), points):
         gap = views.depths_m[row][pixels[:, 1], pixels[:, 0]] - depth
         inside = (pixels >= 0).all(1)
         through |= inside & (gap > 2 * _SEEN_M)
@@ -123,7 +123,7 @@ def owners(truth: Truth, time: str, points: np.ndarray) -> np.ndarray:
     """(n,) ids of the objects that points of a capture (its Gaussians' means, say) lie on, by its own views."""
     views = truth.views(time)
     votes = np.zeros((len(points), max(s["id"] for s in truth.states(time)) + 1), np.uint16)
-    for row, pixels, depth in _projected(truth.cameras(time), points):
+    for row, pixels, depth in projected(truth.cameras(time), points):
         ids = views.ids[row][pixels[:, 1], pixels[:, 0]]
         on = np.abs(depth - views.depths_m[row][pixels[:, 1], pixels[:, 0]]) < _SEEN_M
         rows = np.flatnonzero(on & (ids >= 0) & (pixels >= 0).all(1))
@@ -131,7 +131,7 @@ def owners(truth: Truth, time: str, points: np.ndarray) -> np.ndarray:
     return np.where(votes.any(1), votes.argmax(1), -1)
 
 
-def _projected(cameras: Cameras, points: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def projected(cameras: Cameras, points: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """For each camera its row, the pixels (n, 2) that points fall on, -1 where outside, and their depths (n,)."""
     for row in range(len(cameras)):
         T = np.linalg.inv(cameras.T_frame_camera[row])

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.change.components import components
+from gsmap.compare.components import components
 from gsmap.change.params import Params
 from gsmap.change.poses import about_up, features, settled, voted
 from gsmap.change.sides import Side

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.change.components import components, groups
+from gsmap.compare.components import components, groups
 from gsmap.change.params import Params
 from gsmap.change.sides import Side
-from gsmap.change.structure import planes
+from gsmap.compare.structure import planes
 from gsmap.geometry.cells import cell_labels
 
 _SMOOTH_M = 0.08  # neighbours that a cell asks

@@ -10,6 +10,7 @@ from gsmap.compare.colours import Balance, balance, differ
 from gsmap.compare.evidence import Evidence, Tally
 from gsmap.compare.looks import Looks, Placed, View, place, view_of
 from gsmap.compare.params import Params
+from gsmap.compare.things import shells
 from gsmap.render import render
 from gsmap.types import Gaussians
 
@@ -88,9 +89,11 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             at = place(of.gaussians.means, picture.own, params.nearest_m)
             _count(judged, at, picture, sure, tolerance)
             _count_colour(judge, own, picture, tolerance)
+    both = older, newer
+    walls = shells([(one.gaussians.means, one.surface) for one in both])
     evidence = [
-        tally.evidence(one.gaussians.means, one.surface, line, params)
-        for tally, one in zip(tallies, (older, newer), strict=True)
+        tally.evidence(one.gaussians.means, one.surface, shell, len(other.views), line, params)
+        for tally, one, other, shell in zip(tallies, both, both[::-1], walls, strict=True)
     ]
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
 

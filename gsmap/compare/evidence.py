@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmap.compare.colours import Balance, limits
 from gsmap.compare.params import Params
+from gsmap.compare.things import Doubts, kin, rooted
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
@@ -61,12 +62,22 @@ class Tally:
         self.chroma = np.zeros((count, 2), dtype=np.float32)
         self.lightness = np.zeros(count, dtype=np.float32)
 
-    def evidence(self, points: np.ndarray, shows: np.ndarray, line: Balance, params: Params) -> Evidence:
-        """The counts and what they come to; ``shows`` (N,) says which Gaussians are part of a surface and vote."""
+    def evidence(
+        self, points: np.ndarray, shows: np.ndarray, shell: np.ndarray, views: int, line: Balance, params: Params
+    ) -> Evidence:
+        """The counts and what they come to.
+
+        Args:
+            points: (N, 3) of the Gaussians.
+            shows: (N,) which of them are part of a surface and vote.
+            shell: (N,) wall, floor or ceiling that each is part of; see `gsmap.compare.things.shells`.
+            views: how many the other capture has.
+        """
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
         near = _Neighbours(points, shows, params)
         state = self._geometry(near, params)
+        unchanged = np.where(state == GONE, np.int8(SAME), state)
         # What is near the other's surface, yet part of a thing that stood before it, is no part of that surface.
         beside = near.sums((state == GONE).astype(np.int32)) >= 2
         state[(state == SAME) & (self.covered > self.colour_seen) & (beside | (self.through >= 1))] = GONE
@@ -74,12 +85,20 @@ class Tally:
         seen = same & (self.colour_seen >= 1) & shows
         limit = limits(line, params)
         differs = np.maximum(np.abs(chroma).max(1) / limit[0], np.abs(lightness) / limit[1])
-        state[same & (near.mean(np.where(seen, differs, 0), seen) >= 1) & (differs >= _PART)] = REPAINTED
+        around = near.mean(np.where(seen, differs, 0), seen)
+        state[same & (around >= 1) & (differs >= _PART)] = REPAINTED
         # What differs less, and alone, is noise; beside what is sure it is its border.
         for _ in range(_ROUNDS):
             beside = near.sums((state >= REPAINTED).astype(np.int32)) >= _BORDER * np.maximum(near.count, 1)
             state[(state == SAME) & beside & (differs >= _PART)] = REPAINTED
         _follow(state, near, self.grazed > 0, self.colour_seen < params.min_views)
+        looks = min(params.min_views, views)
+        gone = (state == GONE) & (self.through >= looks) & ((self.sure >= 1) | (self.on_surface == 0))
+        painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= params.root_colour) & (differs >= 1)
+        # What one can look through is no wall.
+        shell = np.where(state == GONE, -1, shell)
+        doubts = Doubts(points, shell, state >= REPAINTED, gone | painted, state >= SAME, state == HIDDEN, differs)
+        _weigh(state, unchanged, doubts, params)
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
 
@@ -141,3 +160,10 @@ def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray, doubtful: 
     state[(state < SAME) & grazed & ~(sure & (most == 0))] = GONE
     sure &= most > 0
     state[open_ & sure] = np.array([SAME, REPAINTED, GONE], dtype=np.int8)[most[open_ & sure]]
+
+
+def _weigh(state: np.ndarray, unchanged: np.ndarray, doubts: Doubts, params: Params) -> None:
+    """States after whole things have been weighed; ``unchanged`` (N,) are those of what turns out not to have."""
+    stands = rooted(doubts, params)
+    state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]
+    state[kin(replace(doubts, changed=stands), params) & (state < REPAINTED)] = REPAINTED

@@ -28,6 +28,15 @@ class Params:
             own differences, which are large where one was lit otherwise.
         cell_m: Gaussians that near vote together,
         neighbours: at most so many of them.
+        reach_m: changed Gaussians nearer to each other than this, on one wall or on none, are one change,
+        min_roots, root_share: which so many of them, and this share, must prove: looked through more than once, or in
+        root_colour: another colour by this multiple of what counts. What proves it itself, or differs by
+        alone_colour: that multiple whatever its neighbours do, needs no more than to lie
+        about_m: as near to such a change.
+        link_m: Gaussians of one thing.
+        kin_share: of a thing of which this share has changed,
+        kin_colour: what differs by this multiple of what counts, and is tied to it, has changed too,
+        most_left: and so have pieces of at most this share of what changed.
     """
 
     longest_side_px: int = 240
@@ -47,9 +56,19 @@ class Params:
     lightness_spreads: float = 5.0
     cell_m: float = 0.12
     neighbours: int = 16
+    reach_m: float = 0.1
+    min_roots: int = 8
+    root_share: float = 0.2
+    root_colour: float = 2.0
+    alone_colour: float = 4.0
+    about_m: float = 0.35
+    link_m: float = 0.08
+    kin_share: float = 0.1
+    kin_colour: float = 0.2
+    most_left: float = 0.08
 
     def __post_init__(self) -> None:
-        for name in ("longest_side_px", "max_views", "min_views", "cell_m", "least_tolerance_m"):
+        for name in ("longest_side_px", "max_views", "min_views", "cell_m", "least_tolerance_m", "reach_m", "link_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("min_alpha", "min_share"):

@@ -12,7 +12,7 @@ import numpy as np
 from gsmap import compare
 from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
 from gsmap.geometry.sh import sh0_of_rgb
-from gsmap.merge.exposure import apply_gain
+from gsmap.merge.exposure import apply_balance
 from gsmap.merge.placed import overlapping, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
@@ -101,7 +101,7 @@ def settle(
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
     changed = [np.zeros(len(s.gaussians), dtype=bool) for s in scenes]
     rivals = [_none(s) for s in scenes]
-    gains = np.ones((len(scenes), 3))
+    exposures: list[compare.Balance | None] = [None] * len(scenes)
     truth: list[_Standing] = []
     for group in _by_date(scenes) if prefer != "both" else []:
         added = []
@@ -114,10 +114,10 @@ def settle(
             joined = compare.joined([(one.looks, one.shows) for one in parts], scenes[i], params)
             found = compare.compare(looks, joined, params)
             verdict = _verdict(looks, joined, found, prefer)
-            gains[i] = _gains(found)
+            exposures[i] = _exposure(found)
             keeps[i] &= ~verdict.lost
             if prefer == "newest":
-                keeps[i] &= ~_intruders(apply_gain(looks.gaussians, gains[i]), keeps[i], joined, found, verdict)
+                keeps[i] &= ~_intruders(_exposed(looks.gaussians, exposures[i]), keeps[i], joined, found, verdict)
             first = 0
             for one in parts:
                 rows = np.flatnonzero(one.shows)
@@ -129,10 +129,10 @@ def settle(
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
             # Truth grows by what is new to it alone, so that it stays as large as the place.
             shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
-            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), gains[i]), shows))
+            added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), exposures[i]), shows))
         truth += added
     return Settled(
-        [_left(s, k, gain if one_exposure else np.ones(3)) for s, k, gain in zip(scenes, keeps, gains, strict=True)],
+        [_left(s, k, e if one_exposure else None) for s, k, e in zip(scenes, keeps, exposures, strict=True)],
         [int((~k).sum()) for k in keeps],
         [c[k] for c, k in zip(changed, keeps, strict=True)],
         rivals,
@@ -216,22 +216,26 @@ def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Compari
     return out
 
 
-def _gains(found: Comparison) -> np.ndarray:
-    """(3,) by which the older's colours are multiplied, so that the place shows in one exposure: the newest's."""
-    gains = found.balance.gains()
-    return gains if np.abs(np.log(gains)).max() > _NEGLIGIBLE_GAIN else np.ones(3)
+def _exposure(found: Comparison) -> compare.Balance | None:
+    """What brings the older's colours to the newest's exposure, so that the place shows in one; None for nothing."""
+    greys = np.tile(np.array([[0.1], [0.5], [0.9]]), 3)
+    off = np.log(np.maximum(found.balance.applied(greys), 1e-3) / greys)
+    return found.balance if np.abs(off).max() > _NEGLIGIBLE_GAIN else None
 
 
-def _left(scene: PlacedScene, stays: np.ndarray, gains: np.ndarray) -> PlacedScene:
-    if stays.all() and (gains == 1).all():
+def _exposed(gaussians: Gaussians, exposure: compare.Balance | None) -> Gaussians:
+    return gaussians if exposure is None else apply_balance(gaussians, exposure)
+
+
+def _left(scene: PlacedScene, stays: np.ndarray, exposure: compare.Balance | None) -> PlacedScene:
+    if stays.all() and exposure is None:
         return scene
-    gaussians = scene.gaussians[stays]
     # Its views as they were rendered before show what is gone.
-    return replace(scene, sights=None, gaussians=gaussians if (gains == 1).all() else apply_gain(gaussians, gains))
+    return replace(scene, sights=None, gaussians=_exposed(scene.gaussians[stays], exposure))
 
 
-def _in_one_exposure(looks: Looks, gains: np.ndarray) -> Looks:
-    return replace(looks, scene=_left(looks.scene, np.ones(len(looks.gaussians), dtype=bool), gains))
+def _in_one_exposure(looks: Looks, exposure: compare.Balance | None) -> Looks:
+    return replace(looks, scene=_left(looks.scene, np.ones(len(looks.gaussians), dtype=bool), exposure))
 
 
 def _share_of_pixels(these: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:

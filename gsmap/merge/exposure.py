@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.geometry.sh import SH_C0
+from gsmap.compare import Balance
+from gsmap.compare.colours import FLOOR
+from gsmap.geometry.sh import SH_C0, rgb_of_sh0, sh0_of_rgb
 from gsmap.merge.placed import overlapping, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
@@ -63,6 +65,18 @@ def apply_gain(gaussians: Gaussians, gain: np.ndarray) -> Gaussians:
     sh = gaussians.sh * gain.astype(np.float32)
     # Colour is SH + 0.5: the offset must grow too.
     sh[:, 0] += ((gain - 1) * 0.5 / SH_C0).astype(np.float32)
+    return replace(gaussians, sh=sh)
+
+
+def apply_balance(gaussians: Gaussians, balance: Balance) -> Gaussians:
+    """Gaussians in the exposure of another capture: their mean colours on the line of a balance, so that gain, gamma
+    and white balance are in it; what depends on the direction is multiplied by the slope of the line there."""
+    colours = rgb_of_sh0(gaussians.sh[:, 0]).astype(np.float64)
+    within = np.clip(colours, 0, 1)
+    slope = balance.slope * (within + FLOOR) ** (balance.slope - 1) * np.exp(balance.offset)
+    moved = (within + FLOOR) ** balance.slope * np.exp(balance.offset) - FLOOR + slope * (colours - within)
+    sh = gaussians.sh * slope[:, None].astype(np.float32)
+    sh[:, 0] = sh0_of_rgb(moved.astype(np.float32)[:, None])[:, 0]
     return replace(gaussians, sh=sh)
 
 

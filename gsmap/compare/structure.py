@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.change.components import components
+from gsmap.compare.components import components
 
 _BIN_M = 0.03
 _THICK_M = 0.045  # skirting boards, picture frames and the noise of a plane belong to it

@@ -1,0 +1,150 @@
+"""What belongs together changes together: evidence of single Gaussians, weighed over the things that they make up.
+
+Evidence of one Gaussian and its neighbours errs both ways. Thin things, edges and light make a few Gaussians look
+changed on what is as it was; and of a thing that another of its kind stands in place of, most Gaussians lie on the new
+surface in nearly its colour. Both are told by more than a neighbourhood: a change has its roots in what is beyond
+doubt, and of a thing much of which changed, what differs a little did so too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.compare.components import components
+from gsmap.compare.params import Params
+from gsmap.compare.structure import planes
+from gsmap.geometry.cells import cell_labels, group_means
+
+_CELL_M = 0.05  # of the surface in which planes are looked for
+_NORMAL_OF = 12  # cells
+_ASKED = 5
+_BESIDE_M = 0.15  # of what changed, within which small pieces are left over
+
+
+def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    """Of captures, each (N, 3) points and (N,) bool which are part of a surface: (N,) the floor, ceiling or wall that
+    each Gaussian is part of, -1 for none; the same numbers in all. What is no surface goes with the nearest that is."""
+    surface = np.concatenate([points[shows] for points, shows in captures]).astype(np.float64)
+    label, counts = cell_labels(np.floor(surface / _CELL_M))
+    means = group_means(surface, label, counts)
+    plane = planes(means, _normals(means), _CELL_M)
+    out, first = [], 0
+    for points, shows in captures:
+        found = np.full(len(points), -1, dtype=np.int64)
+        last = first + int(shows.sum())
+        found[shows] = plane[label[first:last]]
+        if len(means) and not shows.all():
+            found[~shows] = plane[cKDTree(means).query(points[~shows])[1]]
+        out.append(found)
+        first = last
+    return out
+
+
+def _normals(points: np.ndarray) -> np.ndarray:
+    """(M, 3) unit normals of a surface in cells; signs mean nothing."""
+    if len(points) < 4:
+        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    near = points[cKDTree(points).query(points, k=min(_NORMAL_OF, len(points)))[1]]
+    near = near - near.mean(1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
+    out: np.ndarray = axes[:, :, 0]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Doubts:
+    """What is known of each of N Gaussians of a capture before things are weighed.
+
+    Args:
+        points: (N, 3).
+        shell: (N,) see `shells`.
+        changed: (N,) bool, taken for gone or repainted.
+        sure: (N,) bool, those of them that are beyond doubt.
+        judged: (N,) bool, seen by the other capture.
+        hidden: (N,) bool, behind what the other capture shows.
+        differs: (N,) of the colour, as a multiple of what counts.
+    """
+
+    points: np.ndarray
+    shell: np.ndarray
+    changed: np.ndarray
+    sure: np.ndarray
+    judged: np.ndarray
+    hidden: np.ndarray
+    differs: np.ndarray
+
+
+def rooted(doubts: Doubts, params: Params) -> np.ndarray:
+    """(N,) bool, what belongs to a change, on one wall or on none, that has roots: enough of it is beyond doubt.
+
+    Light that a new colour throws on the next wall has none, nor has what is off at an edge. A change ends a few
+    Gaussians beyond what was taken for its wall, loose ones stand about it, and where they are large they have no
+    neighbours to ask: what is beyond doubt alone needs to be near.
+    """
+    rows = np.flatnonzero(doubts.changed)
+    label = components(doubts.points[rows], params.reach_m, doubts.shell[rows])
+    size = np.bincount(label)
+    roots = np.bincount(label, doubts.sure[rows])
+    out = np.zeros(len(doubts.changed), dtype=bool)
+    out[rows] = ((roots >= params.min_roots) & (roots >= params.root_share * size))[label]
+    alone = (doubts.changed & doubts.sure) | (doubts.differs >= params.alone_colour)
+    beyond, found = np.flatnonzero(alone & ~out), np.flatnonzero(out)
+    while len(beyond) and len(found):
+        near = cKDTree(doubts.points[found]).query(doubts.points[beyond], distance_upper_bound=params.about_m)[0]
+        found, beyond = beyond[np.isfinite(near)], beyond[np.isinf(near)]
+        out[found] = True
+    return out
+
+
+def kin(doubts: Doubts, params: Params) -> np.ndarray:
+    """(N,) bool, the changed and what changed with them: of things much of which changed, what differs a little and is
+    tied to what changed, and small pieces that would be left of them."""
+    thing = np.full(len(doubts.points), -1, dtype=np.int64)
+    loose = np.flatnonzero((doubts.shell < 0) | doubts.changed)
+    loose = loose[doubts.shell[loose] < 0]
+    thing[loose] = components(doubts.points[loose], params.link_m)
+    count = int(thing.max(initial=-1)) + 1
+    out = doubts.changed.copy()
+    for wall in np.unique(doubts.shell[out & doubts.judged & (doubts.shell >= 0)]):
+        on, hidden = doubts.judged & (doubts.shell == wall), doubts.hidden & (doubts.shell == wall)
+        if out[on].mean() >= params.kin_share:
+            out[_with_most(doubts, on, hidden & ~out, out, params.about_m)] = True
+    if not count:
+        return out
+    judged = np.bincount(thing[loose], doubts.judged[loose], count)
+    changed = np.bincount(thing[loose], doubts.changed[loose], count)
+    much = (changed >= params.kin_share * judged) & (changed >= params.min_roots)
+    of_these = loose[much[thing[loose]]]
+    weak = of_these[doubts.changed[of_these] | (doubts.differs[of_these] >= params.kin_colour)]
+    label = components(doubts.points[weak], params.reach_m, thing[weak])
+    tied = np.bincount(label, doubts.changed[weak]) >= params.kin_share * np.bincount(label)
+    out[weak[tied[label]]] = True
+    mine = np.zeros(len(out), dtype=bool)
+    mine[of_these] = True
+    out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, _BESIDE_M)] = True
+    left = of_these[~out[of_these]]
+    if len(left):
+        label = components(doubts.points[left], params.link_m, thing[left])
+        of = np.zeros(int(label.max()) + 1, dtype=np.int64)
+        of[label] = thing[left]
+        small = np.bincount(label) <= params.most_left * changed[of]
+        near = np.isfinite(cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=_BESIDE_M)[0])
+        out[left[small[label] & near]] = True
+    return out
+
+
+def _with_most(
+    doubts: Doubts, judged: np.ndarray, others: np.ndarray, changed: np.ndarray, reach_m: float
+) -> np.ndarray:
+    """Rows of others, that nobody judged as something new hides them, where most that was judged about them has
+    changed: the inside of what was replaced, the rest of a painted wall. All masks are (N,)."""
+    asked, rows = np.flatnonzero(judged), np.flatnonzero(others)
+    if not len(asked) or not len(rows):
+        return rows[:0]
+    count = min(_ASKED, len(asked))
+    near = cKDTree(doubts.points[asked]).query(doubts.points[rows], count, distance_upper_bound=reach_m)[1]
+    known = np.append(np.where(changed[asked], 1, -1), 0)
+    return rows[known[near.reshape(len(rows), count)].sum(1) > 0]

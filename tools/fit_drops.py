@@ -1,0 +1,62 @@
+"""What merging drops of an older capture, over settings of `gsmap.compare`: how these were chosen.
+
+    tools/make_change.py DEV --set dev
+    tools/fit_drops.py DEV/* --set compare.most_left=.04,.08,.16 --set compare.about_m=.2,.35,.5
+
+For each value of each setting, the others at their defaults: the share of the Gaussians of removed and of painted things
+that is dropped, and of those of others, at worst and in the mean over the places (see tools/change_scores.py). The last
+column counts of others only those that both captures' photographs show in one colour: what a wall painted next to
+it lights otherwise has changed, too. Under true poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import change_scores as scores
+import numpy as np
+from change_truth import Truth
+
+from gsmap import compare
+from gsmap.merge.changes import settle
+from gsmap.types import PlacedScene
+
+COLUMNS = ("gone", "painted", "false", "false_unlit")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("places", type=Path, nargs="+")
+    parser.add_argument("--set", action="append", default=[], metavar="compare.NAME=V,V", help="values to try")
+    args = parser.parse_args()
+    places = [Truth(folder) for folder in args.places]
+    captures = [[_placed(truth, time) for time in truth.times[:2]] for truth in places]
+    tried = [("defaults", compare.Params())]
+    for text in args.set:
+        name, values = text.removeprefix("compare.").split("=")
+        kind = type(getattr(compare.Params(), name))
+        tried += [(f"{name}={v}", replace(compare.Params(), **{name: kind(v)})) for v in values.split(",")]
+    print(f"{'':24}", *(f"{c:>19}" for c in COLUMNS), "(worst, mean)")
+    for label, params in tried:
+        rows = []
+        for truth, scenes in zip(places, captures, strict=True):
+            before, after = scenes[0].gaussians.means, settle(scenes, params=params).scenes[0].gaussians.means
+            rows.append(scores.score_drops(truth, truth.times[1], truth.times[0], ~scores.kept_rows(before, after)))
+        cells = []
+        for column in COLUMNS:
+            values = [row[column] for row in rows]
+            worst = (min if column in ("gone", "painted") else max)(values)
+            cells.append(f"{worst:9.2%} {np.mean(values):9.2%}")
+        print(f"{label:24}", *cells, flush=True)
+    return 0
+
+
+def _placed(truth: Truth, time: str) -> PlacedScene:
+    return PlacedScene(truth.gaussians(time), truth.cameras(time), time, truth.captured_at(time))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
