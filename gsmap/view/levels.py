@@ -232,8 +232,8 @@ class Levels:
         if not parts:
             raise InputError("nothing of it can be seen")
         counts = tuple(len(one.gaussians) for _, one in parts)
-        heights, size = extent_of(parts, up_of(list(inside.values())))
-        return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, size), boxes
+        heights, sides = extent_of(parts, up_of(list(inside.values())))
+        return overview_file(parts), ViewOverview("", tuple(places), counts, 0, heights, sides), boxes
 
     def _overview(self, component: int, inside: Mapping[int, ViewScene]) -> ViewOverview:
         """What is known of one island; what is not is asked for."""
@@ -273,8 +273,8 @@ class Levels:
         counts = tuple(len(one.gaussians) for _, one in parts)
         uri = f"overviews/{component}/{name}.spz"
         if island.told_of is None or island.told_of.uri != uri:
-            heights, size = extent_of(parts, up_of(list(inside.values())))
-            island.told_of = ViewOverview(uri, places, counts, pending, heights, size)
+            heights, sides = extent_of(parts, up_of(list(inside.values())))
+            island.told_of = ViewOverview(uri, places, counts, pending, heights, sides)
         island.told_of = replace(island.told_of, scenes=places, pending=pending)
         return island.told_of
 
