@@ -11,7 +11,7 @@ takes part.
     python tools/fit_covariance.py --cache FOLDER
     python tools/fit_covariance.py --cache FOLDER --test house kitchen_splats
 
-Making the places takes some fifteen CPU minutes, once.
+Making the places takes some twenty CPU minutes, once.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -93,7 +93,7 @@ DRAWN = {
 }
 """Drawn after the model's form was chosen."""
 LEAST_OVERLAP = 0.08
-WANDER_KNOTS, WANDER_TURN_PER_M = 6, 0.4
+WANDER_KNOTS, WANDER_TURN_PER_M = 6, 0.4  # radians
 START_DEG, START_M = 1.5, 0.05
 RIGHT_M = 0.3
 THREE_SIGMA = 0.9973
