@@ -1,6 +1,6 @@
 """The fit of merged tiles: how many passes over the views, and how long its steps are; CPU seconds beside PSNR.
 
-    python tools/bench_fit.py [--seed 72] [--vary-exposure] [--tile-size 5] [--set passes=4 rates.sh_base=0.04] [--set ...]
+    python tools/bench_fit.py [--seed 72] [--vary-exposure] [--set passes=4 rates.sh_base=0.02] [--set ...]
 
 A made place of four captures is merged in tiles once for each width of halo, up to the fit, and fitted by each of the
 settings of `gsmap.merge.mergers.tto` that are given: first those that are shipped, then each ``--set`` (several

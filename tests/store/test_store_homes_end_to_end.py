@@ -147,7 +147,8 @@ def test_a_cluster_that_shares_no_folder_makes_the_embedded_map_to_the_bit(remot
             cli("export", place, tmp_path / out, "--tile-size", "4", "--steps", "10", *how)
         with distributed.Client(cluster, set_as_default=False) as client:
             fetched = client.run(os.listdir, os.environ["GSMAP_CACHE"])
-        assert len(fetched) == 2 and all(fetched.values()), "each worker has read captures from the bucket"
+        assert len(fetched) == 2
+        assert all(fetched.values()), "each worker has read captures from the bucket"
     assert len(tiles_of(tmp_path / "here")) > 1
     assert tiles_of(tmp_path / "here") == tiles_of(tmp_path / "there")
     assert_same(tmp_path / "site.gsmap", url)

@@ -37,7 +37,7 @@ _BESIDE_M = 0.025  # of what changed, within which no other capture's Gaussians 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's first steps, for Gaussians that are nearly right: as long as pays within the passes (`tools/bench_fit.py`).
+    """Adam's first steps, for Gaussians that are nearly right: as long as pays in few passes (`tools/bench_fit.py`).
 
     Args:
         means: of positions, as a share of the Gaussians' median size.
@@ -117,9 +117,9 @@ class Params:
     cell_m: float = 0.5
     cover_m: float = 0.1
     ssim_weight: float = 0.2
-    passes: float = 5.0
+    passes: float = 4.0
     steps: int | None = None
-    halo_m: float = 0.5
+    halo_m: float = 1.0
     reach_m: float = 10.0
     min_cameras: int = 12
     longest_side_px: int = 960
