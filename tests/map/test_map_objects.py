@@ -449,6 +449,7 @@ def test_a_thinned_capture_still_tells_what_stood_there(site: Map, tmp_path: Pat
 def test_captures_without_things_are_named(site: Map) -> None:
     may = site.store.scenes.get("may").id
     site.store.graphs.forget([g.key for g in site.store.graphs.list() if g.scene == may])
-    report = site.objects()
+    report, history = site.objects(), site.history(at(CUPBOARD))
     assert "may" in report.notes[0]
+    assert (site.objects(), site.history(at(CUPBOARD))) == (report, history), "kept, it is the same"
     assert len(report.objects) == 2
