@@ -69,7 +69,7 @@ def _as_one(one: MapObject, other: MapObject) -> MapObject:
         order = sorted(
             range(2),
             key=lambda k: (
-                -pair[k].thing if pair[k].thing < 0 else -1,
+                pair[k].thing < 0,
                 pair[k].state != "seen",
                 min((abs(i - j) for j in shown[k]), default=len(one.sightings)),
             ),

@@ -177,7 +177,16 @@ def known_objects(
         )
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
-    return Known(objects, scenes, (*notes, *said), metres, photos, joined, store.objects.facts(), rooms)
+    return Known(
+        objects,
+        scenes,
+        (*notes, *(said if graphs is None else ())),
+        metres,
+        photos,
+        joined,
+        store.objects.facts(),
+        rooms,
+    )
 
 
 def kept_objects(store: Store, settings: Settings) -> Known:

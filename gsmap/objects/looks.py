@@ -89,7 +89,7 @@ def in_view(cameras: Cameras | None, points: np.ndarray, params: Params | None =
     """Whether any camera that a capture looks with has one of the points (K, 3) in its picture, whatever stands before
     it; its frame and unit."""
     params = params or Params()
-    if cameras is None or not len(cameras) or cameras.synthesised:
+    if cameras is None or cameras.synthesised:
         return False
     some = cameras.evenly(params.max_views)
     for view in (some[i] for i in range(len(some))):

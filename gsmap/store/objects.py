@@ -406,7 +406,7 @@ def _read(row: Row[Any]) -> ObjectSet:
             float(value["metres"]),
             {scene: to_pose(pose) for scene, pose in row.poses.items()},
             things,
-            tuple(_object(one, scenes) for one in value["objects"]),
+            tuple(_object(one, scenes, things) for one in value["objects"]),
             _numbers(value["up"], (3,)),
             tuple(_room(one, len(value["rooms"])) for one in value["rooms"]),
         )
@@ -417,7 +417,7 @@ def _read(row: Row[Any]) -> ObjectSet:
         ) from error
 
 
-def _object(one: Mapping[str, Any], scenes: Sequence[str]) -> MapObject:
+def _object(one: Mapping[str, Any], scenes: Sequence[str], things: Mapping[str, str]) -> MapObject:
     said: dict[int, Sighting] = {}
     for at, state, thing, box, looked, asked in one["sightings"]:
         if state not in SIGHTING_STATES or not 0 <= at < len(scenes) or not -1 <= asked < len(scenes):
@@ -427,7 +427,10 @@ def _object(one: Mapping[str, Any], scenes: Sequence[str]) -> MapObject:
         said[at] = Sighting(scenes[at], state, int(thing), corners, float(looked), by)
     if number_of(str(one["id"])) is None:
         raise InputError(f"an object called {one['id']!r}")
-    every = tuple(said.get(i, Sighting(scene, "unseen", -1, None, 0.0)) for i, scene in enumerate(scenes))
+    # Captures whose things nobody knows tell nothing of any.
+    every = tuple(
+        said.get(i, Sighting(scene, "unseen", -1, None, 0.0)) for i, scene in enumerate(scenes) if things[scene]
+    )
     colour = _numbers(one["colour"], (3,)).astype(np.float32)
     box, position = _numbers(one["box"], (2, 3)), _numbers(one["position"], (3,))
     return MapObject(str(one["id"]), int(one["component"]), box, position, colour, every)

@@ -119,8 +119,13 @@ def test_places_are_told_by_object_by_point_and_by_box(site: Map) -> None:
 def test_the_graph_is_written_and_is_what_networkx_gets(site: Map, tmp_path: Path) -> None:
     report = site.objects()
     graph = site.graph()
-    assert set(graph.nodes) == {row.id for row in report.objects}
-    assert graph.number_of_edges() == len(report.relations)
+    (room,) = report.rooms
+    assert room.area_m2 == pytest.approx(12, rel=0.1), "of 4 x 3 m"
+    assert {row.room for row in report.objects} == {room.id} == {"r1"}
+    assert set(room.objects) == {row.id for row in report.objects}
+    np.testing.assert_allclose(room.position, [2, 1.5, 0], atol=0.2)
+    assert set(graph.nodes) == {row.id for row in report.objects} | {room.id}
+    assert graph.number_of_edges() == len(report.relations) + len(room.objects)
     site.write_graph(tmp_path / "o.graphml", "graphml")
     assert set(nx.read_graphml(tmp_path / "o.graphml").nodes) == set(graph.nodes)
     site.write_graph(tmp_path / "o.json", "json")
@@ -449,6 +454,7 @@ def test_a_thinned_capture_still_tells_what_stood_there(site: Map, tmp_path: Pat
 def test_captures_without_things_are_named(site: Map) -> None:
     may = site.store.scenes.get("may").id
     site.store.graphs.forget([g.key for g in site.store.graphs.list() if g.scene == may])
-    report = site.objects()
+    report, history = site.objects(), site.history(at(CUPBOARD))
     assert "may" in report.notes[0]
+    assert (site.objects(), site.history(at(CUPBOARD))) == (report, history), "kept, it is the same"
     assert len(report.objects) == 2
