@@ -21,6 +21,7 @@ from gsmap.geometry.cells import cell_labels, group_means
 _CELL_M = 0.05  # of the surface in which planes are looked for
 _NORMAL_OF = 12  # cells
 _ASKED = 5
+_LEFT_M = 0.3  # a larger piece is a thing of its own, that stood beside
 _BESIDE_M = 0.15  # of what changed, within which small pieces are left over
 
 
@@ -130,10 +131,19 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
         label = components(doubts.points[left], params.link_m, thing[left])
         of = np.zeros(int(label.max()) + 1, dtype=np.int64)
         of[label] = thing[left]
-        small = np.bincount(label) <= params.most_left * changed[of]
+        small = (np.bincount(label) <= params.most_left * changed[of]) & (_extents(doubts.points[left], label) < _LEFT_M)
         near = np.isfinite(cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=_BESIDE_M)[0])
         out[left[small[label] & near]] = True
     return out
+
+
+def _extents(points: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(L,) longest edge of the box around the points (N, 3) of each label."""
+    low, high = np.full((int(label.max()) + 1, 3), np.inf), np.full((int(label.max()) + 1, 3), -np.inf)
+    np.minimum.at(low, label, points)
+    np.maximum.at(high, label, points)
+    longest: np.ndarray = (high - low).max(1)
+    return longest
 
 
 def _with_most(
