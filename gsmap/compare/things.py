@@ -131,7 +131,8 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
         label = components(doubts.points[left], params.link_m, thing[left])
         of = np.zeros(int(label.max()) + 1, dtype=np.int64)
         of[label] = thing[left]
-        small = (np.bincount(label) <= params.most_left * changed[of]) & (_extents(doubts.points[left], label) < _LEFT_M)
+        small = np.bincount(label) <= params.most_left * changed[of]
+        small &= _extents(doubts.points[left], label) < _LEFT_M
         near = np.isfinite(cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=_BESIDE_M)[0])
         out[left[small[label] & near]] = True
     return out

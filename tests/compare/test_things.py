@@ -73,8 +73,10 @@ def test_small_pieces_of_a_thing_that_went_are_not_left_behind():
     hole = (np.abs(points[:, :2] - 0.6) < 0.05).all(1)
     assert 1 < hole.sum() < PARAMS.most_left * len(points)
     assert kin(doubts(points, changed=~hole), PARAMS).all()
-    half = points[:, 0] < 0.6
-    np.testing.assert_array_equal(kin(doubts(points, changed=half), PARAMS), half)
+    # A piece is no splinter that is as large as what went, and none that stands as tall as a lamp.
+    for points, cut in ((sheet((0, 0), (0.6, 0.28)), 0.33), (sheet((0, 0), (3.0, 0.4), spacing=0.035), 2.85)):
+        went = points[:, 0] < cut
+        np.testing.assert_array_equal(kin(doubts(points, changed=went), PARAMS), went)
 
 
 def test_what_nobody_could_judge_goes_with_those_around_it():
