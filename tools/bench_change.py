@@ -258,7 +258,8 @@ def shown(row: dict[str, Any]) -> str:
             f"{moved}; {row['cpu_s']} CPU s"
         )
     if "gone" in row:
-        return f"{head} gone {row['gone']:.1%} painted {row['painted']:.1%} false {row['false']:.2%} (of what is not lit otherwise {row['false_unlit']:.2%})"
+        false = f"{row['false']:.2%} (of what is not lit otherwise {row['false_unlit']:.2%})"
+        return f"{head} gone {row['gone']:.1%} painted {row['painted']:.1%} false {false}"
     kinds = ("new", "recoloured", "vacated", "changed", "same")
     figures = " ".join(f"{k} {row['psnr'][k]:.2f} ({row['held'][k]:.2f})" for k in kinds)
     if "old_mix_new" not in row:

@@ -3,10 +3,10 @@
     tools/make_change.py DEV --set dev
     tools/fit_drops.py DEV/* --set compare.most_left=.04,.08,.16 --set compare.about_m=.2,.35,.5
 
-For each value of each setting, the others at their defaults: the share of the Gaussians of removed and of painted things
-that is dropped, and of those of others, at worst and in the mean over the places (see tools/change_scores.py). The last
-column counts of others only those that both captures' photographs show in one colour: what a wall painted next to
-it lights otherwise has changed, too. Under true poses.
+For each value of each setting, the others at their defaults: the share of the Gaussians of removed and of painted
+things that is dropped, and of those of others, at worst and in the mean over the places (see tools/change_scores.py).
+The last column counts of others only those that both captures' photographs show in one colour: what a wall painted next
+to it lights otherwise has changed, too. Under true poses.
 """
 
 from __future__ import annotations

@@ -10,12 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.compare.components import components
 from gsmap.change.params import Params
 from gsmap.change.poses import about_up, features, settled, voted
 from gsmap.change.sides import Side
 from gsmap.change.things import Cells, Thing, joined, parts
 from gsmap.compare import Looks
+from gsmap.compare.components import components
 from gsmap.compare.looks import place
 from gsmap.types import Sim3
 

@@ -14,6 +14,7 @@ from gsmap.change.poses import tints
 from gsmap.compare import Comparison, Looks, Pictured, View
 from gsmap.compare.colours import FLOOR, Balance
 from gsmap.compare.neighbourhoods import ranges
+from gsmap.compare.structure import normals_of
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.sh import rgb_of_sh0
 
@@ -61,13 +62,7 @@ class Side:
     @cached_property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals; signs mean nothing."""
-        count = len(self.points)
-        if count < 4:
-            return np.tile([0.0, 0.0, 1.0], (count, 1))
-        near = self.points[self.tree.query(self.points, k=min(12, count))[1]]
-        near = near - near.mean(1, keepdims=True)
-        _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
-        return axes[:, :, 0]
+        return normals_of(self.points, self.tree)
 
     def around(self, values: np.ndarray, radius_m: float) -> np.ndarray:
         """(M, ...) sums of values over the cells within a radius of each."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap.compare.components import components, groups
 from gsmap.change.params import Params
 from gsmap.change.sides import Side
+from gsmap.compare.components import components, groups
 from gsmap.compare.structure import planes
 from gsmap.geometry.cells import cell_labels
 
@@ -169,6 +169,8 @@ def paints(sides: tuple[Side, Side], cells: tuple[Cells, Cells], params: Params)
         leaks = [_leak(s, c, p, at) for s, c, p in zip(sides, cells, parts, strict=True)]
         colour = np.concatenate([side.colour[p] for side, p in zip(sides, parts, strict=True)])
         looks = np.concatenate([side.looks[p] for side, p in zip(sides, parts, strict=True)])
+        if not looks.any():  # All that is known of their colour is their neighbours'.
+            continue
         mean, size = np.average(colour, axis=0, weights=looks), np.average(np.abs(colour), axis=0, weights=looks)
         hue, light = np.abs(mean[:2]).max(), abs(mean[2])
         found.append(

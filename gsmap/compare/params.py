@@ -63,7 +63,7 @@ class Params:
     alone_colour: float = 4.0
     about_m: float = 0.35
     link_m: float = 0.08
-    kin_share: float = 0.1
+    kin_share: float = 0.2
     kin_colour: float = 0.2
     most_left: float = 0.08
 

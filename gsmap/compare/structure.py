@@ -16,6 +16,22 @@ _TO_CEILING_M = 0.2  # ... comes this close to the ceiling, where there is one
 _PIECE_M2 = 0.1  # of a wall that furniture hides, pieces at least so large are looked at
 _BESIDE_M = 0.3  # what lies so close to a wall, in its plane, is wall
 _MOST_PLANES = 24
+_NORMAL_OF = 12  # neighbours
+
+
+def normals_of(points: np.ndarray, tree: cKDTree | None = None) -> np.ndarray:
+    """(M, 3) unit normals of a surface in cells; signs mean nothing.
+
+    Args:
+        tree: of the points, where there is one already.
+    """
+    if len(points) < 4:
+        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    near = points[(tree or cKDTree(points)).query(points, k=min(_NORMAL_OF, len(points)))[1]]
+    near = near - near.mean(1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
+    out: np.ndarray = axes[:, :, 0]
+    return out
 
 
 def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray:

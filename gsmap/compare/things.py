@@ -15,22 +15,23 @@ from scipy.spatial import cKDTree
 
 from gsmap.compare.components import components
 from gsmap.compare.params import Params
-from gsmap.compare.structure import planes
+from gsmap.compare.structure import normals_of, planes
 from gsmap.geometry.cells import cell_labels, group_means
 
 _CELL_M = 0.05  # of the surface in which planes are looked for
-_NORMAL_OF = 12  # cells
-_ASKED = 5
+_ASKED = 5  # of the nearest that were judged
+_LEFT_M = 0.3  # a larger piece is a thing of its own, that stood beside
 _BESIDE_M = 0.15  # of what changed, within which small pieces are left over
 
 
 def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
     """Of captures, each (N, 3) points and (N,) bool which are part of a surface: (N,) the floor, ceiling or wall that
-    each Gaussian is part of, -1 for none; the same numbers in all. What is no surface goes with the nearest that is."""
+    each Gaussian is part of, -1 for none; the same numbers in all. What is no surface goes with the nearest that is.
+    z is up: in a frame that is not upright there are none, and all is one thing or another."""
     surface = np.concatenate([points[shows] for points, shows in captures]).astype(np.float64)
     label, counts = cell_labels(np.floor(surface / _CELL_M))
     means = group_means(surface, label, counts)
-    plane = planes(means, _normals(means), _CELL_M)
+    plane = planes(means, normals_of(means), _CELL_M)
     out, first = [], 0
     for points, shows in captures:
         found = np.full(len(points), -1, dtype=np.int64)
@@ -40,17 +41,6 @@ def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
             found[~shows] = plane[cKDTree(means).query(points[~shows])[1]]
         out.append(found)
         first = last
-    return out
-
-
-def _normals(points: np.ndarray) -> np.ndarray:
-    """(M, 3) unit normals of a surface in cells; signs mean nothing."""
-    if len(points) < 4:
-        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    near = points[cKDTree(points).query(points, k=min(_NORMAL_OF, len(points)))[1]]
-    near = near - near.mean(1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
-    out: np.ndarray = axes[:, :, 0]
     return out
 
 
@@ -131,9 +121,19 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
         of = np.zeros(int(label.max()) + 1, dtype=np.int64)
         of[label] = thing[left]
         small = np.bincount(label) <= params.most_left * changed[of]
+        small &= _extents(doubts.points[left], label) < _LEFT_M
         near = np.isfinite(cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=_BESIDE_M)[0])
         out[left[small[label] & near]] = True
     return out
+
+
+def _extents(points: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(L,) longest edge of the box around the points (N, 3) of each label."""
+    low, high = np.full((int(label.max()) + 1, 3), np.inf), np.full((int(label.max()) + 1, 3), -np.inf)
+    np.minimum.at(low, label, points)
+    np.maximum.at(high, label, points)
+    longest: np.ndarray = (high - low).max(1)
+    return longest
 
 
 def _with_most(

@@ -55,11 +55,3 @@ def beside(means: np.ndarray, origin: np.ndarray, chosen: np.ndarray, distance_m
         others = np.flatnonzero(~chosen & (origin != capture))
         near[others[np.isfinite(tree.query(means[others], distance_upper_bound=distance_m)[0])]] = True
     return near
-
-
-def most_visible(visible_pixels: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
-    """(N,) the ``count`` Gaussians of a mask that dominate most pixels; ties by row."""
-    order = np.argsort(np.where(among, -visible_pixels, np.inf), kind="stable")
-    stays = np.zeros(len(visible_pixels), dtype=bool)
-    stays[order[: min(count, int(among.sum()))]] = True
-    return stays

@@ -6,6 +6,7 @@ from synthetic_changes import box, dated, patched, plain
 from synthetic_walls import cameras_facing, texture, wall
 
 from gsmap import compare
+from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.merge import changes, default_params, merge
 from gsmap.merge.changes import settle
 from gsmap.merge.exposure import apply_gain
@@ -191,6 +192,18 @@ def test_the_place_shows_in_the_newest_exposure():
     middle = np.s_[12:36, 16:48]
     np.testing.assert_allclose((after[middle] / before[middle]).mean((0, 1)), gain, atol=0.03)
     assert settle([old, new], "both").scenes[0] is old
+
+
+def test_the_newest_gamma_is_taken_with_its_exposure():
+    """Dark and bright are brought to the newest's alike, as no gain does it."""
+    ramp = lambda x, y: np.tile(np.clip(0.5 + 0.25 * x, 0.1, 0.9)[:, None], (1, 3))  # noqa: E731
+    bent = lambda x, y: 0.9 * ramp(x, y) ** 1.4  # noqa: E731
+    old, new = dated("old", 2020, wall(0, -1.5, 1.5, colour=ramp)), dated("new", 2021, wall(1, -1.5, 1.5, colour=bent))
+    left = settle([old, new]).scenes[0].gaussians
+    shown, wanted = rgb_of_sh0(left.sh[:, 0]), bent(*left.means[:, :2].T)
+    seen = np.abs(left.means[:, 0]) < 1
+    assert np.abs(shown - wanted)[seen].max() < 0.04
+    assert np.ptp(wanted[seen]) > 0.4
 
 
 def test_tiles_keep_each_capture_in_its_own_exposure():

@@ -12,7 +12,7 @@ from gsmap.merge import PlacedScene, default_params, merge
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
 from gsmap.merge.placed import inside
-from gsmap.merge.selection import most_visible, one_owner_per_cell
+from gsmap.merge.selection import one_owner_per_cell
 from gsmap.render import render
 from gsmap.types import Gaussians
 
@@ -115,11 +115,16 @@ def test_a_cell_belongs_to_whoever_shows_most_of_it():
     np.testing.assert_array_equal(np.flatnonzero(stays[:n]), [4, 5])
 
 
-def test_what_shows_least_goes_first():
-    shown = np.array([3.0, 0.0, 5.0, 1.0, 4.0])
-    among = np.array([True, True, False, True, True])
-    np.testing.assert_array_equal(most_visible(shown, among, 2), [True, False, False, False, True])
-    np.testing.assert_array_equal(most_visible(shown, among, 9), among)
+def test_of_too_many_the_most_alike_become_one(watched):
+    """Three quarters of what there is look like all of it: pairs are merged and nothing is cut away."""
+    one = PlacedScene(wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")
+    whole = merge([one], "tto", Params(steps=0, keep=1.0, voxel_m=1e-3)).gaussians
+    fewer = merge([one], "tto", Params(steps=0, keep=0.5, voxel_m=1e-3)).gaussians
+    assert 0.45 * len(one.gaussians) < len(fewer) <= 0.5 * len(one.gaussians)
+    wanted, shown = (render(g, one.cameras).colour for g in (whole, fewer))
+    alpha = render(fewer, one.cameras).alpha[:, 12:36, 16:48]
+    assert alpha.min() > 0.8
+    assert np.abs(wanted - shown)[:, 12:36, 16:48].mean() < 0.03
 
 
 class WatchedFitter(tto.Fitter):

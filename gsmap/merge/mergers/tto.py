@@ -2,9 +2,9 @@
 
 Graph-GSReg's merging (voxelise the union, then minimise the difference to renders of the originals; no photographs
 needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
-shows least goes first, the newest capture wins where the place changed, and exposures can be balanced. With
-`owner_cells` off, both preferred, an `ssim_weight` and `min_weight` of 0 and a `keep` of 1 it is the published method:
-an L1 fit of all voxels of the union.
+is nowhere seen goes, what is most alike becomes one where there is too much, the newest capture wins where the place
+changed, and exposures can be balanced. With `owner_cells` off, both preferred, an `ssim_weight` and `min_weight` of 0
+and a `keep` of 1 it is the published method: an L1 fit of all voxels of the union.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ import numpy as np
 
 from gsmap import compare
 from gsmap.errors import ConfigError
+from gsmap.geometry.decimate import decimate
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import exposure, references
 from gsmap.merge.changes import Prefer, settle
 from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import inside, pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
-from gsmap.merge.selection import beside, most_visible, one_owner_per_cell
+from gsmap.merge.selection import beside, one_owner_per_cell
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
@@ -85,7 +86,8 @@ class Params:
 
     Args:
         min_weight: drop what nowhere makes up this share of a pixel of its capture's own views, and dominates none.
-        keep: at most this share of the Gaussians that went in, by what shows most; of each tile; 1 keeps all.
+        keep: at most this share of the Gaussians that went in, of each tile; of more, the pairs that are most alike
+            become one; 1 keeps all.
         voxel_m: side of the voxels in which Gaussians are first merged.
         owner_cells: give every cell of a grid to the capture that shows most of it, so that two captures of one
             surface do not lie over one another.
@@ -235,10 +237,17 @@ def _start(
     stays |= new
     stays[beside(merged.means, origin, new, _BESIDE_M)] = False
     mine = inside(merged.means, bounds)
-    if params.keep < 1:
-        count = int(params.keep * inside(gaussians.means, bounds).sum()) - int((new & mine).sum())
-        stays &= ~mine | new | most_visible(visible, stays & mine & ~new, max(count, 0))
-    return merged[stays], origin[stays]
+    count = max(int(params.keep * inside(gaussians.means, bounds).sum()) - int((new & mine).sum()), 1)
+    many = stays & mine & ~new
+    if params.keep == 1 or many.sum() <= count:
+        return merged[stays], origin[stays]
+    fewer, into = decimate(merged[many], count)
+    # One that is made of two captures' counts for the one of which more is seen.
+    order = np.argsort(visible[many], kind="stable")
+    of = np.empty(len(fewer), dtype=origin.dtype)
+    of[into[order]] = origin[many][order]
+    stays &= ~many
+    return Gaussians.concatenate([merged[stays], fewer]), np.concatenate([origin[stays], of])
 
 
 def _fit(

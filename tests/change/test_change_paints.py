@@ -1,0 +1,18 @@
+"""Changes of colour: what counts as paint."""
+
+import numpy as np
+
+from gsmap.change.params import Params
+from gsmap.change.sides import Side
+from gsmap.change.things import Cells, paints
+
+
+def test_paint_that_no_pixel_compared_is_none():
+    """Cells that are taken for painted by their neighbours alone, which are of another wall, say nothing."""
+    points = np.stack([*np.meshgrid(np.arange(0, 0.5, 0.05), np.arange(0, 0.5, 0.05)), np.zeros((10, 10))], -1)
+    points = points.reshape(-1, 3)
+    none, zero = np.zeros(len(points)), np.zeros(len(points), dtype=np.int64)
+    side = Side(zero, zero, points, np.ones_like(points), none, none, none, np.zeros_like(points), none, none)
+    painted = np.ones(len(points), dtype=bool)
+    cells = Cells(zero, zero - 1, ~painted, painted, painted, none, none)
+    assert paints((side, side), (cells, cells), Params()) == []

@@ -1,0 +1,113 @@
+"""Evidence of single Gaussians, weighed over the things that they make up."""
+
+import numpy as np
+
+from gsmap.compare import Params
+from gsmap.compare.things import Doubts, kin, rooted, shells
+
+PARAMS = Params()
+
+
+def sheet(low, high, z=0.0, spacing=0.04):
+    """Points of a horizontal sheet between two corners (x, y)."""
+    x, y = np.meshgrid(np.arange(low[0], high[0], spacing), np.arange(low[1], high[1], spacing))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1)
+
+
+def doubts(points, **masks):
+    """Nothing changed and all of it seen, but for what is said otherwise."""
+    given = {name: np.zeros(len(points), dtype=bool) for name in ("changed", "sure", "hidden")}
+    given |= {"judged": np.ones(len(points), dtype=bool), "differs": np.zeros(len(points))}
+    given |= {"shell": np.full(len(points), -1)}
+    return Doubts(points, **given | masks)
+
+
+def test_a_change_without_roots_is_none():
+    light, paint = sheet((0, 0), (0.4, 0.4)), sheet((3, 0), (3.4, 0.4))
+    points = np.concatenate([light, paint])
+    painted = np.arange(len(points)) >= len(light)
+    sure = painted.copy()
+    sure[:3] = True  # a few are sure of light, too: too few
+    found = rooted(doubts(points, changed=np.ones(len(points), bool), sure=sure), PARAMS)
+    np.testing.assert_array_equal(found, painted)
+    # Many that are sure, yet a small share of what changed.
+    many = sheet((0, 0), (1.0, 1.0))
+    sure = np.arange(len(many)) < 0.5 * PARAMS.root_share * len(many)
+    assert sure.sum() > PARAMS.min_roots
+    assert not rooted(doubts(many, changed=np.ones(len(many), bool), sure=sure), PARAMS).any()
+
+
+def test_light_on_the_next_wall_is_no_part_of_the_paint():
+    points = sheet((0, 0), (0.8, 0.4))
+    here = points[:, 0] < 0.4
+    both = doubts(points, changed=np.ones(len(points), bool), sure=here, shell=np.where(here, 1, 2))
+    np.testing.assert_array_equal(rooted(both, PARAMS), here)
+
+
+def test_what_is_beyond_doubt_alone_belongs_to_the_change_near_by():
+    change, loose = sheet((0, 0), (0.4, 0.4)), np.array([[0.6, 0.2, 0], [0.8, 0.2, 0], [3.0, 0.2, 0]])
+    points = np.concatenate([change, loose])
+    changed = np.ones(len(points), bool)
+    for known in (
+        {"changed": changed, "sure": changed},
+        {"changed": changed & (points[:, 0] < 0.5), "sure": changed, "differs": np.full(len(points), 9.0)},
+    ):
+        # The second is near the first alone, and the last near none.
+        np.testing.assert_array_equal(rooted(doubts(points, **known), PARAMS)[-3:], [True, True, False])
+
+
+def test_of_a_thing_much_of_which_changed_what_differs_a_little_did_too():
+    points = sheet((0, 0), (1.0, 0.4))
+    changed = points[:, 0] < 0.3
+    differs = np.where(points[:, 0] < 0.7, 0.5, 0.0)
+    np.testing.assert_array_equal(kin(doubts(points, changed=changed, differs=differs), PARAMS), points[:, 0] < 0.7)
+    # Where next to nothing of it changed, nothing else has; nor has a wall.
+    few = points[:, 0] < 0.03
+    np.testing.assert_array_equal(kin(doubts(points, changed=few, differs=differs), PARAMS), few)
+    wall = doubts(points, changed=changed, differs=differs, shell=np.zeros(len(points), int))
+    np.testing.assert_array_equal(kin(wall, PARAMS), changed)
+
+
+def test_small_pieces_of_a_thing_that_went_are_not_left_behind():
+    points = sheet((0, 0), (1.2, 1.2))
+    hole = (np.abs(points[:, :2] - 0.6) < 0.05).all(1)
+    assert 1 < hole.sum() < PARAMS.most_left * len(points)
+    assert kin(doubts(points, changed=~hole), PARAMS).all()
+    # A piece is no splinter that is as large as what went, and none that stands as tall as a lamp.
+    for points, cut in ((sheet((0, 0), (0.6, 0.28)), 0.33), (sheet((0, 0), (3.0, 0.4), spacing=0.035), 2.85)):
+        went = points[:, 0] < cut
+        np.testing.assert_array_equal(kin(doubts(points, changed=went), PARAMS), went)
+
+
+def test_what_nobody_could_judge_goes_with_those_around_it():
+    points = sheet((0, 0), (0.8, 0.4))
+    hidden = (points[:, 0] > 0.3) & (points[:, 0] < 0.5)
+    for shell in (-1, 3):
+        for side in (points[:, 0] <= 0.3, points[:, 0] >= 0.5):
+            known = doubts(
+                points, changed=side, judged=~hidden, hidden=hidden, shell=np.full(len(points), shell, dtype=int)
+            )
+            found = kin(known, PARAMS)
+            middle = np.abs(points[:, 0] - 0.4)
+            near = np.where(side[0], points[:, 0] < 0.4, points[:, 0] > 0.4) & hidden & (middle > 0.05)
+            far = np.where(side[0], points[:, 0] > 0.4, points[:, 0] < 0.4) & hidden & (middle > 0.05)
+            assert found[near].all()
+            assert not found[far].any()
+    # Of a wall that was not even looked at nothing is known.
+    unseen = doubts(points, changed=points[:, 0] <= 0.3, judged=~hidden, shell=np.zeros(len(points), int))
+    assert not kin(unseen, PARAMS)[hidden].any()
+
+
+def test_the_floor_is_shell_and_what_stands_on_it_is_not():
+    floor, table = sheet((0, 0), (4, 4)), sheet((1, 1), (2, 2), z=0.7)
+    haze = np.array([[3.0, 3.0, 0.2]])
+    older, newer = np.concatenate([floor, table, haze]), floor + 0.01
+    shows = np.arange(len(older)) < len(floor) + len(table)
+    a, b = shells([(older, shows), (newer, np.ones(len(newer), bool))])
+    assert a[0] >= 0
+    assert (a[: len(floor)] == a[0]).all()
+    assert (a[len(floor) : -1] == -1).all()
+    assert a[-1] == a[0]
+    assert (b == a[0]).all()
+    none = shells([(older[:0], shows[:0]), (newer[:0], shows[:0])])
+    assert [len(one) for one in none] == [0, 0]
