@@ -93,8 +93,7 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     """(N,) bool, the changed and what changed with them: of things much of which changed, what differs a little and is
     tied to what changed, and small pieces that would be left of them."""
     thing = np.full(len(doubts.points), -1, dtype=np.int64)
-    loose = np.flatnonzero((doubts.shell < 0) | doubts.changed)
-    loose = loose[doubts.shell[loose] < 0]
+    loose = np.flatnonzero(doubts.shell < 0)
     thing[loose] = components(doubts.points[loose], params.link_m)
     count = int(thing.max(initial=-1)) + 1
     out = doubts.changed.copy()
