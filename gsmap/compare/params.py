@@ -36,7 +36,9 @@ class Params:
         link_m: Gaussians of one thing.
         kin_share: of a thing of which this share has changed,
         kin_colour: what differs by this multiple of what counts, and is tied to it, has changed too,
-        most_left: and so have pieces of at most this share of what changed.
+        most_left: and so have pieces of at most this share of what changed,
+        left_m: no longer than this: a larger one is a thing of its own, that stood beside,
+        beside_m: and so near to it.
     """
 
     longest_side_px: int = 240
@@ -66,6 +68,8 @@ class Params:
     kin_share: float = 0.2
     kin_colour: float = 0.2
     most_left: float = 0.08
+    left_m: float = 0.3
+    beside_m: float = 0.15
 
     def __post_init__(self) -> None:
         for name in ("longest_side_px", "max_views", "min_views", "cell_m", "least_tolerance_m", "reach_m", "link_m"):

@@ -20,8 +20,6 @@ from gsmap.geometry.cells import cell_labels, group_means
 
 _CELL_M = 0.05  # of the surface in which planes are looked for
 _ASKED = 5  # of the nearest that were judged
-_LEFT_M = 0.3  # a larger piece is a thing of its own, that stood beside
-_BESIDE_M = 0.15  # of what changed, within which small pieces are left over
 
 
 def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
@@ -113,16 +111,16 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     out[weak[tied[label]]] = True
     mine = np.zeros(len(out), dtype=bool)
     mine[of_these] = True
-    out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, _BESIDE_M)] = True
+    out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, params.beside_m)] = True
     left = of_these[~out[of_these]]
     if len(left):
         label = components(doubts.points[left], params.link_m, thing[left])
         of = np.zeros(int(label.max()) + 1, dtype=np.int64)
         of[label] = thing[left]
         small = np.bincount(label) <= params.most_left * changed[of]
-        small &= _extents(doubts.points[left], label) < _LEFT_M
-        near = np.isfinite(cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=_BESIDE_M)[0])
-        out[left[small[label] & near]] = True
+        small &= _extents(doubts.points[left], label) < params.left_m
+        near = cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=params.beside_m)[0]
+        out[left[small[label] & np.isfinite(near)]] = True
     return out
 
 
