@@ -45,7 +45,7 @@ class Params:
     """
 
     views: int = 48
-    steps: int = 100
+    steps: int = 200
     deviation_px: float = 3.0
     least_db: float = 30.0
 
