@@ -10,7 +10,6 @@ from gsmap.compare.colours import Balance, balance, differ
 from gsmap.compare.evidence import Evidence, Tally
 from gsmap.compare.looks import Looks, Placed, View, place, view_of
 from gsmap.compare.params import Params
-from gsmap.compare.things import shells
 from gsmap.render import render
 from gsmap.types import Gaussians
 
@@ -90,6 +89,8 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             _count(judged, at, picture, sure, tolerance)
             _count_colour(judge, own, picture, tolerance)
     both = older, newer
+    from gsmap.compare.things import shells  # with scipy, which naming a recipe does without
+
     walls = shells([(one.gaussians.means, one.surface) for one in both])
     evidence = [
         tally.evidence(one.gaussians.means, one.surface, shell, len(other.views), line, params)

@@ -8,7 +8,6 @@ import numpy as np
 
 from gsmap.compare.colours import Balance, limits
 from gsmap.compare.params import Params
-from gsmap.compare.things import Doubts, kin, rooted
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
@@ -97,8 +96,13 @@ class Tally:
         painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= params.root_colour) & (differs >= 1)
         # What one can look through is no wall.
         shell = np.where(state == GONE, -1, shell)
+        from gsmap.compare.things import Doubts, kin, rooted  # with scipy, which naming a recipe does without
+
         doubts = Doubts(points, shell, state >= REPAINTED, gone | painted, state >= SAME, state == HIDDEN, differs)
-        _weigh(state, unchanged, doubts, params)
+        stands = rooted(doubts, params)
+        state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]
+        # Whole things, of what turned out to have changed.
+        state[kin(replace(doubts, changed=stands), params) & (state < REPAINTED)] = REPAINTED
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
         return Evidence(*counts, chroma, lightness, state)
 
@@ -160,10 +164,3 @@ def _follow(state: np.ndarray, near: _Neighbours, grazed: np.ndarray, doubtful: 
     state[(state < SAME) & grazed & ~(sure & (most == 0))] = GONE
     sure &= most > 0
     state[open_ & sure] = np.array([SAME, REPAINTED, GONE], dtype=np.int8)[most[open_ & sure]]
-
-
-def _weigh(state: np.ndarray, unchanged: np.ndarray, doubts: Doubts, params: Params) -> None:
-    """States after whole things have been weighed; ``unchanged`` (N,) are those of what turns out not to have."""
-    stands = rooted(doubts, params)
-    state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]
-    state[kin(replace(doubts, changed=stands), params) & (state < REPAINTED)] = REPAINTED

@@ -17,7 +17,6 @@ import numpy as np
 
 from gsmap import compare
 from gsmap.errors import ConfigError
-from gsmap.geometry.decimate import decimate
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import exposure, references
 from gsmap.merge.changes import Prefer, settle
@@ -241,6 +240,8 @@ def _start(
     many = stays & mine & ~new
     if params.keep == 1 or many.sum() <= count:
         return merged[stays], origin[stays]
+    from gsmap.geometry.decimate import decimate  # with scipy, which naming a recipe does without
+
     fewer, into = decimate(merged[many], count)
     # One that is made of two captures' counts for the one of which more is seen.
     order = np.argsort(visible[many], kind="stable")
