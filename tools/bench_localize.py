@@ -18,8 +18,7 @@ the captures' own photographs, lifted by their splats' depth, matched with the 2
 one pose by LO-RANSAC (pycolmap), said where 12 agree. That needs the photographs to be kept with their poses.
 
 A crowd are the captures' own scenes over and over, elsewhere: their arrays are read as a scene's are, but the parts of
-their summaries and descriptors are exchanged, so that they are as alike to a photograph as the views of another place
-are (cosines of .00 to .03 in the mean, .06 about it, for those of other made places and for these).
+their summaries and descriptors are exchanged, so that they are as alike to a photograph as chance makes them.
 """
 
 # Thread counts must be set before numpy comes in.

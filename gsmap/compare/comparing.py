@@ -67,6 +67,8 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
     Each is rendered from the other's cameras once, its surfaces alone: from where its own cameras never stood its haze
     hides everything.
     """
+    from gsmap.compare.things import shells  # with scipy, which naming a recipe does without
+
     params = params or Params()
     surfaces = {id(one): _surface(one) for one in (older, newer)}
     crossed = [
@@ -89,8 +91,6 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             _count(judged, at, picture, sure, tolerance)
             _count_colour(judge, own, picture, tolerance)
     both = older, newer
-    from gsmap.compare.things import shells  # with scipy, which naming a recipe does without
-
     walls = shells([(one.gaussians.means, one.surface) for one in both])
     evidence = [
         tally.evidence(one.gaussians.means, one.surface, shell, len(other.views), line, params)

@@ -72,6 +72,8 @@ class Tally:
             shell: (N,) wall, floor or ceiling that each is part of; see `gsmap.compare.things.shells`.
             views: how many the other capture has.
         """
+        from gsmap.compare.things import Doubts, kin, rooted  # with scipy, which naming a recipe does without
+
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
         near = _Neighbours(points, shows, params)
@@ -96,8 +98,6 @@ class Tally:
         painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= params.root_colour) & (differs >= 1)
         # What one can look through is no wall.
         shell = np.where(state == GONE, -1, shell)
-        from gsmap.compare.things import Doubts, kin, rooted  # with scipy, which naming a recipe does without
-
         doubts = Doubts(points, shell, state >= REPAINTED, gone | painted, state >= SAME, state == HIDDEN, differs)
         stands = rooted(doubts, params)
         state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.types import Sim3
 
-_SIZED = 20_000  # points are enough to measure a place by
+_SIZED = 4_000  # points are enough to measure a place by
 
 
 def box_corners(bounds: np.ndarray) -> np.ndarray:
@@ -45,8 +45,8 @@ def robust_box(points: np.ndarray, weights: np.ndarray | None = None, outside: f
 
 
 def upright_size(points: np.ndarray, up: np.ndarray, outside: float = 0.01) -> tuple[float, float, float]:
-    """Length, width and height of points (N, 3), N > 0, in the upright box of the smallest floor, whatever way their
-    frame is turned.
+    """Length, width and height, in their unit, of points (N, 3), N > 0: of the upright box of the smallest floor,
+    whatever way their frame is turned.
 
     Args:
         up: (3,) unit vector.

@@ -229,12 +229,11 @@ def view_of(store: Store, settings: Settings, merged: frozenset[int] = frozenset
     graphs = store.graphs.list()
     ups = {one.scene: np.array(one.up, np.float64) for one in graphs if one.up is not None}
     metres = map_metres(store, settings, placed)
-    told, numbers = {}, store.priors.numbers()
-    for prior in store.priors.list():
+    told = {}
+    for number, prior in store.priors.numbered():
         pose = poses.get(prior.scene)
         metre = None if pose is None else metres.get(pose.component)
-        words = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit)
-        told[prior.scene] = (words, numbers[prior.scene])
+        told[prior.scene] = prior_words(prior, 1.0 if metre is None else metre.metres_per_unit), number
     scenes = [_scene(scene, content_key(scene, settings.view.tree), poses, ups, told) for scene in store.scenes.list()]
     living = {entry.scene.id for entry in scenes}
     newest, given = store.revisions.newest(), pose_basis(store, settings)

@@ -40,11 +40,15 @@ class Priors:
 
     def list(self) -> list[Prior]:
         """The standing priors of living scenes, oldest first."""
+        return [prior for _, prior in self.numbered()]
+
+    def numbered(self) -> tuple[tuple[int, Prior], ...]:
+        """The same, each with which of all that was ever told it is."""
         query = select(priors).where(priors.c.removed_at.is_(None)).order_by(priors.c.number)
         with self._catalog.read() as connection:
             alive = living_ids(connection)
             rows = [row for row in connection.execute(query) if row.scene in alive]
-        return [_prior(row) for row in rows]
+        return tuple((row.number, _prior(row)) for row in rows)
 
     def of(self, scene: str) -> Prior | None:
         """The standing prior of a scene (id); None where it has none."""
@@ -52,12 +56,6 @@ class Priors:
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
         return _prior(rows[-1]) if rows else None
-
-    def numbers(self) -> dict[str, int]:
-        """Which of all that was ever told the standing prior of each scene (id) is."""
-        query = select(priors.c.scene, priors.c.number).where(priors.c.removed_at.is_(None)).order_by(priors.c.number)
-        with self._catalog.read() as connection:
-            return {row.scene: row.number for row in connection.execute(query)}
 
     def earlier(self, ref: str, number: int) -> Prior:
         """What was told of a scene once, by its number.

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+_SLACK_M = 0.3  # a point in a room's floor or ceiling is in the room
+
 
 @dataclass(frozen=True, eq=False)
 class Room:
@@ -48,6 +50,3 @@ class Room:
             return False
         cell = np.floor((point[:2] - self.low) / self.cell_m).astype(int)
         return bool((cell >= 0).all() and (cell < self.cells.shape).all() and self.cells[tuple(cell)])
-
-
-_SLACK_M = 0.3

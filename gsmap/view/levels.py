@@ -33,7 +33,7 @@ _LEAST = 16
 _FIRST = -1.0  # rank of what everybody waits for: before any tree
 _ISLANDS_KEPT = 8  # whose sketches are in memory
 _TRIES = 3
-_STRAYS = 0.02  # share of a sketch below the floor of its scene, and above the ceiling
+_STRAYS = 0.02  # share of a sketch below the floor of its scene, above the ceiling, and beyond each side
 _FILES_KEPT = 4  # overviews as bytes
 
 _T = TypeVar("_T")
