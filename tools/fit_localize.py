@@ -33,6 +33,7 @@ from PIL import Image
 from scipy.optimize import minimize
 
 from gsmap.compare.odds import Curve, Odds
+from gsmap.geometry.rotations import log_so3
 from gsmap.ingest import read_captures
 from gsmap.localize import features, localizing, probability, summaries
 from gsmap.localize.candidates import Candidate
@@ -158,7 +159,7 @@ def fit_words(found: list[Place], params: Params, num_words: int = 64, short: in
 RIGHT_DEG, RIGHT_M = 3.0, 0.15
 WRONG_DEG, WRONG_M = 5.0, 0.3  # between the two a pose is neither
 FEWEST = 6  # inliers of a pose that nobody found, to be worth a judgement
-RISES = {"matches", "inliers", "found_again", "spread", "explained", "compared", "colour", "seen"}
+RISES = {"matches", "inliers", "found_again", "spread", "explained", "explained_coarsely", "compared", "colour", "seen"}
 KNOTS = {
     "matches": tuple(np.log10(np.array([6.0, 8, 11, 15, 21, 41, 81]))),
     "inliers": tuple(np.log10(np.array([1.0, 6, 11, 16, 26, 41, 81, 161]))),
@@ -166,6 +167,8 @@ KNOTS = {
     "spread": (0.05, 0.15, 0.25, 0.4, 0.6),
     "explained": (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8),
     "contradicted": (0.05, 0.1, 0.2, 0.3, 0.45, 0.6),
+    "explained_coarsely": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9),
+    "contradicted_coarsely": (0.03, 0.07, 0.12, 0.2, 0.35, 0.5),
     "compared": tuple(np.log10(np.array([31.0, 101, 301, 801, 1501]))),
     "colour": (0.0, 0.2, 0.4, 0.6, 0.8, 0.95),
     "seen": (0.1, 0.3, 0.5, 0.8),
@@ -245,12 +248,6 @@ def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], f
         return error, np.nan
     xi = np.r_[turn, shift]
     return error, float(xi @ np.linalg.solve(judged.covariance, xi))
-
-
-def log_so3(rotation: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_rotvec()
 
 
 def index_of(scenes: list[PlacedFeatures]) -> ViewIndex:

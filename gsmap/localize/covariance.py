@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.rotations import skew
-from gsmap.localize import resection
+from gsmap.localize import aligning, resection
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.types import Sim3
 
@@ -43,39 +43,76 @@ def pose_covariance(
 ) -> np.ndarray:
     """(6, 6) over [rot_rad, trans] on the camera's side, in the unit of the points, of one photograph's adjustment.
 
-    A sandwich of the information between the scores of blocks of the picture (Liang and Zeger 1986): residuals of one
-    block are one measurement, however many patches it holds. Shrunk towards what independent residuals would tell,
-    for there are few blocks.
-
     Args:
         pixels: (K, 2) of the patches.
         focal_sigma: as in `Photo`; where the focal length was solved for, what that costs the pose is in.
     """
-    dim = fit.jacobian.shape[2]
-    J, r = fit.jacobian, fit.residuals_px
-    weights = fit.weights
-    information = np.einsum("kid,k,kie->de", J, weights, J)
-    if dim == 7 and np.isfinite(focal_sigma) and focal_sigma > 0:
-        information[6, 6] += 1 / focal_sigma**2
+    return with_hidden(of_patches(fit, pixels, size_px, params, focal_sigma)[:6, :6], params)
+
+
+def of_patches(
+    fit: resection.Refined, pixels: np.ndarray, size_px: tuple[int, int], params: Params, focal_sigma: float
+) -> np.ndarray:
+    """(dim, dim) of what the residuals of patches tell alone."""
+    least = (params.least_px * max(size_px) / 480) ** 2
+    weights = np.repeat(fit.weights[:, None], 2, axis=1)
+    prior = 1 / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0
+    return _sandwich(fit.jacobian, weights, fit.residuals_px, pixels / size_px, least, prior, params)
+
+
+def of_aligned(fit: aligning.Aligned, size_px: tuple[int, int], params: Params, focal_sigma: float) -> np.ndarray:
+    """(dim, dim) of what the differences of colours tell alone.
+
+    Args:
+        size_px: of the picture that it was aligned with.
+    """
+    noise = float((fit.weights * fit.residuals**2).sum() / max(fit.weights.sum(), 1e-9))
+    prior = noise / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0
+    return _sandwich(fit.jacobian, fit.weights, fit.residuals, fit.pixels / size_px, 0.0, prior, params)
+
+
+def with_hidden(told: np.ndarray, params: Params) -> np.ndarray:
+    """(6, 6) of a pose of which residuals tell so much, with what leaves none."""
+    hidden = np.r_[np.full(3, params.hidden_rad), np.full(3, params.hidden_m)]
+    out: np.ndarray = (told + told.T) / 2 + np.diag(hidden**2)
+    return out
+
+
+def _sandwich(
+    J: np.ndarray, weights: np.ndarray, r: np.ndarray, at: np.ndarray, least: float, focal: float, params: Params
+) -> np.ndarray:
+    """(dim, dim): the information between the scores of blocks of the picture (Liang and Zeger 1986).
+
+    Residuals of one block are one measurement, however many it holds. Shrunk towards what independent residuals would
+    tell, for there are few blocks.
+
+    Args:
+        J: (K, C, dim).
+        weights, r: (K, C).
+        at: (K, 2) shares of the picture's width and height.
+        least: variance of a residual, at the least.
+        focal: information of the focal length from elsewhere.
+    """
+    dim = J.shape[2]
+    information = np.einsum("kcd,kc,kce->de", J, weights, J, optimize=True)
+    if dim == 7:
+        information[6, 6] += focal
     inverse = np.linalg.pinv(information, hermitian=True)
-    scores = np.einsum("kid,k,ki->kd", J, weights, r)
-    at = np.clip((pixels / size_px * params.blocks).astype(int), 0, np.array(params.blocks) - 1)
-    block = at[:, 1] * params.blocks[0] + at[:, 0]
+    scores = np.einsum("kcd,kc,kc->kd", J, weights, r, optimize=True)
+    cell = np.clip((at * params.blocks).astype(int), 0, np.array(params.blocks) - 1)
+    block = cell[:, 1] * params.blocks[0] + cell[:, 0]
     sums = np.zeros((params.blocks[0] * params.blocks[1], dim))
     np.add.at(sums, block, scores)
     used = len(np.unique(block))
     clustered = sums.T @ sums * (used / max(used - dim / 2, 1.0))
-    # Each patch alone, at its own noise or at the least there is, times how many lie in a block together: an upper end
-    # of what blocks could show had chance not made their sums small.
-    seen = float((weights * (r**2).sum(1)).sum() / max(2 * weights.sum() - dim, 1.0))
-    noise = max(seen, (params.least_px * max(size_px) / 480) ** 2)
-    many = len(pixels) / max(used, 1)
-    independent = information * noise * np.sqrt(many)
+    # Each alone, at its own noise or at the least there is, times how many lie in a block together: an upper end of
+    # what blocks could show had chance not made their sums small.
+    seen = float((weights * r**2).sum() / max(weights.sum() - dim, 1.0))
+    many = len(J) / max(used, 1)
+    independent = information * max(seen, least) * np.sqrt(many)
     share = used / (used + 2.0 * dim)
     middle = share * clustered + (1 - share) * independent
-    covariance = (inverse @ middle @ inverse)[:6, :6] * params.swell**2
-    hidden = np.r_[np.full(3, params.hidden_rad), np.full(3, params.hidden_m)]
-    out: np.ndarray = (covariance + covariance.T) / 2 + np.diag(hidden**2)
+    out: np.ndarray = inverse @ middle @ inverse * params.swell**2
     return out
 
 

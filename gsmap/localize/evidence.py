@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -24,6 +24,7 @@ class Params:
         contradict: ... and under which it shows something else.
         inlier_px: a patch that is found again this near to where the pose predicts it is an inlier, at 480 pixels.
         blocks: columns and rows of the picture over which inliers should be spread.
+        coarse: patterns are compared once more in pictures so many times smaller, where renders are as sharp as photos.
         near_m: surfaces nearer than this stand in a camera's face.
     """
 
@@ -34,6 +35,7 @@ class Params:
     contradict: float = 0.15
     inlier_px: float = 2.0
     blocks: tuple[int, int] = (8, 6)
+    coarse: int = 4
     near_m: float = 0.1
 
 
@@ -98,6 +100,25 @@ def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Compariso
         judged |= tells[rows, columns]
     best = np.where(judged, best, np.nan)
     return Comparison(best, float(seen.mean()), _chroma(photo_colour[judged], shown[judged]), float(blocked.mean()))
+
+
+def compare_coarsely(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Comparison:
+    """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
+    fewer = replace(params, step_px=params.half_px // 2)
+    return compare(_smaller(rgb, params.coarse), [_smaller_look(one, params.coarse) for one in looks], fewer)
+
+
+def _smaller_look(one: Look, by: int) -> Look:
+    rgb, alpha, depth = (_smaller(image, by) for image in (one.rgb, one.alpha, one.depth_m))
+    return replace(one, rgb=rgb, grey=_smaller(one.grey, by), alpha=alpha, depth_m=depth, sound=alpha > 0)
+
+
+def _smaller(image: np.ndarray, by: int) -> np.ndarray:
+    """(H // by, W // by, ...) means of blocks."""
+    height, width = (n // by for n in image.shape[:2])
+    blocks = image[: height * by, : width * by].reshape(height, by, width, by, *image.shape[2:])
+    out: np.ndarray = blocks.mean((1, 3), dtype=np.float32)
+    return out
 
 
 def _patches(rgb: np.ndarray, params: Params) -> np.ndarray:

@@ -199,15 +199,14 @@ def judged_pose(picture: Picture, candidate: Candidate, scenes: Mapping[str, Pla
         params.features,
         params.tracking,
         params.resection,
+        params.aligning,
+        params.covariance,
     )
     comparison = evidence.compare(picture.rgb, settled.looks, params.evidence)
-    known = None
-    if settled.fit is not None:
-        known = covariance.pose_covariance(
-            settled.fit, settled.pixels, picture.size_px, params.covariance, focal_sigma=picture.focal_sigma
-        )
+    coarse = evidence.compare_coarsely(picture.rgb, settled.looks, params.evidence)
+    known = settled.covariance
     told = probability.evidence_of(
-        picture, settled, comparison, sigmas_of(known), candidate.num_inliers, params.evidence
+        picture, settled, comparison, coarse, sigmas_of(known), candidate.num_inliers, params.evidence
     )
     return Judged(candidate, settled, known, told, probability.model().probability(told, params.verdict.prior))
 

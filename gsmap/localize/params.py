@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from gsmap.localize import (
+    aligning,
     clips,
     covariance,
     differing,
@@ -36,6 +37,7 @@ class Params:
         resection: how a pose is found among matches.
         settling: how a rough pose is sharpened.
         tracking: how patches of renders are found again in a photo.
+        aligning: how renders are laid over a photo.
         evidence: how a photo is compared with renders.
         covariance: how well a pose is known.
         verdict: the bars that a pose must clear.
@@ -57,6 +59,7 @@ class Params:
     resection: resection.Params = field(default_factory=resection.Params)
     settling: settling.Params = field(default_factory=settling.Params)
     tracking: tracking.Params = field(default_factory=tracking.Params)
+    aligning: aligning.Params = field(default_factory=aligning.Params)
     evidence: evidence.Params = field(default_factory=evidence.Params)
     covariance: covariance.Params = field(default_factory=covariance.Params)
     verdict: verdict.Params = field(default_factory=verdict.Params)

@@ -28,6 +28,7 @@ def evidence_of(
     picture: Picture,
     settled: Settled,
     comparison: evidence.Comparison,
+    coarse: evidence.Comparison,
     sigmas: tuple[float, float],
     num_matches: int,
     params: evidence.Params,
@@ -37,6 +38,7 @@ def evidence_of(
     NaN where one could not be had.
 
     Args:
+        comparison, coarse: of the photo with renders from there, as they are and in smaller pictures.
         sigmas: largest standard deviation of rotation (rad) and translation (metres).
         num_matches: features of the photo that agreed on the rough pose.
     """
@@ -49,6 +51,8 @@ def evidence_of(
         "spread": evidence.spread(settled.pixels[kept], picture.size_px, params.blocks),
         "explained": comparison.explained(params.agree),
         "contradicted": comparison.contradicted(params.contradict),
+        "explained_coarsely": coarse.explained(params.agree),
+        "contradicted_coarsely": coarse.contradicted(params.contradict),
         "compared": float(np.log10(comparison.num_judged + 1)),
         "colour": comparison.colour,
         "seen": comparison.seen,

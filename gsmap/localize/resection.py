@@ -151,7 +151,7 @@ def refine(
     given = np.ones(len(pixels)) if weights is None else weights
     dim = 6 if focal is None else 7
     damping = 1e-6
-    residuals, jacobian = _linearised(pixels, points, pose, intrinsics, dim)
+    residuals, jacobian = linearised(pixels, points, pose, intrinsics, dim)
     for _ in range(params.iterations):
         robust = given * doubted(residuals, params.doubt_px)
         J, w = jacobian.reshape(-1, dim), np.repeat(robust, 2)
@@ -164,7 +164,7 @@ def refine(
         tried, lens = moved(pose, step[:6]), intrinsics.copy()
         if focal is not None:
             lens[:2] *= np.exp(np.clip(step[6], -0.3, 0.3))
-        after, J_after = _linearised(pixels, points, tried, lens, dim)
+        after, J_after = linearised(pixels, points, tried, lens, dim)
         if _cost(after, given, params, lens, focal) > cost:
             damping = max(damping * 100, 1e-3)
             if damping > 1e3:
@@ -186,7 +186,7 @@ def moved(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
     return out
 
 
-def _linearised(
+def linearised(
     pixels: np.ndarray, points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray, dim: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (K, 2) and the prediction's derivative (K, 2, dim); what lies behind the camera counts for nothing."""

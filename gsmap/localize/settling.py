@@ -1,13 +1,15 @@
-"""From a rough pose to a sharp one: the map rendered from there, its patches found in the photo, and again."""
+"""From a rough pose to a sharp one: the map rendered from there, found again in the photo and laid over it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.localize import evidence, features, resection, tracking
+from gsmap.geometry.projection import project
+from gsmap.geometry.rotations import log_so3
+from gsmap.localize import aligning, covariance, evidence, features, resection, tracking
 from gsmap.localize.looks import GREY, Look, look
 from gsmap.localize.placed import PlacedFeatures
 
@@ -17,12 +19,14 @@ class Params:
     """How often the map is rendered, and how far patches are looked for.
 
     Args:
-        reach_px: of each round, at the full size of the picture; all but the last are done at half of it.
+        far_px: patches of the first renders are looked for so far away, at half the size of the picture.
+        near_px: ... and those of the last ones, at its full size; of a picture of 480 pixels both.
         max_scenes: that are rendered, those with most matches first.
         min_found: patches; with fewer the pose stays as it was.
     """
 
-    reach_px: tuple[int, ...] = (32, 24, 6)
+    far_px: int = 32
+    near_px: int = 6
     max_scenes: int = 3
     min_found: int = 8
 
@@ -60,7 +64,8 @@ class Settled:
     Args:
         T_metric_camera: (4, 4) camera-to-component, metres.
         intrinsics_px: (4,) of the picture's size.
-        fit: the last adjustment; None where too little was found.
+        fit: the last adjustment to patches, with residuals from the pose; None where too few were found.
+        covariance: (6, 6) of the pose, metres; None where nothing tells.
         pixels: (K, 2) where its patches were found.
         points: (K, 3) their places, metres.
         scene: (K,) int, whose patches they are, among ``looks``.
@@ -71,6 +76,7 @@ class Settled:
     T_metric_camera: np.ndarray
     intrinsics_px: np.ndarray
     fit: resection.Refined | None
+    covariance: np.ndarray | None
     pixels: np.ndarray
     points: np.ndarray
     scene: np.ndarray
@@ -87,8 +93,13 @@ def settle(
     lifting: features.Params,
     tracks: tracking.Params,
     poses: resection.Params,
+    laying: aligning.Params,
+    known: covariance.Params,
 ) -> Settled:
-    """Render, find again, adjust; as often as ``reach_px`` has rounds.
+    """Find patches from far, lay renders over the photo, find patches again; what both tell is one pose.
+
+    Patches are exact where renders are sharp and have corners; what is laid over whole holds where they are blurred, or
+    show little but edges.
 
     Args:
         picture: of the photo.
@@ -97,33 +108,104 @@ def settle(
     """
     pose, lens = T_metric_camera, intrinsics_px
     scenes = scenes[: params.max_scenes]
-    fit, pixels, points, scene, tried = None, np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, int), 0
-    for number, reach in enumerate(params.reach_px):
-        half = number < len(params.reach_px) - 1
-        seen = picture.halved() if half else picture
-        factor = 0.5 if half else 1.0
-        looks = look(scenes, pose, lens * factor, seen.size_px, lifting)
-        found, places, whose, tried = [], [], [], 0
-        for place, one in enumerate(looks):
-            hits = tracking.track(one.grey, one.sound, seen.grey, int(np.ceil(reach * factor)), tracks)
-            keep = hits.found
-            tried += len(keep)
-            found.append(hits.photo_px[keep] / factor)
-            places.append(one.points(hits.render_px[keep], pose, lens * factor))
-            whose.append(np.full(int(keep.sum()), place))
-        if sum(map(len, found)) < params.min_found:
-            break
-        pixels, points, scene = np.concatenate(found), np.concatenate(places), np.concatenate(whose)
-        start = pose
-        if half:  # some of what was found far away is wrong
-            again = resection.resect(pixels, points, lens, picture.size_px, 0.0, poses)
-            if again is not None:
-                start = again.T_map_camera
-        free = None if picture.focal_sigma <= 0.01 else (picture.intrinsics_px[0], picture.focal_sigma)
-        fit = resection.refine(pixels, points, start, lens, poses, focal=free)
-        pose, lens = fit.T_map_camera, fit.intrinsics_px
-    looks = look(scenes, pose, lens, picture.size_px, lifting) if fit is not None else []
-    return Settled(pose, lens, fit, pixels, points, scene, tried, looks)
+    free = None if picture.focal_sigma <= 0.01 else (picture.intrinsics_px[0], picture.focal_sigma)
+    half = picture.halved()
+
+    looks = look(scenes, pose, lens / 2, half.size_px, lifting)
+    patches = _found_again(half, 0.5, looks, pose, lens, params.far_px, tracks)
+    if len(patches.pixels) >= params.min_found:  # some of what was found far away is wrong
+        again = resection.resect(patches.pixels, patches.points, lens, picture.size_px, 0.0, poses)
+        start = pose if again is None else again.T_map_camera
+        rough = resection.refine(patches.pixels, patches.points, start, lens, poses, focal=free)
+        pose, lens = rough.T_map_camera, rough.intrinsics_px
+
+    aligned = None
+    looks = look(scenes, pose, lens / 2, half.size_px, lifting)
+    scores = [aligning.agreement(half.rgb, one, laying.blur_px[0] / 2, laying) for one in looks]
+    best = int(np.argmax(scores))
+    for blur in laying.blur_px:
+        one = looks[best] if aligned is None else look([scenes[best]], pose, lens / 2, half.size_px, lifting)[0]
+        laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
+        if len(laid.pixels):
+            aligned, pose, lens = laid, laid.T_metric_camera, 2 * laid.intrinsics_px
+
+    looks = look(scenes, pose, lens, picture.size_px, lifting)
+    patches = _found_again(picture, 1.0, looks, pose, lens, params.near_px, tracks)
+    told = None if aligned is None else covariance.of_aligned(aligned, half.size_px, known, picture.focal_sigma)
+    fit: resection.Refined | None = None
+    if len(patches.pixels) >= params.min_found:
+        fit = resection.refine(patches.pixels, patches.points, pose, lens, poses, focal=free)
+        by_patches = covariance.of_patches(fit, patches.pixels, picture.size_px, known, picture.focal_sigma)
+        if told is None:
+            pose, lens, told = fit.T_map_camera, fit.intrinsics_px, by_patches
+        else:
+            pose, lens, told = _between(pose, lens, told, fit, by_patches)
+        at, _ = project(patches.points, np.linalg.inv(pose), lens)
+        fit = replace(fit, residuals_px=patches.pixels - at)
+    if told is None:
+        return Settled(pose, lens, None, None, patches.pixels, patches.points, patches.scene, patches.tried, [])
+    return Settled(
+        pose,
+        lens,
+        fit,
+        covariance.with_hidden(told[:6, :6], known),
+        patches.pixels,
+        patches.points,
+        patches.scene,
+        patches.tried,
+        look(scenes, pose, lens, picture.size_px, lifting),
+    )
+
+
+def _between(
+    pose: np.ndarray, lens: np.ndarray, told: np.ndarray, fit: resection.Refined, by_patches: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A pose and that of patches as one, each by what is known of it.
+
+    They saw the same pictures, so they err together in part: the covariance is as if each told half (covariance
+    intersection, Julier and Uhlmann 1997).
+    """
+    dim = len(told)
+    apart = np.linalg.inv(pose) @ fit.T_map_camera
+    xi = np.r_[log_so3(apart[:3, :3]), apart[:3, 3], np.log(fit.intrinsics_px[0] / lens[0])][:dim]
+    mine, theirs = np.linalg.pinv(told, hermitian=True), np.linalg.pinv(by_patches, hermitian=True)
+    both = np.linalg.pinv(mine + theirs, hermitian=True)
+    step = both @ theirs @ xi
+    moved_lens = lens.copy()
+    if dim == 7:
+        moved_lens[:2] *= np.exp(step[6])
+    return resection.moved(pose, step[:6]), moved_lens, 2 * both
+
+
+@dataclass(frozen=True, eq=False)
+class _Patches:
+    """Patches of renders that were found again in a photo; as in `Settled`."""
+
+    pixels: np.ndarray
+    points: np.ndarray
+    scene: np.ndarray
+    tried: int
+
+
+def _found_again(
+    seen: Picture,
+    factor: float,
+    looks: Sequence[Look],
+    pose: np.ndarray,
+    lens: np.ndarray,
+    reach_px: int,
+    tracks: tracking.Params,
+) -> _Patches:
+    """Patches of renders in a photo that is so many times its full size; pixels are those of the full size."""
+    found, places, whose, tried = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros(0, int)], 0
+    for place, one in enumerate(looks):
+        hits = tracking.track(one.grey, one.sound, seen.grey, int(np.ceil(reach_px * factor)), tracks)
+        keep = hits.found
+        tried += len(keep)
+        found.append(hits.photo_px[keep] / factor)
+        places.append(one.points(hits.render_px[keep], pose, lens * factor))
+        whose.append(np.full(int(keep.sum()), place))
+    return _Patches(np.concatenate(found), np.concatenate(places), np.concatenate(whose), tried)
 
 
 def inliers(settled: Settled, params: evidence.Params, size_px: tuple[int, int]) -> np.ndarray:

@@ -142,7 +142,7 @@ def _help(
             ties[k, other] = True
             continue
         judged = judged_pose(shot.picture, start, scenes, params)
-        if judged.settled.fit is None or not _same(judged, start, params):
+        if judged.settled.covariance is None or not _same(judged, start, params):
             judged = _by_matches(shot, start, pixels[pose.inliers], places[pose.inliers], helper.best, judged, params)
         if max(judged.probability, helper.probability) >= shot.probability:
             shot.judged, shot.helped = [judged, *shot.judged], False
@@ -186,6 +186,7 @@ def _by_matches(
         fit.T_map_camera,
         fit.intrinsics_px,
         fit,
+        own,
         pixels,
         points,
         np.zeros(len(pixels), int),

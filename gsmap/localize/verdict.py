@@ -63,6 +63,8 @@ def _weakest(evidence: Mapping[str, float]) -> str:
         "spread": f"what is found again covers {evidence['spread']:.0%} of the picture",
         "explained": f"the map explains {evidence['explained']:.0%} of what can be compared",
         "contradicted": f"{evidence['contradicted']:.0%} of what can be compared differs",
+        "explained_coarsely": f"the map explains {evidence['explained_coarsely']:.0%} of the coarse picture",
+        "contradicted_coarsely": f"{evidence['contradicted_coarsely']:.0%} of the coarse picture differs",
         "compared": "little can be compared",
         "colour": f"colours agree by {evidence['colour']:.2f}",
         "seen": f"the map covers {evidence['seen']:.0%} of the picture",

@@ -1,0 +1,123 @@
+"""Laying a render over a photograph: poses found from far, through blur and exposure, on surfaces that slant."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from gsmap.geometry.rotations import angle_between, exp_so3
+from gsmap.localize import aligning, covariance
+from gsmap.localize.looks import GREY, Look
+
+SIZE = (240, 180)
+LENS = np.array([200.0, 200.0, 120.0, 90.0])
+PARAMS = aligning.Params()
+
+
+def _texture(points: np.ndarray) -> np.ndarray:
+    """Smooth colours (..., 3) of places on a surface, the same from everywhere."""
+    rng = np.random.default_rng(3)
+    out = np.full((*points.shape[:-1], 3), 0.5)
+    for frequency in (1.5, 3.0, 6.0, 11.0):
+        for channel in range(3):
+            along = rng.normal(size=(2, 3))
+            along *= frequency / np.linalg.norm(along, axis=1, keepdims=True)
+            phase = rng.uniform(0, 6, 2)
+            waves = np.sin(points @ along[0] + phase[0]) * np.sin(points @ along[1] + phase[1])
+            out[..., channel] += 0.12 * waves
+    return out
+
+
+def _seen(pose: np.ndarray, lens: np.ndarray = LENS) -> tuple[np.ndarray, np.ndarray]:
+    """Picture (H, W, 3) and depth (H, W) of a floor at y = 1 and a wall at z = 4, by intersecting rays with both."""
+    width, height = SIZE
+    column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(column - lens[2]) / lens[0], (row - lens[3]) / lens[1], np.ones_like(column)], axis=-1)
+    rays = rays @ pose[:3, :3].T
+    centre = pose[:3, 3]
+    to_wall = (4.0 - centre[2]) / rays[..., 2]
+    with np.errstate(divide="ignore"):
+        to_floor = np.where(rays[..., 1] > 1e-6, (1.0 - centre[1]) / rays[..., 1], np.inf)
+    depth = np.minimum(to_wall, to_floor)
+    return _texture(centre + depth[..., None] * rays).astype(np.float32), depth.astype(np.float32)
+
+
+def _look(pose: np.ndarray, blur: float = 0.0, lens: np.ndarray = LENS) -> Look:
+    rgb, depth = _seen(pose, lens)
+    rgb = gaussian_filter(rgb, (blur, blur, 0)) if blur else rgb
+    return Look("a", rgb, rgb @ GREY, np.ones_like(depth), depth, depth > 0)
+
+
+def _pose(turn_deg: list[float], at: list[float]) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3] = exp_so3(np.radians(turn_deg))
+    out[:3, 3] = at
+    return out
+
+
+def _laid(photo: np.ndarray, start: np.ndarray, focal: tuple[float, float] | None = None, blur: float = 0.0):
+    pose, lens, laid = start, LENS, None
+    for width in PARAMS.blur_px:
+        laid = aligning.align(photo, _look(pose, blur, lens), pose, lens, width / 2, PARAMS, focal)
+        pose, lens = laid.T_metric_camera, laid.intrinsics_px
+    assert laid is not None
+    return laid
+
+
+TRUE = _pose([-14.0, 4.0, 1.0], [0.05, -0.2, 0.3])
+START = _pose([-12.0, 2.0, -0.5], [-0.03, -0.15, 0.38])  # 3.2 degrees and 12 cm off
+
+
+@pytest.mark.parametrize(("blur", "gain", "bar_m"), [(0.0, 1.0, 0.004), (3.0, 1.0, 0.016), (1.0, 0.6, 0.006)])
+def test_a_pose_is_found_from_far_though_the_render_is_blurred_and_the_light_another(blur, gain, bar_m):
+    photo = gain * _seen(TRUE)[0] + 0.2
+    laid = _laid(photo, START, blur=blur)
+    assert np.linalg.norm(laid.T_metric_camera[:3, 3] - TRUE[:3, 3]) < bar_m
+    assert np.degrees(angle_between(laid.T_metric_camera[:3, :3], TRUE[:3, :3])) < 0.2
+
+
+def test_a_third_of_the_picture_that_shows_something_else_does_not_move_it():
+    photo = _seen(TRUE)[0]
+    photo[:, 80:160] = np.random.default_rng(0).uniform(size=(18, 8, 3)).repeat(10, 0).repeat(10, 1)
+    laid = _laid(photo, START)
+    assert np.linalg.norm(laid.T_metric_camera[:3, 3] - TRUE[:3, 3]) < 0.02
+
+
+def test_a_free_focal_length_is_found_with_the_pose():
+    lens = LENS * [1.06, 1.06, 1, 1]
+    laid = _laid(_seen(TRUE, lens)[0], _pose([-13.5, 4.5, 1.0], [0.04, -0.18, 0.3]), focal=(200.0, 0.3))
+    assert laid.intrinsics_px[0] == pytest.approx(lens[0], rel=0.01)
+    assert np.linalg.norm(laid.T_metric_camera[:3, 3] - TRUE[:3, 3]) < 0.03
+
+
+def test_the_information_says_what_moves_a_pose_that_is_one_sigma_off():
+    rng = np.random.default_rng(1)
+    truth, found = [], None
+    for _ in range(12):
+        noise = gaussian_filter(rng.normal(size=(*SIZE[::-1], 3)), (2, 2, 0)).astype(np.float32)
+        found = _laid(_seen(TRUE)[0] + 0.02 * noise / noise.std(), TRUE)
+        truth.append(found.T_metric_camera[:3, 3] - TRUE[:3, 3])
+    told = covariance.of_aligned(found, SIZE, covariance.Params(swell=1.0), 0.0)
+    spread = np.sqrt(np.mean(np.square(truth), axis=0).sum())
+    assert 0.3 < spread / np.sqrt(np.trace(told[3:6, 3:6])) < 2.0
+
+
+def test_a_slanted_floor_is_smooth_and_a_step_is_an_edge():
+    look = _look(TRUE)
+    smooth = aligning._smooth(look, PARAMS)
+    assert smooth[5:-5, 5:-5].mean() > 0.97  # all but the line where floor and wall meet
+    stepped = look.depth_m.copy()
+    stepped[:, :100] *= 0.7  # nearer
+    smooth = aligning._smooth(Look("a", look.rgb, look.grey, look.alpha, stepped, look.sound), PARAMS)
+    assert not smooth[20:60, 98:102].any()
+    assert smooth[20:60, 10:90].all()
+
+
+def test_where_little_is_known_the_pose_stays_as_it_was():
+    look = _look(START)
+    bare = Look("a", look.rgb, look.grey, np.zeros_like(look.alpha), look.depth_m, look.sound)
+    laid = aligning.align(_seen(TRUE)[0], bare, START, LENS, 4.0, PARAMS)
+    assert not len(laid.pixels)
+    assert np.array_equal(laid.T_metric_camera, START)
+    assert aligning.agreement(_seen(TRUE)[0], look, 4.0, PARAMS) > aligning.agreement(_seen(TRUE)[0], bare, 4.0, PARAMS)
