@@ -23,14 +23,16 @@ class Params:
         hidden_m: standard deviation of a translation that leaves no residual: the splats of a capture lie beside the
             surface that its photographs show; fitted on made places by ``tools/fit_localize.py``.
         hidden_rad: the same of a rotation.
-        swell: by which share the standard deviations that residuals tell are too small on made places.
+        swell: by how many times the standard deviations that residuals of patches tell are too small on made places.
+        swell_aligned: the same of what differences of colours tell.
     """
 
     blocks: tuple[int, int] = (6, 4)
     least_px: float = 0.15
-    hidden_m: float = 0.002
-    hidden_rad: float = 0.0005
-    swell: float = 1.5
+    hidden_m: float = 0.007
+    hidden_rad: float = 0.001
+    swell: float = 2.1
+    swell_aligned: float = 3.7
 
 
 def pose_covariance(
@@ -57,7 +59,8 @@ def of_patches(
     least = (params.least_px * max(size_px) / 480) ** 2
     weights = np.repeat(fit.weights[:, None], 2, axis=1)
     prior = 1 / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0
-    return _sandwich(fit.jacobian, weights, fit.residuals_px, pixels / size_px, least, prior, params)
+    told = _sandwich(fit.jacobian, weights, fit.residuals_px, pixels / size_px, least, prior, params.blocks)
+    return told * params.swell**2
 
 
 def of_aligned(fit: aligning.Aligned, size_px: tuple[int, int], params: Params, focal_sigma: float) -> np.ndarray:
@@ -68,7 +71,8 @@ def of_aligned(fit: aligning.Aligned, size_px: tuple[int, int], params: Params, 
     """
     noise = float((fit.weights * fit.residuals**2).sum() / max(fit.weights.sum(), 1e-9))
     prior = noise / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0
-    return _sandwich(fit.jacobian, fit.weights, fit.residuals, fit.pixels / size_px, 0.0, prior, params)
+    told = _sandwich(fit.jacobian, fit.weights, fit.residuals, fit.pixels / size_px, 0.0, prior, params.blocks)
+    return told * params.swell_aligned**2
 
 
 def with_hidden(told: np.ndarray, params: Params) -> np.ndarray:
@@ -79,7 +83,13 @@ def with_hidden(told: np.ndarray, params: Params) -> np.ndarray:
 
 
 def _sandwich(
-    J: np.ndarray, weights: np.ndarray, r: np.ndarray, at: np.ndarray, least: float, focal: float, params: Params
+    J: np.ndarray,
+    weights: np.ndarray,
+    r: np.ndarray,
+    at: np.ndarray,
+    least: float,
+    focal: float,
+    blocks: tuple[int, int],
 ) -> np.ndarray:
     """(dim, dim): the information between the scores of blocks of the picture (Liang and Zeger 1986).
 
@@ -92,6 +102,7 @@ def _sandwich(
         at: (K, 2) shares of the picture's width and height.
         least: variance of a residual, at the least.
         focal: information of the focal length from elsewhere.
+        blocks: columns and rows.
     """
     dim = J.shape[2]
     information = np.einsum("kcd,kc,kce->de", J, weights, J, optimize=True)
@@ -99,9 +110,9 @@ def _sandwich(
         information[6, 6] += focal
     inverse = np.linalg.pinv(information, hermitian=True)
     scores = np.einsum("kcd,kc,kc->kd", J, weights, r, optimize=True)
-    cell = np.clip((at * params.blocks).astype(int), 0, np.array(params.blocks) - 1)
-    block = cell[:, 1] * params.blocks[0] + cell[:, 0]
-    sums = np.zeros((params.blocks[0] * params.blocks[1], dim))
+    cell = np.clip((at * blocks).astype(int), 0, np.array(blocks) - 1)
+    block = cell[:, 1] * blocks[0] + cell[:, 0]
+    sums = np.zeros((blocks[0] * blocks[1], dim))
     np.add.at(sums, block, scores)
     used = len(np.unique(block))
     clustered = sums.T @ sums * (used / max(used - dim / 2, 1.0))
@@ -112,7 +123,7 @@ def _sandwich(
     independent = information * max(seen, least) * np.sqrt(many)
     share = used / (used + 2.0 * dim)
     middle = share * clustered + (1 - share) * independent
-    out: np.ndarray = inverse @ middle @ inverse * params.swell**2
+    out: np.ndarray = inverse @ middle @ inverse
     return out
 
 

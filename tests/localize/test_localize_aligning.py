@@ -98,7 +98,7 @@ def test_the_information_says_what_moves_a_pose_that_is_one_sigma_off():
         noise = gaussian_filter(rng.normal(size=(*SIZE[::-1], 3)), (2, 2, 0)).astype(np.float32)
         found = _laid(_seen(TRUE)[0] + 0.02 * noise / noise.std(), TRUE)
         truth.append(found.T_metric_camera[:3, 3] - TRUE[:3, 3])
-    told = covariance.of_aligned(found, SIZE, covariance.Params(swell=1.0), 0.0)
+    told = covariance.of_aligned(found, SIZE, covariance.Params(swell_aligned=1.0), 0.0)
     spread = np.sqrt(np.mean(np.square(truth), axis=0).sum())
     assert 0.3 < spread / np.sqrt(np.trace(told[3:6, 3:6])) < 2.0
 
