@@ -5,10 +5,10 @@
     tools/bench_street.py --cache FOLDER --report             # the tables of what was measured so far
 
 The street is two rows of rooms back to back, every room with walls and furniture of its own, with doors along each row
-and from row to row at every eighth room. A capture walks from a room into the next one; one in eight walks a way that an
-earlier one took. So loops of 18 rooms follow one another. Each capture is small (``--gaussians`` laid on the depth of
+and from row to row at every eighth room. A capture walks from a room into the next one; every second one walks, the
+other way round, where an earlier one did. So loops of 18 rooms follow one another. Each capture is small (``--gaussians`` laid on the depth of
 ``--frames`` pictures, not trained) and has a frame of its own. It is ingested and ``update`` is run, with the settings
-that a map has, before the next one is made. The street is made ten columns of rooms at a time, so that a capture costs
+that a map has, before the next one is made. The street is made sixteen columns of rooms at a time, so that a capture costs
 the same wherever it lies; a column where two pieces meet is lit a little differently in each.
 
 Of each capture it keeps the CPU seconds of ingesting it, of its own share (describing it, registering its pairs: what
@@ -60,7 +60,7 @@ from gsmap_synthetic.make import DemoCapture
 from gsmap_synthetic.place import Place, build_place
 from gsmap_synthetic.plan import WALL_M, Door, Room
 
-COLUMNS, RUNG, REVISITED = 10, 8, 8  # columns of rooms made at once; a door between the rows; one capture in so many
+COLUMNS, RUNG = 16, 8  # columns of rooms made at once, and from one door between the rows to the next
 _ROOM_M = np.array([4.2, 3.8])
 _PITCH_M = _ROOM_M + WALL_M
 _KINDS = ("living room", "kitchen", "bedroom", "study", "bathroom")
@@ -75,8 +75,9 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, required=True, help="the map, and what was measured, are kept here")
     parser.add_argument("--captures", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=97, help="of the street")
-    parser.add_argument("--gaussians", type=int, default=6000, help="of a capture")
-    parser.add_argument("--frames", type=int, default=24, help="of a capture, 128 x 96")
+    parser.add_argument("--gaussians", type=int, default=3000, help="of a capture")
+    parser.add_argument("--frames", type=int, default=14, help="of a capture")
+    parser.add_argument("--size", type=int, nargs=2, default=(96, 72), help="of a frame, pixels")
     parser.add_argument("--report", action="store_true", help="make nothing more")
     args = parser.parse_args()
     gc.set_threshold(COLLECT_AFTER)  # as the command line does
@@ -103,11 +104,9 @@ def walks(piece: int, seed: int) -> list[Walk]:
             new.append(((0, column), (1, column)))
         new += [((row, column), (row, column + 1)) for row in (0, 1)]
     out: list[Walk] = []
-    for k, walk in enumerate(new, 1):
-        out.append(walk)
-        if k % REVISITED == 0:
-            a, b = out[int(rng.integers(len(out)))]
-            out.append((b, a))
+    for k, walk in enumerate(new):
+        a, b = new[int(rng.integers(k + 1))]
+        out += [walk, (b, a)]
     return out
 
 
@@ -135,7 +134,7 @@ def build_piece(piece: int, seed: int) -> tuple[Place, dict[tuple[int, int], int
         if row == 0 and column % RUNG == 0:
             at = low + [rng.uniform(0.9, _ROOM_M[0] - 0.9), _PITCH_M[1] - WALL_M / 2]
             doors.append(Door(number, numbers[1, column], at, 1.0, True))
-    return build_place(seed, rooms, doors, texel_m=0.02), numbers
+    return build_place(seed, rooms, doors, texel_m=0.03), numbers
 
 
 def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, DemoCapture, Sim3, float]]:
@@ -150,7 +149,7 @@ def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, 
                 route = [numbers[room] for room in walk]
                 made = make_captures(
                     int(np.random.default_rng([args.seed, piece, i, 4]).integers(1 << 30)), 1, steps=0,
-                    num_frames=args.frames, num_gaussians=args.gaussians, size_px=(128, 96), routes=[route], place=place,
+                    num_frames=args.frames, num_gaussians=args.gaussians, size_px=tuple(args.size), routes=[route], place=place,
                 )  # fmt: skip
                 ahead = Sim3(np.eye(3), [piece * COLUMNS * _PITCH_M[0], 0.0, 0.0])
                 took, spent = time.process_time() - spent, time.process_time()
