@@ -326,7 +326,9 @@ def judged(m: gsmap.map.Map, rows: list[dict[str, Any]]) -> dict[str, str]:
         at = np.array([poses[s].S_map_scene.apply(middles[s]) for s in placed])
         really = np.array([truth[s].apply(middles[s]) for s in placed])
         near = cKDTree(at).query_pairs(_BESIDE_M, output_type="ndarray")
-        folded += bool(len(near) and (np.linalg.norm(np.subtract(*really[near.T.reshape(2, -1)]), axis=1) > _APART_M).any())
+        folded += bool(
+            len(near) and (np.linalg.norm(np.subtract(*really[near.T.reshape(2, -1)]), axis=1) > _APART_M).any()
+        )
         anchor = max(placed, key=lambda s: -np.inf if poses[s].covariance is None else -np.trace(poses[s].covariance))
         for s in placed:
             estimated = poses[anchor].S_map_scene.inverse() @ poses[s].S_map_scene
