@@ -46,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", type=int, default=[10, 100, 1000])
     parser.add_argument(
-        "--updates", type=int, default=20, help="one-scene updates before the catalog is weighed; 0: it is not"
+        "--updates", type=int, default=20, help="one-scene updates before the catalog is weighed, 0: not"
     )
     parser.add_argument("--tiles", nargs="+", type=int, default=[100, 1000, 10_000])
     parser.add_argument("--lookup", action="store_true", help="also let the map say which pairs to try")

@@ -1,20 +1,21 @@
 #!/usr/bin/env python
-"""A street of a thousand captures that come one at a time: what each of them costs the map, and whether the map is right.
+"""A street of a thousand captures that come one at a time: what each costs the map, and whether the map is right.
 
     tools/bench_street.py --cache FOLDER --captures 1000      # goes on where it was stopped
     tools/bench_street.py --cache FOLDER --report             # the tables of what was measured so far
 
 The street is two rows of rooms back to back, every room with walls and furniture of its own, with doors along each row
 and from row to row at every eighth room. A capture walks from a room into the next one; every second one walks, the
-other way round, where an earlier one did. So loops of 18 rooms follow one another. Each capture is small (``--gaussians`` laid on the depth of
-``--frames`` pictures, not trained) and has a frame of its own. It is ingested and ``update`` is run, with the settings
-that a map has, before the next one is made. The street is made sixteen columns of rooms at a time, so that a capture costs
-the same wherever it lies; a column where two pieces meet is lit a little differently in each.
+other way round, where an earlier one did. So loops of 18 rooms follow one another. Each capture is small
+(``--gaussians`` laid on the depth of ``--frames`` pictures, not trained) and has a frame of its own. It is ingested and
+``update`` is run, with the settings that a map has, before the next one is made. The street is made sixteen columns of
+rooms at a time, so that a capture costs the same wherever it lies; a column where two pieces meet is lit a little
+differently in each.
 
 Of each capture it keeps the CPU seconds of ingesting it, of its own share (describing it, registering its pairs: what
 the jobs take), and of all else that ``update`` does. What is right is told from the truth: an edge is wrong if it puts
 the source's middle more than .5 m or 5 degrees off; two scenes of a component are folded together if the map has their
-middles within 2 m where they are more than 6 m apart.
+middles within 2 m where they are more than 6 m apart. Poses are judged beside the surest scene of their component.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -129,10 +130,10 @@ def build_piece(piece: int, seed: int) -> tuple[Place, dict[tuple[int, int], int
         rng = np.random.default_rng([seed, column, row, 3])
         low = _PITCH_M * [column - first, row]
         if (row, column + 1) in numbers:
-            at = low + [_PITCH_M[0] - WALL_M / 2, rng.uniform(0.9, _ROOM_M[1] - 0.9)]
+            at = low + np.array([_PITCH_M[0] - WALL_M / 2, rng.uniform(0.9, _ROOM_M[1] - 0.9)])
             doors.append(Door(number, numbers[row, column + 1], at, 1.0, False))
         if row == 0 and column % RUNG == 0:
-            at = low + [rng.uniform(0.9, _ROOM_M[0] - 0.9), _PITCH_M[1] - WALL_M / 2]
+            at = low + np.array([rng.uniform(0.9, _ROOM_M[0] - 0.9), _PITCH_M[1] - WALL_M / 2])
             doors.append(Door(number, numbers[1, column], at, 1.0, True))
     return build_place(seed, rooms, doors, texel_m=0.03), numbers
 
@@ -148,9 +149,15 @@ def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, 
                     place, numbers = build_piece(piece, args.seed)
                 route = [numbers[room] for room in walk]
                 made = make_captures(
-                    int(np.random.default_rng([args.seed, piece, i, 4]).integers(1 << 30)), 1, steps=0,
-                    num_frames=args.frames, num_gaussians=args.gaussians, size_px=tuple(args.size), routes=[route], place=place,
-                )  # fmt: skip
+                    int(np.random.default_rng([args.seed, piece, i, 4]).integers(1 << 30)),
+                    1,
+                    steps=0,
+                    num_frames=args.frames,
+                    num_gaussians=args.gaussians,
+                    size_px=tuple(args.size),
+                    routes=[route],
+                    place=place,
+                )
                 ahead = Sim3(np.eye(3), [piece * COLUMNS * _PITCH_M[0], 0.0, 0.0])
                 took, spent = time.process_time() - spent, time.process_time()
                 yield number, walk, made[0], ahead @ Sim3.from_matrix(made[0].T_scene_world).inverse(), took
