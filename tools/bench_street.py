@@ -3,6 +3,7 @@
 
     tools/bench_street.py --cache FOLDER --captures 1000      # goes on where it was stopped
     tools/bench_street.py --cache FOLDER --report             # the tables of what was measured so far
+    tools/bench_street.py --cache FOLDER --solves 150 --full-scenes 100    # only its solves, from 150 captures on
 
 The street is two rows of rooms back to back, every room with walls and furniture of its own, with doors along each row
 and from row to row at every eighth room. A capture walks from a room into the next one; every second one walks, the
@@ -36,6 +37,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -80,9 +82,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=14, help="of a capture")
     parser.add_argument("--size", type=int, nargs=2, default=(96, 72), help="of a frame, pixels")
     parser.add_argument("--report", action="store_true", help="make nothing more")
+    parser.add_argument("--solves", type=int, metavar="N", help="only time solving N captures, N + 1, ...")
+    parser.add_argument("--full-scenes", type=int, default=500, help="of --solves: optimize.limits.full_scenes")
     args = parser.parse_args()
     gc.set_threshold(COLLECT_AFTER)  # as the command line does
     args.cache.mkdir(parents=True, exist_ok=True)
+    if args.solves:
+        print_solves(args)
+        return
     if not args.report:
         grow(args)
     rows = measured(args.cache)
@@ -277,6 +284,26 @@ def print_costs(rows: list[dict[str, Any]]) -> None:
     print(f"{'captures in the map':48}" + "".join(f"{end:>9,}" for end in ends))
     for name, values in table.items():
         print(f"{name:48}" + "".join(f"{value:>9.4g}" for value in values))
+
+
+def print_solves(args: argparse.Namespace) -> None:
+    """Solve the street's edges again as its captures came, from ``--solves`` of them on."""
+    with gsmap.map.open(args.cache / "map.gsmap", "r") as m:
+        given, params = optimize.pose_inputs(m.store, m.settings), m.settings.optimize
+    params = replace(params, limits=replace(params.limits, full_scenes=args.full_scenes))
+    answer, seconds, methods = None, [], Counter[str]()
+    for count in range(args.solves, len(given.scenes) + 1):
+        some = set(given.scenes[:count])
+        edges = [edge for edge in given.edges if {edge.target, edge.source} <= some]
+        start = time.process_time()
+        found = optimize.solver.optimize(given.scenes[:count], edges, (), answer, params)
+        answer = optimize.solver.kept_still(found, answer, edges, params)
+        seconds.append(time.process_time() - start)
+        methods[answer.provenance.method] += 1
+    assert answer is not None
+    print(f"{len(seconds)} solves ({dict(methods)}): {np.mean(seconds[1:]):.3f} CPU s in the mean after the first")
+    print(f"scenes {dict(Counter(pose.status for pose in answer.poses.values()))}")
+    print(f"edges {dict(Counter(outcome.use for outcome in answer.outcomes.values()))}")
 
 
 # --- is it right ----------------------------------------------------------------------------------------------------
