@@ -12,6 +12,7 @@ What Gaussians reach beyond their means is not counted; `tools/bench_store.py --
 from __future__ import annotations
 
 import argparse
+
 import numpy as np
 
 from gsmap.geometry.morton import morton_order
