@@ -45,7 +45,9 @@ from gsmap.types import Sim3
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", type=int, default=[10, 100, 1000])
-    parser.add_argument("--updates", type=int, default=20, help="one-scene updates before the catalog is weighed")
+    parser.add_argument(
+        "--updates", type=int, default=20, help="one-scene updates before the catalog is weighed, 0: not"
+    )
     parser.add_argument("--tiles", nargs="+", type=int, default=[100, 1000, 10_000])
     parser.add_argument("--lookup", action="store_true", help="also let the map say which pairs to try")
     parser.add_argument("--cache", type=Path, help="keep the two real captures here")
@@ -59,11 +61,12 @@ def main() -> None:
             with filled(Path(scratch) / f"{num}.gsmap", num, made) as one:
                 rows.append(measured(one, made, options))
                 more = one.num_scenes - num
-            with filled(Path(scratch) / f"{num}-at-once.gsmap", num, made) as one:
-                for _ in range(more):
-                    one.add()
-                one.map.update()
-                rows[-1]["catalog MB, made at once"] = one.catalog_bytes() / 1e6
+            if options.updates:
+                with filled(Path(scratch) / f"{num}-at-once.gsmap", num, made) as one:
+                    for _ in range(more):
+                        one.add()
+                    one.map.update()
+                    rows[-1]["catalog MB, made at once"] = one.catalog_bytes() / 1e6
             print(json.dumps({"scenes": num} | rows[-1]), flush=True)
         table(options.scenes, rows)
     print("plan_tiles (tiles of 10 m, reach 11 m), CPU s")

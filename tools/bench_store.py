@@ -1,10 +1,15 @@
 """The storage table: what writing, reading and checking a scene costs, beside what people would use instead.
 
     python tools/bench_store.py [FILE.ply] [--gaussians 1000000] [--degree 3] [--repeat 3] [--json out.json]
+    python tools/bench_store.py [FILE.ply] --boxes [--city]
 
 Without a file the Gaussians are random (worse to compress than real ones). CPU is process time of all threads, best of
 the repeats; MB/s counts the bytes of the arrays in memory. "damage found" flips some 16 bits, evenly over the files
 that hold arrays, one after the other, and reads the scene: how many of them raised an error.
+
+--boxes: what reading a box of 26 in 1,000 Gaussians would ask of a bucket (medians of 12 boxes): range requests, and
+bytes as a multiple of what its Gaussians take of the file. Boxes are cubes, or stand like a wall, a quarter as deep as
+wide and high; --city takes a made city (walls, roofs and streets) in place of random Gaussians.
 """
 
 from __future__ import annotations
@@ -16,12 +21,15 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
 from gsmap import formats
-from gsmap.store import Store
+from gsmap.store import Store, arrays, packed
+from gsmap.store.object_arrays import MAX_REQUESTS, joined
 from gsmap.types import Cameras, Gaussians
+from gsmap_synthetic.city import PER_BLOCK, City
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
@@ -33,10 +41,20 @@ def main() -> None:
     parser.add_argument("--degree", type=int, default=3)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--boxes", action="store_true", help="only what boxes ask of a bucket")
+    parser.add_argument("--city", action="store_true", help="a made city instead of random Gaussians")
     options = parser.parse_args()
-    g = formats.read(options.file) if options.file else random_gaussians(options.gaussians, options.degree)
+    if options.file:
+        g = formats.read(options.file)
+    elif options.city:
+        g = City(-(-options.gaussians // PER_BLOCK), seed=9, sh_degree=options.degree).load()
+    else:
+        g = random_gaussians(options.gaussians, options.degree)
     print(f"{len(g)} Gaussians, SH degree {g.sh_degree}, {g.nbytes / 1e6:.0f} MB\n")
     with tempfile.TemporaryDirectory() as folder:
+        if options.boxes:
+            boxes(Path(folder), g)
+            return
         rows = [bench(Path(folder), g, options.repeat) for bench in (gsmap_store, ply, plain_zarr, npz)]
     print(f"{'':24}{'write s':>9}{'MB/s':>7}{'read s':>9}{'MB/s':>7}{'box ms':>8}{'check s':>9}{'MB':>7}  damage found")
     for row in rows:
@@ -80,6 +98,29 @@ def gsmap_store(folder: Path, g: Gaussians, repeat: int) -> dict:
             folder / "map",
             damage(folder / "map" / "arrays", read),
         )
+
+
+def boxes(folder: Path, g: Gaussians, share: float = 0.026, count: int = 12) -> None:
+    """Print what boxes around some of the Gaussians would ask of a bucket."""
+    asked: list[list[tuple[int, int]]] = []
+    with Store.create(folder / "map") as store:
+        store.scenes.add(g, one_camera(), name="scene")
+        size = (next((folder / "map" / "arrays").rglob(packed.FILE))).stat().st_size
+        with mock.patch.object(arrays._Files, "expect", lambda self, file, ranges: asked.append(list(ranges))):
+            for name, shape in (("cube", (1.0, 1.0, 1.0)), ("wall", (1.0, 0.25, 1.0))):
+                rng, found = np.random.default_rng(5), []
+                for centre in g.means[rng.integers(len(g), size=count)].astype(np.float64):
+                    away = (np.abs(g.means - centre) / shape).max(1)
+                    reach = np.quantile(away, share) * np.array(shape)
+                    asked.clear()
+                    hit = len(store.scenes.gaussians("scene", np.stack([centre - reach, centre + reach])))
+                    few = [part for ranges in asked for part in joined(ranges, MAX_REQUESTS)]
+                    found.append((len(few), sum(b - a for a, b in few) / (size * hit / len(g)), hit))
+                requests, times, hits = np.median(found, axis=0)
+                print(
+                    f"{name}: {hits:.0f} Gaussians in {requests:.0f} requests, {times:.2f} times their bytes",
+                    flush=True,
+                )
 
 
 def ply(folder: Path, g: Gaussians, repeat: int) -> dict:

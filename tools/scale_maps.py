@@ -160,7 +160,17 @@ class Filled:
         step[0, 6] = 0
         S = self.truth(i).inverse() @ self.truth(j) @ exp(step).item(0)
         information = np.diag(_SIGMAS**-2.0)
-        return replace(self.made.accepted, target=target, source=source, S_target_source=S, information=information)
+        # Of its own: where all pairs disagree alike, one that noise has thrown out puts all the others in doubt.
+        evidence = dict(self.made.accepted.evidence)
+        evidence["disagreement"] = evidence.get("disagreement", 0.01) * float(np.exp(rng.normal(0, 0.5)))
+        return replace(
+            self.made.accepted,
+            target=target,
+            source=source,
+            S_target_source=S,
+            information=information,
+            evidence=evidence,
+        )
 
     def add(self) -> str:
         """Ingest one capture more; its id."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -116,11 +117,29 @@ def _agreeing(poses: Sequence[ScenePose]) -> list[ScenePose]:
     if not poses:
         return []
     logs = np.log([pose.S_map_scene.scale for pose in poses])
-    apart = np.abs(logs[:, None] - logs)
-    variances = 2 * _ASSUMED_SIGMA**2 + np.add.outer(*[[_scale_variance(pose) for pose in poses]] * 2)
-    near = apart <= _AGREE * np.sqrt(variances)
-    most = int(near.sum(1).argmax())
-    return [poses[i] for i in np.flatnonzero(near[most]).tolist()] if 2 * near[most].sum() > len(poses) else []
+    own = np.array([_scale_variance(pose) for pose in poses])
+
+    def reach(i: int | slice, of_other: np.ndarray | float) -> np.ndarray:
+        out: np.ndarray = _AGREE * np.sqrt(2 * _ASSUMED_SIGMA**2 + own[i] + of_other)
+        return out
+
+    # What lies within the least reach agrees whatever the other's variance, and what lies beyond the most does not. So
+    # few pairs are looked at one by one, and a map may have ten thousand scenes.
+    order = np.argsort(logs, kind="stable")
+    inside, maybe = (
+        [np.searchsorted(logs[order], logs + sign * reach(slice(None), spread), side) for sign, side in _ENDS]
+        for spread in (own.min(), own.max())
+    )
+    counts = inside[1] - inside[0]
+    for i in np.flatnonzero((maybe[0] < inside[0]) | (maybe[1] > inside[1])).tolist():
+        others = np.r_[order[maybe[0][i] : inside[0][i]], order[inside[1][i] : maybe[1][i]]]
+        counts[i] += int((np.abs(logs[others] - logs[i]) <= reach(i, own[others])).sum())
+    i = int(counts.argmax())
+    near = np.flatnonzero(np.abs(logs - logs[i]) <= reach(i, own))
+    return [poses[k] for k in near.tolist()] if 2 * len(near) > len(poses) else []
+
+
+_ENDS: tuple[tuple[int, Literal["left", "right"]], ...] = ((-1, "left"), (1, "right"))
 
 
 def _scale_variance(pose: ScenePose) -> float:

@@ -29,7 +29,7 @@ from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.places import SINGLE_PUT_BYTES, chunks_of
 
 _ROOT = "arrays"
-_MAX_REQUESTS = 5  # for the parts of a group that are read, beside the one for its table of contents
+MAX_REQUESTS = 5  # for the parts of a group that are read, beside the one for its table of contents
 _WHOLE = 0.5  # of a file: who reads so much of it gets all of it
 
 
@@ -263,7 +263,7 @@ class _Objects:
         missing = [r for r in ranges if not any(at <= r[0] and r[1] <= at + len(b) for at, b in self._held[file])]
         if self._whole[file] is not None or not missing:
             return
-        few = joined(missing, _MAX_REQUESTS)
+        few = joined(missing, MAX_REQUESTS)
         if sum(stop - start for start, stop in few) > _WHOLE * size:
             one = self._files[file]
             self._whole[file] = cache.keep(one.sha256, self._home.get(self._keys[file]), self._keys[file])

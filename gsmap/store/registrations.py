@@ -17,6 +17,7 @@ from sqlalchemy import (
     case,
     func,
     insert,
+    null,
     or_,
     select,
     true,
@@ -194,10 +195,14 @@ class Registrations:
             copied = {name: value for name, value in row._mapping.items() if name != "number"}
             return self._insert(connection, copied | {"adopts": original, "created_at": now()})
 
-    def current(self) -> list[StoredRegistration]:
-        """The current registration of each pair of living scenes, by the pair's first registration."""
+    def current(self, *, brief: bool = False) -> list[StoredRegistration]:
+        """The current registration of each pair of living scenes, by the pair's first registration.
+
+        Args:
+            brief: without evidence and notes, which are most of what there is to read.
+        """
         with self._catalog.read() as connection:
-            return _current(connection)
+            return _current(connection, columns=_BRIEF if brief else _FULL)
 
     def current_of(self, scene: str) -> list[StoredRegistration]:
         """The same of the pairs of one scene (id)."""
@@ -392,6 +397,7 @@ _FULL = tuple(
     type_coerce(column, LargeBinary).label(column.name) if column.name in ("S_target_source", "information") else column
     for column in registrations.columns
 )
+_BRIEF = tuple(null().label(column.name) if column.name in ("evidence", "notes") else column for column in _FULL)
 _PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "status")
 _LEAN = (
     *(registrations.c[name] for name in _PARTS),
@@ -401,9 +407,12 @@ _EVIDENCE = case((registrations.c.status == "accepted", registrations.c.evidence
 
 
 def _current(
-    connection: Connection, of: ColumnElement[bool] | None = None, silent_if: ColumnElement[bool] | None = None
+    connection: Connection,
+    of: ColumnElement[bool] | None = None,
+    silent_if: ColumnElement[bool] | None = None,
+    columns: Sequence[ColumnElement[Any]] = _FULL,
 ) -> list[StoredRegistration]:
-    return _stored_all(_living(connection, _choose(connection, _FULL, of, silent_if)))
+    return _stored_all(_living(connection, _choose(connection, columns, of, silent_if)))
 
 
 def _living(connection: Connection, chosen: Iterable[_Choice]) -> list[_Choice]:
@@ -495,8 +504,8 @@ def _stored(
         proposer=row.proposer,
         exact=bool(row.exact),
         seconds=row.seconds,
-        evidence=row.evidence,
-        notes=tuple(row.notes),
+        evidence=row.evidence or {},
+        notes=tuple(row.notes or ()),
     )
     review = None if word is None else word.review
     return StoredRegistration(row.number, registration, row.key, row.created_at, review, row.recipe, row.adopts)

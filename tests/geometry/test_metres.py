@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gsmap.errors import InputError
-from gsmap.geometry.metres import SceneUnit, in_metres, metre_of, resized
+from gsmap.geometry.metres import SceneUnit, _agreeing, in_metres, metre_of, resized
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, ScenePose, Sim3
@@ -114,3 +114,32 @@ def test_a_scene_in_metres_is_the_scene_in_the_map_times_metres_per_unit():
     np.testing.assert_allclose(back.means, direct.means, atol=2e-6)
     np.testing.assert_allclose(back.log_scales, direct.log_scales, atol=2e-6)
     assert resized(g, 1.0) is g
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_whose_units_agree_is_told_pair_by_pair(seed):
+    rng = np.random.default_rng(seed)
+    sigmas = rng.choice([None, 0.01, 0.1, 0.4], 15)
+    poses = [pose(float(np.exp(rng.normal(0, 0.4))), sigma) for sigma in sigmas]
+    variances = [0.0 if sigma is None else sigma**2 for sigma in sigmas]
+    logs = np.log([one.S_map_scene.scale for one in poses])
+    near = np.abs(logs[:, None] - logs) <= 5 * np.sqrt(2 * 0.03**2 + np.add.outer(variances, variances))
+    most = near[near.sum(1).argmax()]
+    expected = [one for one, agrees in zip(poses, most, strict=True) if agrees] if 2 * most.sum() > 15 else []
+    assert _agreeing(poses) == expected
+
+
+def test_units_may_agree_since_both_are_vague():
+    vague = [pose(float(np.exp(log)), 0.1) for log in (3.0, 2.4, 2.4, 3.6, 3.6)]
+    assert _agreeing([*[pose()] * 3, *vague]) == vague  # .6 is within five sigmas of two vague ones, not of one
+
+
+def test_whose_units_agree_takes_no_room_for_every_pair():
+    import tracemalloc
+
+    poses = [pose(1.0 + 1e-6 * k, 0.01 + 1e-6 * k) for k in range(5000)]
+    tracemalloc.start()
+    assert len(_agreeing(poses)) == 5000
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6  # a number for every pair would be 200 MB

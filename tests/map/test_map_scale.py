@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 import pytest
 from scale_maps import Filled, filled, tiny_pattern
 
+from gsmap.map.stages import optimize
+
 SMALL, LARGE = 12, 36
 LOOKED_UP = False  # whether the map says which pairs to try; else these are given (`Filled.standing_in`)
 MOST_STATEMENTS = 300
@@ -54,3 +56,14 @@ def test_cost_is_that_of_what_is_new(street: Filled) -> None:
     note(street, "status", num, m.status)
     if num == LARGE:
         assert len(COUNTS["one scene more"]) == 2
+
+
+def test_poses_are_named_again_only_where_edges_came_after_the_solve(
+    street: Filled, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named, pose_basis = [], optimize.pose_basis
+    monkeypatch.setattr(optimize, "pose_basis", lambda *given: named.append(1) or pose_basis(*given))
+    street.add()
+    with street.standing_in():
+        street.map.update()
+    assert len(named) == 2  # to see whether to solve, and what is solved

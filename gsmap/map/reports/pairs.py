@@ -47,7 +47,7 @@ def edge_rows(
         inside = {row.id for row in scene_rows(store, component=component, tag=tag, as_of=as_of)}
     return [
         row
-        for row in _edge_rows(store, store.registrations.current())
+        for row in _edge_rows(store, store.registrations.current(brief=True))
         if (inside is None or {row.target, row.source} <= inside)
         and (status is None or row.status == status)
         and (since is None or is_after(row.registered_at, since))

@@ -212,7 +212,7 @@ def stale(current: Iterable[StoredRegistration], graphs: Mapping[str, RecipeKey]
     return [
         (a, b)
         for a, b, key in ends
-        if {a, b} <= set(graphs) and key != recipe.digest_of(graphs[a].digest, graphs[b].digest)
+        if a in graphs and b in graphs and key != recipe.digest_of(graphs[a].digest, graphs[b].digest)
     ]
 
 
