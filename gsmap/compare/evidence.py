@@ -62,7 +62,14 @@ class Tally:
         self.lightness = np.zeros(count, dtype=np.float32)
 
     def evidence(
-        self, points: np.ndarray, shows: np.ndarray, shell: np.ndarray, views: int, line: Balance, params: Params
+        self,
+        points: np.ndarray,
+        shows: np.ndarray,
+        shell: np.ndarray,
+        others: np.ndarray,
+        views: int,
+        line: Balance,
+        params: Params,
     ) -> Evidence:
         """The counts and what they come to.
 
@@ -70,9 +77,10 @@ class Tally:
             points: (N, 3) of the Gaussians.
             shows: (N,) which of them are part of a surface and vote.
             shell: (N,) wall, floor or ceiling that each is part of; see `gsmap.compare.things.shells`.
+            others: (M, 3) of the other capture's Gaussians that are part of a surface.
             views: how many the other capture has.
         """
-        from gsmap.compare.things import Doubts, kin, rooted  # with scipy, which naming a recipe does without
+        from gsmap.compare.things import Doubts, clear, kin, rooted  # with scipy, which naming a recipe does without
 
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
@@ -95,6 +103,7 @@ class Tally:
         _follow(state, near, self.grazed > 0, self.colour_seen < params.min_views)
         looks = min(params.min_views, views)
         gone = (state == GONE) & (self.through >= looks) & ((self.sure >= 1) | (self.on_surface == 0))
+        gone[gone] = clear(points[gone], others, params.clear_m)
         painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= params.root_colour) & (differs >= 1)
         # What one can look through is no wall.
         shell = np.where(state == GONE, -1, shell)

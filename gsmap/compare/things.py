@@ -89,7 +89,7 @@ def rooted(doubts: Doubts, params: Params) -> np.ndarray:
 
 def kin(doubts: Doubts, params: Params) -> np.ndarray:
     """(N,) bool, the changed and what changed with them: of things much of which changed, what differs a little and is
-    tied to what changed, and small pieces that would be left of them."""
+    tied to what changed, and what most of those about it on the thing did."""
     thing = np.full(len(doubts.points), -1, dtype=np.int64)
     loose = np.flatnonzero(doubts.shell < 0)
     thing[loose] = components(doubts.points[loose], params.link_m)
@@ -112,32 +112,72 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     mine = np.zeros(len(out), dtype=bool)
     mine[of_these] = True
     out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, params.beside_m)] = True
-    left = of_these[~out[of_these]]
-    if len(left):
-        label = components(doubts.points[left], params.link_m, thing[left])
-        of = np.zeros(int(label.max()) + 1, dtype=np.int64)
-        of[label] = thing[left]
-        small = np.bincount(label) <= params.most_left * changed[of]
-        small &= _extents(doubts.points[left], label) < params.left_m
-        near = cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=params.beside_m)[0]
-        out[left[small[label] & np.isfinite(near)]] = True
+    out[_with_most(doubts, mine, mine & ~out, out, params.beside_m)] = True
     return out
 
 
-def _extents(points: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """(L,) longest edge of the box around the points (N, 3) of each label."""
-    low, high = np.full((int(label.max()) + 1, 3), np.inf), np.full((int(label.max()) + 1, 3), -np.inf)
-    np.minimum.at(low, label, points)
-    np.maximum.at(high, label, points)
-    longest: np.ndarray = (high - low).max(1)
-    return longest
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of two captures, after `kin`.
+
+    Args:
+        points, colours: (N, 3), colours in [0, 1].
+        shell: (N,) see `shells`.
+        changed: (N,) bool.
+    """
+
+    points: np.ndarray
+    colours: np.ndarray
+    shell: np.ndarray
+    changed: np.ndarray
+
+
+def remnants(one: Side, other: Side, params: Params) -> np.ndarray:
+    """(N,) bool, what is left of things most of which changed and belongs to them: a sofa that was pushed along by
+    half its length still shows itself, in its own colour, where its halves meet.
+
+    Things that touch are one thing here, so that what is left may as well be another that stood beside and stayed: that
+    is told by colours, and by what the other capture shows in its place.
+    """
+    thing, share = _things(one, params)
+    out = np.zeros(len(one.points), dtype=bool)
+    left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
+    if not len(left) or not len(other.points):
+        return out
+    new = _things(other, params)[1]
+    score = params.new_weight * new[cKDTree(other.points).query(one.points[left])[1]]
+    for k in np.unique(thing[left]):
+        changed, rows = one.colours[one.changed & (thing == k)], np.flatnonzero(thing[left] == k)
+        if len(changed) >= max(_ASKED, params.min_roots):
+            score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < params.alike
+    label = components(one.points[left], params.link_m, thing[left])
+    out[left[(np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]]] = True
+    return out
+
+
+def _things(side: Side, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) the thing of each Gaussian, -1 for what is on a shell, and (N,) the share of it that changed, there 0."""
+    thing, share = np.full(len(side.points), -1, dtype=np.int64), np.zeros(len(side.points))
+    loose = np.flatnonzero(side.shell < 0)
+    thing[loose] = components(side.points[loose], params.link_m)
+    if len(loose):
+        own = thing[loose]
+        share[loose] = (np.bincount(own, side.changed[loose]) / np.bincount(own))[own]
+    return thing, share
+
+
+def clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarray:
+    """(N,) bool, which points (N, 3) have none of the others (M, 3) within reach."""
+    if not len(points) or not len(others):
+        return np.ones(len(points), dtype=bool)
+    return np.isinf(cKDTree(others).query(points, distance_upper_bound=reach_m)[0])
 
 
 def _with_most(
     doubts: Doubts, judged: np.ndarray, others: np.ndarray, changed: np.ndarray, reach_m: float
 ) -> np.ndarray:
-    """Rows of others, that nobody judged as something new hides them, where most that was judged about them has
-    changed: the inside of what was replaced, the rest of a painted wall. All masks are (N,)."""
+    """Rows of others where most that was judged about them has changed: the inside of what was replaced, which nobody
+    judged as something new hides it, the rest of a painted wall. All masks are (N,)."""
     asked, rows = np.flatnonzero(judged), np.flatnonzero(others)
     if not len(asked) or not len(rows):
         return rows[:0]
