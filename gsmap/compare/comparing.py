@@ -105,7 +105,7 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
         )
         for tally, one, other, shell in zip(tallies, both, both[::-1], walls, strict=True)
     ]
-    ends = [
+    older_end, newer_end = (
         Side(
             one.gaussians.means,
             np.clip(rgb_of_sh0(one.gaussians.sh[:, 0]), 0, 1),
@@ -113,10 +113,8 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             found.state >= REPAINTED,
         )
         for one, found, shell in zip(both, evidence, walls, strict=True)
-    ]
-    for found, rest in zip(
-        evidence, (remnants(ends[0], ends[1], params), remnants(ends[1], ends[0], params)), strict=True
-    ):
+    )
+    for found, rest in zip(evidence, remnants((older_end, newer_end), params), strict=True):
         found.state[rest] = REPAINTED
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
 

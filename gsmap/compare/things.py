@@ -132,27 +132,29 @@ class Side:
     changed: np.ndarray
 
 
-def remnants(one: Side, other: Side, params: Params) -> np.ndarray:
-    """(N,) bool, what is left of things most of which changed and belongs to them: a sofa that was pushed along by
-    half its length still shows itself, in its own colour, where its halves meet.
+def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
+    """Of each of two captures (N,) bool, what is left of things most of which changed and belongs to them: a sofa that
+    was pushed along by half its length still shows itself, in its own colour, where its halves meet.
 
     Things that touch are one thing here, so that what is left may as well be another that stood beside and stayed: that
     is told by colours, and by what the other capture shows in its place.
     """
-    thing, share = _things(one, params)
-    out = np.zeros(len(one.points), dtype=bool)
-    left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
-    if not len(left) or not len(other.points):
-        return out
-    new = _things(other, params)[1]
-    score = params.new_weight * new[cKDTree(other.points).query(one.points[left])[1]]
-    for k in np.unique(thing[left]):
-        changed, rows = one.colours[one.changed & (thing == k)], np.flatnonzero(thing[left] == k)
-        if len(changed) >= max(_ASKED, params.min_roots):
-            score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < params.alike
-    label = components(one.points[left], params.link_m, thing[left])
-    out[left[(np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]]] = True
-    return out
+    things = [_things(side, params) for side in sides]
+    found = []
+    for one, other, (thing, share), (_, new) in zip(sides, sides[::-1], things, things[::-1], strict=True):
+        out = np.zeros(len(one.points), dtype=bool)
+        found.append(out)
+        left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
+        if not len(left) or not len(other.points):
+            continue
+        score = params.new_weight * new[cKDTree(other.points).query(one.points[left])[1]]
+        for k in np.unique(thing[left]):
+            changed, rows = one.colours[one.changed & (thing == k)], np.flatnonzero(thing[left] == k)
+            if len(changed) >= max(_ASKED, params.min_roots):
+                score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < params.alike
+        label = components(one.points[left], params.link_m, thing[left])
+        out[left[(np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]]] = True
+    return found
 
 
 def _things(side: Side, params: Params) -> tuple[np.ndarray, np.ndarray]:

@@ -103,7 +103,8 @@ def settle(
     rivals = [_none(s) for s in scenes]
     exposures: list[compare.Balance | None] = [None] * len(scenes)
     truth: list[_Standing] = []
-    for group in _by_date(scenes) if prefer != "both" else []:
+    groups = _by_date(scenes) if prefer != "both" else []
+    for group in groups:
         added = []
         for i in group:
             looks = compare.look(scenes[i], params)
@@ -127,6 +128,8 @@ def settle(
                 one.shows[rows[verdict.beaten[mine]]] = False
                 first += len(rows)
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
+            if group is groups[-1]:
+                continue  # Nothing is compared with the oldest.
             # Truth grows by what is new to it alone, so that it stays as large as the place.
             shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
             added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), exposures[i]), shows))

@@ -92,22 +92,22 @@ def test_a_sofa_that_was_pushed_along_takes_with_it_where_it_still_shows_itself(
     points = sheet((0, 0), (1.2, 0.4))
     went = points[:, 0] < 0.8
     now = side(points + 0.01 * UP, np.zeros(len(points), bool))
-    np.testing.assert_array_equal(remnants(side(points, went), now, PARAMS), ~went)
+    np.testing.assert_array_equal(remnants((side(points, went), now), PARAMS)[0], ~went)
     # Of a thing less than half of which changed, the rest stays.
-    assert not remnants(side(points, points[:, 0] < 0.5), now, PARAMS).any()
+    assert not remnants((side(points, points[:, 0] < 0.5), now), PARAMS)[0].any()
     # A white fridge that stood against it stays ...
     colours = np.where(went[:, None], RED, WHITE)
-    assert not remnants(side(points, went, colours), now, PARAMS).any()
+    assert not remnants((side(points, went, colours), now), PARAMS)[0].any()
     # ... and where its colours are in doubt, what stands there now decides.
     halves = went | (np.arange(len(points)) % 2 == 0)
     colours = np.where(halves[:, None], RED, WHITE)
-    assert not remnants(side(points, went, colours), now, PARAMS).any()
+    assert not remnants((side(points, went, colours), now), PARAMS)[0].any()
     new = side(points + 0.01 * UP, np.ones(len(points), bool))
-    np.testing.assert_array_equal(remnants(side(points, went, colours), new, PARAMS), ~went)
+    np.testing.assert_array_equal(remnants((side(points, went, colours), new), PARAMS)[0], ~went)
     # Walls are no things, and of nothing nothing is left.
     wall = Side(points, np.broadcast_to(RED, points.shape), np.zeros(len(points), int), went)
-    assert not remnants(wall, new, PARAMS).any()
-    assert not remnants(side(points, went), side(points[:0], went[:0]), PARAMS).any()
+    assert not remnants((wall, new), PARAMS)[0].any()
+    assert not remnants((side(points, went), side(points[:0], went[:0])), PARAMS)[0].any()
 
 
 def test_what_can_be_looked_through_is_not_gone_where_the_other_shows_a_surface():
