@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.compare.colours import Balance, balance, differ
-from gsmap.compare.evidence import GONE, REPAINTED, Evidence, Tally
+from gsmap.compare.evidence import REPAINTED, Evidence, Tally
 from gsmap.compare.looks import Looks, Placed, View, place, view_of
 from gsmap.compare.params import Params
 from gsmap.geometry.sh import rgb_of_sh0
@@ -109,10 +109,10 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
         Side(
             one.gaussians.means,
             np.clip(rgb_of_sh0(one.gaussians.sh[:, 0]), 0, 1),
-            np.where(found.state == GONE, -1, shell),
+            found.thing,
             found.state >= REPAINTED,
         )
-        for one, found, shell in zip(both, evidence, walls, strict=True)
+        for one, found in zip(both, evidence, strict=True)
     )
     for found, rest in zip(evidence, remnants((older_end, newer_end), params), strict=True):
         found.state[rest] = REPAINTED

@@ -42,6 +42,14 @@ def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
     return out
 
 
+def things(points: np.ndarray, shell: np.ndarray, params: Params) -> np.ndarray:
+    """(N,) int64 what hangs together off floors, ceilings and walls, from 0; -1 for what is on these."""
+    out = np.full(len(points), -1, dtype=np.int64)
+    loose = np.flatnonzero(shell < 0)
+    out[loose] = components(points[loose], params.link_m)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Doubts:
     """What is known of each of N Gaussians of a capture before things are weighed.
@@ -49,6 +57,7 @@ class Doubts:
     Args:
         points: (N, 3).
         shell: (N,) see `shells`.
+        thing: (N,) see `things`.
         changed: (N,) bool, taken for gone or repainted.
         sure: (N,) bool, those of them that are beyond doubt.
         judged: (N,) bool, seen by the other capture.
@@ -58,6 +67,7 @@ class Doubts:
 
     points: np.ndarray
     shell: np.ndarray
+    thing: np.ndarray
     changed: np.ndarray
     sure: np.ndarray
     judged: np.ndarray
@@ -90,9 +100,7 @@ def rooted(doubts: Doubts, params: Params) -> np.ndarray:
 def kin(doubts: Doubts, params: Params) -> np.ndarray:
     """(N,) bool, the changed and what changed with them: of things much of which changed, what differs a little and is
     tied to what changed, and what most of those about it on the thing did."""
-    thing = np.full(len(doubts.points), -1, dtype=np.int64)
-    loose = np.flatnonzero(doubts.shell < 0)
-    thing[loose] = components(doubts.points[loose], params.link_m)
+    thing, loose = doubts.thing, np.flatnonzero(doubts.thing >= 0)
     count = int(thing.max(initial=-1)) + 1
     out = doubts.changed.copy()
     for wall in np.unique(doubts.shell[out & doubts.judged & (doubts.shell >= 0)]):
@@ -122,14 +130,21 @@ class Side:
 
     Args:
         points, colours: (N, 3), colours in [0, 1].
-        shell: (N,) see `shells`.
+        thing: (N,) see `things`.
         changed: (N,) bool.
     """
 
     points: np.ndarray
     colours: np.ndarray
-    shell: np.ndarray
+    thing: np.ndarray
     changed: np.ndarray
+
+    def share(self) -> np.ndarray:
+        """(N,) of the thing of each Gaussian the share that changed; 0 for what is part of none."""
+        out, loose = np.zeros(len(self.points)), np.flatnonzero(self.thing >= 0)
+        of = self.thing[loose]
+        out[loose] = (np.bincount(of, self.changed[loose]) / np.maximum(np.bincount(of), 1))[of]
+        return out
 
 
 def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
@@ -139,11 +154,12 @@ def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
     Things that touch are one thing here, so that what is left may as well be another that stood beside and stayed: that
     is told by colours, and by what the other capture shows in its place.
     """
-    things = [_things(side, params) for side in sides]
+    shares = [side.share() for side in sides]
     found = []
-    for one, other, (thing, share), (_, new) in zip(sides, sides[::-1], things, things[::-1], strict=True):
+    for one, other, share, new in zip(sides, sides[::-1], shares, shares[::-1], strict=True):
         out = np.zeros(len(one.points), dtype=bool)
         found.append(out)
+        thing = one.thing
         left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
         if not len(left) or not len(other.points):
             continue
@@ -155,17 +171,6 @@ def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
         label = components(one.points[left], params.link_m, thing[left])
         out[left[(np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]]] = True
     return found
-
-
-def _things(side: Side, params: Params) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) the thing of each Gaussian, -1 for what is on a shell, and (N,) the share of it that changed, there 0."""
-    thing, share = np.full(len(side.points), -1, dtype=np.int64), np.zeros(len(side.points))
-    loose = np.flatnonzero(side.shell < 0)
-    thing[loose] = components(side.points[loose], params.link_m)
-    if len(loose):
-        own = thing[loose]
-        share[loose] = (np.bincount(own, side.changed[loose]) / np.bincount(own))[own]
-    return thing, share
 
 
 def clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarray:

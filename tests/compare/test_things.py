@@ -5,7 +5,7 @@ import numpy as np
 from gsmap.compare import GONE, SAME, Params
 from gsmap.compare.colours import IDENTITY
 from gsmap.compare.evidence import Tally
-from gsmap.compare.things import Doubts, Side, kin, remnants, rooted, shells
+from gsmap.compare.things import Doubts, Side, kin, remnants, rooted, shells, things
 
 PARAMS = Params()
 UP = np.array([0.0, 0.0, 1.0])
@@ -22,7 +22,8 @@ def doubts(points, **masks):
     given = {name: np.zeros(len(points), dtype=bool) for name in ("changed", "sure", "hidden")}
     given |= {"judged": np.ones(len(points), dtype=bool), "differs": np.zeros(len(points))}
     given |= {"shell": np.full(len(points), -1)}
-    return Doubts(points, **given | masks)
+    given |= masks
+    return Doubts(points, **given, thing=things(points, given["shell"], PARAMS))
 
 
 def test_a_change_without_roots_is_none():
@@ -85,7 +86,7 @@ RED, WHITE = (0.7, 0.1, 0.1), (0.9, 0.9, 0.9)
 
 
 def side(points, changed, colour=RED):
-    return Side(points, np.broadcast_to(colour, points.shape), np.full(len(points), -1), changed)
+    return Side(points, np.broadcast_to(colour, points.shape), np.zeros(len(points), int), changed)
 
 
 def test_a_sofa_that_was_pushed_along_takes_with_it_where_it_still_shows_itself():
@@ -105,7 +106,7 @@ def test_a_sofa_that_was_pushed_along_takes_with_it_where_it_still_shows_itself(
     new = side(points + 0.01 * UP, np.ones(len(points), bool))
     np.testing.assert_array_equal(remnants((side(points, went, colours), new), PARAMS)[0], ~went)
     # Walls are no things, and of nothing nothing is left.
-    wall = Side(points, np.broadcast_to(RED, points.shape), np.zeros(len(points), int), went)
+    wall = Side(points, np.broadcast_to(RED, points.shape), np.full(len(points), -1), went)
     assert not remnants((wall, new), PARAMS)[0].any()
     assert not remnants((side(points, went), side(points[:0], went[:0])), PARAMS)[0].any()
 
