@@ -28,7 +28,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 4
+VERSION = 5
 STEPS: str | None = "steps"
 RENDERS = True
 
@@ -85,8 +85,8 @@ class Params:
 
     Args:
         min_weight: drop what nowhere makes up this share of a pixel of its capture's own views, and dominates none.
-        keep: at most this share of the Gaussians that went in, of each tile; of more, the pairs that are most alike
-            become one; 1 keeps all.
+        keep: at most this share of the Gaussians that went in, of each tile that several captures show; of more, the
+            pairs that are most alike become one; 1 keeps all.
         voxel_m: side of the voxels in which Gaussians are first merged.
         owner_cells: give every cell of a grid to the capture that shows most of it, so that two captures of one
             surface do not lie over one another.
@@ -194,7 +194,12 @@ def merge(
         lambda fraction, text: progress(0.2 * fraction, text),
         params.references,
     )
-    start, origin = _start(scenes, wanted, settled.changed, params, bounds)
+    # One capture alone shows nothing twice and is what its pictures show: thinned or fitted it could but lose.
+    alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
+    start, origin = _start(scenes, wanted, settled.changed, replace(params, keep=1.0) if alone else params, bounds)
+    if alone:
+        mine = inside(start.means, bounds)
+        return MergeResult(start[mine], origin[mine], notes=tuple(notes))
     if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
