@@ -197,12 +197,12 @@ def merge(
     # One capture alone shows nothing twice and is what its pictures show: thinned or fitted it could but lose.
     alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
     start, origin, new = _start(scenes, wanted, settled, replace(params, keep=1.0) if alone else params, bounds)
-    if alone:
-        mine = inside(start.means, bounds)
-        return MergeResult(start[mine], origin[mine], notes=tuple(notes))
     if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
+    if alone:
+        mine = inside(start.means, bounds)
+        return MergeResult(start[mine], origin[mine], notes=tuple(notes))
     # The near half of the halo is fitted along, then dropped: were it frozen, what is at the border would make up for
     # neighbours that are going to be refined too.
     # What is new was fitted to photographs, and has no other capture to agree with.
