@@ -1,7 +1,8 @@
 """What merging drops of an older capture, over settings of `gsmap.compare`: how these were chosen.
 
     tools/make_change.py DEV --set dev
-    tools/fit_drops.py DEV/* --set compare.most_left=.04,.08,.16 --set compare.about_m=.2,.35,.5
+    tools/make_change.py SEEN --set seen
+    tools/fit_drops.py DEV/* SEEN/2* --set compare.alike=.04,.05,.06 --set compare.about_m=.2,.35,.5
 
 For each value of each setting, the others at their defaults: the share of the Gaussians of removed and of painted
 things that is dropped, and of those of others, at worst and in the mean over the places (see tools/change_scores.py).

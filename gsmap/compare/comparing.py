@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.compare.colours import Balance, balance, differ
-from gsmap.compare.evidence import Evidence, Tally
+from gsmap.compare.evidence import REPAINTED, Evidence, Tally
 from gsmap.compare.looks import Looks, Placed, View, place, view_of
 from gsmap.compare.params import Params
+from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.render import render
 from gsmap.types import Gaussians
 
@@ -67,7 +68,7 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
     Each is rendered from the other's cameras once, its surfaces alone: from where its own cameras never stood its haze
     hides everything.
     """
-    from gsmap.compare.things import shells  # with scipy, which naming a recipe does without
+    from gsmap.compare.things import Side, remnants, shells  # with scipy, which naming a recipe does without
 
     params = params or Params()
     surfaces = {id(one): _surface(one) for one in (older, newer)}
@@ -93,9 +94,28 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
     both = older, newer
     walls = shells([(one.gaussians.means, one.surface) for one in both])
     evidence = [
-        tally.evidence(one.gaussians.means, one.surface, shell, len(other.views), line, params)
+        tally.evidence(
+            one.gaussians.means,
+            one.surface,
+            shell,
+            other.gaussians.means[other.surface],
+            len(other.views),
+            line,
+            params,
+        )
         for tally, one, other, shell in zip(tallies, both, both[::-1], walls, strict=True)
     ]
+    older_end, newer_end = (
+        Side(
+            one.gaussians.means,
+            np.clip(rgb_of_sh0(one.gaussians.sh[:, 0]), 0, 1),
+            found.thing,
+            found.state >= REPAINTED,
+        )
+        for one, found in zip(both, evidence, strict=True)
+    )
+    for found, rest in zip(evidence, remnants((older_end, newer_end), params), strict=True):
+        found.state[rest] = REPAINTED
     return Comparison(evidence[0], evidence[1], tuple(pictured[0]), tuple(pictured[1]), line, tolerance)
 
 

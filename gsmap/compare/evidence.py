@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmap.compare.colours import Balance, limits
 from gsmap.compare.params import Params
+from gsmap.geometry.morton import morton_order
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
@@ -25,6 +26,7 @@ class Evidence:
         sharpness: (N,) float32 as in `Looks`, over the other's views that looked at it or through it.
         colour_seen: (N,) int32 views, of either capture, in which its colour could be compared.
         chroma, lightness: (N, 2) and (N,) float32 means, over these views, of by how much the newer's colour differs.
+        thing: (N,) int64 what it hangs together with off floors, ceilings and walls; -1 for what is on these.
         state: (N,) int8, one of the five, after neighbours have voted.
     """
 
@@ -36,6 +38,7 @@ class Evidence:
     colour_seen: np.ndarray
     chroma: np.ndarray
     lightness: np.ndarray
+    thing: np.ndarray
     state: np.ndarray
 
 
@@ -62,7 +65,14 @@ class Tally:
         self.lightness = np.zeros(count, dtype=np.float32)
 
     def evidence(
-        self, points: np.ndarray, shows: np.ndarray, shell: np.ndarray, views: int, line: Balance, params: Params
+        self,
+        points: np.ndarray,
+        shows: np.ndarray,
+        shell: np.ndarray,
+        others: np.ndarray,
+        views: int,
+        line: Balance,
+        params: Params,
     ) -> Evidence:
         """The counts and what they come to.
 
@@ -70,9 +80,10 @@ class Tally:
             points: (N, 3) of the Gaussians.
             shows: (N,) which of them are part of a surface and vote.
             shell: (N,) wall, floor or ceiling that each is part of; see `gsmap.compare.things.shells`.
+            others: (M, 3) of the other capture's Gaussians that are part of a surface.
             views: how many the other capture has.
         """
-        from gsmap.compare.things import Doubts, kin, rooted  # with scipy, which naming a recipe does without
+        from gsmap.compare.things import Doubts, clear, kin, rooted, things  # with scipy: naming a recipe has none
 
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
@@ -95,16 +106,19 @@ class Tally:
         _follow(state, near, self.grazed > 0, self.colour_seen < params.min_views)
         looks = min(params.min_views, views)
         gone = (state == GONE) & (self.through >= looks) & ((self.sure >= 1) | (self.on_surface == 0))
+        gone[gone] = clear(points[gone], others, params.clear_m)
         painted = (state == REPAINTED) & (self.colour_seen >= looks) & (around >= params.root_colour) & (differs >= 1)
         # What one can look through is no wall.
         shell = np.where(state == GONE, -1, shell)
-        doubts = Doubts(points, shell, state >= REPAINTED, gone | painted, state >= SAME, state == HIDDEN, differs)
+        thing = things(points, shell, params)
+        changed, judged, hidden = state >= REPAINTED, state >= SAME, state == HIDDEN
+        doubts = Doubts(points, shell, thing, changed, gone | painted, judged, hidden, differs)
         stands = rooted(doubts, params)
         state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]
         # Whole things, of what turned out to have changed.
         state[kin(replace(doubts, changed=stands), params) & (state < REPAINTED)] = REPAINTED
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
-        return Evidence(*counts, chroma, lightness, state)
+        return Evidence(*counts, chroma, lightness, thing, state)
 
     def _geometry(self, near: _Neighbours, params: Params) -> np.ndarray:
         through, on = near.sums(self.through), near.sums(self.on_surface)
@@ -133,8 +147,11 @@ class _Neighbours:
         if len(self.rows):
             tree = cKDTree(points[self.rows])
             count = min(params.neighbours, len(self.rows))
-            index = tree.query(points, count, distance_upper_bound=params.cell_m)[1]
-            self.index = np.asarray(index, dtype=np.int64).reshape(len(points), -1)
+            # Along a curve through them, as their neighbours are then in the cache.
+            order = morton_order(points)
+            index = tree.query(points[order], count, distance_upper_bound=params.cell_m)[1]
+            self.index = np.empty((len(points), count), dtype=np.int64)
+            self.index[order] = index.reshape(len(points), count)
 
     @property
     def count(self) -> np.ndarray:

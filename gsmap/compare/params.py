@@ -29,16 +29,20 @@ class Params:
         cell_m: Gaussians that near vote together,
         neighbours: at most so many of them.
         reach_m: changed Gaussians nearer to each other than this, on one wall or on none, are one change,
-        min_roots, root_share: which so many of them, and this share, must prove: looked through more than once, or in
+        min_roots, root_share: which so many of them, and this share, must prove: looked through more than once, with
+        clear_m: nothing of the other capture so near (what is blurred there can be looked through, and stands), or in
         root_colour: another colour by this multiple of what counts. What proves it itself, or differs by
         alone_colour: that multiple whatever its neighbours do, needs no more than to lie
         about_m: as near to such a change.
         link_m: Gaussians of one thing.
         kin_share: of a thing of which this share has changed,
         kin_colour: what differs by this multiple of what counts, and is tied to it, has changed too,
-        most_left: and so have pieces of at most this share of what changed,
-        left_m: no longer than this: a larger one is a thing of its own, that stood beside,
-        beside_m: and so near to it.
+        beside_m: and so has what is so near to it that most of its neighbours on the thing changed.
+        most_share: of a thing of which this share has changed, what is left is a piece of it, or another thing that
+            stood beside. It goes along if its Gaussians reach, in the mean,
+        piece_score: this score: 1 for one that has, in the colours that changed on the thing, some as near as
+        alike: this, of [0, 1], and
+        new_weight: this for the share that is new of the thing that the other capture shows there.
     """
 
     longest_side_px: int = 240
@@ -61,15 +65,18 @@ class Params:
     reach_m: float = 0.1
     min_roots: int = 8
     root_share: float = 0.2
+    clear_m: float = 0.05
     root_colour: float = 2.0
     alone_colour: float = 4.0
     about_m: float = 0.35
     link_m: float = 0.08
     kin_share: float = 0.2
     kin_colour: float = 0.2
-    most_left: float = 0.08
-    left_m: float = 0.3
     beside_m: float = 0.15
+    most_share: float = 0.5
+    piece_score: float = 0.7
+    alike: float = 0.05
+    new_weight: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("longest_side_px", "max_views", "min_views", "cell_m", "least_tolerance_m", "reach_m", "link_m"):

@@ -42,6 +42,14 @@ def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
     return out
 
 
+def things(points: np.ndarray, shell: np.ndarray, params: Params) -> np.ndarray:
+    """(N,) int64 what hangs together off floors, ceilings and walls, from 0; -1 for what is on these."""
+    out = np.full(len(points), -1, dtype=np.int64)
+    loose = np.flatnonzero(shell < 0)
+    out[loose] = components(points[loose], params.link_m)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Doubts:
     """What is known of each of N Gaussians of a capture before things are weighed.
@@ -49,6 +57,7 @@ class Doubts:
     Args:
         points: (N, 3).
         shell: (N,) see `shells`.
+        thing: (N,) see `things`.
         changed: (N,) bool, taken for gone or repainted.
         sure: (N,) bool, those of them that are beyond doubt.
         judged: (N,) bool, seen by the other capture.
@@ -58,6 +67,7 @@ class Doubts:
 
     points: np.ndarray
     shell: np.ndarray
+    thing: np.ndarray
     changed: np.ndarray
     sure: np.ndarray
     judged: np.ndarray
@@ -89,10 +99,8 @@ def rooted(doubts: Doubts, params: Params) -> np.ndarray:
 
 def kin(doubts: Doubts, params: Params) -> np.ndarray:
     """(N,) bool, the changed and what changed with them: of things much of which changed, what differs a little and is
-    tied to what changed, and small pieces that would be left of them."""
-    thing = np.full(len(doubts.points), -1, dtype=np.int64)
-    loose = np.flatnonzero(doubts.shell < 0)
-    thing[loose] = components(doubts.points[loose], params.link_m)
+    tied to what changed, and what most of those about it on the thing did."""
+    thing, loose = doubts.thing, np.flatnonzero(doubts.thing >= 0)
     count = int(thing.max(initial=-1)) + 1
     out = doubts.changed.copy()
     for wall in np.unique(doubts.shell[out & doubts.judged & (doubts.shell >= 0)]):
@@ -112,32 +120,71 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     mine = np.zeros(len(out), dtype=bool)
     mine[of_these] = True
     out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, params.beside_m)] = True
-    left = of_these[~out[of_these]]
-    if len(left):
-        label = components(doubts.points[left], params.link_m, thing[left])
-        of = np.zeros(int(label.max()) + 1, dtype=np.int64)
-        of[label] = thing[left]
-        small = np.bincount(label) <= params.most_left * changed[of]
-        small &= _extents(doubts.points[left], label) < params.left_m
-        near = cKDTree(doubts.points[out]).query(doubts.points[left], distance_upper_bound=params.beside_m)[0]
-        out[left[small[label] & np.isfinite(near)]] = True
+    out[_with_most(doubts, mine, mine & ~out, out, params.beside_m)] = True
     return out
 
 
-def _extents(points: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """(L,) longest edge of the box around the points (N, 3) of each label."""
-    low, high = np.full((int(label.max()) + 1, 3), np.inf), np.full((int(label.max()) + 1, 3), -np.inf)
-    np.minimum.at(low, label, points)
-    np.maximum.at(high, label, points)
-    longest: np.ndarray = (high - low).max(1)
-    return longest
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of two captures, after `kin`.
+
+    Args:
+        points, colours: (N, 3), colours in [0, 1].
+        thing: (N,) see `things`.
+        changed: (N,) bool.
+    """
+
+    points: np.ndarray
+    colours: np.ndarray
+    thing: np.ndarray
+    changed: np.ndarray
+
+    def share(self) -> np.ndarray:
+        """(N,) of the thing of each Gaussian the share that changed; 0 for what is part of none."""
+        out, loose = np.zeros(len(self.points)), np.flatnonzero(self.thing >= 0)
+        of = self.thing[loose]
+        out[loose] = (np.bincount(of, self.changed[loose]) / np.maximum(np.bincount(of), 1))[of]
+        return out
+
+
+def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
+    """Of each of two captures (N,) bool, what is left of things most of which changed and belongs to them: a sofa that
+    was pushed along by half its length still shows itself, in its own colour, where its halves meet.
+
+    Things that touch are one thing here, so that what is left may as well be another that stood beside and stayed: that
+    is told by colours, and by what the other capture shows in its place.
+    """
+    shares = [side.share() for side in sides]
+    found = []
+    for one, other, share, new in zip(sides, sides[::-1], shares, shares[::-1], strict=True):
+        out = np.zeros(len(one.points), dtype=bool)
+        found.append(out)
+        thing = one.thing
+        left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
+        if not len(left) or not len(other.points):
+            continue
+        score = params.new_weight * new[cKDTree(other.points).query(one.points[left])[1]]
+        for k in np.unique(thing[left]):
+            changed, rows = one.colours[one.changed & (thing == k)], np.flatnonzero(thing[left] == k)
+            if len(changed) >= max(_ASKED, params.min_roots):
+                score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < params.alike
+        label = components(one.points[left], params.link_m, thing[left])
+        out[left[(np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]]] = True
+    return found
+
+
+def clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarray:
+    """(N,) bool, which points (N, 3) have none of the others (M, 3) within reach."""
+    if not len(points) or not len(others):
+        return np.ones(len(points), dtype=bool)
+    return np.isinf(cKDTree(others).query(points, distance_upper_bound=reach_m)[0])
 
 
 def _with_most(
     doubts: Doubts, judged: np.ndarray, others: np.ndarray, changed: np.ndarray, reach_m: float
 ) -> np.ndarray:
-    """Rows of others, that nobody judged as something new hides them, where most that was judged about them has
-    changed: the inside of what was replaced, the rest of a painted wall. All masks are (N,)."""
+    """Rows of others where most that was judged about them has changed: the inside of what was replaced, which nobody
+    judged as something new hides it, the rest of a painted wall. All masks are (N,)."""
     asked, rows = np.flatnonzero(judged), np.flatnonzero(others)
     if not len(asked) or not len(rows):
         return rows[:0]

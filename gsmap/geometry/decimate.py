@@ -4,7 +4,8 @@ Each pair of neighbours has a cost: the energy of the difference between the lig
 Gaussian which keeps their moments (`gsmap.geometry.voxels.merge_groups`), all blurred a little. A Gaussian's light is
 its opacity times the root of its projected area; of two, the share that they have in common is Bhattacharyya's
 coefficient. So each is merged with the neighbour that it is most like, in place, shape and colour, and no grid cuts
-through. Every round merges as many pairs as there are that are cheapest for both: taking only the cheapest of all was
+through. What is looked at more often, or from nearer, than its area alone tells costs more, where somebody knows. Every
+round merges as many pairs as there are that are cheapest for both: taking only the cheapest of all was
 tried, and draws worse pictures, as the same few places grow coarse.
 """
 
@@ -24,11 +25,17 @@ _NEIGHBOURS = 12
 _BLUR = 0.05  # of the median Gaussian's largest deviation: what is thinner is not told apart
 _COVER = 0.1  # how much hiding what is behind counts beside the light of a colour: black is seen, too
 _BLOCK = 1 << 14  # points whose neighbours are compared at once
+_ABOUT = 16  # Gaussians over which the pixels that each shows in are averaged
+_MOST = 10.0  # times more, or less, than the median that a Gaussian's cost may count
 _PASSES = 6  # over the pairs of a round, each taking those that are cheapest for both
 
 
-def decimate(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, np.ndarray]:
+def decimate(gaussians: Gaussians, max_count: int, pixels: np.ndarray | None = None) -> tuple[Gaussians, np.ndarray]:
     """At most ``max_count`` Gaussians, and (N,) int64 which of them each of the given ones went into.
+
+    Args:
+        pixels: (N,) in how many pixels of the pictures that matter each Gaussian shows; without, all are looked at
+            alike.
 
     Raises:
         ConfigError: less than one is asked for.
@@ -36,17 +43,33 @@ def decimate(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, np.ndarra
     if max_count < 1:
         raise ConfigError(f"at least one Gaussian must be left, {max_count} asked for")
     label = np.arange(len(gaussians))
+    if len(gaussians) <= max_count:
+        return gaussians, label
+    weights = np.ones(len(gaussians)) if pixels is None else _looked_at(gaussians, pixels)
     while len(gaussians) > max_count:
-        first, second = _cheapest(gaussians, len(gaussians) - max_count)
+        first, second = _cheapest(gaussians, weights, len(gaussians) - max_count)
         into = np.arange(len(gaussians))
         into[second] = first
         into = np.unique(into, return_inverse=True)[1]
         gaussians, _ = merge_groups(gaussians, into)
-        label = into[label]
+        heavier = np.zeros(len(gaussians))
+        np.maximum.at(heavier, into, weights)
+        label, weights = into[label], heavier
     return gaussians, label
 
 
-def _cheapest(gaussians: Gaussians, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _looked_at(gaussians: Gaussians, pixels: np.ndarray) -> np.ndarray:
+    """(N,) pixels in which Gaussians show for their area, about each, as a multiple of the median."""
+    near = cKDTree(gaussians.means).query(gaussians.means, np.arange(1, min(_ABOUT, len(gaussians)) + 1))[1]
+    density = pixels[near].sum(1) / projected_areas(gaussians.scales)[near].sum(1)
+    known = density > 0
+    if not known.any():
+        return np.ones(len(gaussians))
+    out: np.ndarray = np.clip(density / np.median(density[known]), 1 / _MOST, _MOST)
+    return out
+
+
+def _cheapest(gaussians: Gaussians, weights: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows of pairs that have no Gaussian in common, the cheapest, at most so many and at least one."""
     n = len(gaussians)
     pairs = _neighbours(gaussians.means)
@@ -62,6 +85,7 @@ def _cheapest(gaussians: Gaussians, most: int) -> tuple[np.ndarray, np.ndarray]:
         _BLUR * deviation,
         _COVER,
     )
+    costs = costs * weights[pairs].mean(1)
     # Of equal costs the earlier pair goes first, whatever sorts them.
     order = np.argsort(costs, kind="stable")
     first, second = pairs[order].T

@@ -41,6 +41,8 @@ class Settled:
         lost: how many Gaussians each lost.
         changed: per scene (N,) bool, the Gaussians that stand where another capture was overruled: nothing of an older
             capture is left there to share the work with, so they stay as they are.
+        behind: per scene (N,) bool, the Gaussians beside a change that lie behind what newer captures show: nobody
+            disproved them, but how the place looks now is not told by them.
         rivals: per scene, what stands now where it is overruled; empty where it is not.
         losers: per scene, the Gaussians it lost.
     """
@@ -48,6 +50,7 @@ class Settled:
     scenes: list[PlacedScene]
     lost: list[int]
     changed: list[np.ndarray]
+    behind: list[np.ndarray]
     rivals: list[Gaussians]
     losers: list[Gaussians]
 
@@ -99,11 +102,12 @@ def settle(
     """
     params = params or compare.Params()
     keeps = [np.ones(len(s.gaussians), dtype=bool) for s in scenes]
-    changed = [np.zeros(len(s.gaussians), dtype=bool) for s in scenes]
+    changed, behind = ([np.zeros(len(s.gaussians), dtype=bool) for s in scenes] for _ in range(2))
     rivals = [_none(s) for s in scenes]
     exposures: list[compare.Balance | None] = [None] * len(scenes)
     truth: list[_Standing] = []
-    for group in _by_date(scenes) if prefer != "both" else []:
+    groups = _by_date(scenes) if prefer != "both" else []
+    for group in groups:
         added = []
         for i in group:
             looks = compare.look(scenes[i], params)
@@ -117,7 +121,10 @@ def settle(
             exposures[i] = _exposure(found)
             keeps[i] &= ~verdict.lost
             if prefer == "newest":
-                keeps[i] &= ~_intruders(_exposed(looks.gaussians, exposures[i]), keeps[i], joined, found, verdict)
+                beside = _beside(looks.gaussians.means, joined, verdict)
+                behind[i] = beside & (found.older.state == HIDDEN)
+                exposed = _exposed(looks.gaussians, exposures[i])
+                keeps[i] &= ~_intruders(exposed, keeps[i] & beside, joined)
             first = 0
             for one in parts:
                 rows = np.flatnonzero(one.shows)
@@ -127,6 +134,8 @@ def settle(
                 one.shows[rows[verdict.beaten[mine]]] = False
                 first += len(rows)
             rivals[i] = Gaussians.concatenate([rivals[i], joined.gaussians[verdict.changed]])
+            if group is groups[-1]:
+                continue  # Nothing is compared with the oldest.
             # Truth grows by what is new to it alone, so that it stays as large as the place.
             shows = keeps[i] & looks.surface & np.isin(found.older.state, (UNSEEN, HIDDEN))
             added.append(_Standing(i, _in_one_exposure(compare.outdated(looks, found, keeps[i]), exposures[i]), shows))
@@ -135,6 +144,7 @@ def settle(
         [_left(s, k, e if one_exposure else None) for s, k, e in zip(scenes, keeps, exposures, strict=True)],
         [int((~k).sum()) for k in keeps],
         [c[k] for c, k in zip(changed, keeps, strict=True)],
+        [b[k] for b, k in zip(behind, keeps, strict=True)],
         rivals,
         [s.gaussians[~k] for s, k in zip(scenes, keeps, strict=True)],
     )
@@ -183,20 +193,28 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
     return out
 
 
-def _intruders(older: Gaussians, stays: np.ndarray, newer: Looks, found: Comparison, verdict: _Verdict) -> np.ndarray:
-    """(N,) which of the older's Gaussians that stay would show, in pictures of the newer, where these look otherwise.
+def _beside(older: np.ndarray, newer: Looks, verdict: _Verdict) -> np.ndarray:
+    """(N,) which of the older's Gaussians (N, 3) lie beside what left or what is new."""
+    from scipy.spatial import cKDTree
+
+    disputed = np.concatenate([older[verdict.lost], newer.gaussians.means[verdict.changed]])
+    if not len(disputed):
+        return np.zeros(len(older), dtype=bool)
+    out: np.ndarray = np.isfinite(cKDTree(disputed).query(older, distance_upper_bound=_NEAR_M)[0])
+    return out
+
+
+def _intruders(older: Gaussians, asked: np.ndarray, newer: Looks) -> np.ndarray:
+    """(N,) which of the older's Gaussians that are asked would show, in pictures of the newer, where these look
+    otherwise.
 
     They are in the newer's exposure. A last look at what evidence of single Gaussians leaves beside a change: shards,
     and what is smaller than a pixel.
     """
-    from scipy.spatial import cKDTree
-
     out = np.zeros(len(older), dtype=bool)
-    disputed = np.concatenate([older.means[verdict.lost], newer.gaussians.means[verdict.changed]])
-    if not len(disputed) or not stays.any():
+    rows = np.flatnonzero(asked)
+    if not len(rows):
         return out
-    rows = np.flatnonzero(stays)
-    rows = rows[np.isfinite(cKDTree(disputed).query(older.means[rows], distance_upper_bound=_NEAR_M)[0])]
     count = len(newer.gaussians)
     together = Gaussians.concatenate([newer.gaussians, older[rows]])
     good, bad = np.zeros(len(rows)), np.zeros(len(rows))

@@ -2,10 +2,13 @@
 
 import numpy as np
 
-from gsmap.compare import Params
-from gsmap.compare.things import Doubts, kin, rooted, shells
+from gsmap.compare import GONE, SAME, Params
+from gsmap.compare.colours import IDENTITY
+from gsmap.compare.evidence import Tally
+from gsmap.compare.things import Doubts, Side, kin, remnants, rooted, shells, things
 
 PARAMS = Params()
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def sheet(low, high, z=0.0, spacing=0.04):
@@ -19,7 +22,8 @@ def doubts(points, **masks):
     given = {name: np.zeros(len(points), dtype=bool) for name in ("changed", "sure", "hidden")}
     given |= {"judged": np.ones(len(points), dtype=bool), "differs": np.zeros(len(points))}
     given |= {"shell": np.full(len(points), -1)}
-    return Doubts(points, **given | masks)
+    given |= masks
+    return Doubts(points, **given, thing=things(points, given["shell"], PARAMS))
 
 
 def test_a_change_without_roots_is_none():
@@ -68,15 +72,53 @@ def test_of_a_thing_much_of_which_changed_what_differs_a_little_did_too():
     np.testing.assert_array_equal(kin(wall, PARAMS), changed)
 
 
-def test_small_pieces_of_a_thing_that_went_are_not_left_behind():
+def test_what_most_about_it_changed_on_its_thing_is_not_left_behind():
     points = sheet((0, 0), (1.2, 1.2))
-    hole = (np.abs(points[:, :2] - 0.6) < 0.05).all(1)
-    assert 1 < hole.sum() < PARAMS.most_left * len(points)
-    assert kin(doubts(points, changed=~hole), PARAMS).all()
-    # A piece is no splinter that is as large as what went, and none that stands as tall as a lamp.
-    for points, cut in ((sheet((0, 0), (0.6, 0.28)), 0.33), (sheet((0, 0), (3.0, 0.4), spacing=0.035), 2.85)):
-        went = points[:, 0] < cut
-        np.testing.assert_array_equal(kin(doubts(points, changed=went), PARAMS), went)
+    speck = np.linalg.norm(points[:, :2] - 0.6, axis=1) < 0.03
+    assert 1 <= speck.sum() <= 2
+    assert kin(doubts(points, changed=~speck), PARAMS).all()
+    # What is beside it is no part of it: an edge stays where it is.
+    went = points[:, 0] < 0.6
+    np.testing.assert_array_equal(kin(doubts(points, changed=went), PARAMS), went)
+
+
+RED, WHITE = (0.7, 0.1, 0.1), (0.9, 0.9, 0.9)
+
+
+def side(points, changed, colour=RED):
+    return Side(points, np.broadcast_to(colour, points.shape), np.zeros(len(points), int), changed)
+
+
+def test_a_sofa_that_was_pushed_along_takes_with_it_where_it_still_shows_itself():
+    points = sheet((0, 0), (1.2, 0.4))
+    went = points[:, 0] < 0.8
+    now = side(points + 0.01 * UP, np.zeros(len(points), bool))
+    np.testing.assert_array_equal(remnants((side(points, went), now), PARAMS)[0], ~went)
+    # Of a thing less than half of which changed, the rest stays.
+    assert not remnants((side(points, points[:, 0] < 0.5), now), PARAMS)[0].any()
+    # A white fridge that stood against it stays ...
+    colours = np.where(went[:, None], RED, WHITE)
+    assert not remnants((side(points, went, colours), now), PARAMS)[0].any()
+    # ... and where its colours are in doubt, what stands there now decides.
+    halves = went | (np.arange(len(points)) % 2 == 0)
+    colours = np.where(halves[:, None], RED, WHITE)
+    assert not remnants((side(points, went, colours), now), PARAMS)[0].any()
+    new = side(points + 0.01 * UP, np.ones(len(points), bool))
+    np.testing.assert_array_equal(remnants((side(points, went, colours), new), PARAMS)[0], ~went)
+    # Walls are no things, and of nothing nothing is left.
+    wall = Side(points, np.broadcast_to(RED, points.shape), np.full(len(points), -1), went)
+    assert not remnants((wall, new), PARAMS)[0].any()
+    assert not remnants((side(points, went), side(points[:0], went[:0])), PARAMS)[0].any()
+
+
+def test_what_can_be_looked_through_is_not_gone_where_the_other_shows_a_surface():
+    points = sheet((0, 0), (0.6, 0.6))
+    for others, state in ((points + 0.8 * PARAMS.clear_m * UP, SAME), (points + 3 * PARAMS.clear_m * UP, GONE)):
+        tally = Tally(len(points))
+        tally.through[:], tally.sure[:] = 3, 1
+        shows, shell = np.ones(len(points), bool), np.full(len(points), -1)
+        found = tally.evidence(points, shows, shell, others, 9, IDENTITY, PARAMS)
+        assert (found.state == state).all()
 
 
 def test_what_nobody_could_judge_goes_with_those_around_it():

@@ -40,9 +40,21 @@ def test_as_many_are_left_as_are_asked_for_and_moments_stay(count):
 def test_no_gaussian_is_in_two_pairs_of_a_round():
     from gsmap.geometry.decimate import _cheapest
 
-    pairs = np.concatenate(_cheapest(wall(1000), 1000))
+    pairs = np.concatenate(_cheapest(wall(1000), np.ones(1000), 1000))
     assert len(pairs) > 800
     assert len(set(pairs.tolist())) == len(pairs)
+
+
+def test_what_is_looked_at_more_keeps_more():
+    g = wall(2000, lambda xy: np.stack([np.sin(9 * xy[:, 0]) / 4 + 0.5] * 3, axis=1))
+    left = g.means[:, 0] < 0.5
+    fewer, _ = decimate(g, 500, np.where(left, 9.0, 1.0))
+    assert (fewer.means[:, 0] < 0.5).sum() > 1.25 * (fewer.means[:, 0] >= 0.5).sum()
+    # Where nobody looked, and where all look alike, it is as without.
+    plain, into = decimate(g, 500)
+    assert abs((plain.means[:, 0] < 0.5).sum() - 250) < 50
+    for pixels in (np.zeros(2000), np.full(2000, 3.0) * projected_areas(g.scales)):
+        np.testing.assert_array_equal(decimate(g, 500, pixels)[1], into)
 
 
 def test_few_enough_are_left_as_they_are():

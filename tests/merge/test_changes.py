@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from synthetic_changes import box, dated, patched, plain
 from synthetic_walls import cameras_facing, texture, wall
 
@@ -10,6 +11,7 @@ from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.merge import changes, default_params, merge
 from gsmap.merge.changes import settle
 from gsmap.merge.exposure import apply_gain
+from gsmap.merge.mergers import tto
 from gsmap.merge.references import render_references
 from gsmap.render import render
 from gsmap.types import Gaussians
@@ -108,6 +110,36 @@ def test_merged_it_looks_like_the_newest():
     assert np.abs(merged - wanted)[18:30, 26:38].mean() < 0.03
     mixed = render(merge([old, new], "tto", Params(steps=60, prefer="both")).gaussians, camera).colour[0]
     assert np.abs(mixed - wanted)[18:30, 26:38].mean() > 0.1
+
+
+def test_what_is_new_stays_as_its_capture_has_it():
+    old, new = dated("a", 2020, wall(0, -1.5, 1.5)), dated("b", 2021, wall(1, -1.5, 1.5), box(6))
+    merged = merge([old, new], "tto", Params(steps=20)).gaussians
+    stands, own = merged.means[:, 2] < -0.4, box(6)
+    assert stands.sum() > 0.9 * len(own)
+    row = cKDTree(own.means).query(merged.means[stands])[1]
+    for name in ("means", "sh", "log_scales", "logit_opacities"):
+        np.testing.assert_array_equal(getattr(merged, name)[stands], getattr(own, name)[row])
+
+
+def test_what_lies_behind_the_newest_beside_a_change_wins_no_cell():
+    back = wall(4, -0.2, 0.2, z=0.2, half_height=0.15)
+    old = dated("a", 2020, wall(0, -1.5, 1.5, colour=plain), back)
+    behind = np.arange(len(old.gaussians)) >= len(old.gaussians) - len(back)
+    painted = settle([old, dated("b", 2021, wall(1, -1.5, 1.5, colour=patched))])
+    assert painted.behind[0].sum() == len(back)
+    assert not painted.behind[1].any()
+    # Far from what changed nothing is said of it.
+    unchanged = settle([old, dated("b", 2021, wall(1, -1.5, 1.5, colour=plain))])
+    assert not unchanged.behind[0].any()
+    new = dated("b", 2021, wall(1, -1.5, 1.5))
+    both = [dated("a", 2020, wall(0, -1.5, 1.5)), new]
+    settled = settle(both)
+    wanted = render_references(settled.scenes, None, 1.0, 120, settled, quiet)
+    for behind, share in ((False, (0.3, 0.7)), (True, (0.0, 0.05))):
+        told = replace(settled, behind=[np.full(len(g), behind and i == 0) for i, g in enumerate(settled.changed)])
+        origin = tto._start(settled.scenes, wanted, told, Params(keep=1.0), None)[1]
+        assert share[0] <= (origin == 0).mean() <= share[1]
 
 
 def test_the_newest_who_looked_decides():

@@ -45,11 +45,27 @@ def test_steps_help_and_are_repeatable():
     np.testing.assert_array_equal(again.origin, 1 - many.origin)
 
 
+def halves():
+    """Two captures that show one wall, each a half of it."""
+    whole, cameras = wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5))
+    left = whole.means[:, 0] < 0
+    return [PlacedScene(whole[left], cameras, "a"), PlacedScene(whole[~left], cameras, "b")]
+
+
+def test_one_capture_alone_is_neither_thinned_nor_fitted():
+    one = PlacedScene(wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")
+    result = merge([one], "tto", Params(keep=0.3, voxel_m=1e-3))
+    assert result.steps == 0
+    assert likeness(result.gaussians, [one]) > 40
+    far = PlacedScene(wall(0, 50, 52), cameras_facing(np.linspace(50.4, 51.6, 5)), "b")
+    here = np.array([[-2.0, -2, -2], [2, 2, 2]])
+    tile = merge([one, far], "tto", Params(keep=0.3, voxel_m=1e-3), bounds=here)
+    assert tile.steps == 0
+    assert likeness(tile.gaussians, [one]) > 40
+
+
 def test_it_stops_when_it_no_longer_gains():
-    g = wall(0, -1, 1)
-    result = merge(
-        [PlacedScene(g, cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")], "tto", Params(keep=1.0, passes=100)
-    )
+    result = merge(halves(), "tto", Params(keep=1.0, passes=100))
     assert 10 <= result.steps < 2000
     assert not result.truncated
 
@@ -117,12 +133,13 @@ def test_a_cell_belongs_to_whoever_shows_most_of_it():
 
 def test_of_too_many_the_most_alike_become_one(watched):
     """Three quarters of what there is look like all of it: pairs are merged and nothing is cut away."""
-    one = PlacedScene(wall(0, -1, 1), cameras_facing(np.linspace(-0.6, 0.6, 5)), "a")
-    whole = merge([one], "tto", Params(steps=0, keep=1.0, voxel_m=1e-3)).gaussians
-    fewer = merge([one], "tto", Params(steps=0, keep=0.5, voxel_m=1e-3)).gaussians
-    assert 0.45 * len(one.gaussians) < len(fewer) <= 0.5 * len(one.gaussians)
-    wanted, shown = (render(g, one.cameras).colour for g in (whole, fewer))
-    alpha = render(fewer, one.cameras).alpha[:, 12:36, 16:48]
+    both = halves()
+    cameras, count = both[0].cameras, sum(len(one.gaussians) for one in both)
+    whole = merge(both, "tto", Params(steps=0, keep=1.0, voxel_m=1e-3)).gaussians
+    fewer = merge(both, "tto", Params(steps=0, keep=0.5, voxel_m=1e-3)).gaussians
+    assert 0.45 * count < len(fewer) <= 0.5 * count
+    wanted, shown = (render(g, cameras).colour for g in (whole, fewer))
+    alpha = render(fewer, cameras).alpha[:, 12:36, 16:48]
     assert alpha.min() > 0.8
     assert np.abs(wanted - shown)[:, 12:36, 16:48].mean() < 0.03
 

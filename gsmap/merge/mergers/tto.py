@@ -19,7 +19,7 @@ from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import exposure, references
-from gsmap.merge.changes import Prefer, settle
+from gsmap.merge.changes import Prefer, Settled, settle
 from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import inside, pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
@@ -28,7 +28,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 4
+VERSION = 5
 STEPS: str | None = "steps"
 RENDERS = True
 
@@ -85,8 +85,8 @@ class Params:
 
     Args:
         min_weight: drop what nowhere makes up this share of a pixel of its capture's own views, and dominates none.
-        keep: at most this share of the Gaussians that went in, of each tile; of more, the pairs that are most alike
-            become one; 1 keeps all.
+        keep: at most this share of the Gaussians that went in, of each tile that several captures show; of more, the
+            pairs that are most alike become one; 1 keeps all.
         voxel_m: side of the voxels in which Gaussians are first merged.
         owner_cells: give every cell of a grid to the capture that shows most of it, so that two captures of one
             surface do not lie over one another.
@@ -194,13 +194,19 @@ def merge(
         lambda fraction, text: progress(0.2 * fraction, text),
         params.references,
     )
-    start, origin = _start(scenes, wanted, settled.changed, params, bounds)
+    # One capture alone shows nothing twice and is what its pictures show: thinned or fitted it could but lose.
+    alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
+    start, origin, new = _start(scenes, wanted, settled, replace(params, keep=1.0) if alone else params, bounds)
     if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
+    if alone:
+        mine = inside(start.means, bounds)
+        return MergeResult(start[mine], origin[mine], notes=tuple(notes))
     # The near half of the halo is fitted along, then dropped: were it frozen, what is at the border would make up for
     # neighbours that are going to be refined too.
-    frozen = ~inside(start.means, bounds, params.halo_m / 2)
+    # What is new was fitted to photographs, and has no other capture to agree with.
+    frozen = ~inside(start.means, bounds, params.halo_m / 2) | new
     fitted, steps, truncated = _fit(start, frozen, wanted, params, deadline, progress)
     # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
     mine = inside(start.means, bounds)
@@ -211,17 +217,17 @@ def merge(
 def _start(
     scenes: Sequence[PlacedScene],
     wanted: References,
-    changed: Sequence[np.ndarray],
+    settled: Settled,
     params: Params,
     bounds: np.ndarray | None,
-) -> tuple[Gaussians, np.ndarray]:
+) -> tuple[Gaussians, np.ndarray, np.ndarray]:
     """The voxelised originals within the halo, one capture per cell, and within the bounds only what shows most.
 
-    What stands where the place changed is taken as it is. Also the scene of each Gaussian.
+    What stands where the place changed is taken as it is. Also the scene of each Gaussian, and whether it is new.
     """
     gaussians, origin = united(scenes)
     near = inside(gaussians.means, bounds, params.halo_m)
-    new = np.concatenate(changed)[near]
+    new = np.concatenate(settled.changed)[near]
     labels = voxel_labels(gaussians.means[near], params.voxel_m)
     # A Gaussian of what changed shares its voxel with none.
     labels[new] = labels.max(initial=-1) + 1 + np.arange(int(new.sum()))
@@ -231,7 +237,10 @@ def _start(
     origin, new = origin[near][heaviest], new[heaviest]
     stays = np.ones(len(merged), dtype=bool)
     if params.owner_cells:
-        stays &= one_owner_per_cell(merged, origin, visible, params.cell_m, params.cover_m)
+        # What lies behind the newest wins it no cell.
+        behind = np.concatenate(settled.behind)[near][heaviest]
+        votes = np.where(behind, np.minimum(visible, WEIGHT_UNIT), visible)
+        stays &= one_owner_per_cell(merged, origin, votes, params.cell_m, params.cover_m)
     stays &= visible >= WEIGHT_UNIT * params.min_weight
     stays |= new
     stays[beside(merged.means, origin, new, _BESIDE_M)] = False
@@ -239,16 +248,17 @@ def _start(
     count = max(int(params.keep * inside(gaussians.means, bounds).sum()) - int((new & mine).sum()), 1)
     many = stays & mine & ~new
     if params.keep == 1 or many.sum() <= count:
-        return merged[stays], origin[stays]
+        return merged[stays], origin[stays], new[stays]
     from gsmap.geometry.decimate import decimate  # with scipy, which naming a recipe does without
 
-    fewer, into = decimate(merged[many], count)
+    fewer, into = decimate(merged[many], count, visible[many])
     # One that is made of two captures' counts for the one of which more is seen.
     order = np.argsort(visible[many], kind="stable")
     of = np.empty(len(fewer), dtype=origin.dtype)
     of[into[order]] = origin[many][order]
     stays &= ~many
-    return Gaussians.concatenate([merged[stays], fewer]), np.concatenate([origin[stays], of])
+    parts = Gaussians.concatenate([merged[stays], fewer]), np.concatenate([origin[stays], of])
+    return *parts, np.concatenate([new[stays], np.zeros(len(fewer), dtype=bool)])
 
 
 def _fit(
