@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap._native import ranks
+from gsmap import _native
 
 
 def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +23,7 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         return label.reshape(-1), counts
     key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-    labels, counts = ranks(np.ascontiguousarray(key))
+    labels, counts = _native.ranks(np.ascontiguousarray(key))
     return labels, counts
 
 
@@ -31,3 +31,33 @@ def group_means(values: np.ndarray, labels: np.ndarray, counts: np.ndarray) -> n
     """(M, F) float64 means of the rows (N, F) of each of M labels; see `cell_labels`."""
     sums = [np.bincount(labels, column, len(counts)) for column in values.T]
     return np.stack(sums, axis=1) / counts[:, None] if len(values) else np.zeros((0, values.shape[1]))
+
+
+def cell_means(
+    points: np.ndarray,
+    values: np.ndarray,
+    cell: float,
+    weights: np.ndarray | None = None,
+    origin: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (N, 3) and values (N, 3) averaged over the cells of a grid: (M, 3), (M, 3) and the cells' weights (M,).
+
+    The same as `group_means` over `cell_labels`, in one walk and without arrays for what lies between.
+
+    Args:
+        cell: side of the cells.
+        weights: (N,), 1 each by default.
+        origin: (3,) corner of a cell, 0 by default.
+    """
+    origin = np.zeros(3) if origin is None else np.asarray(origin, np.float64)
+    points, values = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(values, np.float64)
+    weights = None if weights is None else np.ascontiguousarray(weights, np.float64)
+    try:
+        return _native.cell_means(points=points, values=values, weights=weights, origin=origin[None], cell=cell)
+    except OverflowError:  # strays very far out
+        labels, counts = cell_labels(np.floor((points - origin) / cell))
+        share = np.ones(len(points)) if weights is None else weights
+        total = np.maximum(np.bincount(labels, share, len(counts)), 1e-300)
+        both = np.concatenate([points, values], axis=1) * share[:, None]
+        means = np.stack([np.bincount(labels, column, len(counts)) for column in both.T], axis=1) / total[:, None]
+        return means[:, :3], means[:, 3:], total

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.geometry.cells import cell_labels
+from gsmap.geometry.cells import cell_means
 from gsmap.geometry.neighbours import spatial_order
+from gsmap.types.views import Cloud
 
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's
@@ -20,7 +21,7 @@ _MANY = 400_000  # points; clouds of more are thinned to what each grid resolves
 _UNTOLD = 0.3  # cells within which points are not told apart: a fifth of a blob's scale
 _ORDER_ACROSS = 256  # cells of the order in which points are spread over grids
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
-_BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
+_BLOCK_CELLS = 128  # grids larger than this are worked through in blocks: memory stays bounded
 
 
 @dataclass(frozen=True)
@@ -67,23 +68,23 @@ class Blobs:
 
 
 class Octaves:
-    """The extrema of one levelled cloud by the size of the grid's cells, for layers that have octaves in common.
+    """One levelled cloud in its own unit, and its extrema by the size of the grid's cells, for layers that share both.
 
-    Layers whose units differ by a power of two do: they look at the same grids, bit by bit.
+    Layers whose units differ by a power of two look at the same grids, bit by bit.
     """
 
     def __init__(self) -> None:
-        self._order: np.ndarray | None = None
+        self._levelled: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
 
-    def order(self, points: np.ndarray) -> np.ndarray | slice:
-        """Rows of the points, neighbours together: spread over a grid so, they stay in the processor's cache; as they
-        are where they will be thinned, which sorts them."""
-        if len(points) > _MANY:
-            return slice(None)
-        if self._order is None:
-            self._order = spatial_order(points, _ORDER_ACROSS)
-        return self._order
+    def levelled(self, cloud: Cloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points, L*a*b* and areas of the cloud, always the same one, turned by ``level`` (3, 3), neighbours together:
+        spread over a grid so, or thinned, they stay in the processor's cache."""
+        if self._levelled is None:
+            points = cloud.points @ level.T
+            order = spatial_order(points, _ORDER_ACROSS)
+            self._levelled = points[order], cloud.lab[order], cloud.areas[order]
+        return self._levelled
 
     def extrema(
         self,
@@ -108,13 +109,7 @@ def thinned(
     their surface; one of fewer as it is."""
     if len(points) <= _MANY:
         return points, lab, areas
-    labels, counts = cell_labels(np.floor(points / (size_m * _UNTOLD)))
-    total = np.maximum(np.bincount(labels, areas, len(counts)), 1e-300)
-    means = np.empty((2, len(counts), 3))
-    for k, values in enumerate((points, lab)):
-        for axis in range(3):
-            means[k, :, axis] = np.bincount(labels, areas * values[:, axis], len(counts)) / total
-    return means[0], means[1], total
+    return cell_means(points, lab, size_m * _UNTOLD, areas)
 
 
 def find_blobs(
