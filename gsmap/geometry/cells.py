@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap import _native
+from gsmap._native import cell_means as native_cell_means
+from gsmap._native import ranks
 
 
 def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +24,7 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         return label.reshape(-1), counts
     key = (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
-    labels, counts = _native.ranks(np.ascontiguousarray(key))
+    labels, counts = ranks(np.ascontiguousarray(key))
     return labels, counts
 
 
@@ -53,11 +54,14 @@ def cell_means(
     points, values = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(values, np.float64)
     weights = None if weights is None else np.ascontiguousarray(weights, np.float64)
     try:
-        return _native.cell_means(points=points, values=values, weights=weights, origin=origin[None], cell=cell)
+        means: tuple[np.ndarray, np.ndarray, np.ndarray] = native_cell_means(
+            points=points, values=values, weights=weights, origin=origin[None], cell=cell
+        )
+        return means
     except OverflowError:  # strays very far out
         labels, counts = cell_labels(np.floor((points - origin) / cell))
         share = np.ones(len(points)) if weights is None else weights
         total = np.maximum(np.bincount(labels, share, len(counts)), 1e-300)
         both = np.concatenate([points, values], axis=1) * share[:, None]
-        means = np.stack([np.bincount(labels, column, len(counts)) for column in both.T], axis=1) / total[:, None]
-        return means[:, :3], means[:, 3:], total
+        mean = np.stack([np.bincount(labels, column, len(counts)) for column in both.T], axis=1) / total[:, None]
+        return mean[:, :3], mean[:, 3:], total

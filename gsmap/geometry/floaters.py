@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap import _native
+from gsmap._native import PointTree
 
 _FAR = 4.0  # times the median distance to the 8th neighbour
 
@@ -25,6 +25,6 @@ def find_floaters(points: np.ndarray, colours: np.ndarray, max_difference: float
     """
     if len(points) < 9:
         return np.zeros(len(points), bool), np.zeros(len(points))
-    tree = _native.PointTree(np.ascontiguousarray(points, np.float64))
+    tree = PointTree(np.ascontiguousarray(points, np.float64))
     spacing, unlike = tree.unlike(np.ascontiguousarray(colours, np.float64), 8)
     return (spacing > _FAR * np.median(spacing)) | (unlike >= max_difference), spacing

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsmap import _native
+from gsmap._native import PointTree
 from gsmap.geometry.cells import cell_labels
 
 _ACROSS = 64  # cells of the grid by whose order points are visited
@@ -38,12 +38,12 @@ def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarra
 
 def nearest_neighbours(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances and rows (N, k) of the nearest of the points (N, 3) to each; see `chunks_of_neighbours`."""
-    found: tuple[np.ndarray, np.ndarray] = _native.PointTree(np.ascontiguousarray(points, np.float64)).neighbours(k)
+    found: tuple[np.ndarray, np.ndarray] = PointTree(np.ascontiguousarray(points, np.float64)).neighbours(k)
     return found
 
 
 def nearest_of(points: np.ndarray, at: np.ndarray, radius: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
     """Distance to and row (M,) of the point (N, 3) nearest to each place (M, 3); inf and 0 where all are farther."""
-    tree = _native.PointTree(np.ascontiguousarray(points, np.float64))
+    tree = PointTree(np.ascontiguousarray(points, np.float64))
     found: tuple[np.ndarray, np.ndarray] = tree.nearest(np.ascontiguousarray(at, np.float64), radius)
     return found

@@ -89,41 +89,43 @@ void both(Flags &flags, const Flags &others) {
 #define WIDE
 #endif
 
-// One pass along the first or second axis into the wanted segments. Rows that share what they read follow each other.
-WIDE void pass_across(const Grid &g, int axis, const std::vector<float> &taps, const Field &in, const Flags &filled,
-                      Field &out, const Flags &wanted) {
-    const int reach = int(taps.size()) / 2, length = axis == 0 ? g.nx : g.ny, others = axis == 0 ? g.ny : g.nx;
-    const std::ptrdiff_t step = axis == 0 ? g.ny : 1;
-    for (int other = 0; other < others; ++other)
-        for (int at = 0; at < length; ++at) {
-            const std::size_t row = axis == 0 ? g.row(at, other) : g.row(other, at);
-            const int from = std::max(-reach, -at), to = std::min(reach, length - 1 - at);
-            for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
-                const int s = __builtin_ctzll(left);
-                Half first = {}, second = {};
-                for (int k = from; k <= to; ++k) {
-                    if (!(filled[row + k * step] >> s & 1)) continue;
-                    const Half *source = reinterpret_cast<const Half *>(&in[g.at(row + k * step, s)]);
-                    first += taps[k + reach] * source[0];
-                    second += taps[k + reach] * source[1];
-                }
-                Half *to_write = reinterpret_cast<Half *>(&out[g.at(row, s)]);
-                to_write[0] = first, to_write[1] = second;
+// One pass along the first or second axis into the wanted segments of the rows of one plane (x), of which `out` holds no
+// more; `in` holds the whole block, or that plane.
+WIDE void pass_across(const Grid &g, int x, int axis, const std::vector<float> &taps, const Field &in,
+                      const Flags &filled, Field &out, const Flags &wanted) {
+    const int reach = int(taps.size()) / 2;
+    const std::ptrdiff_t step = axis == 0 ? g.ny : 1, first_in = axis == 0 ? 0 : g.row(x, 0);
+    for (int y = 0; y < g.ny; ++y) {
+        const int at = axis == 0 ? x : y, length = axis == 0 ? g.nx : g.ny;
+        const int from = std::max(-reach, -at), to = std::min(reach, length - 1 - at);
+        const std::size_t row = g.row(x, y);
+        for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
+            const int s = __builtin_ctzll(left);
+            Half first = {}, second = {};
+            for (int k = from; k <= to; ++k) {
+                if (!(filled[row + k * step] >> s & 1)) continue;
+                const Half *source = reinterpret_cast<const Half *>(&in[g.at(row + k * step - first_in, s)]);
+                first += taps[k + reach] * source[0];
+                second += taps[k + reach] * source[1];
             }
+            Half *target = reinterpret_cast<Half *>(&out[g.at(y, s)]);
+            target[0] = first, target[1] = second;
         }
+    }
 }
 
-// One pass along the last axis into the wanted segments.
-WIDE void pass_along(const Grid &g, const std::vector<float> &taps, const Field &in, const Flags &filled, Field &out,
-                     const Flags &wanted) {
+// One pass along the last axis, from what holds one plane into the whole block.
+WIDE void pass_along(const Grid &g, int x, const std::vector<float> &taps, const Field &in, const Flags &filled,
+                     Field &out, const Flags &wanted) {
     const int reach = int(taps.size()) / 2;
     const int margin = (reach + SEGMENT - 1) / SEGMENT;  // segments
     Field line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH, 0.f);
-    for (std::size_t row = 0; row < g.rows(); ++row) {
+    for (int y = 0; y < g.ny; ++y) {
+        const std::size_t row = g.row(x, y);
         if (!wanted[row]) continue;
         for (int s = 0; s < g.segments; ++s) {
             float *to = &line[(s + margin) * Grid::WIDTH];
-            if (filled[row] >> s & 1) std::memcpy(to, &in[g.at(row, s)], Grid::WIDTH * sizeof(float));
+            if (filled[row] >> s & 1) std::memcpy(to, &in[g.at(y, s)], Grid::WIDTH * sizeof(float));
             else std::memset(to, 0, Grid::WIDTH * sizeof(float));
         }
         for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
@@ -134,8 +136,8 @@ WIDE void pass_along(const Grid &g, const std::vector<float> &taps, const Field 
                 first += taps[k] * reinterpret_cast<const Half *>(source)[0];
                 second += taps[k] * reinterpret_cast<const Half *>(source)[1];
             }
-            Half *to_write = reinterpret_cast<Half *>(&out[g.at(row, s)]);
-            to_write[0] = first, to_write[1] = second;
+            Half *target = reinterpret_cast<Half *>(&out[g.at(row, s)]);
+            target[0] = first, target[1] = second;
         }
     }
 }
@@ -159,9 +161,11 @@ struct Blur {
     }
 
     void operator()(const Grid &g, const Field &in, const Flags &filled, Field &a, Field &b, Field &out) const {
-        pass_across(g, 0, taps, in, filled, a, after_x);
-        pass_across(g, 1, taps, a, after_x, b, after_y);
-        pass_along(g, taps, b, after_y, out, after_z);
+        for (int x = 0; x < g.nx; ++x) {
+            pass_across(g, x, 0, taps, in, filled, a, after_x);
+            pass_across(g, x, 1, taps, a, after_x, b, after_y);
+            pass_along(g, x, taps, b, after_y, out, after_z);
+        }
     }
 };
 
@@ -295,12 +299,15 @@ void maximum(const Grid &g, const Field &response, const int *shape, int x, int 
 
 // Cells of a block, kept from one to the next: making them anew costs as much as filling them.
 struct Work {
-    Field field;         // zero between blocks
-    Field a, b, smooth;  // anything
+    Field field;   // zero between blocks
+    Field smooth;  // anything
+    Field a, b;    // anything, of one plane
 
-    void fit(std::size_t values) {
-        for (Field *f : {&field, &a, &b, &smooth})
-            if (f->size() < values) f->resize(values, 0.f);
+    void fit(const Grid &g) {
+        for (Field *f : {&field, &smooth})
+            if (f->size() < g.values()) *f = Field(g.values(), 0.f);
+        for (Field *f : {&a, &b})
+            if (f->size() < g.at(g.ny, 0)) *f = Field(g.at(g.ny, 0), 0.f);
     }
 };
 
@@ -313,8 +320,8 @@ void empty(const Grid &g, Field &field, const Flags &flags) {
 std::vector<Extremum> extrema(const Block &block, Work &work, const double *thresholds, double sigma, double surround) {
     const int *shape = block.shape;
     const Grid g(shape[0], shape[1], shape[2]);
-    work.fit(g.values());
-    auto &[field, a, b, smooth] = work;
+    work.fit(g);
+    auto &[field, smooth, a, b] = work;
     Flags filled(g.rows(), 0), surface(g.rows(), 0);
     splat(g, block, field, filled);
     const Blur near(g, sigma, filled, nullptr);
@@ -329,18 +336,16 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
             surface[row] |= std::uint64_t(any) << s;
         });
     const Blur far(g, sigma * std::sqrt(surround * surround - 1), near.after_z, &surface);
-    Field &wide = field;
-    far(g, smooth, near.after_z, a, b, wide);
-    Field &response = a;  // zero around the surface, as far as windows reach
-    empty(g, response, dilated(g, dilated(g, dilated(g, surface, 0, WINDOW), 1, WINDOW), 2, WINDOW));
+    far(g, smooth, near.after_z, a, b, field);
+    Field &response = field;  // takes the place of what is around
     const auto of = [](Field &values, std::size_t cell) -> Cell & { return *reinterpret_cast<Cell *>(&values[cell]); };
     for (std::size_t row = 0; row < g.rows(); ++row)
         each(surface[row], [&](int s) {
             for (std::size_t cell = g.at(row, s); cell < g.at(row, s + 1); cell += CHANNELS) {
-                const float mass = smooth[cell + 3];
-                if (is_surface(mass))
-                    of(response, cell) =
-                        of(smooth, cell) / std::max(mass, 1e-9f) - of(wide, cell) / std::max(wide[cell + 3], 1e-9f);
+                const float mass = smooth[cell + 3], around = field[cell + 3];
+                of(response, cell) = is_surface(mass) ? of(smooth, cell) / std::max(mass, 1e-9f) -
+                                                            of(field, cell) / std::max(around, 1e-9f)
+                                                      : Cell{};
                 response[cell + 3] = mass * plane - 1;
             }
         });
@@ -360,7 +365,7 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
                             maximum(g, response, shape, x, y, z, c, -1.f, thresholds[c], found);
                     }
             });
-    empty(g, field, surface);
+    empty(g, response, surface);
     return found;
 }
 

@@ -21,7 +21,7 @@ _MANY = 400_000  # points; clouds of more are thinned to what each grid resolves
 _UNTOLD = 0.3  # cells within which points are not told apart: a fifth of a blob's scale
 _ORDER_ACROSS = 256  # cells of the order in which points are spread over grids
 _HALO_CELLS = 12  # reach of the surround's kernel and of the maxima
-_BLOCK_CELLS = 128  # grids larger than this are worked through in blocks: memory stays bounded
+_BLOCK_CELLS = 192  # grids larger than this are worked through in blocks: memory stays bounded
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,7 @@ def find_blobs(
     octaves: Octaves | None = None,
     unit_m: float = 1.0,
     median_area_m2: float | None = None,
+    thinned_m: float = 0.0,
 ) -> Blobs:
     """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
 
@@ -132,7 +133,8 @@ def find_blobs(
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
         octaves: of this cloud in its own unit, which is ``unit_m`` metres.
-        median_area_m2: of the points before they were thinned.
+        median_area_m2: of the points before they were thinned ...
+        thinned_m: ... to what a grid of this size resolves.
     """
     params, known = params or Params(), octaves or Octaves()
     lab_threshold, count = params.lab_threshold, params.octaves
@@ -145,7 +147,8 @@ def find_blobs(
         size_m = params.cell_m * 2**octave
         if spacing_m > params.max_spacing_cells * size_m:
             continue
-        points, lab, areas = thinned(points, lab, areas, size_m)
+        if size_m > thinned_m:
+            points, lab, areas = thinned(points, lab, areas, size_m)
         parts = [_empty()]
         for channel, negative, cells, ratio in known.extrema(points, lab, areas, thresholds, size_m, unit_m):
             kind = np.full(len(cells), (channel * 2 + negative) * count + octave, np.int32)

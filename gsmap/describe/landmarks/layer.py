@@ -78,8 +78,9 @@ def landmark_layer(
     octaves = octaves or Octaves()
     points, lab, areas = octaves.levelled(cloud, level)
     spacing_m2 = float(np.median(areas)) * unit_m**2
-    points, lab, areas = thinned(points * unit_m, lab, areas * unit_m**2, params.detect.cell_m)
-    blobs = find_blobs(points, lab, areas, params.detect, octaves, unit_m, spacing_m2)
+    finest_m = params.detect.cell_m
+    points, lab, areas = thinned(points * unit_m, lab, areas * unit_m**2, finest_m)
+    blobs = find_blobs(points, lab, areas, params.detect, octaves, unit_m, spacing_m2, finest_m)
     if len(blobs) == 0:
         return NodeLayer.empty(descriptor, dim, unit_m)
     around = surroundings(blobs.positions, points, lab, params.context)

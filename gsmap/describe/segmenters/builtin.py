@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from gsmap import _native
+from gsmap._native import graph_parts
 from gsmap.describe.cloud import downsample, local_planes
 from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
 from gsmap.types.views import Cloud, Mask, SceneContext, View
@@ -111,5 +111,5 @@ def felzenszwalb(
     """
     order = np.argsort(weight, kind="stable")
     ends = [np.ascontiguousarray(end[order], np.int64) for end in (a, b)]
-    part = _native.graph_parts(count, *ends, np.ascontiguousarray(weight[order], np.float64), scale, min_size)
+    part = graph_parts(count, *ends, np.ascontiguousarray(weight[order], np.float64), scale, min_size)
     return np.unique(part, return_inverse=True)[1]
