@@ -15,6 +15,7 @@ namespace {
 
 constexpr int CHANNELS = 4;  // L*, a*, b* and surface, side by side in memory: one walk over the grid does them all
 constexpr int SEGMENT = 4;   // cells along the last axis that are worked on, or left out, together
+constexpr int ROOM = 16;     // rows have so many cells, or a multiple; what is blurred beyond their ends is lost
 constexpr int MOST = 64 * SEGMENT;  // cells a side of a block: a word has a bit for each segment of a row
 constexpr int WINDOW = 2;    // a maximum is one among so many cells to either side
 
@@ -35,7 +36,7 @@ struct Grid {
     int nx, ny, nz, segments;
 
     Grid(int x, int y, int z)
-        : nx(x), ny(y), nz((z + SEGMENT - 1) / SEGMENT * SEGMENT), segments(nz / SEGMENT) {}
+        : nx(x), ny(y), nz((z + ROOM - 1) / ROOM * ROOM), segments(nz / SEGMENT) {}
     std::size_t row(int x, int y) const { return std::size_t(x) * ny + y; }
     std::size_t rows() const { return std::size_t(nx) * ny; }
     std::size_t values() const { return rows() * nz * CHANNELS; }
