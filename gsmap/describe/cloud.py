@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.cells import cell_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.floaters import find_floaters
+from gsmap.geometry.neighbours import nearest_neighbours
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians
 from gsmap.types.views import Cloud
@@ -57,10 +57,8 @@ def surface_cloud(gaussians: Gaussians, params: Params | None = None) -> Cloud:
 
 
 def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean position and mean value of the points of each occupied cell of a grid; ``values`` is (N, F)."""
-    cells = np.floor((points - points.min(0)) / cell) if len(points) else points
-    mean = group_means(np.concatenate([points, values], axis=1), *cell_labels(cells))
-    return mean[:, :3], mean[:, 3:]
+    """Mean position and mean value of the points of each occupied cell of a grid; ``values`` is (N, 3)."""
+    return cell_means(points, values, cell, origin=points.min(0) if len(points) else None)[:2]
 
 
 def local_planes(points: np.ndarray, num_neighbours: int = 16) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +66,7 @@ def local_planes(points: np.ndarray, num_neighbours: int = 16) -> tuple[np.ndarr
     k = min(num_neighbours, len(points))
     if k < 4:
         return np.zeros((len(points), 3)), np.zeros(len(points))
-    neighbours = points[cKDTree(points).query(points, k=k)[1]]
+    neighbours = points[nearest_neighbours(points, k)[1]]
     centred = neighbours - neighbours.mean(1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
     planarity = (values[:, 1] - values[:, 0]) / np.maximum(values[:, 2], 1e-12)

@@ -90,7 +90,7 @@ def _planes(points: np.ndarray, max_normals: int) -> tuple[np.ndarray, np.ndarra
     """Normals and weights of a sample of the surface, and the sample."""
     span = np.ptp(np.percentile(points, [2, 98], axis=0), axis=0)
     cell = float(np.sort(span)[1:].mean()) / 60 or 1.0
-    sample, _ = downsample(points, points[:, :0], cell)
+    sample, _ = downsample(points, points, cell)
     normals, planarity = local_planes(sample, 40)
     step = max(1, len(sample) // max_normals)
     return normals[::step], planarity[::step] ** 2, sample

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap.geometry.neighbours import chunks_of_neighbours
+from gsmap._native import PointTree
 
 _FAR = 4.0  # times the median distance to the 8th neighbour
 
@@ -17,7 +17,7 @@ def find_floaters(points: np.ndarray, colours: np.ndarray, max_difference: float
 
     Args:
         points: (N, 3), any unit.
-        colours: (N, C) in any space where Euclidean distance means unlikeness.
+        colours: (N, 3) in any space where Euclidean distance means unlikeness.
         max_difference: colours farther apart are unlike.
 
     Returns:
@@ -25,10 +25,6 @@ def find_floaters(points: np.ndarray, colours: np.ndarray, max_difference: float
     """
     if len(points) < 9:
         return np.zeros(len(points), bool), np.zeros(len(points))
-    spacing, foreign = np.empty(len(points)), np.empty(len(points), bool)
-    for rows, distances, neighbours in chunks_of_neighbours(points, 9):
-        spacing[rows] = distances[:, 8]
-        own = colours[rows]
-        unlike = np.stack([np.linalg.norm(colours[column] - own, axis=1) for column in neighbours[:, 1:].T])
-        foreign[rows] = np.partition(unlike, 1, axis=0)[1] >= max_difference
-    return (spacing > _FAR * np.median(spacing)) | foreign, spacing
+    tree = PointTree(np.ascontiguousarray(points, np.float64))
+    spacing, unlike = tree.unlike(np.ascontiguousarray(colours, np.float64), 8)
+    return (spacing > _FAR * np.median(spacing)) | (unlike >= max_difference), spacing

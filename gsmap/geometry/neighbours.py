@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap._native import PointTree
 from gsmap.geometry.cells import cell_labels
 
 _ACROSS = 64  # cells of the grid by whose order points are visited
@@ -37,7 +38,12 @@ def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarra
 
 def nearest_neighbours(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances and rows (N, k) of the nearest of the points (N, 3) to each; see `chunks_of_neighbours`."""
-    distances, neighbours = np.zeros((len(points), k)), np.zeros((len(points), k), np.int64)
-    for rows, near, found in chunks_of_neighbours(points, k):
-        distances[rows], neighbours[rows] = near.reshape(-1, k), found.reshape(-1, k)
-    return distances, neighbours
+    found: tuple[np.ndarray, np.ndarray] = PointTree(np.ascontiguousarray(points, np.float64)).neighbours(k)
+    return found
+
+
+def nearest_of(points: np.ndarray, at: np.ndarray, radius: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Distance to and row (M,) of the point (N, 3) nearest to each place (M, 3); inf and 0 where all are farther."""
+    tree = PointTree(np.ascontiguousarray(points, np.float64))
+    found: tuple[np.ndarray, np.ndarray] = tree.nearest(np.ascontiguousarray(at, np.float64), radius)
+    return found

@@ -13,7 +13,10 @@
 namespace gsmap {
 namespace {
 
-constexpr int SEGMENT = 16;  // cells along the last axis that are worked on, or left out, together
+constexpr int CHANNELS = 4;  // L*, a*, b* and surface, side by side in memory: one walk over the grid does them all
+constexpr int SEGMENT = 4;   // cells along the last axis that are worked on, or left out, together
+constexpr int ROOM = 16;     // rows have so many cells, or a multiple; what is blurred beyond their ends is lost
+constexpr int MOST = 64 * SEGMENT;  // cells a side of a block: a word has a bit for each segment of a row
 constexpr int WINDOW = 2;    // a maximum is one among so many cells to either side
 
 // Taps of a normalised Gaussian, three standard deviations to either side.
@@ -27,36 +30,51 @@ std::vector<float> taps_of(double sigma) {
     return out;
 }
 
-// A dense block of cells, and which of its segments hold, or need, anything: surfaces fill little of a place.
+// A dense block of cells. Of its rows along the last axis, words say which segments hold, or need, anything: surfaces
+// fill little of a place.
 struct Grid {
     int nx, ny, nz, segments;
 
     Grid(int x, int y, int z)
-        : nx(x), ny(y), nz((z + SEGMENT - 1) / SEGMENT * SEGMENT), segments(nz / SEGMENT) {}
-    std::size_t row(int x, int y) const { return (std::size_t(x) * ny + y) * nz; }
-    std::size_t flag(int x, int y) const { return (std::size_t(x) * ny + y) * segments; }
-    std::size_t cells() const { return std::size_t(nx) * ny * nz; }
-    std::size_t flags() const { return std::size_t(nx) * ny * segments; }
+        : nx(x), ny(y), nz((z + ROOM - 1) / ROOM * ROOM), segments(nz / SEGMENT) {}
+    std::size_t row(int x, int y) const { return std::size_t(x) * ny + y; }
+    std::size_t rows() const { return std::size_t(nx) * ny; }
+    std::size_t values() const { return rows() * nz * CHANNELS; }
+    // First value of a segment, of a cell.
+    std::size_t at(std::size_t row, int segment) const { return (row * segments + segment) * WIDTH; }
+    std::size_t cell(int x, int y, int z) const { return (row(x, y) * nz + z) * CHANNELS; }
+
+    static constexpr int WIDTH = SEGMENT * CHANNELS;  // values of a segment
 };
 
-using Field = std::vector<float>;
-using Flags = std::vector<std::uint8_t>;
+// Values of one cell, and of half a segment; wherever they lie.
+typedef float Cell __attribute__((vector_size(16), aligned(4), may_alias));
+typedef float Half __attribute__((vector_size(32), aligned(4), may_alias));
+static_assert(2 * sizeof(Half) == Grid::WIDTH * sizeof(float) && sizeof(Cell) == CHANNELS * sizeof(float));
 
-// Segments that have a flagged one within `reach` steps along an axis (along the last one: of segments).
+using Field = std::vector<float>;
+using Flags = std::vector<std::uint64_t>;  // a word for each row
+
+// Calls visit(segment) for each that is flagged.
+template <class Visit> void each(std::uint64_t flags, Visit visit) {
+    for (; flags; flags &= flags - 1) visit(__builtin_ctzll(flags));
+}
+
+// Segments that have a flagged one within `reach` cells along an axis.
 Flags dilated(const Grid &g, const Flags &in, int axis, int reach) {
-    Flags out(g.flags(), 0);
-    const int n[3] = {g.nx, g.ny, g.segments};
-    const std::size_t step[3] = {std::size_t(g.ny) * g.segments, std::size_t(g.segments), 1};
-    const int a = (axis + 1) % 3, b = (axis + 2) % 3;
-    for (int i = 0; i < n[a]; ++i)
-        for (int j = 0; j < n[b]; ++j) {
-            const std::size_t base = i * step[a] + j * step[b];
-            int last = -reach - 1;
-            for (int k = 0; k < n[axis] + reach; ++k) {
-                if (k < n[axis] && in[base + k * step[axis]]) last = k;
-                const int at = k - reach;  // the latest flag up to k tells of at, and so does any from at - reach on
-                if (at >= 0 && last >= at - reach) out[base + at * step[axis]] = 1;
-            }
+    Flags out(in);
+    if (axis == 2) {
+        const std::uint64_t all = g.segments == 64 ? ~std::uint64_t(0) : (std::uint64_t(1) << g.segments) - 1;
+        for (int k = 1; k <= (reach + SEGMENT - 1) / SEGMENT; ++k)
+            for (std::size_t i = 0; i < out.size(); ++i) out[i] |= (in[i] << k | in[i] >> k) & all;
+        return out;
+    }
+    const std::size_t step = axis == 0 ? g.ny : 1;
+    for (int x = 0; x < g.nx; ++x)
+        for (int y = 0; y < g.ny; ++y) {
+            const int at = axis == 0 ? x : y, length = axis == 0 ? g.nx : g.ny;
+            for (int k = std::max(-reach, -at); k <= std::min(reach, length - 1 - at); ++k)
+                out[g.row(x, y)] |= in[g.row(x, y) + k * step];
         }
     return out;
 }
@@ -72,51 +90,57 @@ void both(Flags &flags, const Flags &others) {
 #define WIDE
 #endif
 
-// One pass along the first or second axis into the wanted segments.
-WIDE void pass_across(const Grid &g, int axis, const std::vector<float> &taps, const Field &in, const Flags &filled,
-                 Field &out, const Flags &wanted) {
-    const int reach = int(taps.size()) / 2, length = axis == 0 ? g.nx : g.ny;
-    const std::ptrdiff_t step = axis == 0 ? g.row(1, 0) : g.nz, flag_step = axis == 0 ? g.flag(1, 0) : g.segments;
-    for (int x = 0; x < g.nx; ++x)
-        for (int y = 0; y < g.ny; ++y) {
-            const int at = axis == 0 ? x : y, from = std::max(-reach, -at), to = std::min(reach, length - 1 - at);
-            for (int s = 0; s < g.segments; ++s) {
-                const std::size_t flag = g.flag(x, y) + s, cell = g.row(x, y) + std::size_t(s) * SEGMENT;
-                if (!wanted[flag]) continue;
-                float sum[SEGMENT] = {};
-                for (int k = from; k <= to; ++k) {
-                    if (!filled[flag + k * flag_step]) continue;
-                    const float *source = &in[cell + k * step], tap = taps[k + reach];
-                    for (int c = 0; c < SEGMENT; ++c) sum[c] += tap * source[c];
-                }
-                std::memcpy(&out[cell], sum, sizeof sum);
+// One pass along the first or second axis into the wanted segments of the rows of one plane (x), of which `out` holds no
+// more; `in` holds the whole block, or that plane.
+WIDE void pass_across(const Grid &g, int x, int axis, const std::vector<float> &taps, const Field &in,
+                      const Flags &filled, Field &out, const Flags &wanted) {
+    const int reach = int(taps.size()) / 2;
+    const std::ptrdiff_t step = axis == 0 ? g.ny : 1, first_in = axis == 0 ? 0 : g.row(x, 0);
+    for (int y = 0; y < g.ny; ++y) {
+        const int at = axis == 0 ? x : y, length = axis == 0 ? g.nx : g.ny;
+        const int from = std::max(-reach, -at), to = std::min(reach, length - 1 - at);
+        const std::size_t row = g.row(x, y);
+        for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
+            const int s = __builtin_ctzll(left);
+            Half first = {}, second = {};
+            for (int k = from; k <= to; ++k) {
+                if (!(filled[row + k * step] >> s & 1)) continue;
+                const Half *source = reinterpret_cast<const Half *>(&in[g.at(row + k * step - first_in, s)]);
+                first += taps[k + reach] * source[0];
+                second += taps[k + reach] * source[1];
             }
+            Half *target = reinterpret_cast<Half *>(&out[g.at(y, s)]);
+            target[0] = first, target[1] = second;
         }
+    }
 }
 
-// One pass along the last axis into the wanted segments.
-WIDE void pass_along(const Grid &g, const std::vector<float> &taps, const Field &in, const Flags &filled, Field &out,
-                const Flags &wanted) {
-    const int reach = int(taps.size()) / 2;  // less than a segment
-    Field line(g.nz + 2 * SEGMENT, 0.f);
-    for (int x = 0; x < g.nx; ++x)
-        for (int y = 0; y < g.ny; ++y) {
-            const std::size_t flag = g.flag(x, y), row = g.row(x, y);
-            if (!std::memchr(&wanted[flag], 1, g.segments)) continue;
-            for (int s = 0; s < g.segments; ++s) {
-                float *to = &line[(s + 1) * SEGMENT];
-                if (filled[flag + s]) std::memcpy(to, &in[row + s * SEGMENT], SEGMENT * sizeof(float));
-                else std::memset(to, 0, SEGMENT * sizeof(float));
-            }
-            for (int s = 0; s < g.segments; ++s) {
-                if (!wanted[flag + s]) continue;
-                float sum[SEGMENT] = {};
-                const float *source = &line[(s + 1) * SEGMENT - reach];
-                for (std::size_t k = 0; k < taps.size(); ++k)
-                    for (int c = 0; c < SEGMENT; ++c) sum[c] += taps[k] * source[k + c];
-                std::memcpy(&out[row + s * SEGMENT], sum, sizeof sum);
-            }
+// One pass along the last axis, from what holds one plane into the whole block.
+WIDE void pass_along(const Grid &g, int x, const std::vector<float> &taps, const Field &in, const Flags &filled,
+                     Field &out, const Flags &wanted) {
+    const int reach = int(taps.size()) / 2;
+    const int margin = (reach + SEGMENT - 1) / SEGMENT;  // segments
+    Field line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH, 0.f);
+    for (int y = 0; y < g.ny; ++y) {
+        const std::size_t row = g.row(x, y);
+        if (!wanted[row]) continue;
+        for (int s = 0; s < g.segments; ++s) {
+            float *to = &line[(s + margin) * Grid::WIDTH];
+            if (filled[row] >> s & 1) std::memcpy(to, &in[g.at(y, s)], Grid::WIDTH * sizeof(float));
+            else std::memset(to, 0, Grid::WIDTH * sizeof(float));
         }
+        for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
+            const int s = __builtin_ctzll(left);
+            Half first = {}, second = {};
+            const float *source = &line[(s + margin) * Grid::WIDTH - reach * CHANNELS];
+            for (std::size_t k = 0; k < taps.size(); ++k, source += CHANNELS) {
+                first += taps[k] * reinterpret_cast<const Half *>(source)[0];
+                second += taps[k] * reinterpret_cast<const Half *>(source)[1];
+            }
+            Half *target = reinterpret_cast<Half *>(&out[g.at(row, s)]);
+            target[0] = first, target[1] = second;
+        }
+    }
 }
 
 // A Gaussian convolution, zero beyond the block, of what is filled into what is wanted.
@@ -128,19 +152,21 @@ struct Blur {
         const int reach = int(taps.size()) / 2;
         after_x = dilated(g, filled, 0, reach);
         after_y = dilated(g, after_x, 1, reach);
-        after_z = dilated(g, after_y, 2, 1);
+        after_z = dilated(g, after_y, 2, reach);
         if (wanted) {
             after_z = *wanted;
-            const Flags around = dilated(g, after_z, 2, 1);
+            const Flags around = dilated(g, after_z, 2, reach);
             both(after_y, around);
             both(after_x, dilated(g, around, 1, reach));
         }
     }
 
     void operator()(const Grid &g, const Field &in, const Flags &filled, Field &a, Field &b, Field &out) const {
-        pass_across(g, 0, taps, in, filled, a, after_x);
-        pass_across(g, 1, taps, a, after_x, b, after_y);
-        pass_along(g, taps, b, after_y, out, after_z);
+        for (int x = 0; x < g.nx; ++x) {
+            pass_across(g, x, 0, taps, in, filled, a, after_x);
+            pass_across(g, x, 1, taps, a, after_x, b, after_y);
+            pass_along(g, x, taps, b, after_y, out, after_z);
+        }
     }
 };
 
@@ -221,9 +247,11 @@ struct Block {
     }
 };
 
-// Trilinear splatting of values of points (in cells of the block) into its cells.
-void splat(const Grid &g, const Block &block, const std::vector<double> &values, Field &out) {
-    for (std::size_t i = 0; i < values.size(); ++i) {
+// Trilinear splatting of the points' surface, and of it times their colours, into cells; flags the segments.
+void splat(const Grid &g, const Block &block, Field &out, Flags &filled) {
+    for (std::size_t i = 0; i < block.areas.size(); ++i) {
+        const double *lab = &block.lab[3 * i], area = block.areas[i];
+        const double values[CHANNELS] = {area * (lab[0] - 50.0), area * lab[1], area * lab[2], area};
         int base[3];
         double t[3];
         for (int k = 0; k < 3; ++k) {
@@ -234,109 +262,111 @@ void splat(const Grid &g, const Block &block, const std::vector<double> &values,
         for (int corner = 0; corner < 8; ++corner) {
             const int dx = corner >> 2, dy = corner >> 1 & 1, dz = corner & 1;
             const double share = (dx ? t[0] : 1 - t[0]) * (dy ? t[1] : 1 - t[1]) * (dz ? t[2] : 1 - t[2]);
-            out[g.row(base[0] + dx, base[1] + dy) + base[2] + dz] += float(share * values[i]);
+            const Cell part = {float(share * values[0]), float(share * values[1]), float(share * values[2]),
+                               float(share * values[3])};
+            *reinterpret_cast<Cell *>(&out[g.cell(base[0] + dx, base[1] + dy, base[2] + dz)]) += part;
+            filled[g.row(base[0] + dx, base[1] + dy)] |= std::uint64_t(1) << (base[2] + dz) / SEGMENT;
         }
     }
 }
 
-void maxima(const Grid &g, const Field &response, const Flags &surface, const int *shape, float sign, double threshold,
-            int channel, std::vector<Extremum> &found) {
-    for (int x = 0; x < shape[0]; ++x)
-        for (int y = 0; y < shape[1]; ++y)
-            for (int s = 0; s < g.segments; ++s) {
-                if (!surface[g.flag(x, y) + s]) continue;
-                for (int z = s * SEGMENT; z < std::min((s + 1) * SEGMENT, shape[2]); ++z) {
-                    const float top = sign * response[g.row(x, y) + z];
-                    if (!(top > threshold)) continue;
-                    const int x0 = std::max(x - WINDOW, 0), x1 = std::min(x + WINDOW, shape[0] - 1);
-                    const int y0 = std::max(y - WINDOW, 0), y1 = std::min(y + WINDOW, shape[1] - 1);
-                    const int z0 = std::max(z - WINDOW, 0), z1 = std::min(z + WINDOW, shape[2] - 1);
-                    bool highest = true;
-                    double total = 0, mean[3] = {};
-                    for (int i = x0; highest && i <= x1; ++i)
-                        for (int j = y0; highest && j <= y1; ++j)
-                            for (int k = z0; k <= z1; ++k) {
-                                const float value = sign * response[g.row(i, j) + k];
-                                if (value > top) {
-                                    highest = false;
-                                    break;
-                                }
-                                if (value > 0.6 * top) {
-                                    total += value;
-                                    mean[0] += double(value) * i, mean[1] += double(value) * j;
-                                    mean[2] += double(value) * k;
-                                }
-                            }
-                    if (highest)
-                        found.push_back({{mean[0] / total, mean[1] / total, mean[2] / total},
-                                         double(top) / threshold, channel, sign < 0});
+// The maxima of a channel times a sign within their windows, at one cell.
+void maximum(const Grid &g, const Field &response, const int *shape, int x, int y, int z, int channel, float sign,
+             double threshold, std::vector<Extremum> &found) {
+    const auto value_at = [&](int i, int j, int k) { return sign * response[g.cell(i, j, k) + channel]; };
+    const float top = value_at(x, y, z);
+    // Most cells have a higher neighbour.
+    if ((z > 0 && value_at(x, y, z - 1) > top) || (z + 1 < shape[2] && value_at(x, y, z + 1) > top) ||
+        (y > 0 && value_at(x, y - 1, z) > top) || (y + 1 < shape[1] && value_at(x, y + 1, z) > top) ||
+        (x > 0 && value_at(x - 1, y, z) > top) || (x + 1 < shape[0] && value_at(x + 1, y, z) > top))
+        return;
+    const int x0 = std::max(x - WINDOW, 0), x1 = std::min(x + WINDOW, shape[0] - 1);
+    const int y0 = std::max(y - WINDOW, 0), y1 = std::min(y + WINDOW, shape[1] - 1);
+    const int z0 = std::max(z - WINDOW, 0), z1 = std::min(z + WINDOW, shape[2] - 1);
+    double total = 0, mean[3] = {};
+    for (int i = x0; i <= x1; ++i)
+        for (int j = y0; j <= y1; ++j)
+            for (int k = z0; k <= z1; ++k) {
+                const float value = value_at(i, j, k);
+                if (value > top) return;
+                if (value > 0.6 * top) {
+                    total += value;
+                    mean[0] += double(value) * i, mean[1] += double(value) * j;
+                    mean[2] += double(value) * k;
                 }
             }
+    found.push_back({{mean[0] / total, mean[1] / total, mean[2] / total}, double(top) / threshold, channel, sign < 0});
 }
 
 // Cells of a block, kept from one to the next: making them anew costs as much as filling them.
 struct Work {
-    Field field, response;           // zero between blocks
-    Field a, b, mass, wide, smooth;  // anything
+    Field field;   // zero between blocks
+    Field smooth;  // anything
+    Field a, b;    // anything, of one plane
 
-    void fit(std::size_t cells) {
-        for (Field *f : {&field, &response, &a, &b, &mass, &wide, &smooth})
-            if (f->size() < cells) f->resize(cells, 0.f);
+    void fit(const Grid &g) {
+        for (Field *f : {&field, &smooth})
+            if (f->size() < g.values()) *f = Field(g.values(), 0.f);
+        for (Field *f : {&a, &b})
+            if (f->size() < g.at(g.ny, 0)) *f = Field(g.at(g.ny, 0), 0.f);
     }
 };
 
-void empty(Field &field, const Flags &flags) {
-    for (std::size_t i = 0; i < flags.size(); ++i)
-        if (flags[i]) std::fill_n(&field[i * SEGMENT], SEGMENT, 0.f);
+void empty(const Grid &g, Field &field, const Flags &flags) {
+    for (std::size_t row = 0; row < flags.size(); ++row)
+        each(flags[row], [&](int s) { std::fill_n(&field[g.at(row, s)], Grid::WIDTH, 0.f); });
 }
 
 // See gsmap/describe/landmarks/detect.py.
 std::vector<Extremum> extrema(const Block &block, Work &work, const double *thresholds, double sigma, double surround) {
     const int *shape = block.shape;
     const Grid g(shape[0], shape[1], shape[2]);
-    const std::size_t n = block.areas.size();
-    work.fit(g.cells());
-    auto &[field, response, a, b, mass, wide, smooth] = work;
-    std::vector<double> values(block.areas);
-    splat(g, block, values, field);
-    Flags filled(g.flags());
-    for (std::size_t i = 0; i < filled.size(); ++i)
-        filled[i] = std::any_of(&field[i * SEGMENT], &field[i * SEGMENT] + SEGMENT, [](float v) { return v > 0; });
+    work.fit(g);
+    auto &[field, smooth, a, b] = work;
+    Flags filled(g.rows(), 0), surface(g.rows(), 0);
+    splat(g, block, field, filled);
     const Blur near(g, sigma, filled, nullptr);
-    near(g, field, filled, a, b, mass);
+    near(g, field, filled, a, b, smooth);
+    empty(g, field, filled);
     const float plane = float(std::sqrt(2 * 3.14159265358979323846) * sigma);
-    const auto is_surface = [&](std::size_t cell) { return mass[cell] * plane > 0.3f; };
-    Flags surface(g.flags(), 0);
-    for (std::size_t i = 0; i < surface.size(); ++i)
-        if (near.after_z[i])
-            for (int c = 0; c < SEGMENT; ++c) surface[i] |= is_surface(i * SEGMENT + c);
+    const auto is_surface = [&](float mass) { return mass * plane > 0.3f; };
+    for (std::size_t row = 0; row < g.rows(); ++row)
+        each(near.after_z[row], [&](int s) {
+            bool any = false;
+            for (int c = 0; c < SEGMENT; ++c) any |= is_surface(smooth[g.at(row, s) + c * CHANNELS + 3]);
+            surface[row] |= std::uint64_t(any) << s;
+        });
     const Blur far(g, sigma * std::sqrt(surround * surround - 1), near.after_z, &surface);
-    far(g, mass, near.after_z, a, b, wide);
-    std::vector<Extremum> found;
-    for (int channel = 0; channel < 4; ++channel) {
-        if (channel < 3) {
-            empty(field, filled);
-            for (std::size_t i = 0; i < n; ++i)
-                values[i] = block.areas[i] * (block.lab[3 * i + channel] - (channel == 0 ? 50.0 : 0.0));
-            splat(g, block, values, field);
-            near(g, field, filled, a, b, smooth);
-            far(g, smooth, near.after_z, a, b, field);  // leaves more filled than was: emptied below
-        }
-        for (std::size_t i = 0; i < surface.size(); ++i) {
-            if (!surface[i]) continue;
-            for (std::size_t cell = i * SEGMENT; cell < (i + 1) * SEGMENT; ++cell) {
-                if (channel == 3) response[cell] = mass[cell] * plane - 1;
-                else if (is_surface(cell))
-                    response[cell] = smooth[cell] / std::max(mass[cell], 1e-9f) - field[cell] / std::max(wide[cell], 1e-9f);
-                else response[cell] = 0;
-                field[cell] = 0;
+    far(g, smooth, near.after_z, a, b, field);
+    Field &response = field;  // takes the place of what is around
+    const auto of = [](Field &values, std::size_t cell) -> Cell & { return *reinterpret_cast<Cell *>(&values[cell]); };
+    for (std::size_t row = 0; row < g.rows(); ++row)
+        each(surface[row], [&](int s) {
+            for (std::size_t cell = g.at(row, s); cell < g.at(row, s + 1); cell += CHANNELS) {
+                const float mass = smooth[cell + 3], around = field[cell + 3];
+                of(response, cell) = is_surface(mass) ? of(smooth, cell) / std::max(mass, 1e-9f) -
+                                                            of(field, cell) / std::max(around, 1e-9f)
+                                                      : Cell{};
+                response[cell + 3] = mass * plane - 1;
             }
-        }
-        maxima(g, response, surface, shape, 1.f, thresholds[channel], channel, found);
-        if (channel < 3) maxima(g, response, surface, shape, -1.f, thresholds[channel], channel, found);
-    }
-    empty(field, filled);
-    empty(response, surface);
+        });
+    float about[CHANNELS];  // no more than the thresholds: most cells are far below
+    for (int c = 0; c < CHANNELS; ++c) about[c] = std::nextafter(float(thresholds[c]), 0.f);
+    std::vector<Extremum> found;
+    for (int x = 0; x < g.nx; ++x)
+        for (int y = 0; y < g.ny; ++y)
+            each(surface[g.row(x, y)], [&](int s) {
+                for (int z = s * SEGMENT; z < std::min((s + 1) * SEGMENT, shape[2]); ++z)
+                    for (int c = 0; c < CHANNELS; ++c) {
+                        const float value = response[g.cell(x, y, z) + c];
+                        if (std::abs(value) < about[c]) continue;
+                        if (value > thresholds[c])
+                            maximum(g, response, shape, x, y, z, c, 1.f, thresholds[c], found);
+                        else if (c < 3 && -value > thresholds[c])
+                            maximum(g, response, shape, x, y, z, c, -1.f, thresholds[c], found);
+                    }
+            });
+    empty(g, response, surface);
     return found;
 }
 
@@ -350,8 +380,9 @@ void bind_landmarks(nb::module_ &m) {
             const std::size_t n = points.shape(0);
             if (lab.shape(0) != n || areas.shape(0) != n || thresholds.shape(0) != 4)
                 throw std::invalid_argument("extrema need as many colours and areas as points, and 4 thresholds");
-            if (!(edge > 0 && edge <= 1024 && halo >= 0 && halo <= 64))
-                throw std::invalid_argument("a block has at most 1024 cells a side, and 64 around");
+            // Of a block's cells the first and the last hold parts of a cell, and there is room beside them.
+            if (!(edge > 0 && halo >= 0 && edge + 2 * halo <= MOST - 8))
+                throw std::invalid_argument("a block has at most 248 cells a side, those around included");
             for (std::size_t i = 0; i < 3 * n; ++i)
                 if (!std::isfinite(points.data()[i])) throw std::invalid_argument("points must be finite");
             std::vector<double> rows;

@@ -11,6 +11,7 @@ void bind_correspondences(nb::module_ &);
 void bind_fit(nb::module_ &);
 void bind_landmarks(nb::module_ &);
 void bind_merging(nb::module_ &);
+void bind_parts(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_stopping(nb::module_ &);
 void bind_surroundings(nb::module_ &);
@@ -26,6 +27,7 @@ NB_MODULE(_native, m) {
     gsmap::bind_fit(m);
     gsmap::bind_landmarks(m);
     gsmap::bind_merging(m);
+    gsmap::bind_parts(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_stopping(m);
     gsmap::bind_surroundings(m);

@@ -23,6 +23,8 @@ class PointTree {
         for (int32_t i = 0; i < n; ++i) std::copy_n(point(rows_[i]), 3, &sorted_[3 * std::size_t(i)]);
     }
     int32_t size() const { return int32_t(rows_.size()); }
+    // Rows, those near each other together.
+    const std::vector<int32_t> &order() const { return rows_; }
     const double *point(int32_t row) const { return &points_[3 * std::size_t(row)]; }
 
     static double squared(const double *a, const double *b) {

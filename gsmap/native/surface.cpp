@@ -324,6 +324,60 @@ void bind_surface(nb::module_ &m) {
             nb::arg("at"), nb::arg("radius"),
             "Distance (n,) to and row (n,) of the point nearest to each; inf and 0 where none is nearer than the radius.")
         .def(
+            "neighbours",
+            [](const PointTree &tree, int k) {
+                if (k < 1 || k > kMostNeighbours) throw std::invalid_argument("a point has 1 to 64 neighbours");
+                const std::size_t n = std::size_t(tree.size());
+                std::vector<double> distance(n * k, __builtin_inf());
+                std::vector<int64_t> row(n * k, int64_t(n));
+                {
+                    nb::gil_scoped_release release;
+                    over_blocks(tree.size(), [&](int64_t, int64_t begin, int64_t end) {
+                        Neighbour near[kMostNeighbours];
+                        for (int64_t i = begin; i < end; ++i) {
+                            const int64_t at = tree.order()[i];
+                            for (int j = 0, found = tree.nearest(tree.point(int32_t(at)), k, near); j < found; ++j) {
+                                distance[at * k + j] = std::sqrt(near[j].squared);
+                                row[at * k + j] = near[j].row;
+                            }
+                        }
+                    });
+                }
+                return std::make_tuple(numpy_of(std::move(distance), {n, std::size_t(k)}), numpy_of(std::move(row), {n, std::size_t(k)}));
+            },
+            nb::arg("k"),
+            "Distances and rows (n, k) of the points nearest to each, itself among them; inf and n where there are fewer.")
+        .def(
+            "unlike",
+            [](const PointTree &tree, Points values, int k) {
+                if (k < 2 || k >= kMostNeighbours) throw std::invalid_argument("a point is held against 2 to 63 neighbours");
+                const std::size_t n = std::size_t(tree.size());
+                if (values.shape(0) != n) throw std::invalid_argument("a tree's points and values must be as many");
+                std::vector<double> far(n, __builtin_inf()), second(n, __builtin_inf());
+                {
+                    nb::gil_scoped_release release;
+                    over_blocks(tree.size(), [&](int64_t, int64_t begin, int64_t end) {
+                        Neighbour near[kMostNeighbours];
+                        for (int64_t i = begin; i < end; ++i) {
+                            const int32_t at = tree.order()[i];
+                            double least = __builtin_inf();
+                            for (int j = 0, found = tree.nearest(tree.point(at), k + 1, near); j < found; ++j) {
+                                if (j == k) far[at] = std::sqrt(near[j].squared);
+                                if (near[j].row == at) continue;
+                                const double off = PointTree::squared(values.data() + 3 * at, values.data() + 3 * near[j].row);
+                                second[at] = std::min(second[at], std::max(off, least));
+                                least = std::min(least, off);
+                            }
+                            second[at] = std::sqrt(second[at]);
+                        }
+                    });
+                }
+                return std::make_tuple(numpy_of(std::move(far), {n}), numpy_of(std::move(second), {n}));
+            },
+            nb::arg("values"), nb::arg("k"),
+            "How far (n,) the k-th neighbour of each point lies, and how far (n,) its three values are from those of the\n"
+            "second most alike of these k; inf where there are fewer.")
+        .def(
             "normals",
             [](const PointTree &tree, int k) {
                 if (k < 1 || k > kMostNeighbours) throw std::invalid_argument("a plane is that of 1 to 64 points");

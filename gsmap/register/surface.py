@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.cells import cell_means
 from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Cameras, Gaussians
@@ -104,9 +104,8 @@ class Surface:
     @cached_property
     def coarse(self) -> tuple[np.ndarray, np.ndarray]:
         """Cell means (M, 3) of points and of colours at the aligned cloud's resolution, in a fixed order."""
-        labels, counts = cell_labels(np.floor(self.points / self.resolution_m))
-        means = group_means(np.concatenate([self.points, self.colours], axis=1), labels, counts)
-        return means[:, :3], means[:, 3:].astype(np.float32)
+        points, colours, _ = cell_means(self.points, self.colours, self.resolution_m)
+        return points, colours.astype(np.float32)
 
     def sample(self, count: int) -> np.ndarray:
         """Rows of at most ``count`` cell means, evenly strided (cells come in spatial order)."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap._native import ranks
-from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.cells import cell_labels, cell_means, group_means
 
 
 def test_labels_count_cells_in_the_order_x_then_y_then_z():
@@ -62,3 +62,27 @@ def test_ranks_are_numpys_however_large_keys_are(most):
 def test_ranks_of_negative_keys_are_refused():
     with pytest.raises(ValueError, match="negative"):
         ranks(np.array([0, -1]))
+
+
+@pytest.mark.parametrize("far", [1.0, 1e9], ids=["near", "strays_far_out"])
+def test_cell_means_are_those_of_each_cell(far):
+    rng = np.random.default_rng(2)
+    points, values, weights = rng.normal(size=(400, 3)), rng.normal(size=(400, 3)), rng.uniform(0.1, 1, 400)
+    points[0] *= far
+    origin = np.array([0.3, -0.2, 0.7])
+    labels, counts = cell_labels(np.floor((points - origin) / 0.5))
+    assert len(counts) < 300
+    plain = cell_means(points, values, 0.5, origin=origin)
+    np.testing.assert_allclose(plain[0], group_means(points, labels, counts))
+    np.testing.assert_allclose(plain[1], group_means(values, labels, counts))
+    np.testing.assert_array_equal(plain[2], counts)
+    weighted = cell_means(points, values, 0.5, weights, origin)
+    total = np.bincount(labels, weights)
+    np.testing.assert_allclose(weighted[2], total)
+    np.testing.assert_allclose(
+        weighted[1] * total[:, None], group_means(values * weights[:, None], labels, np.ones(len(counts)))
+    )
+
+
+def test_cell_means_of_nothing_are_nothing():
+    assert [len(part) for part in cell_means(np.zeros((0, 3)), np.zeros((0, 3)), 0.1)] == [0, 0, 0]

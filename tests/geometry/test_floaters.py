@@ -1,6 +1,7 @@
 """Floaters are told from the surface, and the surface from floaters."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsmap.geometry.floaters import find_floaters
 
@@ -24,3 +25,16 @@ def test_a_handful_of_points_does_not_stray():
     stray, spacing = find_floaters(np.eye(3), np.eye(3), 0.1)
     assert not stray.any()
     assert not spacing.any()
+
+
+def test_floaters_are_those_of_the_plain_computation():
+    rng = np.random.default_rng(1)
+    points, colours = rng.normal(size=(800, 3)) ** 3, rng.uniform(size=(800, 3))
+    distances, neighbours = cKDTree(points).query(points, k=9)
+    unlike = np.sort(np.linalg.norm(colours[neighbours[:, 1:]] - colours[:, None], axis=2), axis=1)
+    foreign = unlike[:, 1] >= 0.4
+    alone = distances[:, 8] > 4 * np.median(distances[:, 8])
+    assert min(foreign.sum(), (~foreign).sum(), alone.sum()) > 5
+    stray, spacing = find_floaters(points, colours, 0.4)
+    np.testing.assert_array_equal(stray, foreign | alone)
+    np.testing.assert_allclose(spacing, distances[:, 8])

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gsmap.geometry import neighbours
-from gsmap.geometry.neighbours import chunks_of_neighbours, nearest_neighbours, spatial_order
+from gsmap.geometry.neighbours import chunks_of_neighbours, nearest_neighbours, nearest_of, spatial_order
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 3000])
@@ -26,3 +26,15 @@ def test_points_in_one_place_keep_their_order():
     np.testing.assert_array_equal(spatial_order(np.ones((4, 3)), 8), np.arange(4))
     points = np.array([[0.0, 0, 0], [9, 0, 0], [0.1, 0, 0], [9.1, 0, 0]])
     np.testing.assert_array_equal(spatial_order(points, 4), [0, 2, 1, 3])
+
+
+def test_the_nearest_of_other_points_is_that_of_a_search_tree():
+    rng = np.random.default_rng(4)
+    points, at = rng.normal(size=(500, 3)), rng.normal(size=(300, 3))
+    far, row = cKDTree(points).query(at)
+    distances, rows = nearest_of(points, at)
+    np.testing.assert_allclose(distances, far)
+    np.testing.assert_array_equal(rows, row)
+    distances, rows = nearest_of(points, at, 0.2)
+    np.testing.assert_array_equal(np.isfinite(distances), far < 0.2)
+    np.testing.assert_array_equal(rows[far < 0.2], row[far < 0.2])

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.geometry.cells import cell_labels
+from gsmap.geometry.cells import cell_means
 from gsmap.geometry.neighbours import spatial_order
+from gsmap.types.views import Cloud
 
 _SIGMA_CELLS = 1.6  # blob scale in cells of its octave's grid
 _SURROUND = 1.8  # scale of the surround relative to the blob's
@@ -67,23 +68,23 @@ class Blobs:
 
 
 class Octaves:
-    """The extrema of one levelled cloud by the size of the grid's cells, for layers that have octaves in common.
+    """One levelled cloud in its own unit, and its extrema by the size of the grid's cells, for layers that share both.
 
-    Layers whose units differ by a power of two do: they look at the same grids, bit by bit.
+    Layers whose units differ by a power of two look at the same grids, bit by bit.
     """
 
     def __init__(self) -> None:
-        self._order: np.ndarray | None = None
+        self._levelled: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._found: dict[object, list[tuple[int, int, np.ndarray, np.ndarray]]] = {}
 
-    def order(self, points: np.ndarray) -> np.ndarray | slice:
-        """Rows of the points, neighbours together: spread over a grid so, they stay in the processor's cache; as they
-        are where they will be thinned, which sorts them."""
-        if len(points) > _MANY:
-            return slice(None)
-        if self._order is None:
-            self._order = spatial_order(points, _ORDER_ACROSS)
-        return self._order
+    def levelled(self, cloud: Cloud, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points, L*a*b* and areas of the cloud, always the same one, turned by ``level`` (3, 3), neighbours together:
+        spread over a grid so, or thinned, they stay in the processor's cache."""
+        if self._levelled is None:
+            points = cloud.points @ level.T
+            order = spatial_order(points, _ORDER_ACROSS)
+            self._levelled = points[order], cloud.lab[order], cloud.areas[order]
+        return self._levelled
 
     def extrema(
         self,
@@ -108,13 +109,7 @@ def thinned(
     their surface; one of fewer as it is."""
     if len(points) <= _MANY:
         return points, lab, areas
-    labels, counts = cell_labels(np.floor(points / (size_m * _UNTOLD)))
-    total = np.maximum(np.bincount(labels, areas, len(counts)), 1e-300)
-    means = np.empty((2, len(counts), 3))
-    for k, values in enumerate((points, lab)):
-        for axis in range(3):
-            means[k, :, axis] = np.bincount(labels, areas * values[:, axis], len(counts)) / total
-    return means[0], means[1], total
+    return cell_means(points, lab, size_m * _UNTOLD, areas)
 
 
 def find_blobs(
@@ -125,6 +120,7 @@ def find_blobs(
     octaves: Octaves | None = None,
     unit_m: float = 1.0,
     median_area_m2: float | None = None,
+    thinned_m: float = 0.0,
 ) -> Blobs:
     """Extrema of colour and density against their surround, at 1.6 cells and one scale per octave above.
 
@@ -137,7 +133,8 @@ def find_blobs(
     Args:
         points, lab, areas: (N, 3), (N, 3), (N,) levelled cloud in metres, its L*a*b*, and square metres.
         octaves: of this cloud in its own unit, which is ``unit_m`` metres.
-        median_area_m2: of the points before they were thinned.
+        median_area_m2: of the points before they were thinned ...
+        thinned_m: ... to what a grid of this size resolves.
     """
     params, known = params or Params(), octaves or Octaves()
     lab_threshold, count = params.lab_threshold, params.octaves
@@ -150,7 +147,8 @@ def find_blobs(
         size_m = params.cell_m * 2**octave
         if spacing_m > params.max_spacing_cells * size_m:
             continue
-        points, lab, areas = thinned(points, lab, areas, size_m)
+        if size_m > thinned_m:
+            points, lab, areas = thinned(points, lab, areas, size_m)
         parts = [_empty()]
         for channel, negative, cells, ratio in known.extrema(points, lab, areas, thresholds, size_m, unit_m):
             kind = np.full(len(cells), (channel * 2 + negative) * count + octave, np.int32)

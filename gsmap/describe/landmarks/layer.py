@@ -75,12 +75,12 @@ def landmark_layer(
     if not cloud.areas.any():  # nothing, or only coincident points
         return NodeLayer.empty(descriptor, dim, unit_m)
     level = np.eye(3) if up is None else level_frame(up)
-    octaves, points = octaves or Octaves(), cloud.points @ level.T
-    order = octaves.order(points)
-    points, lab, areas = points[order] * unit_m, cloud.lab[order], cloud.areas[order] * unit_m**2
-    spacing_m2 = float(np.median(areas))
-    points, lab, areas = thinned(points, lab, areas, params.detect.cell_m)
-    blobs = find_blobs(points, lab, areas, params.detect, octaves, unit_m, spacing_m2)
+    octaves = octaves or Octaves()
+    points, lab, areas = octaves.levelled(cloud, level)
+    spacing_m2 = float(np.median(areas)) * unit_m**2
+    finest_m = params.detect.cell_m
+    points, lab, areas = thinned(points * unit_m, lab, areas * unit_m**2, finest_m)
+    blobs = find_blobs(points, lab, areas, params.detect, octaves, unit_m, spacing_m2, finest_m)
     if len(blobs) == 0:
         return NodeLayer.empty(descriptor, dim, unit_m)
     around = surroundings(blobs.positions, points, lab, params.context)

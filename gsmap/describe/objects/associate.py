@@ -33,7 +33,7 @@ def associate(nodes: list[Node], region: Node, tau: float, cell: float) -> Node:
         nodes.append(region)
         return region
     united = np.concatenate([best.points, region.points])
-    best.points = downsample(united, united[:, :0], cell)[0]
+    best.points = downsample(united, united, cell)[0]
     best.box = box_of(best.points)
     seen = len(best.confidences)
     mean = (best.feature * seen + region.feature) / (seen + 1)
@@ -47,7 +47,7 @@ def region(
     points: np.ndarray, feature: np.ndarray, confidence: float, view: int, cell: float, part: int | None = None
 ) -> Node:
     """What one mask shows, as a node of its own."""
-    points = downsample(points, points[:, :0], cell)[0]
+    points = downsample(points, points, cell)[0]
     return Node(points, box_of(points), feature, [confidence], {view}, part)
 
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap.describe.objects.structure import Structure, components, find_structure
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.directions import level_frame
-from gsmap.geometry.neighbours import nearest_neighbours
+from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
 from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.types import Gaussians, Things
@@ -85,23 +84,24 @@ def find_things(
     """
     members = _members(gaussians, cloud, up, unit_m, params or Params())
     count = int(members.max(initial=-1)) + 1
-    order = np.argsort(members, kind="stable")
-    parts = np.split(order, np.searchsorted(members[order], np.arange(count + 1)))[1:-1]
-    colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[:, 0]), 0.0, 1.0))
-    means = gaussians.means.astype(np.float64)
-    # One sample a cell: as many as it takes to show where a thing is, whatever its detail.
     rows = np.flatnonzero(members >= 0)
-    cells = np.floor(means[rows] * unit_m / _SAMPLE_M).astype(np.int64)
-    labels, counts = cell_labels(np.column_stack([members[rows], cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
+    of = members[rows]
+    means = gaussians.means[rows].astype(np.float64)
+    colours = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[rows, 0]), 0.0, 1.0))
+    order = np.argsort(of, kind="stable")
+    parts = np.split(order, np.searchsorted(of[order], np.arange(1, count))) if count else []
+    # One sample a cell: as many as it takes to show where a thing is, whatever its detail.
+    cells = np.floor(means * unit_m / _SAMPLE_M).astype(np.int64)
+    labels, counts = cell_labels(np.column_stack([of, cell_labels(cells)[0], np.zeros(len(rows), np.int64)]))
     of_cell = np.empty(len(counts), np.int64)
-    of_cell[labels] = members[rows]
+    of_cell[labels] = of
     return Things(
         members,
         np.array([means[p].mean(0) for p in parts]).reshape(-1, 3),
         np.array([[means[p].min(0), means[p].max(0)] for p in parts]).reshape(-1, 2, 3),
         np.array([np.median(colours[p], axis=0) for p in parts]).reshape(-1, 3),
-        group_means(means[rows], labels, counts),
-        group_means(colours[rows].astype(np.float64), labels, counts),
+        group_means(means, labels, counts),
+        group_means(colours.astype(np.float64), labels, counts),
         np.bincount(of_cell, minlength=count),
         unit_m,
     )
@@ -118,7 +118,6 @@ def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: 
     if np.ptp(points, axis=0).max() > _WIDEST_M:
         return out
     areas = cloud.areas[rows] * unit_m**2 * (len(cloud) / len(rows))
-    tree = cKDTree(points)
     distances, neighbours = nearest_neighbours(points, _NEIGHBOURS + 1)
     normals, planarity = _normals(gaussians, cloud.index[rows], points, neighbours, level)
     structure = find_structure(points, normals, planarity, areas, neighbours)
@@ -131,7 +130,7 @@ def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: 
     others[cloud.index[rows]] = False
     rest = np.flatnonzero(others)
     at = gaussians.means[rest].astype(np.float64) @ level.T * unit_m
-    distance, nearest = tree.query(at, distance_upper_bound=params.assign_m)
+    distance, nearest = nearest_of(points, at, params.assign_m)
     near = np.isfinite(distance)
     out[rest[near]] = things[nearest[near]]
     return out

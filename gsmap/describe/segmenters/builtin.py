@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
+from gsmap._native import graph_parts
 from gsmap.describe.cloud import downsample, local_planes
+from gsmap.geometry.neighbours import nearest_neighbours, nearest_of
 from gsmap.types.views import Cloud, Mask, SceneContext, View
 
 VERSION = 1
@@ -86,7 +87,7 @@ def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
     if len(points) < 16:
         return np.zeros(len(cloud), np.int64)
     normals, _ = local_planes(points, 16)
-    distance, neighbours = cKDTree(points).query(points, k=min(9, len(points)))
+    distance, neighbours = nearest_neighbours(points, min(9, len(points)))
     a = np.repeat(np.arange(len(points)), neighbours.shape[1] - 1)
     b = neighbours[:, 1:].ravel()
     once = (a < b) | ~(neighbours[b] == a[:, None]).any(1)
@@ -97,7 +98,7 @@ def cut_surface(cloud: Cloud, params: Params) -> np.ndarray:
     turn = 1 - np.abs((normals[a] * normals[b]).sum(1))
     weight = np.linalg.norm(difference, axis=1) / params.lab_scale + params.turn_weight * turn
     parts = felzenszwalb(len(points), a, b, weight, params.scale, max(4, int(params.min_share * len(points))))
-    return parts[cKDTree(points).query(cloud.points)[1]]
+    return parts[nearest_of(points, cloud.points)[1]]
 
 
 def felzenszwalb(
@@ -109,24 +110,6 @@ def felzenszwalb(
     then joined along their lightest edges.
     """
     order = np.argsort(weight, kind="stable")
-    edges = list(zip(a[order].tolist(), b[order].tolist(), weight[order].tolist(), strict=True))
-    parent, size, limit = list(range(count)), [1] * count, [scale] * count
-
-    def find(i: int) -> int:
-        while parent[i] != i:
-            parent[i] = parent[parent[i]]
-            i = parent[i]
-        return i
-
-    for i, j, w in edges:
-        i, j = find(i), find(j)
-        if i != j and w <= limit[i] and w <= limit[j]:
-            parent[j] = i
-            size[i] += size[j]
-            limit[i] = w + scale / size[i]
-    for i, j, _ in edges:
-        i, j = find(i), find(j)
-        if i != j and min(size[i], size[j]) < min_size:
-            parent[j] = i
-            size[i] += size[j]
-    return np.unique([find(i) for i in range(count)], return_inverse=True)[1]
+    ends = [np.ascontiguousarray(end[order], np.int64) for end in (a, b)]
+    part = graph_parts(count, *ends, np.ascontiguousarray(weight[order], np.float64), scale, min_size)
+    return np.unique(part, return_inverse=True)[1]
