@@ -103,13 +103,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
     parser.add_argument("--cache", type=Path, required=True)
+    parser.add_argument("--only", nargs="+", help="photographs of these test places (seeds) alone")
     parser.add_argument("--scenes", type=int, nargs="*", default=[100, 1000])
     args = parser.parse_args()
     params = Params()
     extractor = family("extractor").get("sift").make({}, params.extractors["sift"])
     test, fitted = (places(args.places, split, args.cache, params) for split in ("test", "fit"))
     shots: list[tuple[Asked, Segment]] = []
-    for place in test:
+    for place in [place for place in test if args.only is None or place.seed in args.only]:
         own = new_segment([(scene.features, "0" * 32) for scene in place.scenes], params.features.indexed)
         made = [Asked(place, told, params, extractor) for told in place.photos]
         shots += [(one, own) for one in made if one.has(list(one.right))]

@@ -197,13 +197,14 @@ class _Matches:
 
 def _matches(index: ViewIndex, found: Keypoints, params: Params) -> _Matches:
     words = words_for(found.descriptors.shape[1])
+    probes = _probes(found, words, params)
     scenes = sorted(index.wanted)
     number = {scene: k for k, scene in enumerate(scenes)}
     nearer = np.zeros((len(found), params.max_signs + 1), np.int64)  # features of the map, by signs that differ
     parts = []
     for segment in index.segments:
         number_of = np.array([-2 if m is None else number.get(m.scene, -1) for m in segment.members], np.int64)
-        for feature, differ, rows in _near(segment, found, words, params):
+        for feature, differ, rows in _near(segment, probes, params.max_signs):
             scene = number_of[places_of(rows, len(number_of))]
             np.add.at(nearer, (feature[scene > -2], differ[scene > -2]), 1)
             kept = scene >= 0
@@ -220,19 +221,34 @@ def _matches(index: ViewIndex, found: Keypoints, params: Params) -> _Matches:
     return _Matches(feature[kept], scene[kept], view, turn, worth[kept], scenes)
 
 
-def _near(
-    segment: Segment, found: Keypoints, words: Words, params: Params
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Features of the photo (k,), signs (k,) by which they differ from those of a segment, and these, rows (k, B)."""
+@dataclass(frozen=True, eq=False)
+class _Probes:
+    """Lists that the features of a photo look into, by list.
+
+    Args:
+        words: (P,) rising.
+        feature: (P,) who looks.
+        signs: (P,) uint64 its signature beside that word.
+    """
+
+    words: np.ndarray
+    feature: np.ndarray
+    signs: np.ndarray
+
+
+def _probes(found: Keypoints, words: Words, params: Params) -> _Probes:
     short = words.shortened(found.descriptors)
     probed = words.nearest(short, min(params.words, len(words.centres)))
-    asking = np.repeat(np.arange(len(found)), probed.shape[1])
-    signs = words.signatures(short[asking], probed.ravel())
-    order = np.argsort(probed.ravel(), kind="stable")
-    asking, signs, probes = asking[order], signs[order], probed.ravel()[order]
+    feature, word = np.repeat(np.arange(len(found)), probed.shape[1]), probed.ravel()
+    order = np.argsort(word, kind="stable")
+    return _Probes(word[order], feature[order], words.signatures(short[feature], word)[order])
+
+
+def _near(segment: Segment, probes: _Probes, max_signs: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Features of the photo (k,), signs (k,) by which they differ from those of a segment, and these, rows (k, B)."""
     keys, starts = lists_of(segment)
-    wanted, first = np.unique(probes, return_index=True)
-    last = np.r_[first[1:], len(probes)]
+    wanted, first = np.unique(probes.words, return_index=True)
+    last = np.r_[first[1:], len(probes.words)]
     at = np.searchsorted(keys, wanted)
     there = np.flatnonzero(at < len(keys))
     there = there[keys[at[there]] == wanted[there]]
@@ -245,9 +261,9 @@ def _near(
         hits: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for k in mine:
             begin, end = int(starts[at[k]]) - low, int(starts[at[k] + 1]) - low
-            differ = np.bitwise_count(signs[first[k] : last[k], None] ^ theirs[begin:end])
-            who, which = np.nonzero(differ <= params.max_signs)
-            hits.append((asking[first[k] + who], differ[who, which].astype(np.int64), which + begin))
+            differ = np.bitwise_count(probes.signs[first[k] : last[k], None] ^ theirs[begin:end])
+            who, which = np.nonzero(differ <= max_signs)
+            hits.append((probes.feature[first[k] + who], differ[who, which].astype(np.int64), which + begin))
         feature, differ, which = (np.concatenate([hit[k] for hit in hits]) for k in range(3))
         yield feature, differ, rows[which]
 

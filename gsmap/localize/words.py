@@ -52,10 +52,10 @@ class Words:
         half = (self.centres**2).sum(1) / 2
         out = np.empty((len(short), count), np.int64)
         for start in range(0, len(short), _BLOCK):
-            nearness = short[start : start + _BLOCK] @ self.centres.T - half
-            out[start : start + _BLOCK] = (
-                nearness.argmax(1)[:, None] if count == 1 else np.argsort(-nearness, axis=1, kind="stable")[:, :count]
-            )
+            farness = half - short[start : start + _BLOCK] @ self.centres.T
+            near = np.argpartition(farness, count - 1, axis=1)[:, :count] if count > 1 else farness.argmin(1)[:, None]
+            order = np.argsort(np.take_along_axis(farness, near, axis=1), axis=1, kind="stable")
+            out[start : start + _BLOCK] = np.take_along_axis(near, order, axis=1)
         return out
 
     def signatures(self, short: np.ndarray, words: np.ndarray) -> np.ndarray:
