@@ -311,6 +311,17 @@ def test_the_index_of_views_is_made_once_and_grows_by_what_is_new(made, world, t
         assert after.num_nodes > before.num_nodes
 
 
+def test_a_scene_whose_features_could_not_be_made_stays_out_of_the_index(made, world, tmp_path, monkeypatch) -> None:
+    folder, lens, _ = made
+    shutil.copytree(folder / "m.gsmap", tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        other = world.capture.gaussians
+        m.ingest(other[np.arange(0, len(other), 2)], cameras=world.capture.cameras, name="again")
+        m.optimize()
+        monkeypatch.setattr("gsmap.map.stages.localize.ensure", lambda *arguments: None)
+        assert m.localize(folder / "photo.png", intrinsics=lens).results[0].scenes == ("room",)
+
+
 def test_a_damaged_index_of_views_is_made_anew(made, tmp_path) -> None:
     folder, lens, report = made
     shutil.copytree(folder / "m.gsmap", tmp_path / "c.gsmap")

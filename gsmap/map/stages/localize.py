@@ -117,11 +117,13 @@ class Localizer:
         self.extractor: Extractor = method.make(specs, self.params.extractors[self.params.extractor])
 
     def _scene_index(self) -> SceneIndex:
+        """The index of the scenes that have features: a scene whose job was given up has none."""
+        kept = self.store.view_features.kept(self.keys.values())
         return SceneIndex(
             self.store,
             localizing.index_recipe(),
             {retrieve.index_recipe(self.settings.retrieve)},
-            {scene: key.digest for scene, key in self.keys.items()},
+            {scene: key.digest for scene, key in self.keys.items() if key.digest in kept or scene in self._held},
             self._segment,
         )
 
