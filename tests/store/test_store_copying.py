@@ -49,7 +49,6 @@ def fill(store):
     cameras = make_cameras()
     starts = np.zeros(len(cameras) + 1, np.int64)
     shown, angles = np.zeros((0, 128), np.int8), np.zeros(0, np.uint8)
-    summaries = np.zeros((len(cameras), 8), np.int8)
     views = SceneFeatures(a.id, cameras, starts, np.zeros((0, 3), np.float32), shown, angles)
     store.view_features.save(views, key("localize", a.id))
     store.photos.add(kept_photo(a.id), JPEG)
