@@ -7,7 +7,7 @@
     python tools/bench_localize.py DATA WORK --elsewhere     # photographs of other places: none may be placed
     python tools/bench_localize.py DATA WORK --beside        # and retrieval alone, and SIFT + PnP on photographs
     python tools/bench_localize.py DATA WORK --small 0.05    # and a small map in so much of the captures' bytes
-    python tools/bench_localize.py DATA WORK --crowd 1000    # and in a map of so many scenes
+    python tools/bench_localize.py DATA WORK --crowd 1000 --places PLACES    # and in a map of so many scenes
 
 DATA is the folder of the given captures; maps are made in WORK once. The captures' poses in the map are gsmap's own,
 and the truth of a photograph is taken to the map through the scene that supports it most. A photograph's coverage is
@@ -17,8 +17,9 @@ Beside it (of the house): the pose of the most alike view, alone; and what is do
 the captures' own photographs, lifted by their splats' depth, matched with the 20 most alike ones by ratio and mutually,
 one pose by LO-RANSAC (pycolmap), said where 12 agree. That needs the photographs to be kept with their poses.
 
-A crowd are the captures' own scenes over and over, elsewhere: their arrays are read as a scene's are, but the parts of
-their summaries and descriptors are exchanged, so that they are as alike to a photograph as chance makes them.
+A crowd are made captures (`--places`, of `make_localize_places.py`) over and over, elsewhere: each once as it is; the
+others have every feature moved a random part of the way to one of the same word, which leaves as many features in every
+word as captures have. They are no places: what agrees in one copy by chance is likely to agree in the next.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -41,22 +42,26 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from fit_localize import places
 from PIL import Image
 
 import gsmap.map
 from gsmap.geometry.rotations import angle_between
-from gsmap.localize import localize_photo
+from gsmap.localize import index_recipe, localize_photo, new_segment, view_index
 from gsmap.localize.features import lifted, quantised
-from gsmap.localize.localizing import near, photo_features, prepared
+from gsmap.localize.localizing import photo_features, prepared
 from gsmap.localize.matching import Described, matched
-from gsmap.localize.retrieval import ViewIndex, most_alike
-from gsmap.localize.summaries import summarised
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.retrieval import most_alike
+from gsmap.localize.together import words_of
+from gsmap.localize.words import Words, words_for
 from gsmap.map.logs import logged
 from gsmap.map.small_map import SmallLocalizer, export_small
 from gsmap.map.stages.localize import Localizer
 from gsmap.render import render
 from gsmap.types import Cameras, Sim3
 from gsmap.types.localization import Photo, Placement, SceneFeatures
+from gsmap.types.segments import merged
 
 
 @dataclass(eq=False)
@@ -86,34 +91,37 @@ class World:
         """
         held = within or self.localizer
         began = time.process_time()
-        index = near(held.index, allowed | self.crowd)
+        index = held.index.only(allowed | self.crowd)
         found = localize_photo(photo, index, held.placed, held.extractor, held.params, held.metres)
         return found, time.process_time() - began
 
-    def fill(self, num_scenes: int) -> None:
-        """Add others until the map has so many scenes."""
+    def fill(self, num_scenes: int, strangers: list[PlacedFeatures], work: Path) -> None:
+        """Add others until the map has so many scenes; their segment lies on the disk as a map's does."""
         held, rng = self.localizer, np.random.default_rng(7)
-        own = sorted(self.ids.values())
-        turned = rng.permutation(held.placed[own[0]].features.descriptors.shape[1])
-        parts = [held.index]
-        for number in range(num_scenes - len(own)):
-            like = own[number % len(own)]
-            views = near(held.index, {like})
-            exchanged, signs = rng.permutation(views.summaries.shape[1]), rng.choice([-1, 1], views.summaries.shape[1])
-            summaries = (views.summaries[:, exchanged] * signs).astype(np.int8)
-            name = f"crowd {number}"
-            there = Sim3(np.eye(3), np.array([100.0 * (number + 1), 0, 0])) @ held.placed[like].S_metric_scene
-            read = partial(_strange, held, like, turned)
-            held.placed[name] = replace(held.placed[like], scene=name, S_metric_scene=there, read_features=read)
+        kept = [scene.features for scene in strangers]
+        words = words_for(kept[0].descriptors.shape[1])
+        others = Others(words, np.concatenate([found.descriptors for found in kept]))
+        component = held.placed[next(iter(self.ids.values()))].component
+        shutil.rmtree(work / "crowd", ignore_errors=True)
+        parts, there = [], []
+        for number in range(num_scenes - len(self.ids)):
+            scene = strangers[number % len(strangers)]
+            found = scene.features if number < len(strangers) else others.like(scene.features, rng)
+            name = f"{number:032x}"
+            place = Sim3(np.eye(3), np.array([100.0 * (number + 1), 0, 0])) @ scene.S_metric_scene
+            read = partial(_read, _written(found, work / "crowd" / f"{number}.npz"), scene.features)
+            held.placed[name] = replace(
+                scene, scene=name, S_metric_scene=place, component=component, read_features=read
+            )
             self.crowd.add(name)
-            parts.append(ViewIndex((name,), summaries, np.zeros(len(summaries), np.int64), views.view))
-        firsts = np.cumsum([0, *(len(part.scenes) for part in parts)])
-        held.index = ViewIndex(
-            tuple(scene for part in parts for scene in part.scenes),
-            np.concatenate([part.summaries for part in parts]),
-            np.concatenate([part.scene + first for part, first in zip(parts, firsts[:-1], strict=True)]),
-            np.concatenate([part.view for part in parts]),
-        )
+            there.append((replace(found, scene=name), "0" * 32))
+            if len(there) == 64 or number == num_scenes - len(self.ids) - 1:
+                parts.append(new_segment(there, held.params.features.indexed))
+                there = []
+        whole = merged(parts)
+        store = gsmap.map.create(work / "crowd" / "crowd.gsmap").store
+        store.indexes.put(index_recipe(), [m for m in whole.members if m is not None], whole.arrays, ())
+        held.index = view_index([*held.index.segments, *store.indexes.segments(index_recipe())])
 
     def truth(self, shot: Shot, scene: str) -> np.ndarray:
         """(4, 4) the camera in the frame of the map that a scene says."""
@@ -126,11 +134,47 @@ class World:
         return out
 
 
-def _strange(held: Localizer, scene: str, turned: np.ndarray) -> SceneFeatures:
-    """The features of a scene, read anew, with the parts of their descriptors exchanged."""
-    found = held.store.view_features.load(scene, held.keys[scene])
-    assert found is not None
-    return replace(found, descriptors=np.ascontiguousarray(found.descriptors[:, turned]))
+class Others:
+    """Features as alike to those of captures as captures' are to each other.
+
+    Args:
+        words: of the index.
+        descriptors: (N, D) int8 that there are.
+    """
+
+    def __init__(self, words: Words, descriptors: np.ndarray) -> None:
+        word = words.nearest(words.shortened(descriptors / np.float32(254)))[:, 0]
+        self.words, self.descriptors = words, descriptors[np.argsort(word, kind="stable")]
+        self._known: dict[str, np.ndarray] = {}  # by scene, the words of its features
+        self.starts = np.searchsorted(np.sort(word), np.arange(len(words.centres) + 1))
+
+    def _words_of(self, found: SceneFeatures) -> np.ndarray:
+        if found.scene not in self._known:
+            short = self.words.shortened(found.descriptors / np.float32(254))
+            self._known[found.scene] = self.words.nearest(short)[:, 0]
+        return self._known[found.scene]
+
+    def like(self, found: SceneFeatures, rng: np.random.Generator) -> SceneFeatures:
+        """Each feature moved a random part of the way to another one of its word."""
+        own = found.descriptors.astype(np.float32)
+        word = self._words_of(found)
+        size = self.starts[word + 1] - self.starts[word]
+        other = self.descriptors[self.starts[word] + (rng.random(len(own)) * size).astype(int)].astype(np.float32)
+        out = own + rng.random((len(own), 1), np.float32) * (other - own)
+        out *= 254 / np.linalg.norm(out, axis=1, keepdims=True)
+        return replace(found, descriptors=np.clip(np.round(out), -127, 127).astype(np.int8))
+
+
+def _written(found: SceneFeatures, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, descriptors=found.descriptors)
+    return path
+
+
+def _read(path: Path, like: SceneFeatures) -> SceneFeatures:
+    """The features of a scene of the crowd, read anew."""
+    with np.load(path) as stored:
+        return replace(like, descriptors=stored["descriptors"])
 
 
 def world(data: Path, work: Path, names: list[str]) -> World:
@@ -274,13 +318,15 @@ def retrieval_alone(held: World) -> Localise:
     def localise(photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
         began = time.process_time()
         localizer = held.localizer
-        index = near(localizer.index, allowed)
+        index = localizer.index.only(allowed)
         picture, _ = prepared(photo, localizer.params)
         found = photo_features(picture, localizer.extractor, [localizer.params.matching.smooth_px])
-        rows, _ = most_alike(index, summarised(found.descriptors), 1)
-        scene = index.scenes[index.scene[rows[0]]]
+        views = most_alike(index, found, picture.intrinsics_px, 1, localizer.params.retrieval)
+        if not views:
+            return Placement(photo.name, "no view is like it"), time.process_time() - began
+        scene, view = views[0]
         placed = localizer.placed[scene]
-        pose = _in_map(held, scene, placed.features.cameras.T_frame_camera[index.view[rows[0]]])
+        pose = _in_map(held, scene, placed.features.cameras.T_frame_camera[view])
         return Placement(photo.name, "", pose, None, placed.component, (scene,)), time.process_time() - began
 
     return localise
@@ -300,7 +346,7 @@ class PosedPhotos:
 
     def __init__(self, data: Path, held: World) -> None:
         self.held = held
-        self.features: list[tuple[str, Described, np.ndarray, np.ndarray]] = []  # scene, features, summary, points
+        self.features: list[tuple[str, Described, np.ndarray, np.ndarray]] = []  # scene, features, words, points
         began = time.process_time()
         for shot, scene in _photographs(data, held):
             camera = Cameras(shot.T_world_camera[None], shot.photo.intrinsics_px[None], np.array([shot.photo.size_px]))
@@ -310,7 +356,7 @@ class PosedPhotos:
             rows, points = lifted(found, shown, camera)
             described = Described(quantised(found.descriptors[rows]), np.zeros(len(rows), np.uint8))
             at = placed.S_metric_scene.apply(points)
-            self.features.append((scene, described, summarised(found.descriptors), at))
+            self.features.append((scene, described, words_of(found), at))
         print(f"features of {len(self.features)} posed photographs: {time.process_time() - began:.0f} CPU s")
 
     def __call__(self, photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
@@ -320,9 +366,9 @@ class PosedPhotos:
         localizer = self.held.localizer
         found = localizer.extractor.extract(photo.rgb)
         mine = Described(quantised(found.descriptors), np.zeros(len(found), np.uint8))
-        summary = summarised(found.descriptors).astype(np.float32)
+        mine_words = words_of(found)
         known = [one for one in self.features if one[0] in allowed]
-        likeness = np.array([one[2].astype(np.float32) @ summary for one in known])
+        likeness = np.array([one[2] @ mine_words for one in known])
         parts: dict[int, list[tuple[str, np.ndarray, np.ndarray]]] = {}
         for k in np.argsort(-likeness, kind="stable")[:MOST_PHOTOS]:
             scene, described, _, points = known[k]
@@ -439,6 +485,7 @@ def main() -> int:
     parser.add_argument("--beside", action="store_true")
     parser.add_argument("--small", type=float, metavar="SHARE")
     parser.add_argument("--crowd", type=int, metavar="SCENES")
+    parser.add_argument("--places", type=Path, help="that the crowd is made of")
     parser.add_argument("-v", action="store_true")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
@@ -466,7 +513,10 @@ def main() -> int:
         say("retrieval alone", measure(held, shots, as_is, args.v, retrieval_alone(held)), deg, metres)
         say("SIFT + PnP on photographs", measure(held, shots, as_is, args.v, PosedPhotos(data, held)), deg, metres)
     if args.crowd:
-        held.fill(args.crowd)
+        if args.places is None:
+            parser.error("a crowd is of made captures: --places FOLDER")
+        made = places(args.places, "fit", args.work / "features", held.localizer.params)
+        held.fill(args.crowd, [scene for place in made for scene in place.scenes], args.work)
         say(f"among {args.crowd} scenes", measure(held, shots, as_is, args.v), deg, metres)
     if args.small is not None:
         small = small_map(held, data, args.work, args.small)

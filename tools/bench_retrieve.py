@@ -45,9 +45,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
 
-from gsmap.retrieve import Params, Voters, look_up, merged, new_segment, to_merge, voters_of
+from gsmap.retrieve import Params, Voters, look_up, new_segment, voters_of
 from gsmap.store import Store
 from gsmap.types import SceneGraph
+from gsmap.types.segments import merged, to_merge
 
 SEED, ROOMS, DECORATIONS = 31, 31, 5
 A_FLOOR = ROOMS - 1

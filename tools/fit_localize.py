@@ -1,7 +1,7 @@
-"""Fits what localisation knows before it sees a map: the words of its summaries, and what its evidence is worth.
+"""Fits what localisation knows before it sees a map: the words of its index, and what its evidence is worth.
 
     python tools/make_localize_places.py PLACES --set fit && python tools/make_localize_places.py PLACES --set test
-    python tools/fit_localize.py PLACES words --cache FOLDER     # writes gsmap/localize/vocabulary.npz
+    python tools/fit_localize.py PLACES words --cache FOLDER     # writes gsmap/localize/words.npz
     python tools/fit_localize.py PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
     python tools/fit_localize.py PLACES test --cache FOLDER      # says how both do on places that they have not seen
 
@@ -35,12 +35,12 @@ from scipy.optimize import minimize
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.rotations import log_so3
 from gsmap.ingest import read_captures
-from gsmap.localize import features, localizing, probability, summaries
+from gsmap.localize import features, localizing, probability, words
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.resection import moved
-from gsmap.localize.retrieval import ViewIndex
+from gsmap.localize.retrieval import ViewIndex, new_segment, view_index
 from gsmap.methods import family
 from gsmap.types import Sim3
 from gsmap.types.localization import Photo, SceneFeatures
@@ -88,12 +88,8 @@ def _features(path: Path, cache: Path, params: Params) -> SceneFeatures:
     code = hashlib.sha256(settings.encode()).hexdigest()[:8]
     kept = cache / f"{path.parent.name}-{path.stem}-{code}.pickle"
     if kept.exists():
-        found = pickle.loads(kept.read_bytes())
-        views = zip(found.starts[:-1], found.starts[1:], strict=True)
-        return replace(
-            found,
-            summaries=np.stack([summaries.summarised(found.descriptors[a:b] / np.float32(254)) for a, b in views]),
-        )
+        found: SceneFeatures = pickle.loads(kept.read_bytes())
+        return found
     cache.mkdir(parents=True, exist_ok=True)
     capture = next(iter(read_captures([str(path)])))
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
@@ -109,49 +105,82 @@ def _features(path: Path, cache: Path, params: Params) -> SceneFeatures:
 
 # --- words -----------------------------------------------------------------------------------------------------------
 
+NUM_WORDS, NUM_AXES = 2048, 64
 
-def fit_words(found: list[Place], params: Params, num_words: int = 64, short: int = 32, length: int = 256) -> None:
-    """Principal axes of descriptors, their k-means, and the whitening of what becomes of pictures."""
+
+def fit_words(found: list[Place], params: Params) -> None:
+    """Principal axes of descriptors, their k-means, and how near features of other places come."""
     from scipy.cluster.vq import kmeans2
 
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
-    pictures = []
+    shown = {scene.scene: _indexed(scene.features, params) for place in found for scene in place.scenes}
+    asking: dict[str, np.ndarray] = {}
     for place in found:
-        for scene in place.scenes:
-            held = scene.features
-            pictures += [
-                held.descriptors[a:b] / np.float32(254) for a, b in zip(held.starts[:-1], held.starts[1:], strict=True)
-            ]
-        pictures += [extractor.extract(place.photo(told).rgb).descriptors for told in place.photos]
-    pictures = [picture for picture in pictures if len(picture) > 10]
-    everything = np.concatenate(pictures)
-    some = everything[np.random.default_rng(0).permutation(len(everything))[:60_000]]
-    mean = some.mean(0)
-    values, axes = np.linalg.eigh(np.cov((some - mean).T))
-    axes = axes[:, ::-1][:, :short] / np.sqrt(values[::-1][:short] + values[::-1][:short].mean())
-    axes = axes.astype(np.float32)
-    words, _ = kmeans2((some - mean) @ axes, num_words, iter=30, minit="++", rng=np.random.default_rng(1))
-    words = words.astype(np.float32)
-    first = summaries.Vocabulary(
-        mean, axes, words, np.zeros(words.size, np.float32), np.eye(words.size, dtype=np.float32)
+        pictures = [localizing.prepared(place.photo(told), params)[0] for told in place.photos]
+        smooth = [params.matching.smooth_px]
+        asking[place.seed] = np.concatenate(
+            [localizing.photo_features(picture, extractor, smooth).descriptors for picture in pictures]
+        )
+    everything = np.concatenate([*shown.values(), *asking.values()])
+    some = everything[np.random.default_rng(0).permutation(len(everything))[:120_000]].astype(np.float32)
+    mean = some.mean(0).astype(np.float16)
+    values, axes = np.linalg.eigh(np.cov((some - mean.astype(np.float32)).T))
+    axes = axes[:, ::-1][:, :NUM_AXES].astype(np.float16)
+    short = (some - mean.astype(np.float32)) @ axes.astype(np.float32)
+    centres, _ = kmeans2(short, NUM_WORDS, iter=15, minit="points", rng=np.random.default_rng(1))
+    step = np.abs(centres).max() / 127
+    kept = {
+        "mean": mean,
+        "axes": axes,
+        "centres": np.round(centres / step).astype(np.int8),
+        "step": np.float32(step),
+        "turned": words.turned_axes(NUM_AXES).astype(np.float16),
+        "chance": np.zeros(words.NUM_SIGNS + 1, np.float32),
+    }
+    np.savez_compressed(ROOT / "words.npz", **kept)
+    words.words_for.cache_clear()
+    kept["chance"] = _chance(words.words_for(some.shape[1]), shown, asking, params).astype(np.float32)
+    np.savez_compressed(ROOT / "words.npz", **kept)
+    words.words_for.cache_clear()
+    size = (ROOT / "words.npz").stat().st_size >> 10
+    share = values[::-1][:NUM_AXES].sum() / values.sum()
+    print(f"{len(everything)} features, {share:.1%} of their variance kept: {size} KB")
+    told = ", ".join(f"{signs}: {kept['chance'][signs]:.2g}" for signs in range(4, params.retrieval.max_signs + 1, 4))
+    print(f"features of a scene that is another place, by signs that differ at most: {told}")
+
+
+def _indexed(held: SceneFeatures, params: Params) -> np.ndarray:
+    """Descriptors of what an index holds of a scene."""
+    views = zip(held.starts[:-1], held.starts[1:], strict=True)
+    return np.concatenate([held.descriptors[a : min(b, a + params.features.indexed)] for a, b in views]) / np.float32(
+        254
     )
-    vectors = np.stack([first.residuals(picture) for picture in pictures])
-    centre = vectors.mean(0)
-    _, singular, turned = np.linalg.svd(vectors - centre, full_matrices=False)
-    power = singular[:length] ** 2 / len(vectors)
-    # Half whitened: the last directions of a thousand pictures are noise.
-    whitening = (turned[:length].T / np.sqrt(power + 0.5 * power.mean())).astype(np.float32)
-    steps = np.abs(whitening).max(0) / 127
-    np.savez_compressed(
-        ROOT / "vocabulary.npz",
-        mean=mean.astype(np.float16),
-        axes=axes.astype(np.float16),
-        words=words.astype(np.float16),
-        centre=centre.astype(np.float16),
-        whitening=np.round(whitening / steps).astype(np.int8),
-        steps=steps.astype(np.float32),
-    )
-    print(f"{len(pictures)} pictures, {len(everything)} features: {(ROOT / 'vocabulary.npz').stat().st_size >> 10} KB")
+
+
+def _chance(
+    held: words.Words, shown: dict[str, np.ndarray], asking: dict[str, np.ndarray], params: Params
+) -> np.ndarray:
+    """(65,) features of a scene within so many signs of a photo's, where it shows another place."""
+    counts, pairs = np.zeros(words.NUM_SIGNS + 1), 0
+    rng = np.random.default_rng(2)
+    for seed, descriptors in asking.items():
+        short = held.shortened(descriptors[rng.permutation(len(descriptors))[:2000]])
+        probed = held.nearest(short, params.retrieval.words)
+        for scene, theirs in shown.items():
+            if scene.startswith(f"{seed}/"):
+                continue
+            pairs += len(short)
+            other = held.shortened(theirs)
+            word = held.nearest(other)[:, 0]
+            order = np.argsort(word, kind="stable")
+            signs, starts = held.signatures(other, word)[order], np.searchsorted(word[order], np.arange(NUM_WORDS + 1))
+            for column in probed.T:
+                mine = held.signatures(short, column)
+                sizes = starts[column + 1] - starts[column]
+                within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+                differ = np.bitwise_count(np.repeat(mine, sizes) ^ signs[np.repeat(starts[column], sizes) + within])
+                counts += np.bincount(differ, minlength=words.NUM_SIGNS + 1)
+    return np.cumsum(counts) / max(pairs, 1)
 
 
 # --- verdict ---------------------------------------------------------------------------------------------------------
@@ -208,7 +237,7 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
     probability.model = lambda: Odds({name: Curve((0.0, 1.0), (0.0, 0.0), 0.0) for name in KNOTS}, 0.0, 1e-3)
     params = replace(params, max_candidates=4, sure=2.0)
     rng, out = np.random.default_rng(5), []
-    indexes = {place.seed: index_of(place.scenes) for place in found}
+    indexes = {place.seed: index_of(place.scenes, params) for place in found}
     for number, place in enumerate(found):
         own = {scene.scene: scene for scene in place.scenes}
         others = [found[(number + k) % len(found)] for k in (1, 4)]
@@ -250,15 +279,9 @@ def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], f
     return error, float(xi @ np.linalg.solve(judged.covariance, xi))
 
 
-def index_of(scenes: list[PlacedFeatures]) -> ViewIndex:
+def index_of(scenes: list[PlacedFeatures], params: Params) -> ViewIndex:
     """All views of some scenes."""
-    counts = [scene.features.num_views for scene in scenes]
-    return ViewIndex(
-        tuple(scene.scene for scene in scenes),
-        np.concatenate([scene.features.summaries for scene in scenes]),
-        np.repeat(np.arange(len(scenes)), counts),
-        np.concatenate([np.arange(count) for count in counts]),
-    )
+    return view_index([new_segment([(scene.features, scene.scene) for scene in scenes], params.features.indexed)])
 
 
 def design(rows: list[dict[str, float]]) -> np.ndarray:

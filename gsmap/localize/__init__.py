@@ -8,7 +8,7 @@ from gsmap.localize.params import Params
 from gsmap.localize.photos import Lens, read_photo
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.recipe import recipe_key
-from gsmap.localize.retrieval import ViewIndex
+from gsmap.localize.retrieval import ViewIndex, index_recipe, new_segment, view_index
 from gsmap.localize.together import localize_together
 
 __all__ = [
@@ -20,11 +20,14 @@ __all__ = [
     "Region",
     "ViewIndex",
     "compare_photo",
+    "index_recipe",
     "localize_photo",
     "localize_together",
+    "new_segment",
     "open_eyes",
     "read_clip",
     "read_photo",
     "recipe_key",
     "scene_features",
+    "view_index",
 ]

@@ -10,7 +10,6 @@ import numpy as np
 from gsmap.geometry.rotations import angle_between
 from gsmap.localize import matching, resection
 from gsmap.localize.placed import PlacedFeatures
-from gsmap.localize.retrieval import ViewIndex, most_alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,7 @@ class Matches:
         feature: (K,) rows of the photo's.
         points: (K, 3) in the frame of the component, metres.
         scene: (K,) whose, among ``scenes``.
-        view: (K,) by which of the views that look most alike.
+        view: (K,) by which of the views.
         scenes: ids.
     """
 
@@ -53,21 +52,18 @@ class Matches:
 
 def matches_by_component(
     photo: matching.Described,
-    summary: np.ndarray,
-    index: ViewIndex,
+    views: Sequence[tuple[str, int]],
     scenes: Mapping[str, PlacedFeatures],
     params: matching.Params,
 ) -> dict[int, Matches]:
-    """What the features of a photo match in the views that look most like it, by component of the map.
+    """What the features of a photo match in some views (of scenes, by number), by component of the map.
 
     Matches with all views of a component are one set, so that captures which each show a part of the place add up.
     """
-    rows, _ = most_alike(index, summary, params.views)
     chosen: dict[int, list[tuple[str, int]]] = {}
-    for row in rows:
-        scene = index.scenes[index.scene[row]]
-        chosen.setdefault(scenes[scene].component, []).append((scene, int(index.view[row])))
-    return {component: _matches(photo, views, scenes, params) for component, views in chosen.items()}
+    for scene, view in views:
+        chosen.setdefault(scenes[scene].component, []).append((scene, view))
+    return {component: _matches(photo, mine, scenes, params) for component, mine in chosen.items()}
 
 
 def _matches(

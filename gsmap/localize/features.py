@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.localize import views
-from gsmap.localize.summaries import summarised
 from gsmap.methods.extractor import Extractor
 from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import Keypoints, SceneFeatures
 
-VERSION = 1
+VERSION = 2
 
 _STEP = 254.0  # of quantised descriptors: unit vectors of 64 and more dimensions hardly have a part above a half
 
@@ -24,6 +23,7 @@ class Params:
 
     Args:
         max_features: of a view; those that the extractor gives first.
+        indexed: of these, the first that photographs are looked for by.
         min_alpha: where the render is fainter, nothing is known of the surface.
         max_step: a feature whose surroundings differ in depth by more than this share lies on an edge, and its place
             is not known.
@@ -31,6 +31,7 @@ class Params:
     """
 
     max_features: int = 600
+    indexed: int = 150
     min_alpha: float = 0.9
     max_step: float = 0.05
     around_px: int = 3
@@ -52,7 +53,7 @@ def scene_features(
     """
     params = params or Params()
     chosen = views.choose_views(gaussians, cameras, view_params)
-    points, descriptors, angles, summaries, kept = [], [], [], [], []
+    points, descriptors, angles, kept = [], [], [], []
     for row in range(len(chosen)):
         camera = chosen[row]
         shown = render(gaussians, camera, dominant_id=False, backend="native")
@@ -65,7 +66,6 @@ def scene_features(
         points.append(places[: len(rows)].astype(np.float32))
         descriptors.append(quantised(found.descriptors[rows]))
         angles.append(turns(found)[rows])
-        summaries.append(summarised(found.descriptors[rows]))
     count = np.array([len(p) for p in points], dtype=np.int64)
     width = descriptors[0].shape[1] if descriptors else 0
     return SceneFeatures(
@@ -75,7 +75,6 @@ def scene_features(
         np.concatenate([np.zeros((0, 3), np.float32), *points]),
         np.concatenate([np.zeros((0, width), np.int8), *descriptors]),
         np.concatenate([np.zeros(0, np.uint8), *angles]),
-        np.stack(summaries) if summaries else np.zeros((0, 0), np.int8),
     )
 
 

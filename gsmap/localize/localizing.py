@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +15,8 @@ from gsmap.localize.features import quantised, turns
 from gsmap.localize.looks import GREY
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
-from gsmap.localize.retrieval import ViewIndex
+from gsmap.localize.retrieval import ViewIndex, most_alike
 from gsmap.localize.settling import Picture, Settled, inliers, settle
-from gsmap.localize.summaries import summarised
 from gsmap.methods.extractor import Extractor
 from gsmap.types.localization import Keypoints, Photo, Placement
 
@@ -167,7 +166,8 @@ def _rough_poses(
 ) -> tuple[list[Candidate], int]:
     """Poses that matches agree on, and how many matches there were."""
     described = matching.Described(quantised(found.descriptors), turns(found))
-    matches = matches_by_component(described, summarised(found.descriptors), index, scenes, matched)
+    views = most_alike(index, found, picture.intrinsics_px, matched.views, params.retrieval)
+    matches = matches_by_component(described, views, scenes, matched)
     rough = candidates(
         found.pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma, params.resection
     )
@@ -254,9 +254,3 @@ def _num_seen(scene: PlacedFeatures, settled: Settled, picture: Picture) -> int:
     one = next(look for look in settled.looks if look.scene == scene.scene)
     column, row = pixels[inside].astype(np.int64).T
     return int((depth[inside] * scene.S_metric_scene.scale <= 1.05 * one.depth_m[row, column]).sum())
-
-
-def near(index: ViewIndex, wanted: Collection[str]) -> ViewIndex:
-    """The views of some scenes."""
-    keep = np.array([scene in wanted for scene in index.scenes], bool)
-    return index.only(np.flatnonzero(keep[index.scene])) if len(index) else index

@@ -65,7 +65,7 @@ def weights(scene: PlacedFeatures, cameras: Cameras | None, params: Params) -> n
 
 
 def fewer(features: SceneFeatures, most: int) -> SceneFeatures:
-    """At most so many features of every view, those that came first; summaries are those of all."""
+    """At most so many features of every view, those that came first."""
     rows = [np.arange(a, min(b, a + most)) for a, b in zip(features.starts[:-1], features.starts[1:], strict=True)]
     keep = np.concatenate([np.zeros(0, np.int64), *rows])
     return replace(
@@ -119,7 +119,6 @@ def pack_features(features: SceneFeatures) -> dict[str, np.ndarray]:
         "poses": features.cameras.T_frame_camera.reshape(-1, 16).astype(np.float64),
         "intrinsics": features.cameras.intrinsics_px.astype(np.float64),
         "sizes": features.cameras.sizes_px.astype(np.int64),
-        "summaries": features.summaries.astype(np.int8),
     }
 
 
@@ -137,13 +136,10 @@ def unpack_features(scene: str, arrays: Mapping[str, np.ndarray]) -> SceneFeatur
             raise ValueError("arrays that do not fit each other")
         if starts.dtype != np.int64 or starts[0] != 0 or starts[-1] != count or (np.diff(starts) < 0).any():
             raise ValueError("views that do not divide their features")
-        if packed.dtype != np.uint8 or arrays["points"].dtype != np.uint16 or arrays["summaries"].dtype != np.int8:
+        if packed.dtype != np.uint8 or arrays["points"].dtype != np.uint16:
             raise ValueError("arrays of other types")
         (low, size), (least, step) = arrays["box"], arrays["range"]
-        if (
-            not (np.isfinite(arrays["box"]).all() and np.isfinite(arrays["range"]).all())
-            or len(arrays["summaries"]) != views
-        ):
+        if not (np.isfinite(arrays["box"]).all() and np.isfinite(arrays["range"]).all()):
             raise ValueError("numbers that are not finite")
         nibbles = np.empty((count, 2 * packed.shape[1]), np.float64)
         nibbles[:, 0::2], nibbles[:, 1::2] = packed >> 4, packed & 15
@@ -157,7 +153,6 @@ def unpack_features(scene: str, arrays: Mapping[str, np.ndarray]) -> SceneFeatur
             (low + arrays["points"] / _STEPS * size).astype(np.float32),
             np.clip(np.round(values), -_MOST, _MOST).astype(np.int8),
             arrays["angles"].astype(np.uint8),
-            arrays["summaries"],
         )
     except (KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
         raise CorruptError(

@@ -14,6 +14,7 @@ from gsmap.localize import (
     matching,
     packing,
     resection,
+    retrieval,
     settling,
     tracking,
     tying,
@@ -33,6 +34,7 @@ class Params:
         extractors: settings of each extractor.
         views: which views of a scene are rendered.
         features: which of their features are kept.
+        retrieval: which views a photo is matched with.
         matching: when features of a photo and of a view are the same.
         resection: how a pose is found among matches.
         settling: how a rough pose is sharpened.
@@ -55,6 +57,7 @@ class Params:
     extractors: MethodParams = field(default_factory=lambda: MethodParams("extractor"))
     views: views.Params = field(default_factory=views.Params)
     features: features.Params = field(default_factory=features.Params)
+    retrieval: retrieval.Params = field(default_factory=retrieval.Params)
     matching: matching.Params = field(default_factory=matching.Params)
     resection: resection.Params = field(default_factory=resection.Params)
     settling: settling.Params = field(default_factory=settling.Params)

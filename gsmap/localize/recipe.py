@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gsmap.localize import features, summaries
+from gsmap.localize import features
 from gsmap.localize.params import Params
 from gsmap.methods import RecipeKey, family
 from gsmap.types.model import ModelSpec
@@ -21,7 +21,7 @@ def recipe_key(params: Params, models: Mapping[str, ModelSpec] | None = None) ->
     return RecipeKey(
         stage="localize",
         method=name,
-        version={"features": features.VERSION, "summaries": summaries.VERSION, **family("extractor").version(name)},
+        version={"features": features.VERSION, **family("extractor").version(name)},
         settings={
             "views": plain(params.views),
             "features": plain(params.features),

@@ -22,7 +22,7 @@ from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.retrieval import ViewIndex
 from gsmap.localize.settling import Picture, Settled
-from gsmap.localize.summaries import summarised
+from gsmap.localize.words import words_for
 from gsmap.methods.extractor import Extractor
 from gsmap.types.localization import Keypoints, Photo, Placement
 
@@ -36,7 +36,6 @@ class _Shot:
     scale: np.ndarray
     found: Keypoints
     described: matching.Described
-    summary: np.ndarray
     judged: list[Judged]
     why: str
     helped: bool = False  # whether it has helped its neighbours from the pose that it has now
@@ -94,20 +93,28 @@ def _shot(
     found = photo_features(picture, extractor, [0.0])  # photos hold what renders do not
     described = matching.Described(quantised(found.descriptors), turns(found))
     judged, why = judged_poses(picture, index, scenes, extractor, params)
-    return _Shot(photo, picture, scale, found, described, summarised(found.descriptors), judged, why)
+    return _Shot(photo, picture, scale, found, described, judged, why)
 
 
 def _neighbours(shots: Sequence[_Shot], count: int) -> list[list[int]]:
     """Of each photo those that look most alike, and those given just before and after it."""
-    vectors = np.stack([shot.summary.astype(np.float32) for shot in shots])
+    vectors = np.stack([words_of(shot.found) for shot in shots])
     cosines = vectors @ vectors.T
-    cosines /= np.maximum(np.sqrt(np.outer(np.diag(cosines), np.diag(cosines))), 1e-6)
     np.fill_diagonal(cosines, -2)
     out = []
     for k in range(len(shots)):
         alike = np.argsort(-cosines[k], kind="stable")[: min(count, len(shots) - 1)].tolist()
         beside = [one for one in (k - 1, k + 1) if 0 <= one < len(shots)]
         out.append(list(dict.fromkeys([*beside, *alike])))
+    return out
+
+
+def words_of(found: Keypoints) -> np.ndarray:
+    """(W,) unit vector of how many features are of each word; the root, since what repeats itself says little."""
+    words = words_for(found.descriptors.shape[1])
+    word = words.nearest(words.shortened(found.descriptors))[:, 0]
+    counts = np.sqrt(np.bincount(word, minlength=len(words.centres)))
+    out: np.ndarray = counts / max(float(np.linalg.norm(counts)), 1e-9)
     return out
 
 

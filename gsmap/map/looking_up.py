@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 
-from gsmap import retrieve
-from gsmap.errors import CorruptError, GsmapError, NotFoundError
+from gsmap import localize, retrieve
+from gsmap.errors import CorruptError, NotFoundError
+from gsmap.map.indexing import AT_ONCE, PATIENCE, SceneIndex
 from gsmap.methods import RecipeKey
 from gsmap.retrieve import Voters
 from gsmap.store import Store
-from gsmap.store.indexes import Lookup, StoredSegment
+from gsmap.store.indexes import Lookup
 from gsmap.types import SceneGraph
 from gsmap.types.progress import StageProgress
-from gsmap.types.retrieval import Candidate, Member
+from gsmap.types.retrieval import Candidate
+from gsmap.types.segments import InMemory, Segment
 
-_AT_ONCE = 64  # scenes whose nodes lie in memory: about 8 MB
-_PATIENCE = 8  # times that others may change the index while it is read, or that a damaged one is made anew
 _KEPT = 2  # times as many candidates are kept as are tried, to be shown
 
 
@@ -33,20 +32,20 @@ def ask(
         graphs: the key of the graph of every scene that counts; they are put into the index where they are not.
         asking: ids of those that ask.
     """
-    for left in reversed(range(_PATIENCE)):
+    mine: dict[str, Voters] = {}
+    index = _index(store, graphs, params, set(asking), mine)
+    for left in reversed(range(PATIENCE)):
         try:
-            mine = _bring_up_to_date(store, graphs, set(asking), params, progress)
-            for start in range(0, len(asking), _AT_ONCE):
-                scenes = asking[start : start + _AT_ONCE]
+            index.bring_up_to_date(lambda told: progress("register", 0.0, f"{told} of retrieval"))
+            for start in range(0, len(asking), AT_ONCE):
+                scenes = asking[start : start + AT_ONCE]
                 voters = [mine[scene] if scene in mine else _voters(store, graphs[scene], params) for scene in scenes]
-                found = retrieve.look_up(voters, _segments(store, graphs, params), params)
+                found = retrieve.look_up(voters, index.segments(), params)
                 store.indexes.note([_lookup(one, said, params) for one, said in zip(voters, found, strict=True)])
             return
         except CorruptError:
-            damaged = [segment.id for segment in _segments(store, graphs, params) if _is_damaged(segment)]
-            if not (damaged and left):
+            if not (left and index.forget_damaged()):
                 raise
-            store.indexes.forget(damaged)
         except NotFoundError:  # another process made segments one while they were read
             if not left:
                 raise
@@ -61,14 +60,13 @@ def ask_once(
         graphs: the key of the graph of every scene that counts; those that the index lacks are read.
         graph: made by the recipe of these.
     """
-    for left in reversed(range(_PATIENCE)):
+    index = _index(store, graphs, params)
+    for left in reversed(range(PATIENCE)):
         try:
-            segments: list[retrieve.Segment] = list(_segments(store, graphs, params))
-            present = {member.scene for segment in segments for member in segment.members if member is not None}
-            missing = sorted(set(graphs) - present)
-            for start in range(0, len(missing), _AT_ONCE):
-                new = [_voters(store, graphs[scene], params) for scene in missing[start : start + _AT_ONCE]]
-                segments.append(retrieve.new_segment(new))
+            kept = index.segments()
+            missing = index.missing(kept)
+            parts = [missing[start : start + AT_ONCE] for start in range(0, len(missing), AT_ONCE)]
+            segments: list[Segment] = [*kept, *(index.make(part) for part in parts)]
             asking = retrieve.voters_of(graph, "", params.nodes_per_scene)
             return retrieve.look_up([asking], segments, params)[0]
         except NotFoundError:  # another process made segments one while they were read
@@ -85,54 +83,28 @@ def keys_of_lookups(graphs: Mapping[str, RecipeKey], params: retrieve.Params) ->
     return {scene: recipe.digest_of(key.digest) for scene, key in graphs.items()}
 
 
-def _bring_up_to_date(
+def _index(
     store: Store,
     graphs: Mapping[str, RecipeKey],
-    asking: Collection[str],
     params: retrieve.Params,
-    progress: StageProgress,
-) -> dict[str, Voters]:
-    """Put the scenes into the index that are not in it; returns what was read of some that ask."""
-    recipe, read = retrieve.index_recipe(params), dict[str, Voters]()
-    while True:
-        segments = _segments(store, graphs, params)
-        present = {member.scene for segment in segments for member in segment.members if member is not None}
-        missing = sorted(set(graphs) - present)
-        if not missing:
-            return {scene: voters for scene, voters in read.items() if scene in asking}
-        if len(missing) > _AT_ONCE:
-            progress("register", 0.0, f"{len(missing)} scenes into the index of retrieval")
-        new = [read.get(scene) or _voters(store, graphs[scene], params) for scene in missing[:_AT_ONCE]]
-        read = {voters.member.scene: voters for voters in new}
-        sizes = [sum(member is not None for member in segment.members) for segment in segments]
-        old = [segments[k] for k in retrieve.to_merge(sizes, len(new))]
-        whole = retrieve.merged([*old, retrieve.new_segment(new)])
-        members = [member for member in whole.members if member is not None]
-        store.indexes.put(recipe, members, whole.arrays, [segment.id for segment in old])
+    asking: Collection[str] = (),
+    read: dict[str, Voters] | None = None,
+) -> SceneIndex:
+    """The index of graphs.
 
+    Args:
+        read: takes what was read of those that ask, while they are put in.
+    """
 
-def _segments(store: Store, graphs: Mapping[str, RecipeKey], params: retrieve.Params) -> list[StoredSegment]:
-    """The index; of its scenes those count whose present graph it holds, each once."""
-    present, seen = {scene: key.digest for scene, key in graphs.items()}, set[str]()
-    found = []
-    for segment in store.indexes.segments(retrieve.index_recipe(params)):
-        members: list[Member | None] = []
-        for member in segment.members:
-            counts = None
-            if member is not None and member.scene not in seen and present.get(member.scene) == member.graph:
-                counts = member
-                seen.add(member.scene)
-            members.append(counts)
-        found.append(replace(segment, members=members))
-    return found
+    def make(scenes: Sequence[str]) -> InMemory:
+        new = [_voters(store, graphs[scene], params) for scene in scenes]
+        if read is not None:
+            read.clear()  # those before lie in the index
+            read.update({voters.member.scene: voters for voters in new if voters.member.scene in asking})
+        return retrieve.new_segment(new)
 
-
-def _is_damaged(segment: StoredSegment) -> bool:
-    try:
-        retrieve.merged([segment])
-    except GsmapError:
-        return True
-    return False
+    keys = {scene: key.digest for scene, key in graphs.items()}
+    return SceneIndex(store, retrieve.index_recipe(params), {localize.index_recipe()}, keys, make)
 
 
 def _voters(store: Store, key: RecipeKey, params: retrieve.Params) -> Voters:

@@ -23,7 +23,7 @@ from gsmap.export.levels import Params as LevelParams
 from gsmap.export.levels import make_level
 from gsmap.geometry.metres import in_metres
 from gsmap.geometry.morton import morton_order
-from gsmap.localize import PlacedFeatures, ViewIndex, packing
+from gsmap.localize import PlacedFeatures, ViewIndex, new_segment, packing, view_index
 from gsmap.map import persisting
 from gsmap.map.objects import Known
 from gsmap.map.persisting import what_passes
@@ -43,7 +43,7 @@ _HEADER_BYTES = 1500  # of a scene in localize.json, about
 _ROUNDS = 3
 _GAUSSIAN_BYTES = 14.5  # of one, packed
 _DEVIATION_PX = 2.0  # of merged Gaussians in the pictures that they are fitted to
-_FEATURES = ("starts", "box", "points", "range", "descriptors", "angles", "poses", "intrinsics", "sizes", "summaries")
+_FEATURES = ("starts", "box", "points", "range", "descriptors", "angles", "poses", "intrinsics", "sizes")
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +296,6 @@ class SmallLocalizer(Localizer):
         self.small = {one.id: one for one in small}
         self.scenes = self.small  # type: ignore[assignment]
         self.placed = {}
-        summaries = []
         for one in small:
             self.placed[one.id] = PlacedFeatures(
                 one.id,
@@ -306,17 +305,16 @@ class SmallLocalizer(Localizer):
                 partial(self._small_gaussians, one.id),
                 partial(self._small_features, one.id),
             )
-            summaries.append(self._arrays(one.id, ("summaries",))["summaries"])
         self._used, self._eyes = [], {}
-        counts = [len(s) for s in summaries]
-        self.index = ViewIndex(
-            tuple(self.placed),
-            np.concatenate(summaries) if summaries else np.zeros((0, 0), np.int8),
-            np.repeat(np.arange(len(counts)), counts),
-            np.concatenate([np.zeros(0, np.int64), *(np.arange(count) for count in counts)]),
-        )
+        held = [(placed.features, one) for one, placed in self.placed.items()]
+        self.index = view_index([new_segment(held, self.params.features.indexed)])
+        for placed in self.placed.values():
+            placed.drop()
         method = family("extractor").get(self.params.extractor)
         self.extractor = method.make({}, self.params.extractors[self.params.extractor])
+
+    def _renewed(self, error: GsmapError) -> ViewIndex:
+        raise error  # it lies in memory
 
     def near(self, text: str) -> Near:
         """``SCENE``, or ``X,Y,Z,R``, see `gsmap.map.stages.localize.parse_near`."""

@@ -1,6 +1,6 @@
 """Retrieval: which of many scenes, views and objects are worth a closer look."""
 
-from gsmap.retrieve.index import Segment, merged, new_segment, to_merge
+from gsmap.retrieve.index import new_segment
 from gsmap.retrieve.lookup import VERSION, look_up
 from gsmap.retrieve.neighbours import Placed, neighbours
 from gsmap.retrieve.pairs import candidate_pairs
@@ -14,16 +14,13 @@ __all__ = [
     "Params",
     "Placed",
     "Rounds",
-    "Segment",
     "Voters",
     "candidate_pairs",
     "directed",
     "index_recipe",
     "look_up",
-    "merged",
     "neighbours",
     "new_segment",
     "recipe_key",
-    "to_merge",
     "voters_of",
 ]

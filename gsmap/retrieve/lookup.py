@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.retrieve import codes
-from gsmap.retrieve.index import Segment, Unpacked, checked_places, lists_of, unpacked
+from gsmap.retrieve.index import Unpacked, unpacked
 from gsmap.retrieve.params import Params
 from gsmap.retrieve.voters import Voters
 from gsmap.types.retrieval import Candidate, Member
+from gsmap.types.segments import Segment, lists_of
 
 VERSION = 3
 
@@ -114,8 +115,8 @@ def _read(
         low, high = np.searchsorted(keys, wanted[0]), np.searchsorted(keys, wanted[-1], side="right")
         if low == high:
             continue
-        found = unpacked(segment.rows(int(starts[low]), int(starts[high])))
-        places = place_of[checked_places(found.places, len(segment.members))]
+        found = unpacked(segment.rows(int(starts[low]), int(starts[high])), len(segment.members))
+        places = place_of[found.places]
         first = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
         at = np.stack([starts[first], starts[first + (keys[first] == wanted)]], 1) - starts[low]
         at[keys[first] != wanted] = 0

@@ -1,4 +1,4 @@
-"""What retrieval derives from graphs: segments of an index, and what it said of scenes. Losing it costs time only."""
+"""Segments of the indexes of graphs and of views, and what the first said of scenes. Losing it costs time only."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Lookup:
 
 
 class Indexes:
-    """The retrieval index of a map, and the lookups in it."""
+    """The indexes of a map, by their recipes, and the lookups in that of its graphs."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
@@ -90,12 +90,20 @@ class Indexes:
             rows = connection.execute(query).all()
             return [self._segment(row, manifest(connection, row.group_id)) for row in rows]
 
-    def put(self, key: str, members: Sequence[Member], arrays: IndexArrays, instead_of: Collection[str]) -> bool:
-        """Keep a segment in place of others, whose arrays go; segments of other recipes go as well.
+    def put(
+        self,
+        key: str,
+        members: Sequence[Member],
+        arrays: IndexArrays,
+        instead_of: Collection[str],
+        beside: Collection[str] = (),
+    ) -> bool:
+        """Keep a segment in place of others, whose arrays go; segments of recipes that are no longer used go as well.
 
         Args:
             key: of the recipe.
             instead_of: ids of the segments that it holds what counts of.
+            beside: recipes of the map's other indexes.
 
         Returns:
             Whether it was kept: not where another process has replaced one of those meanwhile.
@@ -109,7 +117,7 @@ class Indexes:
             there = connection.execute(select(index_segments.c.group_id, index_segments.c.key)).all()
             if not set(instead_of) <= {old.group_id for old in there}:
                 return False
-            gone = {old.group_id for old in there if old.group_id in instead_of or old.key != key}
+            gone = {old.group_id for old in there if old.group_id in instead_of or old.key not in {key, *beside}}
             dropped = self._unname(connection, gone)
             known = manifest(connection, group_id)
             if not known or self._arrays.problems(KIND, group_id, known):

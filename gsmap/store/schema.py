@@ -255,7 +255,7 @@ view_features = _table(
     _scene("scene", index=True),
     Column("num_views", Integer, nullable=False),
     Column("num_features", Integer, nullable=False),
-    Column("summaries", LargeBinary, nullable=False),  # int8, as many to each view
+    Column("summaries", LargeBinary, nullable=False),  # empty; older maps hold a vector of each view
     Column("group_id", Digest, ForeignKey("groups.id"), nullable=False),
     Column("created_at", Text, nullable=False),
 )

@@ -1,13 +1,12 @@
 """What the views of each scene show (`SceneFeatures`), kept under what they were made from and how.
 
-The summaries of all views lie in the catalog's own rows, so that a photograph is compared with those of a thousand
-scenes without opening one of their archives. Losing any of it costs time only.
+By which views a photograph is looked for, the index of views says (`gsmap.store.indexes`). Losing any of it costs time
+only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from sqlalchemy import delete, insert, select
@@ -20,7 +19,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.groups import manifest, publish, unless_pruned, unname
 from gsmap.store.scene_refs import resolve
-from gsmap.store.schema import scenes, view_features
+from gsmap.store.schema import view_features
 from gsmap.types import Cameras
 from gsmap.types.localization import SceneFeatures
 
@@ -35,23 +34,6 @@ _ARRAYS = {
     "intrinsics": np.dtype(np.float64),
     "sizes": np.dtype(np.int64),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class StoredViews:
-    """What the catalog knows of a scene's views without reading their features.
-
-    Args:
-        key: `RecipeKey.digest`.
-        scene: its id.
-        num_features: of all views.
-        summaries: (V, S) int8.
-    """
-
-    key: str
-    scene: str
-    num_features: int
-    summaries: np.ndarray
 
 
 class ViewFeatures:
@@ -84,7 +66,7 @@ class ViewFeatures:
             "scene": found.scene,
             "num_views": found.num_views,
             "num_features": found.num_features,
-            "summaries": np.ascontiguousarray(found.summaries, np.int8).tobytes(),
+            "summaries": b"",
             "group_id": group_id,
         }
         staging = self._arrays.stage(arrays, KIND, group_id)
@@ -105,33 +87,6 @@ class ViewFeatures:
         """Those of the keys (as digests) that features are kept under."""
         with self._catalog.read() as connection:
             return recipes.kept(connection, view_features.c.key, keys)
-
-    def list(self) -> list[StoredViews]:
-        """Of all living scenes, by id of the scene; no archive is opened.
-
-        Raises:
-            CorruptError: what the catalog holds makes no sense.
-        """
-        query = select(view_features).join(scenes, scenes.c.id == view_features.c.scene)
-        with self._catalog.read() as connection:
-            rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).order_by(view_features.c.scene)).all()
-        out = []
-        for row in rows:
-            flat = np.frombuffer(row.summaries, np.int8)
-            if row.num_views < 0 or (row.num_views and len(flat) % row.num_views) or (len(flat) and not row.num_views):
-                raise CorruptError(
-                    f"the catalog holds {len(flat)} bytes in view_features.summaries for {row.num_views} views: gsmap "
-                    "did not write that; restore the catalog from a backup"
-                )
-            out.append(
-                StoredViews(
-                    row.key,
-                    row.scene,
-                    row.num_features,
-                    flat.reshape(row.num_views, -1) if row.num_views else flat.reshape(0, 0),
-                )
-            )
-        return out
 
     def load(self, scene: str, key: RecipeKey | str) -> SceneFeatures | None:
         """Read the features of a scene; None where none are kept under this key.
@@ -159,16 +114,14 @@ class ViewFeatures:
         with unless_pruned(self._catalog, row.group_id, f"the features of scene {scene[:12]} were made anew"):
             arrays = self._arrays.read(KIND, row.group_id, files, shapes=shapes)
         try:
-            return _features(scene, arrays, np.frombuffer(row.summaries, np.int8), V, N)
+            return _features(scene, arrays, N)
         except (InputError, *MALFORMED) as error:
             raise CorruptError(
                 f"the features of scene {scene[:12]} make no sense ({error}): run gsmap check"
             ) from error
 
 
-def _features(
-    scene: str, arrays: dict[str, np.ndarray], summaries: np.ndarray, num_views: int, num_features: int
-) -> SceneFeatures:
+def _features(scene: str, arrays: dict[str, np.ndarray], num_features: int) -> SceneFeatures:
     for name, dtype in _ARRAYS.items():
         if arrays[name].dtype != dtype:
             raise InputError(f"{name} are {arrays[name].dtype}")
@@ -178,12 +131,4 @@ def _features(
     if not np.isfinite(arrays["points"]).all():
         raise InputError("a point holds NaN or infinity")
     cameras = Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"])
-    return SceneFeatures(
-        scene,
-        cameras,
-        starts,
-        arrays["points"],
-        arrays["descriptors"],
-        arrays["angles"],
-        summaries.reshape(num_views, -1) if num_views else np.zeros((0, 0), np.int8),
-    )
+    return SceneFeatures(scene, cameras, starts, arrays["points"], arrays["descriptors"], arrays["angles"])

@@ -65,7 +65,7 @@ class Keypoints:
 
 @dataclass(frozen=True, eq=False)
 class SceneFeatures:
-    """What views of a scene show of it: local features with their places, and a summary of each view.
+    """What views of a scene show of it: local features with their places.
 
     Args:
         scene: its id.
@@ -74,7 +74,6 @@ class SceneFeatures:
         points: (N, 3) float32 places of the features, scene frame and unit.
         descriptors: (N, D) int8 of unit vectors (`gsmap.localize.quantised`).
         angles: (N,) uint8 by which each was turned before it was described, 256 to a full turn; zeros where none was.
-        summaries: (V, S) int8 of unit vectors; what views are found by.
     """
 
     scene: str
@@ -83,7 +82,6 @@ class SceneFeatures:
     points: np.ndarray
     descriptors: np.ndarray
     angles: np.ndarray
-    summaries: np.ndarray
 
     @property
     def num_views(self) -> int:

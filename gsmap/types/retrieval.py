@@ -13,7 +13,7 @@ class Member:
 
     Args:
         scene: its id.
-        graph: key of the graph that its nodes are of.
+        graph: key of the graph that its nodes are of; in an index of views, of its features, and nothing more is said.
         upright: whether the third coordinate of its nodes is their height.
         metric: whether its unit is, or may be, the metre.
         coarseness: metres that look like one does in a room (`SceneGraph.working_m`).
@@ -21,9 +21,9 @@ class Member:
 
     scene: str
     graph: str
-    upright: bool
-    metric: bool
-    coarseness: float
+    upright: bool = True
+    metric: bool = True
+    coarseness: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from scanned_flat import SEED, SIZE_PX, Flat, Scanned, scanned
 
 import gsmap
 from gsmap.geometry.rotations import exp_so3
-from gsmap.localize import Params, PlacedFeatures, ViewIndex, scene_features
+from gsmap.localize import Params, PlacedFeatures, ViewIndex, new_segment, scene_features, view_index
 from gsmap.localize.extractors import sift
 from gsmap.types import Sim3
 from gsmap.types.localization import Photo
@@ -55,9 +55,7 @@ class World:
 
     @cached_property
     def index(self) -> ViewIndex:
-        found = self.placed.features
-        views = np.arange(found.num_views)
-        return ViewIndex(("scene",), found.summaries, np.zeros_like(views), views)
+        return view_index([new_segment([(self.placed.features, "0" * 32)], Params().features.indexed)])
 
     @cached_property
     def poses(self) -> np.ndarray:

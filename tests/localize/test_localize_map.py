@@ -13,8 +13,10 @@ from PIL import Image
 import gsmap.map
 from gsmap.cli.app import run
 from gsmap.errors import ConfigError, CorruptError, InputError, NotFoundError, ReadOnlyError, StoreError
-from gsmap.localize import packing
+from gsmap.localize import Lens, index_recipe, packing, read_photo
 from gsmap.map.localizing_small import localize_small
+from gsmap.map.settings import settings_of
+from gsmap.map.stages.localize import Localizer, feature_keys
 from gsmap.map.viewing import view_of
 from gsmap.store import Store
 from gsmap.types import Sim3
@@ -274,7 +276,6 @@ def test_features_survive_four_bits_a_number(world) -> None:
     assert np.quantile(cosine, 0.05) > 0.98
     assert np.abs(np.linalg.norm(b, axis=1) - 254).max() < 8
     assert np.abs(features.points - back.points).max() < 1e-3
-    assert np.array_equal(features.summaries, back.summaries)
     fewer = packing.fewer(features, 10)
     assert fewer.num_features == np.minimum(np.diff(features.starts), 10).sum()
     assert np.array_equal(fewer.points[fewer.starts[1]], features.points[features.starts[1]])
@@ -283,27 +284,95 @@ def test_features_survive_four_bits_a_number(world) -> None:
 # --- what is kept ---------------------------------------------------------------------------------------------------
 
 
+def _segments(store: Store):
+    return store.indexes.segments(index_recipe())
+
+
+def test_the_index_of_views_is_made_once_and_grows_by_what_is_new(made, world, tmp_path, monkeypatch) -> None:
+    folder, lens, report = made
+    shutil.copytree(folder / "m.gsmap", tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        (before,) = _segments(m.store)
+        assert before.num_nodes > 100
+        asked = []
+        put = m.store.indexes.put
+        monkeypatch.setattr(m.store.indexes, "put", lambda *a, **k: asked.append(a) or put(*a, **k))
+        again = m.localize(folder / "photo.png", intrinsics=lens).results[0]
+        assert np.array_equal(again.T_map_camera, report.results[0].T_map_camera)
+        assert not asked
+        m.register()  # the index of graphs leaves that of views alone
+        assert [one.id for one in _segments(m.store)] == [before.id]
+        other = world.capture.gaussians
+        m.ingest(other[np.arange(0, len(other), 2)], cameras=world.capture.cameras, name="again")
+        m.optimize()
+        m.localize(folder / "photo.png", intrinsics=lens)
+        (after,) = _segments(m.store)
+        assert len(after.members) == 2
+        assert after.num_nodes > before.num_nodes
+
+
+def test_a_scene_whose_features_could_not_be_made_stays_out_of_the_index(made, world, tmp_path, monkeypatch) -> None:
+    folder, lens, _ = made
+    shutil.copytree(folder / "m.gsmap", tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        other = world.capture.gaussians
+        m.ingest(other[np.arange(0, len(other), 2)], cameras=world.capture.cameras, name="again")
+        m.optimize()
+        monkeypatch.setattr("gsmap.map.stages.localize.ensure", lambda *arguments: None)
+        assert m.localize(folder / "photo.png", intrinsics=lens).results[0].scenes == ("room",)
+
+
+def test_a_damaged_index_of_views_is_made_anew(made, tmp_path) -> None:
+    folder, lens, report = made
+    shutil.copytree(folder / "m.gsmap", tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        (segment,) = _segments(m.store)
+        (archive,) = (m.store.arrays.root / "indexes" / segment.id).glob("*")
+        os.chmod(archive, 0o644)
+        content = bytearray(archive.read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        archive.write_bytes(bytes(content))
+    with gsmap.map.Map(Store.open(tmp_path / "c.gsmap", "r")) as m, pytest.raises(CorruptError):
+        m.localize(folder / "photo.png", intrinsics=lens)
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        again = m.localize(folder / "photo.png", intrinsics=lens).results[0]
+        assert np.array_equal(again.T_map_camera, report.results[0].T_map_camera)
+        assert m.check().ok
+
+
+def test_segments_that_others_made_one_meanwhile_are_asked_anew(made, tmp_path) -> None:
+    folder, lens, report = made
+    shutil.copytree(folder / "m.gsmap", tmp_path / "c.gsmap")
+    with gsmap.map.open(tmp_path / "c.gsmap") as m:
+        photo = read_photo(folder / "photo.png", Lens(tuple(float(x) for x in lens.split(","))))
+        localizer = Localizer(m.store, m.settings, lambda *told: None)
+        m.store.indexes.forget([one.id for one in _segments(m.store)])
+        found = localizer.localize(photo)
+        assert np.array_equal(found.T_map_camera, report.results[0].T_map_camera)
+        assert len(_segments(m.store)) == 1
+
+
 def test_features_come_and_go_with_their_scene(made, world, tmp_path) -> None:
     """Kept by key, damaged bytes are told, and nothing is left of a scene that is purged."""
     folder, _, _ = made
     with gsmap.map.open(folder / "m.gsmap") as m:
         m.clone(tmp_path / "c.gsmap")
     with Store.open(tmp_path / "c.gsmap") as store:
-        (stored,) = store.view_features.list()
-        held = store.view_features.load(stored.scene, stored.key)
+        (scene,) = store.scenes.list()
+        (key,) = feature_keys(store, [scene], settings_of({})).values()
+        held = store.view_features.load(scene.id, key)
         assert np.array_equal(held.points, world.placed.features.points) or held.num_features > 100
-        assert held.num_views == len(stored.summaries)
-        assert store.view_features.kept([stored.key, "0" * 32]) == {stored.key}
-        assert store.view_features.load(stored.scene, "0" * 32) is None
+        assert store.view_features.kept([key, "0" * 32]) == {key.digest}
+        assert store.view_features.load(scene.id, "0" * 32) is None
         (archive,) = (store.arrays.root / "views").glob("*/*")
         os.chmod(archive, 0o644)
         content = bytearray(archive.read_bytes())
         content[len(content) // 3] ^= 0xFF
         archive.write_bytes(bytes(content))
         with pytest.raises(CorruptError):
-            store.view_features.load(stored.scene, stored.key)
+            store.view_features.load(scene.id, key)
     with gsmap.map.open(tmp_path / "c.gsmap") as m:
         assert not m.check().ok
         m.purge("room")
-        assert m.store.view_features.list() == []
+        assert m.store.view_features.kept([key]) == set()
         assert m.check().ok

@@ -1,4 +1,4 @@
-"""Parts of localisation beside arithmetic: adjustment, tracks, matches, views, summaries, pictures in files."""
+"""Parts of localisation beside arithmetic: adjustment, tracks, matches, views, pictures in files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, shift
 from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3
-from gsmap.localize import Lens, covariance, matching, read_photo, resection, summaries, tracking, views
+from gsmap.localize import Lens, covariance, matching, read_photo, resection, tracking, views
 from gsmap.localize.extractors import sift
 from gsmap.localize.features import quantised
 from gsmap.localize.resection import moved
@@ -111,15 +111,6 @@ def test_matches_agree_both_ways_and_in_how_the_camera_was_held() -> None:
     rows, columns = matching.matched(photo, matching.Described(quantised(vectors[order]), turned), matching.Params())
     assert (order[columns] == rows).all()
     assert sorted(columns) == list(range(5, 50))
-
-
-def test_summaries_of_the_same_features_are_alike(world) -> None:
-    one, two = (SIFT.extract(photo.rgb).descriptors for photo in world.photos[:2])
-    a, b, c = (summaries.summarised(x).astype(float) for x in (one, one[: len(one) * 9 // 10], two))
-    assert a @ b / np.linalg.norm(a) / np.linalg.norm(b) > 0.7
-    assert abs(a @ c / np.linalg.norm(a) / np.linalg.norm(c)) < 0.5
-    assert summaries.summarised(one[:0]).shape == a.shape
-    assert summaries.random_vocabulary(64).summary(one[:, :64]).shape == a.shape
 
 
 def test_views_are_few_and_some_stand_off_the_path(world) -> None:

@@ -66,8 +66,12 @@ def test_what_a_segment_takes_the_place_of_leaves_the_disk(store):
     # Others did the same meanwhile: what would be in place of what is gone is not kept.
     assert not store.indexes.put(A, members(A), arrays(3), [first.id])
     assert [s.id for s in store.indexes.segments(A)] == [only.id]
-    # Another recipe: the older segments go.
-    store.indexes.put(B, members(A), arrays(4), ())
+    # Another index lies beside it.
+    store.indexes.put(B, members(A), arrays(5), (), beside={A})
+    assert [s.id for s in store.indexes.segments(A)] == [only.id]
+    assert len(bodies(store)) == 2
+    # Another recipe in its place: the older segments go.
+    store.indexes.put(B, members(A), arrays(4), [s.id for s in store.indexes.segments(B)])
     assert store.indexes.segments(A) == []
     assert len(bodies(store)) == 1
     store.indexes.forget([s.id for s in store.indexes.segments(B)])

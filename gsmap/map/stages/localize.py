@@ -7,15 +7,18 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
 from gsmap import localize as localizing
+from gsmap import retrieve
 from gsmap.engine import SetAside, run_jobs
-from gsmap.errors import ConfigError, NotFoundError, ReadOnlyError
+from gsmap.errors import ConfigError, CorruptError, GsmapError, NotFoundError, ReadOnlyError
 from gsmap.geometry.metres import in_metres
-from gsmap.localize import PlacedFeatures, ViewIndex
+from gsmap.localize import PlacedFeatures, ViewIndex, new_segment, view_index
 from gsmap.map import models
+from gsmap.map.indexing import AT_ONCE, PATIENCE, SceneIndex
 from gsmap.map.jobs import features_of_scene
 from gsmap.map.metres import map_metres
 from gsmap.map.settings import Settings
@@ -26,6 +29,9 @@ from gsmap.store import Store
 from gsmap.types import Gaussians, PoseGraph, Scene
 from gsmap.types.localization import Photo, Placement, SceneFeatures
 from gsmap.types.progress import StageProgress
+from gsmap.types.segments import InMemory
+
+_Said = TypeVar("_Said")
 
 _KEPT = 12  # scenes whose arrays stay in memory while photographs come: about a gigabyte
 
@@ -105,25 +111,66 @@ class Localizer:
         }
         self._used: list[str] = []
         self._eyes: dict[str, localizing.Eyes] = {}
-        self.index = self._index()
+        self.index = self._index(progress)
         specs = models.specs(store)
         method = family("extractor").get(self.params.extractor)
         self.extractor: Extractor = method.make(specs, self.params.extractors[self.params.extractor])
 
-    def _index(self) -> ViewIndex:
-        wanted = {key.digest: scene for scene, key in self.keys.items()}
-        found = {one.scene: one.summaries for one in self.store.view_features.list() if one.key in wanted}
-        found |= {scene: held.summaries for scene, held in self._held.items()}
-        ids = [scene for scene in sorted(found) if scene in self.scenes and found[scene].size]
-        if not ids:
-            return ViewIndex((), np.zeros((0, 0), np.int8), np.zeros(0, np.int64), np.zeros(0, np.int64))
-        counts = [len(found[scene]) for scene in ids]
-        return ViewIndex(
-            tuple(ids),
-            np.concatenate([found[scene] for scene in ids]),
-            np.repeat(np.arange(len(ids)), counts),
-            np.concatenate([np.arange(count) for count in counts]),
+    def _scene_index(self) -> SceneIndex:
+        """The index of the scenes that have features: a scene whose job was given up has none."""
+        kept = self.store.view_features.kept(self.keys.values())
+        return SceneIndex(
+            self.store,
+            localizing.index_recipe(),
+            {retrieve.index_recipe(self.settings.retrieve)},
+            {scene: key.digest for scene, key in self.keys.items() if key.digest in kept or scene in self._held},
+            self._segment,
         )
+
+    def _index(self, progress: StageProgress) -> ViewIndex:
+        """The index of all views, brought up to date; scenes that cannot be put in are put in memory."""
+        index = self._scene_index()
+        for left in reversed(range(PATIENCE)):
+            try:
+                if self.store.catalog.writable and not self._held:
+                    index.bring_up_to_date(lambda told: progress("localize", 0.0, f"{told} of views"))
+                kept = index.segments()
+                missing = index.missing(kept)
+                parts = [missing[start : start + AT_ONCE] for start in range(0, len(missing), AT_ONCE)]
+                return view_index([*kept, *(self._segment(part) for part in parts)])
+            except NotFoundError:  # another process made segments one while they were read
+                if not left:
+                    raise
+            except CorruptError:
+                if not (left and self.store.catalog.writable and index.forget_damaged()):
+                    raise
+        raise AssertionError("unreachable")
+
+    def _segment(self, scenes: Sequence[str]) -> InMemory:
+        found = []
+        for scene in scenes:
+            found.append((self.placed[scene].features, self.keys[scene].digest))
+            self.placed[scene].drop()
+        return new_segment(found, self.params.features.indexed)
+
+    def _asked(self, near: Near | None, ask: Callable[[ViewIndex], _Said]) -> _Said:
+        """What is said by the index; once more where others have changed it meanwhile, or it was damaged."""
+        try:
+            return ask(self.index if near is None else localizing_near(self, near))
+        except (NotFoundError, CorruptError) as error:
+            self.index = self._renewed(error)
+        return ask(self.index if near is None else localizing_near(self, near))
+
+    def _renewed(self, error: GsmapError) -> ViewIndex:
+        """The index as it is now, where that may help.
+
+        Raises:
+            GsmapError: the error, where it will not.
+        """
+        damaged = isinstance(error, CorruptError)
+        if damaged and not (self.store.catalog.writable and self._scene_index().forget_damaged()):
+            raise error
+        return self._index(lambda *told: None)
 
     def _gaussians(self, scene: str) -> Gaussians:
         self._use(scene)
@@ -153,15 +200,15 @@ class Localizer:
 
     def localize(self, photo: Photo, near: Near | None = None) -> Placement:
         """Find one photograph."""
-        index = self.index if near is None else localizing_near(self, near)
-        found = localizing.localize_photo(photo, index, self.placed, self.extractor, self.params, self.metres)
+        options = (self.placed, self.extractor, self.params, self.metres)
+        found = self._asked(near, lambda index: localizing.localize_photo(photo, index, *options))
         return _within(found, near)
 
     def localize_together(self, photos: Sequence[Photo], near: Near | None = None) -> list[Placement]:
         """Find photographs of one place that overlap."""
-        index = self.index if near is None else localizing_near(self, near)
-        options = (index, self.placed, self.extractor, self.params, self.metres)
-        return [_within(found, near) for found in localizing.localize_together(photos, *options)]
+        options = (self.placed, self.extractor, self.params, self.metres)
+        found = self._asked(near, lambda index: localizing.localize_together(photos, index, *options))
+        return [_within(one, near) for one in found]
 
 
 def _within(found: Placement, near: Near | None) -> Placement:
@@ -180,14 +227,12 @@ def _within(found: Placement, near: Near | None) -> Placement:
 
 def localizing_near(localizer: Localizer, near: Near) -> ViewIndex:
     """The views of scenes that reach to where photographs are thought to be from."""
-    from gsmap.localize.localizing import near as only
-
     metres = localizer.metres
     if near.scene is not None:
         if near.scene not in localizer.placed:
             raise NotFoundError(f"scene {near.scene[:12]} has no place in the map yet: run gsmap update first")
         around = localizer.placed[near.scene]
-        return only(localizer.index, {one for one in localizer.placed if _overlap(localizer, around, one)})
+        return localizer.index.only({one for one in localizer.placed if _overlap(localizer, around, one)})
     assert near.point is not None
     wanted = set()
     for scene, placed in localizer.placed.items():
@@ -197,7 +242,7 @@ def localizing_near(localizer: Localizer, near: Near) -> ViewIndex:
         low, high = np.asarray(localizer.scenes[scene].bounds)
         if np.linalg.norm(np.maximum(np.maximum(low - at, at - high), 0)) <= reach:
             wanted.add(scene)
-    return only(localizer.index, wanted)
+    return localizer.index.only(wanted)
 
 
 def _overlap(localizer: Localizer, around: PlacedFeatures, scene: str) -> bool:

@@ -1,0 +1,154 @@
+"""Lists of rows in a few segments that never change, only become one: how an index lies on a disk.
+
+A row is bytes of which the last four say whose it is: the place of its scene among the segment's members.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from gsmap.errors import CorruptError
+from gsmap.types.retrieval import IndexArrays, Member
+
+LEVEL = 16
+"""A segment holds from a power of this many scenes to the next; there is at most one of each size."""
+
+PLACE_BYTES = 4
+
+
+class Segment(Protocol):
+    """A part of an index, as it lies on a disk.
+
+    Args:
+        members: its scenes; None in the place of one that does not count (any more).
+        num_nodes: how many rows there are.
+    """
+
+    @property
+    def members(self) -> Sequence[Member | None]: ...
+    @property
+    def num_nodes(self) -> int: ...
+
+    def lists(self) -> tuple[np.ndarray, np.ndarray]:
+        """(W,) int64 rising keys of its lists, and (W + 1,) int64 where each begins in the rows."""
+        ...
+
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        """(stop - start, B) uint8."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class InMemory:
+    """A segment that lies in memory."""
+
+    members: Sequence[Member | None]
+    arrays: IndexArrays
+
+    @property
+    def num_nodes(self) -> int:
+        return len(self.arrays.nodes)
+
+    def lists(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.arrays.keys, self.arrays.starts
+
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        return self.arrays.nodes[start:stop]
+
+
+def in_lists(members: Sequence[Member | None], keys: np.ndarray, rows: np.ndarray) -> InMemory:
+    """A segment of rows (M, B) uint8, each in the list that its key (M,) names."""
+    order = np.argsort(keys, kind="stable")
+    names, counts = np.unique(keys, return_counts=True)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return InMemory(members, IndexArrays(names, starts, rows[order]))
+
+
+def places_of(rows: np.ndarray, num_members: int) -> np.ndarray:
+    """(M,) int32 the scene of each row among the members.
+
+    Raises:
+        CorruptError: a row of a scene that is not there.
+    """
+    places = np.ascontiguousarray(rows[:, -PLACE_BYTES:]).view("<i4")[:, 0]
+    if len(places) and not (places.min() >= 0 and places.max() < num_members):
+        raise CorruptError("an index has rows of scenes that it has not")
+    return places
+
+
+def write_places(rows: np.ndarray, places: np.ndarray | int) -> None:
+    """Say whose rows (M, B) uint8 are."""
+    held = np.broadcast_to(np.asarray(places, "<i4"), len(rows))
+    rows[:, -PLACE_BYTES:] = np.ascontiguousarray(held)[:, None].view(np.uint8)
+
+
+def merged(segments: Iterable[Segment]) -> InMemory:
+    """One segment of what counts in several."""
+    members: list[Member | None] = []
+    keys, parts = [], []
+    for segment in segments:
+        names, starts = lists_of(segment)
+        rows = np.array(segment.rows(0, int(starts[-1])))
+        count = len(segment.members)
+        new_place = np.full(count, -1, dtype=np.int64)
+        for place, member in enumerate(segment.members):
+            if member is not None:
+                new_place[place] = len(members)
+                members.append(member)
+        places = new_place[places_of(rows, count)]
+        write_places(rows, places)
+        keys.append(np.repeat(names, np.diff(starts))[places >= 0])
+        parts.append(rows[places >= 0])
+    return in_lists(members, np.concatenate(keys), np.concatenate(parts))
+
+
+def to_merge(sizes: Sequence[int], added: int) -> list[int]:
+    """Which segments a new one is to become one with, so that of each size there is one; by the scenes that count.
+
+    Args:
+        sizes: of the segments that there are.
+        added: scenes of the new one.
+
+    Returns:
+        Their places among ``sizes``.
+    """
+    chosen: list[int] = []
+    total = added
+    for place in sorted(range(len(sizes)), key=lambda k: sizes[k]):
+        if _level(sizes[place]) <= _level(total):
+            chosen.append(place)
+            total += sizes[place]
+    return sorted(chosen)
+
+
+def lists_of(segment: Segment) -> tuple[np.ndarray, np.ndarray]:
+    """`Segment.lists`, none of which leads outside of the rows.
+
+    Raises:
+        CorruptError: no segment has such.
+    """
+    keys, starts = segment.lists()
+    sound = (
+        keys.dtype == starts.dtype == np.int64
+        and keys.ndim == starts.ndim == 1
+        and len(starts) == len(keys) + 1
+        and starts[0] == 0
+        and starts[-1] == segment.num_nodes
+        and (np.diff(starts) >= 0).all()
+        and (np.diff(keys) > 0).all()
+    )
+    if not sound:
+        raise CorruptError("the lists of an index make no sense")
+    return keys, starts
+
+
+def _level(size: int) -> int:
+    level = 0
+    while size >= LEVEL:
+        size //= LEVEL
+        level += 1
+    return level
