@@ -121,8 +121,7 @@ def settle(
 
     aligned = None
     looks = look(scenes, pose, lens / 2, half.size_px, lifting)
-    scores = [aligning.agreement(half.rgb, one, laying.blur_px[0] / 2, laying) for one in looks]
-    best = int(np.argmax(scores))
+    best = _clearest(half, looks, patches, laying, params)
     for blur in laying.blur_px:
         one = looks[best] if aligned is None else look([scenes[best]], pose, lens / 2, half.size_px, lifting)[0]
         laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
@@ -155,6 +154,14 @@ def settle(
         patches.tried,
         look(scenes, pose, lens, picture.size_px, lifting),
     )
+
+
+def _clearest(half: Picture, looks: Sequence[Look], patches: _Patches, laying: aligning.Params, params: Params) -> int:
+    """Which look is to be laid over the photo: that with most patches; where there are none, which agrees most."""
+    counts = np.bincount(patches.scene, minlength=len(looks))
+    if counts.max() >= params.min_found:
+        return int(counts.argmax())
+    return int(np.argmax([aligning.agreement(half.rgb, one, laying.blur_px[0] / 2, laying) for one in looks]))
 
 
 def _between(

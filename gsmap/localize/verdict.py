@@ -25,7 +25,7 @@ class Params:
 
     min_probability: float = 0.95
     prior: float = 0.3
-    min_inliers: int = 12
+    min_inliers: int = 6
     max_rival: float = 0.2
     max_rotation_sigma_deg: float = 3.0
     max_translation_sigma_m: float = 0.25

@@ -20,7 +20,9 @@ GOOD = {
     "found_again": 0.4,
     "spread": 0.7,
     "explained": 0.9,
+    "explained_coarsely": 0.95,
     "contradicted": 0.02,
+    "contradicted_coarsely": 0.01,
     "compared": 3.2,
     "colour": 0.97,
     "seen": 1.0,
@@ -28,7 +30,7 @@ GOOD = {
     "sigma_m": -2.3,
 }
 BAD = GOOD | {"matches": 0.9, "inliers": 0.9, "found_again": 0.03, "spread": 0.1, "explained": 0.15}
-BAD |= {"contradicted": 0.6, "colour": 0.0, "sigma_m": -1.0}
+BAD |= {"explained_coarsely": 0.2, "contradicted": 0.6, "contradicted_coarsely": 0.5, "colour": 0.0, "sigma_m": -1.0}
 SURE = (0.003, 0.005)
 
 
@@ -43,7 +45,7 @@ def test_good_evidence_is_probable_and_bad_is_not() -> None:
 @pytest.mark.parametrize("name", GOOD)
 def test_every_piece_counts_in_one_direction(name: str) -> None:
     worth = np.diff(model().curves[name].worth)
-    falls = name in ("contradicted", "blocked", "sigma_m")
+    falls = name in ("contradicted", "contradicted_coarsely", "blocked", "sigma_m")
     assert (worth <= 1e-9).all() if falls else (worth >= -1e-9).all()
 
 
