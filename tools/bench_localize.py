@@ -188,7 +188,7 @@ def world(data: Path, work: Path, names: list[str]) -> World:
         print(f"{path.name}: {time.process_time() - began:.0f} CPU s in this process")
     began = time.process_time()
     localizer = Localizer(m.store, m.settings, logged(None))
-    print(f"{len(localizer.scenes)} scenes, {len(localizer.index)} views, {time.process_time() - began:.1f} CPU s here")
+    print(f"{len(localizer.scenes)} scenes, {time.process_time() - began:.1f} CPU s here")
     truth, ids = {}, {}
     for scene in localizer.scenes.values():
         told = json.loads((data / "truth" / f"{scene.name}.json").read_text())

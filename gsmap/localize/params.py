@@ -16,6 +16,7 @@ from gsmap.localize import (
     resection,
     retrieval,
     settling,
+    sighted,
     tracking,
     tying,
     verdict,
@@ -46,6 +47,7 @@ class Params:
         together: how photographs of one place help each other.
         clips: which frames of a clip are looked at.
         differences: when a placed photo shows something else than the map.
+        sighted: when a placed photo says that a thing is there, or gone.
         small: what a small map keeps.
         max_candidates: rough poses that are looked into.
         sure: once one is this probable, others are looked into only ...
@@ -69,6 +71,7 @@ class Params:
     together: tying.Params = field(default_factory=tying.Params)
     clips: clips.Params = field(default_factory=clips.Params)
     differences: differing.Params = field(default_factory=differing.Params)
+    sighted: sighted.Params = field(default_factory=sighted.Params)
     small: packing.Params = field(default_factory=packing.Params)
     max_candidates: int = 5
     sure: float = 0.97

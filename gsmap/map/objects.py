@@ -172,9 +172,8 @@ def known_objects(
     kept = store.photos.list() if graphs is None else []
     if kept:
         at = {scene: pose.S_map_scene for scene, pose in placed.poses.items()}
-        objects = with_photos(
-            objects, kept, scenes, at, metres, {scene: pose.component for scene, pose in placed.poses.items()}
-        )
+        components = {scene: pose.component for scene, pose in placed.poses.items()}
+        objects = with_photos(objects, kept, scenes, at, metres, components, settings.localize.sighted)
     progress("objects", 1.0, f"{len(objects)} objects")
     photos = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in kept}
     return Known(

@@ -86,7 +86,7 @@ class Teller:
         held = self._localizer
         poses = {scene: pose.S_map_scene for scene, pose in held.store.revisions.poses().items()}
         unit = held.metres.get(row.component, 1.0)
-        return things_in(told, row, unit, self.known.objects, self._graph, poses)
+        return things_in(told, row, unit, self.known.objects, self._graph, poses, held.params.sighted)
 
     def _graph(self, scene: str) -> SceneGraph | None:
         if scene not in self._graphs:

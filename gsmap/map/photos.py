@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.transforms import transform_poses
-from gsmap.localize import Differences
+from gsmap.localize import Differences, sighted
 from gsmap.map.dates import parsed
 from gsmap.map.placed_photos import placed_photo
 from gsmap.store import Store
@@ -25,10 +25,6 @@ from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
 from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow, PhotoRow
 
 _SIDE_PX = 640  # of the picture that is kept: to be shown
-_ON_M = 0.12  # a surface so near to a thing's sample is the thing's
-_FEWEST, _LEAST = 8, 0.1  # samples, and share of them, that must be in sight to say anything of a thing
-_SEEN, _GONE = 0.6, 0.5  # share of what is in sight that agrees, or lies in a region that differs
-_SAME_PLACE_M = 0.15  # a thing that was spoken of stands so near to an object's box
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +101,7 @@ def things_in(
     objects: Sequence[MapObject],
     graph_of: Callable[[str], SceneGraph | None],
     poses: Mapping[str, Sim3],
+    params: sighted.Params,
 ) -> list[ThingInPhoto]:
     """What a placed photo says of the objects of its component: those it shows, and those it shows to be gone.
 
@@ -133,14 +130,16 @@ def things_in(
         rows = np.flatnonzero(in_image(pixels, depth, np.array([width, height])))
         column, line = pixels[rows].astype(np.int64).T
         surface = told.found.points[line, column]
-        on = np.linalg.norm(surface - points[rows] * unit, axis=1) < _ON_M  # NaN where nothing was compared: not on
+        on = (
+            np.linalg.norm(surface - points[rows] * unit, axis=1) < params.on_m
+        )  # NaN where nothing was compared: not on
         column, line = column[on], line[on]
         share = len(column) / len(points)
-        if len(column) < _FEWEST or share < _LEAST:
+        if len(column) < params.min_samples or share < params.min_share:
             continue
-        if gone[line, column].mean() >= _GONE:
+        if gone[line, column].mean() >= params.gone:
             out.append(ThingInPhoto(thing.position, "absent", share))
-        elif (told.found.agrees & ~hidden)[line, column].mean() >= _SEEN:
+        elif (told.found.agrees & ~hidden)[line, column].mean() >= params.seen:
             out.append(ThingInPhoto(thing.position, "seen", share))
     return out
 
@@ -167,6 +166,7 @@ def with_photos(
     poses: Mapping[str, Sim3],
     metres: Mapping[int, float],
     components: Mapping[str, int],
+    params: sighted.Params,
 ) -> list[MapObject]:
     """Objects with what kept photographs say of them, among the captures in the order of dates.
 
@@ -184,7 +184,7 @@ def with_photos(
         component = components[one.scene]
         for thing in one.things:
             at = poses[one.scene].apply(thing.position)
-            number = _at(objects, component, at, _SAME_PLACE_M / metres[component])
+            number = _at(objects, component, at, params.same_place_m / metres[component])
             if number is not None:
                 sighting = Sighting(one.digest, thing.state, -1, None, thing.share)
                 said.setdefault(number, {}).setdefault(one.digest, sighting)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsmap.localize import Differences, Region
+from gsmap.localize import Differences, Region, sighted
 from gsmap.map.objects import Known, history_report, objects_report
 from gsmap.map.photos import things_in, with_photos
 from gsmap.objects import permanence
@@ -60,12 +60,18 @@ def seen(scene: str, at=(0.0, 0.0, DEPTH)) -> Sighting:
     return Sighting(scene, "seen", 0, np.array([np.array(at) - 0.25, np.array(at) + 0.25]))
 
 
-def said(found: Differences, samples: np.ndarray) -> list[ThingInPhoto]:
+def said(found: Differences, samples: np.ndarray, params: sighted.Params | None = None) -> list[ThingInPhoto]:
+    params = params or sighted.Params()
     things = OneThing(samples, np.array([len(samples)]))
     row = SimpleNamespace(T_map_camera=np.eye(4), intrinsics_px=LENS, component=0)
     graph = SimpleNamespace(things=things)
     poses = {"a": Sim3.identity()}
-    return things_in(SimpleNamespace(found=found), row, 1.0, [an_object(seen("a"))], lambda scene: graph, poses)
+    return things_in(SimpleNamespace(found=found), row, 1.0, [an_object(seen("a"))], lambda scene: graph, poses, params)
+
+
+def test_how_much_must_be_in_sight_is_a_setting():
+    assert not said(Sketch().found(), Sketch().thing(), sighted.Params(min_samples=10_000))
+    assert not said(Sketch().found(), Sketch().thing(), sighted.Params(seen=1.1))
 
 
 def test_a_thing_that_the_photo_shows_is_seen():
@@ -105,7 +111,7 @@ SCENES = {"a": scene("a", "2026-01-01T00:00:00+00:00"), "b": scene("b", "2026-06
 def known(*photos: StoredPhoto, S: Sim3 | None = None) -> Known:
     thing = an_object(seen("a"), seen("b"))
     at = {"a": S or Sim3.identity(), "b": Sim3.identity()}
-    objects = with_photos([thing], photos, SCENES, at, {0: 1.0}, {"a": 0, "b": 0})
+    objects = with_photos([thing], photos, SCENES, at, {0: 1.0}, {"a": 0, "b": 0}, sighted.Params())
     names = {one.sighting.digest: (one.sighting.name, one.sighting.captured_at) for one in photos}
     return Known(objects, SCENES, (), {0: 1.0}, names)
 
