@@ -6,6 +6,7 @@
     python tools/bench_localize.py DATA WORK --perturb       # exposure, resolution, focal length, people
     python tools/bench_localize.py DATA WORK --elsewhere     # photographs of other places: none may be placed
     python tools/bench_localize.py DATA WORK --beside        # and retrieval alone, and SIFT + PnP on photographs
+    python tools/bench_localize.py DATA WORK --started       # and what settles of poses 10 cm and 3 degrees off
     python tools/bench_localize.py DATA WORK --small 0.05    # and a small map in so much of the captures' bytes
     python tools/bench_localize.py DATA WORK --crowd 1000 --places PLACES    # and in a map of so many scenes
 
@@ -48,11 +49,16 @@ from PIL import Image
 import gsmap.map
 from gsmap.geometry.rotations import angle_between
 from gsmap.localize import index_recipe, localize_photo, new_segment, view_index
+from gsmap.localize.candidates import Candidate
+from gsmap.localize.features import Params as Features
 from gsmap.localize.features import lifted, quantised
-from gsmap.localize.localizing import photo_features, prepared
+from gsmap.localize.localizing import judged_pose, photo_features, prepared
+from gsmap.localize.looks import look
 from gsmap.localize.matching import Described, matched
 from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.resection import moved
 from gsmap.localize.retrieval import most_alike
+from gsmap.localize.settling import Picture
 from gsmap.localize.together import words_of
 from gsmap.localize.words import Words, words_for
 from gsmap.map.logs import logged
@@ -341,6 +347,48 @@ def _in_map(held: World, scene: str, T_scene_camera: np.ndarray) -> np.ndarray:
     return out
 
 
+class Started:
+    """What settles of a pose 10 cm and 3 degrees off the true one, whatever is then said of it."""
+
+    def __init__(self, held: World, shots: list[Shot]) -> None:
+        self.held, self.shots, self.rng = held, {shot.photo.name: shot for shot in shots}, np.random.default_rng(0)
+
+    def localize(self, photo: Photo, allowed: set[str]) -> tuple[Placement, float]:
+        shot, localizer = self.shots[photo.name], self.held.localizer
+        begin = time.process_time()
+        picture, scale = prepared(photo, localizer.params)
+        covers = {scene: self._covered(shot, scene, picture) for scene in allowed}
+        scenes = sorted(allowed, key=lambda scene: -covers[scene])[:3]
+        component = localizer.placed[scenes[0]].component
+        unit = localizer.metres.get(component, 1.0)
+        pose = self._metric(shot, scenes[0])
+        turn, shift = self.rng.normal(size=(2, 3))
+        xi = np.r_[np.radians(3) * turn / np.linalg.norm(turn), 0.1 * shift / np.linalg.norm(shift)]
+        start = Candidate(component, moved(pose, xi), picture.intrinsics_px, 0, tuple(scenes))
+        found = judged_pose(picture, start, localizer.placed, localizer.params)
+        seconds = time.process_time() - begin
+        if found.covariance is None:
+            return Placement(photo.name, "nothing was found again"), seconds
+        answer = found.settled.T_metric_camera.copy()
+        answer[:3, 3] /= unit
+        side = np.r_[np.ones(3), np.full(3, 1 / unit)]
+        known = found.covariance * np.outer(side, side)
+        return Placement(
+            photo.name, "", answer, known, component, tuple(scenes), picture.intrinsics_px / scale
+        ), seconds
+
+    def _metric(self, shot: Shot, scene: str) -> np.ndarray:
+        out = self.held.truth(shot, scene)
+        out[:3, 3] *= self.held.localizer.metres.get(self.held.localizer.placed[scene].component, 1.0)
+        return out
+
+    def _covered(self, shot: Shot, scene: str, picture: Picture) -> float:
+        small = (picture.size_px[0] // 4, picture.size_px[1] // 4)
+        placed = [self.held.localizer.placed[scene]]
+        looks = look(placed, self._metric(shot, scene), picture.intrinsics_px / 4, small, Features())
+        return float((looks[0].alpha > 0.9).mean())
+
+
 class PosedPhotos:
     """The captures' own photographs: features, lifted to the map (metres) by the depth of the capture's splat."""
 
@@ -483,6 +531,7 @@ def main() -> int:
     parser.add_argument("--perturb", action="store_true")
     parser.add_argument("--elsewhere", action="store_true")
     parser.add_argument("--beside", action="store_true")
+    parser.add_argument("--started", action="store_true")
     parser.add_argument("--small", type=float, metavar="SHARE")
     parser.add_argument("--crowd", type=int, metavar="SCENES")
     parser.add_argument("--places", type=Path, help="that the crowd is made of")
@@ -509,6 +558,13 @@ def main() -> int:
     for name, change in PERTURBED.items() if args.perturb else [("as it is", PERTURBED["as it is"])]:
         say(name, measure(held, shots, change, args.v), deg, metres)
     as_is = PERTURBED["as it is"]
+    if args.started:
+        say(
+            "from 10 cm and 3 degrees off",
+            measure(held, shots, as_is, args.v, Started(held, shots).localize),
+            deg,
+            metres,
+        )
     if args.beside:
         say("retrieval alone", measure(held, shots, as_is, args.v, retrieval_alone(held)), deg, metres)
         say("SIFT + PnP on photographs", measure(held, shots, as_is, args.v, PosedPhotos(data, held)), deg, metres)

@@ -3,6 +3,7 @@
     python tools/make_localize_places.py PLACES --set fit && python tools/make_localize_places.py PLACES --set test
     python tools/fit_localize.py PLACES words --cache FOLDER     # writes gsmap/localize/words.npz
     python tools/fit_localize.py PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
+    python tools/fit_localize.py PLACES sigma --cache FOLDER     # says which `localize.covariance` fits best
     python tools/fit_localize.py PLACES test --cache FOLDER      # says how both do on places that they have not seen
 
 Everything comes from made places (`gsmap_synthetic`).
@@ -25,7 +26,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ from scipy.optimize import minimize
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.rotations import log_so3
 from gsmap.ingest import read_captures
-from gsmap.localize import features, localizing, probability, words
+from gsmap.localize import features, localizing, probability, settling, words
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
@@ -364,11 +365,60 @@ def report(name: str, rows: list[Row], odds: np.ndarray) -> None:
         those = (p >= low) & (p < high)
         if those.any():
             print(f"  said {low:.2f} to {min(high, 1):.2f}: {those.sum():5d} poses, {right[those].mean():.3f} right")
+    found_again = np.array([10 ** row.evidence["inliers"] - 1 for row in rows])
+    for low, high in ((0, 5.5), (5.5, 11.5), (11.5, np.inf)):
+        sure = (found_again > low) & (found_again < high) & (p >= 0.95)
+        print(f"  {low:.0f} to {high:.0f} patches: {(sure & right).sum()} right, {(sure & ~right).sum()} wrong at .95")
     good = [row for row, q in zip(rows, p, strict=True) if row.right and q > 0.9 and np.isfinite(row.nees)]
     if good:
         nees = np.array([row.nees for row in good])
         told = f"median {np.median(nees):.1f} (expected 5.3), 90th {np.quantile(nees, 0.9):.1f} (expected 10.6)"
         print(f"  NEES of {len(nees)}: {told}; error {np.median([row.error for row in good], axis=0)}")
+
+
+# --- sigma -----------------------------------------------------------------------------------------------------------
+
+
+def fit_sigma(found: list[Place], params: Params) -> None:
+    """By how much residuals are too sure, and what leaves none: the likeliest of a grid.
+
+    Started near the truth, so that all poses are right; every sixth photo. Likelihoods are of Student's t of 8 degrees
+    of freedom, since a few photos are placed on a part of a map that is bent.
+    """
+    plain_sigma = replace(params.covariance, swell=1.0, swell_aligned=1.0, hidden_m=0.0, hidden_rad=0.0)
+    params = replace(params, covariance=plain_sigma)
+    told: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # error, what patches and what colours tell
+    rng, between = np.random.default_rng(7), settling._between
+
+    for place in found:
+        own = {scene.scene: scene for scene in place.scenes}
+        for photo_told in place.photos[::6]:
+            photo, truth = place.photo(photo_told), np.array(photo_told["T_world_camera"])
+            picture, _ = localizing.prepared(photo, params)
+            both: list[tuple[np.ndarray, np.ndarray]] = []
+            settling._between = lambda *args, both=both: (both.append((args[4], args[2])), between(*args))[1]
+            xi = np.r_[rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.05]
+            start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
+            judged = localizing.judged_pose(picture, start, own, params)
+            if both and judged.probability > 0.9:
+                T = judged.settled.T_metric_camera
+                error = np.r_[log_so3(T[:3, :3].T @ truth[:3, :3]), T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])]
+                told.append((error, *both[0]))
+    settling._between = between
+    tried = []
+    for patches, aligned in product((1.5, 2.1, 2.6), (1.5, 2.6, 3.7, 4.7)):
+        for hidden_m, hidden_rad in product((0.002, 0.004, 0.007, 0.01), (0.0005, 0.001, 0.002)):
+            nees, likely = [], []
+            for error, by_patches, by_colours in told:
+                parts = by_patches * patches**2, by_colours * aligned**2
+                known = 2 * np.linalg.inv(sum(np.linalg.inv(part) for part in parts))
+                known += np.diag(np.r_[np.full(3, hidden_rad), np.full(3, hidden_m)] ** 2)
+                nees.append(error @ np.linalg.solve(known, error))
+                likely.append(-0.5 * np.linalg.slogdet(known)[1] - 7 * np.log1p(nees[-1] / 8))
+            tried.append((np.mean(likely), patches, aligned, hidden_m, hidden_rad, *np.quantile(nees, (0.5, 0.9))))
+    for likely_, patches, aligned, hidden_m, hidden_rad, middle, most in sorted(tried, reverse=True)[:8]:
+        settings = f"swell {patches}, swell_aligned {aligned}, hidden_m {hidden_m}, hidden_rad {hidden_rad}"
+        print(f"likelihood {likely_:.2f}: {settings}; NEES {middle:.1f}, 90th {most:.1f}")
 
 
 def save(model: Odds) -> None:
@@ -387,12 +437,15 @@ def save(model: Odds) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
-    parser.add_argument("what", choices=("words", "verdict", "test"))
+    parser.add_argument("what", choices=("words", "sigma", "verdict", "test"))
     parser.add_argument("--cache", type=Path, required=True)
     args = parser.parse_args()
     params = Params()
     if args.what == "words":
         fit_words(places(args.places, "fit", args.cache, params), params)
+        return 0
+    if args.what == "sigma":
+        fit_sigma(places(args.places, "fit", args.cache, params), params)
         return 0
     split = "fit" if args.what == "verdict" else "test"
     kept = args.cache / f"judged-{split}.pickle"
