@@ -48,6 +48,7 @@ from PIL import Image
 
 import gsmap.map
 from gsmap.geometry.rotations import angle_between
+from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import index_recipe, localize_photo, new_segment, view_index
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.features import Params as Features
@@ -485,7 +486,7 @@ def measure(
             unit = held.localizer.metres.get(found.component, 1.0)
             row["m"] = float(np.linalg.norm(pose[:3, 3] - truth[:3, 3]) * unit)
             known = found.covariance
-            xi = np.r_[_log(turn), pose[:3, :3].T @ (truth[:3, 3] - pose[:3, 3])]
+            xi = np.r_[rotation_vectors(turn)[0], pose[:3, :3].T @ (truth[:3, 3] - pose[:3, 3])]
             row["nees"] = np.nan if known is None else float(xi @ np.linalg.solve(known, xi))
         rows.append(row)
         if verbose:
@@ -496,12 +497,6 @@ def measure(
             )
             print(f"  {row['name']} covered {shot.coverage:.0%}: {told} ({seconds:.2f} CPU s)", flush=True)
     return rows
-
-
-def _log(rotation: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_rotvec()
 
 
 def say(name: str, rows: list[dict], deg: float, metres: float) -> None:

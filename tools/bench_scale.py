@@ -26,15 +26,14 @@ import json
 import resource
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 from scale_maps import Filled, Pattern, filled, pattern
+from spent import Spent, spent
 
 from gsmap.cli import COLLECT_AFTER
 from gsmap.export import plan_tiles
@@ -83,10 +82,12 @@ def measured(one: Filled, made: Pattern, options: argparse.Namespace) -> dict[st
         m.update()
     row |= {f"no-op {name}": value for name, value in count.items()}
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with counted(one) as count, parts() as spent:
+    with counted(one) as count, parts() as steps:
         one.add()
         m.update()
-    row |= {f"update {name}": value for name, value in count.items()} | {f"  {k}": v for k, v in spent.items()}
+    row |= {f"update {name}": value for name, value in count.items()} | {
+        f"  {part} CPU s": seconds for part, seconds in steps.seconds.items()
+    }
     row["update memory MB"] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     scene = m.scenes()[-1].name
     looks: dict[str, Callable[[], Any]] = {
@@ -130,28 +131,10 @@ def counted(one: Filled) -> Iterator[dict[str, float]]:
     out |= {"SQL": counts["sql"], "graphs": counts["graphs"]}
 
 
-@contextmanager
-def parts() -> Iterator[dict[str, float]]:
+def parts() -> AbstractContextManager[Spent]:
     """CPU seconds of the steps of an update, each without those inside it."""
     from gsmap.map import reports
     from gsmap.map.stages import describe, optimize, register
-
-    spent: Counter[str] = Counter()
-    open_parts: list[float] = []
-
-    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def inside(*args: Any, **kwargs: Any) -> Any:
-            start = time.process_time()
-            open_parts.append(0.0)
-            try:
-                return function(*args, **kwargs)
-            finally:
-                took = time.process_time() - start
-                spent[f"{name} CPU s"] += took - open_parts.pop()
-                if open_parts:
-                    open_parts[-1] += took
-
-        return inside
 
     steps = [
         ("describe", describe, "describe"),
@@ -163,14 +146,7 @@ def parts() -> Iterator[dict[str, float]]:
         ("poses: save and load", optimize, "_optimize"),
         ("report", reports, "update_report"),
     ]
-    patches = [mock.patch.object(where, name, timed(part, getattr(where, name))) for part, where, name in steps]
-    for patch in patches:
-        patch.start()
-    try:
-        yield spent
-    finally:
-        for patch in patches:
-            patch.stop()
+    return spent(steps)
 
 
 def table(scenes: Sequence[int], rows: Sequence[dict[str, float]]) -> None:

@@ -36,16 +36,14 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
-from sqlalchemy import event
+from spent import spent, statements
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
@@ -149,7 +147,7 @@ def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, 
     """Number, walk, capture, its true ``S_street_scene``, and the CPU seconds that making it took, from a number on."""
     number, piece = 0, 0
     while True:
-        mine, place, spent = walks(piece, args.seed), None, time.process_time()
+        mine, place, since = walks(piece, args.seed), None, time.process_time()
         for i, walk in enumerate(mine):
             if number >= start:
                 if place is None:
@@ -166,14 +164,26 @@ def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, 
                     place=place,
                 )
                 ahead = Sim3(np.eye(3), [piece * COLUMNS * _PITCH_M[0], 0.0, 0.0])
-                took, spent = time.process_time() - spent, time.process_time()
+                took, since = time.process_time() - since, time.process_time()
                 yield number, walk, made[0], ahead @ Sim3.from_matrix(made[0].T_scene_world).inverse(), took
-                spent = time.process_time()
+                since = time.process_time()
             number += 1
         piece += 1
 
 
 # --- one capture after the other ------------------------------------------------------------------------------------
+
+PARTS = [
+    ("describing", describe, "describe_scene"),
+    ("pairs", register, "register_scenes"),
+    ("looking up", register, "ask"),
+    ("solving", optimize.solver, "optimize"),
+    ("keeping still", optimize.solver, "kept_still"),
+    ("naming poses", optimize, "pose_basis"),
+    ("reading edges", optimize, "pose_inputs"),
+    ("report", reports, "update_report"),
+    ("loading graphs", Graphs, "load"),
+]
 
 
 def grow(args: argparse.Namespace) -> None:
@@ -186,11 +196,12 @@ def grow(args: argparse.Namespace) -> None:
             start = time.process_time()
             m.ingest(capture.gaussians, cameras=capture.cameras, name=f"walk-{number:04d}")
             row["ingest"] = time.process_time() - start
-            with counted(m) as counts:
+            with spent(PARTS) as parts, statements(m.store.catalog.engine) as counts:
                 start = time.process_time()
                 m.update()
                 row["update"] = time.process_time() - start
-            row |= counts
+            row |= parts.seconds | {f"{part}, times": times for part, times in parts.times.items()}
+            row["SQL"] = counts["sql"]
             row["peak MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             print(json.dumps(row), file=file, flush=True)
             if (number + 1) % 25 == 0:
@@ -201,52 +212,6 @@ def measured(folder: Path) -> list[dict[str, Any]]:
     """What was kept of each capture, in their order."""
     path = folder / "rows.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-@contextmanager
-def counted(m: gsmap.map.Map) -> Iterator[Counter[str]]:
-    """CPU seconds of the parts of an update, SQL statements, graphs loaded and pairs tried while this is open."""
-    counts: Counter[str] = Counter({"SQL": 0, "graphs": 0})
-    open_parts: list[float] = []
-
-    def counting(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def inside(*args: Any, **kwargs: Any) -> Any:
-            start = time.process_time()
-            open_parts.append(0.0)
-            try:
-                return function(*args, **kwargs)
-            finally:
-                took = time.process_time() - start
-                counts[what] += took - open_parts.pop()
-                counts[f"{what}, times"] += 1
-                if open_parts:
-                    open_parts[-1] += took
-
-        return inside
-
-    def executed(*_: Any) -> None:
-        counts["SQL"] += 1
-
-    steps = [
-        ("describing", describe, "describe_scene"),
-        ("pairs", register, "register_scenes"),
-        ("looking up", register, "ask"),
-        ("solving", optimize.solver, "optimize"),
-        ("keeping still", optimize.solver, "kept_still"),
-        ("naming poses", optimize, "pose_basis"),
-        ("reading edges", optimize, "pose_inputs"),
-        ("report", reports, "update_report"),
-        ("loading graphs", Graphs, "load"),
-    ]
-    event.listen(m.store.catalog.engine, "before_cursor_execute", executed)
-    try:
-        with ExitStack() as stack:
-            for name, where, function in steps:
-                patched = counting(name, getattr(where, function))
-                stack.enter_context(mock.patch.object(where, function, patched))
-            yield counts
-    finally:
-        event.remove(m.store.catalog.engine, "before_cursor_execute", executed)
 
 
 def print_costs(rows: list[dict[str, Any]]) -> None:

@@ -34,7 +34,7 @@ from PIL import Image
 from scipy.optimize import minimize
 
 from gsmap.compare.odds import Curve, Odds
-from gsmap.geometry.rotations import log_so3
+from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
 from gsmap.localize import features, localizing, probability, settling, words
 from gsmap.localize.candidates import Candidate
@@ -271,7 +271,7 @@ def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], f
     if kind == "elsewhere":
         return (180.0, np.inf), np.nan
     T = judged.settled.T_metric_camera
-    turn = log_so3(T[:3, :3].T @ truth[:3, :3])
+    turn = rotation_vectors(T[:3, :3].T @ truth[:3, :3])[0]
     shift = T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])
     error = float(np.degrees(np.linalg.norm(turn))), float(np.linalg.norm(shift))
     if judged.covariance is None:
@@ -402,7 +402,7 @@ def fit_sigma(found: list[Place], params: Params) -> None:
             judged = localizing.judged_pose(picture, start, own, params)
             if both and judged.probability > 0.9:
                 T = judged.settled.T_metric_camera
-                error = np.r_[log_so3(T[:3, :3].T @ truth[:3, :3]), T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])]
+                error = np.r_[rotation_vectors(T[:3, :3].T @ truth[:3, :3])[0], T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])]
                 told.append((error, *both[0]))
     settling._between = between
     tried = []

@@ -19,7 +19,8 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from sqlalchemy import event, insert, select
+from spent import spent, statements
+from sqlalchemy import insert, select
 
 import gsmap.map
 from gsmap.geometry.rotations import exp_so3
@@ -209,22 +210,11 @@ class Filled:
     @contextmanager
     def counting(self) -> Iterator[Counter[str]]:
         """SQL statements, and graphs that are loaded, while this is open."""
-        counts: Counter[str] = Counter()
-        engine, load = self.map.store.catalog.engine, Graphs.load
-
-        def executed(*_: Any) -> None:
-            counts["sql"] += 1
-
-        def loaded(*args: Any, **kwargs: Any) -> Any:
-            counts["graphs"] += 1
-            return load(*args, **kwargs)
-
-        event.listen(engine, "before_cursor_execute", executed)
-        try:
-            with mock.patch.object(Graphs, "load", loaded):
+        with statements(self.map.store.catalog.engine) as counts, spent([("graphs", Graphs, "load")]) as loaded:
+            try:
                 yield counts
-        finally:
-            event.remove(engine, "before_cursor_execute", executed)
+            finally:
+                counts["graphs"] = loaded.times["graphs"]
 
     def _describe(self, job: Any, arguments: Any, *_: Any) -> Iterator[tuple[int, SceneGraph]]:
         for i, (_, scene, *_rest) in enumerate(arguments):

@@ -63,5 +63,5 @@ def cell_means(
         share = np.ones(len(points)) if weights is None else weights
         total = np.maximum(np.bincount(labels, share, len(counts)), 1e-300)
         both = np.concatenate([points, values], axis=1) * share[:, None]
-        mean = np.stack([np.bincount(labels, column, len(counts)) for column in both.T], axis=1) / total[:, None]
+        mean = group_means(both, labels, total)
         return mean[:, :3], mean[:, 3:], total

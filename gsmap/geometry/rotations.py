@@ -77,14 +77,6 @@ def exp_so3(omega: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def log_so3(rotation: np.ndarray) -> np.ndarray:
-    """(3,) rotation vector, radians, of a matrix (3, 3): what `exp_so3` takes."""
-    from scipy.spatial.transform import Rotation
-
-    out: np.ndarray = Rotation.from_matrix(rotation).as_rotvec()
-    return out
-
-
 def retract(pose: Sim3, xi: np.ndarray) -> Sim3:
     """``pose * Exp(xi)`` with xi = [rot_rad (3), trans (3), log_scale], first order in the coupling of the three.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ class Params:
         trust: pixels count by so high a power of how well their surroundings agree: what a splat shows blurred or
             wrongly counts for little.
         least_trust: that correlation, where they do not agree at all.
+        max_gain: a render may have so many times the photo's contrast, or the photo the render's, and no more.
         doubt: residuals count less from about here on, in standard deviations (from their median) of all of them.
         iterations: of each round.
         max_bend: where the inverse of the depth bends by a larger share, the surface has an edge.
@@ -38,6 +40,7 @@ class Params:
     around_px: float = 12.0
     trust: float = 2.0
     least_trust: float = 0.03
+    max_gain: float = 2.5
     doubt: float = 2.0
     iterations: int = 10
     max_bend: float = 0.03
@@ -68,10 +71,10 @@ class Aligned:
     jacobian: np.ndarray
 
 
-def agreement(rgb: np.ndarray, one: Look, blur_px: float, params: Params) -> float:
-    """How many pixels of a render look like a photo's where they lie: the sum of what each is trusted."""
+def agreements(rgb: np.ndarray, looks: Sequence[Look], blur_px: float, params: Params) -> np.ndarray:
+    """(L,) how many pixels of each render look like a photo's where they lie: the sum of what each is trusted."""
     photo = _band(rgb, None, blur_px, params.band)
-    return float(_pixels(photo, one, blur_px, params)[3].sum())
+    return np.array([_pixels(photo, one, blur_px, params)[3].sum() for one in looks])
 
 
 def align(
@@ -114,7 +117,7 @@ def align(
         return _State(pose, lens, pixels, _sampled(planes, pixels), trust * inside, jacobian)
 
     state = at(T_metric_camera, intrinsics_px)
-    gain = _gain(state.seen, shown, state.trust[:, None])
+    gain = _gain(state.seen, shown, state.trust[:, None], params.max_gain)
     left = np.abs(state.seen[:, :3] - gain * shown)[state.trust > 0]
     if len(left) < params.min_points:
         return nothing
@@ -140,7 +143,7 @@ def align(
         else:
             break
         state, damping = tried, max(damping / 10, 1e-6)
-        gain = _gain(state.seen, shown, _linear(state, shown, slope, gain, scale)[1])
+        gain = _gain(state.seen, shown, _linear(state, shown, slope, gain, scale)[1], params.max_gain)
         if np.abs(step[:3]).max() < 2e-5 and np.abs(step[3:6]).max() < 5e-5:
             break
     # Slopes of the render alone: the photo's noise has slopes as well, which would pass for information.
@@ -254,7 +257,7 @@ def _sampled(planes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return out
 
 
-def _gain(seen: np.ndarray, shown: np.ndarray, weights: np.ndarray) -> float:
+def _gain(seen: np.ndarray, shown: np.ndarray, weights: np.ndarray, most: float) -> float:
     """By what the render's band is multiplied to be the photo's."""
     gain = (weights * seen[:, :3] * shown).sum() / max(float((weights * shown**2).sum()), 1e-9)
-    return float(np.clip(gain, 0.4, 2.5))
+    return float(np.clip(gain, 1 / most, most))

@@ -40,22 +40,20 @@ def pose_covariance(
     pixels: np.ndarray,
     size_px: tuple[int, int],
     params: Params,
-    *,
-    focal_sigma: float = 0.0,
 ) -> np.ndarray:
-    """(6, 6) over [rot_rad, trans] on the camera's side, in the unit of the points, of one photograph's adjustment.
-
-    Args:
-        pixels: (K, 2) of the patches.
-        focal_sigma: as in `Photo`; where the focal length was solved for, what that costs the pose is in.
-    """
-    return with_hidden(of_patches(fit, pixels, size_px, params, focal_sigma)[:6, :6], params)
+    """(6, 6) over [rot_rad, trans] on the camera's side, in the unit of the points, of one photograph's adjustment to
+    patches at pixels (K, 2), whose focal length is known."""
+    return with_hidden(of_patches(fit, pixels, size_px, params, 0.0), params)
 
 
 def of_patches(
     fit: resection.Refined, pixels: np.ndarray, size_px: tuple[int, int], params: Params, focal_sigma: float
 ) -> np.ndarray:
-    """(dim, dim) of what the residuals of patches tell alone."""
+    """(dim, dim) of what the residuals of patches tell alone.
+
+    Args:
+        focal_sigma: as in `Photo`; what a focal length that was solved for costs the pose is in.
+    """
     least = (params.least_px * max(size_px) / 480) ** 2
     weights = np.repeat(fit.weights[:, None], 2, axis=1)
     prior = 1 / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from gsmap.localize.looks import Look
+from gsmap.localize.looks import Look, smaller
 
 
 @dataclass(frozen=True)
@@ -105,20 +105,7 @@ def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Compariso
 def compare_coarsely(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Comparison:
     """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
     fewer = replace(params, step_px=params.half_px // 2)
-    return compare(_smaller(rgb, params.coarse), [_smaller_look(one, params.coarse) for one in looks], fewer)
-
-
-def _smaller_look(one: Look, by: int) -> Look:
-    rgb, alpha, depth = (_smaller(image, by) for image in (one.rgb, one.alpha, one.depth_m))
-    return replace(one, rgb=rgb, grey=_smaller(one.grey, by), alpha=alpha, depth_m=depth, sound=alpha > 0)
-
-
-def _smaller(image: np.ndarray, by: int) -> np.ndarray:
-    """(H // by, W // by, ...) means of blocks."""
-    height, width = (n // by for n in image.shape[:2])
-    blocks = image[: height * by, : width * by].reshape(height, by, width, by, *image.shape[2:])
-    out: np.ndarray = blocks.mean((1, 3), dtype=np.float32)
-    return out
+    return compare(smaller(rgb, params.coarse), [one.smaller(params.coarse) for one in looks], fewer)
 
 
 def _patches(rgb: np.ndarray, params: Params) -> np.ndarray:

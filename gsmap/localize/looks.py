@@ -14,6 +14,14 @@ from gsmap.render import render
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601
 
 
+def smaller(image: np.ndarray, by: int) -> np.ndarray:
+    """(H // by, W // by, ...) float32 means of blocks of an image (H, W, ...)."""
+    height, width = (n // by for n in image.shape[:2])
+    blocks = image[: height * by, : width * by].reshape(height, by, width, by, *image.shape[2:])
+    out: np.ndarray = blocks.mean((1, 3), dtype=np.float32)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Look:
     """A render of one scene through a camera of the map.
@@ -33,6 +41,12 @@ class Look:
     alpha: np.ndarray
     depth_m: np.ndarray
     sound: np.ndarray
+
+    def smaller(self, by: int) -> Look:
+        """The same, so many times smaller; sound is what is not wholly empty."""
+        alpha = smaller(self.alpha, by)
+        rgb, depth = smaller(self.rgb, by), smaller(self.depth_m, by)
+        return Look(self.scene, rgb, smaller(self.grey, by), alpha, depth, alpha > 0)
 
     def points(self, pixels: np.ndarray, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray) -> np.ndarray:
         """(K, 3) places in the map, in metres, of pixels (K, 2) of the render."""

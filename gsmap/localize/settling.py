@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.geometry.projection import project
-from gsmap.geometry.rotations import log_so3
+from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import aligning, covariance, evidence, features, resection, tracking
-from gsmap.localize.looks import GREY, Look, look
+from gsmap.localize.looks import GREY, Look, look, smaller
 from gsmap.localize.placed import PlacedFeatures
 
 
@@ -19,10 +19,11 @@ class Params:
     """How often the map is rendered, and how far patches are looked for.
 
     Args:
-        far_px: patches of the first renders are looked for so far away, at half the size of the picture.
-        near_px: ... and those of the last ones, at its full size; of a picture of 480 pixels both.
+        far_px: how far away patches of the first renders, which have half the size of the picture, are looked for; in
+            pixels of its full size.
+        near_px: ... and those of the last ones, which have its full size.
         max_scenes: that are rendered, those with most matches first.
-        min_found: patches; with fewer the pose stays as it was.
+        min_found: fewer patches say nothing of the pose.
     """
 
     far_px: int = 32
@@ -52,8 +53,7 @@ class Picture:
         return self.grey.shape[1], self.grey.shape[0]
 
     def halved(self) -> Picture:
-        height, width = (n // 2 * 2 for n in self.grey.shape)
-        rgb = self.rgb[:height, :width].reshape(height // 2, 2, width // 2, 2, 3).mean((1, 3))
+        rgb = smaller(self.rgb, 2)
         return Picture(rgb, rgb @ GREY, self.intrinsics_px / 2, self.focal_sigma)
 
 
@@ -119,11 +119,15 @@ def settle(
         rough = resection.refine(patches.pixels, patches.points, start, lens, poses, focal=free)
         pose, lens = rough.T_map_camera, rough.intrinsics_px
 
+    # The scene that is laid over it: that with most patches; where they are few, the one that agrees most.
+    counts = np.bincount(patches.scene, minlength=len(scenes))
+    if counts.max() < params.min_found:
+        looks = look(scenes, pose, lens / 2, half.size_px, lifting)
+        counts = aligning.agreements(half.rgb, looks, laying.blur_px[0] / 2, laying)
+    best = int(np.argmax(counts))
     aligned = None
-    looks = look(scenes, pose, lens / 2, half.size_px, lifting)
-    best = _clearest(half, looks, patches, laying, params)
     for blur in laying.blur_px:
-        one = looks[best] if aligned is None else look([scenes[best]], pose, lens / 2, half.size_px, lifting)[0]
+        (one,) = look([scenes[best]], pose, lens / 2, half.size_px, lifting)
         laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
         if len(laid.pixels):
             aligned, pose, lens = laid, laid.T_metric_camera, 2 * laid.intrinsics_px
@@ -156,14 +160,6 @@ def settle(
     )
 
 
-def _clearest(half: Picture, looks: Sequence[Look], patches: _Patches, laying: aligning.Params, params: Params) -> int:
-    """Which look is to be laid over the photo: that with most patches; where there are none, which agrees most."""
-    counts = np.bincount(patches.scene, minlength=len(looks))
-    if counts.max() >= params.min_found:
-        return int(counts.argmax())
-    return int(np.argmax([aligning.agreement(half.rgb, one, laying.blur_px[0] / 2, laying) for one in looks]))
-
-
 def _between(
     pose: np.ndarray, lens: np.ndarray, told: np.ndarray, fit: resection.Refined, by_patches: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -174,7 +170,7 @@ def _between(
     """
     dim = len(told)
     apart = np.linalg.inv(pose) @ fit.T_map_camera
-    xi = np.r_[log_so3(apart[:3, :3]), apart[:3, 3], np.log(fit.intrinsics_px[0] / lens[0])][:dim]
+    xi = np.r_[rotation_vectors(apart[:3, :3])[0], apart[:3, 3], np.log(fit.intrinsics_px[0] / lens[0])][:dim]
     mine, theirs = np.linalg.pinv(told, hermitian=True), np.linalg.pinv(by_patches, hermitian=True)
     both = np.linalg.pinv(mine + theirs, hermitian=True)
     step = both @ theirs @ xi

@@ -130,9 +130,8 @@ def things_in(
         rows = np.flatnonzero(in_image(pixels, depth, np.array([width, height])))
         column, line = pixels[rows].astype(np.int64).T
         surface = told.found.points[line, column]
-        on = (
-            np.linalg.norm(surface - points[rows] * unit, axis=1) < params.on_m
-        )  # NaN where nothing was compared: not on
+        far = np.linalg.norm(surface - points[rows] * unit, axis=1)  # NaN where nothing was compared
+        on = far < params.on_m
         column, line = column[on], line[on]
         share = len(column) / len(points)
         if len(column) < params.min_samples or share < params.min_share:

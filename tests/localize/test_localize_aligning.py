@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from gsmap.geometry.rotations import angle_between, exp_so3
-from gsmap.localize import aligning, covariance
+from gsmap.localize import aligning, covariance, evidence, resection, settling
 from gsmap.localize.looks import GREY, Look
 
 SIZE = (240, 180)
@@ -120,4 +120,35 @@ def test_where_little_is_known_the_pose_stays_as_it_was():
     laid = aligning.align(_seen(TRUE)[0], bare, START, LENS, 4.0, PARAMS)
     assert not len(laid.pixels)
     assert np.array_equal(laid.T_metric_camera, START)
-    assert aligning.agreement(_seen(TRUE)[0], look, 4.0, PARAMS) > aligning.agreement(_seen(TRUE)[0], bare, 4.0, PARAMS)
+    known, unknown = aligning.agreements(_seen(TRUE)[0], [look, bare], 4.0, PARAMS)
+    assert known > unknown
+
+
+@pytest.mark.parametrize(("mine", "theirs", "share"), [(1.0, 1.0, 0.5), (1.0, 9.0, 0.1), (9.0, 1.0, 0.9)])
+def test_two_poses_become_one_by_what_is_known_of_each(mine, theirs, share):
+    other = resection.moved(TRUE, np.array([0.01, -0.02, 0.005, 0.03, 0.01, -0.02]))
+    none = np.zeros((0, 2))
+    fit = resection.Refined(other, LENS, none, none[:, 0], np.zeros((0, 2, 6)))
+    sigmas = np.diag([0.01**2] * 3 + [0.02**2] * 3)
+    pose, lens, told = settling._between(TRUE, LENS, mine * sigmas, fit, theirs * sigmas)
+    between = TRUE[:3, 3] + share * (other[:3, 3] - TRUE[:3, 3])
+    assert np.allclose(pose[:3, 3], between, atol=1e-9)
+    whole = angle_between(TRUE[:3, :3], other[:3, :3])
+    assert angle_between(TRUE[:3, :3], pose[:3, :3]) == pytest.approx(share * whole, rel=1e-6)
+    assert np.array_equal(lens, LENS)
+    # Both saw the same pictures: two that are alike know no more together than each of them alone.
+    assert np.allclose(told, 2 * mine * theirs / (mine + theirs) * sigmas)
+
+
+def test_a_blurred_render_explains_the_coarse_picture_and_little_else():
+    rng = np.random.default_rng(4)
+    fine, coarse = (gaussian_filter(rng.normal(size=(360, 480, 3)), (s, s, 0)).astype(np.float32) for s in (1, 12))
+    photo = (0.5 + 0.1 * fine / fine.std() + 0.1 * coarse / coarse.std()).clip(0, 1)
+    shown = gaussian_filter(photo, (5, 5, 0))
+    flat = np.full(shown.shape[:2], 2.0, np.float32)
+    look, params = Look("a", shown, shown @ GREY, np.ones_like(flat), flat, flat > 0), evidence.Params()
+    assert evidence.compare_coarsely(photo, [look], params).explained(params.agree) > 0.95
+    assert evidence.compare(photo, [look], params).explained(0.8) < 0.5
+    other = np.ascontiguousarray(shown[::-1, ::-1])
+    elsewhere = Look("a", other, other @ GREY, np.ones_like(flat), flat, flat > 0)
+    assert evidence.compare_coarsely(photo, [elsewhere], params).explained(params.agree) < 0.4
