@@ -14,12 +14,14 @@ import numpy as np
 
 from gsmap.errors import MissingDependencyError
 from gsmap.methods import families
+from gsmap.render import native
 
 TESTS = Path(__file__).resolve().parents[1]
 STORED = Path(__file__).with_name("golden.json")
 PROJECTIONS = 8
-TOLERANCE = 1e-6
-"""Relative to the array's norm. Not bit for bit: instruction sets and library versions round differently."""
+TOLERANCE = 5e-5
+"""Relative to the array's norm. Not bit for bit: instruction sets and library versions round differently, and what is
+fitted step by step (``merger.tto``) differs by 1e-5 then."""
 
 Case = Callable[[], dict[str, np.ndarray]]
 
@@ -102,8 +104,15 @@ def _signs(count: int, k: int) -> np.ndarray:
 
 
 def made(name: str, case: Case) -> dict[str, Any]:
-    """What is stored of a case."""
-    return {"version": version_of(name), "arrays": {key: sketch(array) for key, array in sorted(case().items())}}
+    """What is stored of a case, by the kernels that every processor of a family has.
+
+    Others round differently, and where a segmenter joins what ties, a rounding decides.
+    """
+    native.use_instruction_set("baseline")
+    try:
+        return {"version": version_of(name), "arrays": {key: sketch(array) for key, array in sorted(case().items())}}
+    finally:
+        native.use_instruction_set("best")
 
 
 def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
