@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import fcntl
 import importlib.util
+import logging
 import os
 import shutil
 import subprocess
@@ -78,6 +79,14 @@ def _shared_data() -> Path | None:
     named = os.environ.get("GSMAP_SHARED_DATA")
     root = Path(named) if named else ROOT.parent / "shared" / "data"
     return root if (root / "house").is_dir() else None
+
+
+@pytest.fixture(autouse=True)
+def untouched_logger() -> None:
+    """The command line, run in this process by the test before, sent the library's warnings to stderr and kept them."""
+    logger = logging.getLogger("gsmap")
+    logger.setLevel(logging.NOTSET)
+    logger.handlers, logger.propagate = [], True
 
 
 @pytest.fixture(scope="session")

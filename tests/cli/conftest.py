@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,8 @@ class Done:
 
 
 @pytest.fixture
-def cli(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Done]]:
+def cli(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
     """Runs ``gsmap ARGUMENTS...`` in this process."""
-    import logging
-
-    logger = logging.getLogger("gsmap")
-    before = logger.level, list(logger.handlers), logger.propagate
 
     def call(*arguments: object) -> Done:
         capfd.readouterr()
@@ -45,8 +41,7 @@ def cli(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> I
         out, err = capfd.readouterr()
         return Done(exit.value.code or 0, out, err)
 
-    yield call
-    logger.level, logger.handlers, logger.propagate = before
+    return call
 
 
 @pytest.fixture(scope="session")

@@ -43,13 +43,9 @@ def program() -> Callable[..., object]:
 @pytest.fixture
 def run(
     program: Callable[..., object], capfdbinary: pytest.CaptureFixture[bytes], monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[[list[str]], tuple[int, bytes]]]:
+) -> Callable[[list[str]], tuple[int, bytes]]:
     """Runs the command line here, with limits on time and memory; anything but an exit of its own is an error."""
-    import logging
-
     monkeypatch.setattr(command_line, "build", lambda: program)
-    logger = logging.getLogger("gsmap")
-    before = logger.level, list(logger.handlers), logger.propagate
 
     def too_long(*_: object) -> NoReturn:
         raise AssertionError(f"it took more than {_LIMIT_S} s")
@@ -71,8 +67,7 @@ def run(
         out, err = capfdbinary.readouterr()
         return int(exit.value.code or 0), out + err
 
-    yield call
-    logger.level, logger.handlers, logger.propagate = before
+    return call
 
 
 def _look(arguments: list[str]) -> NoReturn:
