@@ -5,6 +5,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <cstdlib>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -19,7 +20,8 @@ namespace gsmap {
 const Kernels *kernels_avx512 = nullptr, *kernels_avx2 = nullptr;
 #endif
 
-static const Kernels *best_kernels() {
+// The widest that this machine can run.
+static const Kernels *widest_kernels() {
 #ifdef GSMAP_X86_KERNELS
     __builtin_cpu_init();
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
@@ -29,7 +31,8 @@ static const Kernels *best_kernels() {
 #endif
     return kernels_baseline;
 }
-const Kernels *kernels = best_kernels();
+static const Kernels *best = widest_kernels();
+const Kernels *kernels = best;
 
 namespace {
 
@@ -78,19 +81,29 @@ void backward(View &view, const Floats &means, const Floats &quats, const Floats
 }
 
 std::string use_instruction_set(const std::string &name) {
-    const Kernels *best = best_kernels();
-    const Kernels *offered[] = {kernels_baseline, kernels_avx2, kernels_avx512};
+    const Kernels *offered[] = {kernels_baseline, kernels_avx2, kernels_avx512}, *widest = widest_kernels();
     if (name == "best") kernels = best;
     for (const Kernels *k : offered) {
         if (k && name == k->name) kernels = k;
-        if (k == best) break;  // what follows cannot run here
+        if (k == widest) break;  // what follows cannot run here
     }
     return kernels->name;
+}
+
+// Other instructions round otherwise: machines that share a map's work can be told to use the same.
+void obey_environment() {
+    const char *told = std::getenv("GSMAP_INSTRUCTION_SET");
+    if (!told || !*told) return;
+    if (use_instruction_set(told) != told)
+        throw std::runtime_error(std::string("GSMAP_INSTRUCTION_SET=") + told + ": this machine runs " +
+                                 widest_kernels()->name + " and what is narrower of baseline, avx2, avx512");
+    best = kernels;
 }
 
 }  // namespace
 
 void bind_rasteriser(nb::module_ &m) {
+    obey_environment();
     const auto none = [](const char *name) { return nb::arg(name).none(); };
     nb::class_<View>(m, "View", "One rendered view and what its backward pass needs.")
         .def(nb::init<>())
@@ -106,7 +119,8 @@ void bind_rasteriser(nb::module_ &m) {
         .def_prop_ro("pairs", &View::pairs)
         .def_prop_ro("workspace_bytes", &View::workspace_bytes);
     m.def("use_instruction_set", &use_instruction_set, nb::arg("name"),
-          "Chooses baseline, avx2, avx512 or best, where this machine can run it; returns the one in use.");
+          "Chooses baseline, avx2, avx512 or best (what the environment says, else the widest), where this machine can run "
+          "it; returns the one in use.");
     m.def("blend_limit", [](int64_t repeats) { return kernels->blend_limit(repeats); }, nb::arg("repeats"),
           nb::call_guard<nb::gil_scoped_release>(),
           "Runs the blending loop alone on data in L1; returns how many (Gaussian, pixel) pairs it blended.");

@@ -167,6 +167,7 @@ int project(const Scene &scene, const Camera &camera, int64_t begin, int64_t end
         const V values[] = {g.a, g.b, g.c, g.det, norm2, colour[0], colour[1], colour[2]};
         for (const V value : values) live = both(live, finite(value));
         for (const V value : ls) live = both(live, lt(value, set1(80.f)));
+        live = both(live, ge(v, v));  // min and exp may lose a NaN
 
         V record[kFields];
         const V l11 = sqrt(g.c / g.det * (0.5f / kLn2));

@@ -136,7 +136,8 @@ INLINE V exp2_in_range(V x) {
     p = fma(p, r, set1(1.0000001192092896f));
     return (V)((U)p + ((U)shifted << 23));
 }
-INLINE V exp2(V x) { return exp2_in_range(max(x, set1(-126.f))); }
+// 2^x, held at 2^-126 and 2^127 where it would leave the normal numbers; a NaN gives 2^-126
+INLINE V exp2(V x) { return exp2_in_range(min(max(x, set1(-126.f)), set1(127.f))); }
 #endif
 
 INLINE V abs(V a) { return (V)((I)a & 0x7fffffff); }

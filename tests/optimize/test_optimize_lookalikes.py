@@ -8,9 +8,10 @@ from gsmap.optimize import Params, optimize
 QUICK = Params(marginals=False)
 
 
-# Known gap: here look-alikes still fold the map, or take single scenes to the wrong wing.
+# Known gap: here look-alikes still fold the map, or take single scenes to the wrong wing. Not strict: on some
+# processors another rounding of the solver decides two of them rightly.
 _FOLDS = pytest.mark.xfail(
-    reason="a scene goes to the wrong wing, or the hall is torn as well and no link stands out", strict=True
+    reason="a scene goes to the wrong wing, or the hall is torn as well and no link stands out", strict=False
 )
 
 

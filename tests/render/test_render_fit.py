@@ -8,7 +8,7 @@ from test_render_parity import random_scene
 
 from gsmap._native import image_loss
 from gsmap.errors import InputError
-from gsmap.render import Fitter, GaussianTensors, LearningRates, native, render, set_num_threads
+from gsmap.render import Fitter, GaussianTensors, LearningRates, render, set_num_threads
 from gsmap.types import Gaussians
 
 
@@ -62,11 +62,9 @@ def test_steps_equal_torch_adam(ssim_weight):
     assert np.array_equal(moved.means[:20], gaussians.means[:20])
 
 
-@pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (7, 3), (200, 37)])
-def test_the_loss_of_an_image_and_its_gradient_are_torch_s_whatever_cuts_it_into_bands(isa, height, width):
-    if native.use_instruction_set(isa) != isa:
-        pytest.skip(f"this machine has no {isa}")
+def test_the_loss_of_an_image_and_its_gradient_are_torch_s_whatever_cuts_it_into_bands(height, width):
     try:
         rng = np.random.default_rng(width)
         ours, wanted = rng.uniform(size=(2, height, width, 3)).astype(np.float32)
@@ -77,7 +75,6 @@ def test_the_loss_of_an_image_and_its_gradient_are_torch_s_whatever_cuts_it_into
             found.append((image_loss(ours, wanted, None, 1.0, gradient), gradient))
     finally:
         set_num_threads()
-        native.use_instruction_set("best")
     image = torch.from_numpy(ours).double().requires_grad_()
     loss = 1 - structural_similarity(image, torch.from_numpy(wanted).double())
     loss.backward()

@@ -1,12 +1,16 @@
 """Degenerate Gaussians are harmless; wrong arguments are named."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
 from test_render_parity import random_scene
 
 from gsmap.errors import ConfigError, InputError
-from gsmap.render import ChunkIndex, GaussianTensors, render
+from gsmap.render import ChunkIndex, GaussianTensors, native, render
 from gsmap.types import Cameras, Gaussians
 
 
@@ -37,6 +41,7 @@ def spoil(gaussians: Gaussians) -> Gaussians:
     return Gaussians.concatenate([gaussians, extra, poisoned])
 
 
+@pytest.mark.usefixtures("instruction_set")
 def test_degenerate_gaussians_are_not_drawn_and_get_no_gradient():
     gaussians, cameras = random_scene(4, n=200)
     spoiled = spoil(gaussians)
@@ -52,6 +57,7 @@ def test_degenerate_gaussians_are_not_drawn_and_get_no_gradient():
     assert not any(t.grad[200:].any() for t in tensors.tensors())
 
 
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize(
     "change",
     [
@@ -63,6 +69,7 @@ def test_degenerate_gaussians_are_not_drawn_and_get_no_gradient():
         {"quats": (0, 0, 0, 0)},  # the identity
         {"quats": (1e-20, 0, 0, 0)},
         {"quats": (1e15, 0, 0, 1e15)},
+        {"logit_opacities": 100.0},
         {"logit_opacities": 200.0},
         {"logit_opacities": np.inf},
         {"means": (0, 0, 0.0101)},
@@ -88,6 +95,8 @@ def test_extreme_but_sound_gaussians_stay_finite(change):
     (out.colour.square().sum() + out.depth.sum() + out.alpha.sum()).backward()
     for name, t in zip((*names, "sh", "pose"), (*tensors.tensors(), pose), strict=True):
         assert torch.isfinite(t.grad).all(), name
+    if one.logit_opacities[0] >= 100:  # as opaque as can be: d ln(opacity) / d logit = 1 - opacity
+        assert abs(tensors.logit_opacities.grad[0]) < 1e-20
 
 
 def test_empty_scenes_and_no_cameras():
@@ -145,3 +154,17 @@ def test_inputs_need_not_be_contiguous_or_leaves():
     image.colour.sum().backward()
     assert wide.grad[:, ::2].any()
     assert not wide.grad[:, 1::2].any()
+
+
+def test_the_environment_chooses_the_kernels():
+    ask = "from gsmap import _native; print(_native.use_instruction_set('best'))"
+
+    def run(name: str) -> subprocess.CompletedProcess[str]:
+        env = {**os.environ, "GSMAP_INSTRUCTION_SET": name}
+        return subprocess.run([sys.executable, "-c", ask], env=env, capture_output=True, text=True, check=False)
+
+    assert run("baseline").stdout.split() == ["baseline"]
+    assert run("").stdout.split() == [native.use_instruction_set("best")]
+    refused = run("sse9")
+    assert refused.returncode != 0
+    assert "GSMAP_INSTRUCTION_SET=sse9: this machine runs" in refused.stderr

@@ -37,14 +37,6 @@ def reference(gaussians: Gaussians, cameras: Cameras):
     return render_reference(*leaves, pose, cameras.intrinsics_px[0], width, height, BACKGROUND), [*leaves, pose]
 
 
-@pytest.fixture(params=["baseline", "avx2", "avx512"])
-def instruction_set(request):
-    if native.use_instruction_set(request.param) != request.param:
-        pytest.skip(f"this machine cannot run {request.param}")
-    yield request.param
-    native.use_instruction_set("best")
-
-
 @pytest.mark.parametrize("k", [1, 4, 9, 16])
 def test_images_match_float64(k, instruction_set):
     gaussians, cameras = random_scene(k)
