@@ -156,6 +156,7 @@ def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, 
                 made = make_captures(
                     int(np.random.default_rng([args.seed, piece, i, 4]).integers(1 << 30)),
                     1,
+                    first=number,
                     steps=0,
                     num_frames=args.frames,
                     num_gaussians=args.gaussians,

@@ -44,6 +44,7 @@ class Hidden:
             swelling over the overlap's radius ...
         turn_by_shift: ... and rotations, over that radius, by this many times as much as those translations.
         most_swell: no sensor's metre is off by more than about this (logarithm of a scale).
+        least_m: no translation is known better than this, and no rotation over the overlap's radius.
     """
 
     shown: float = 0.655
@@ -56,6 +57,7 @@ class Hidden:
     shift_by_swell: float = 0.104
     turn_by_shift: float = 1.0
     most_swell: float = 0.02
+    least_m: float = 1e-4
 
 
 def _grey() -> Hidden:
@@ -274,7 +276,7 @@ def hidden_motion(field_m: float, radius_m: float, swell: float, hidden: Hidden)
         swell: logarithm of the scale that such errors make, measured, or its standard deviation.
     """
     own = hidden.shift_m * (field_m / hidden.field_m) ** hidden.field_power
-    shift = float(np.hypot(own, hidden.shift_by_swell * swell * radius_m))
+    shift = float(np.sqrt(own**2 + (hidden.shift_by_swell * swell * radius_m) ** 2 + hidden.least_m**2))
     return hidden.turn_by_shift * shift / radius_m, shift
 
 
