@@ -50,7 +50,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "synthetic")]
 
 import gsmap.map
 from gsmap.cli import COLLECT_AFTER
-from gsmap.evaluate.calibration import nees_of_pose, relative_covariance
+from gsmap.evaluate.calibration import nees_of_edge, nees_of_pose, relative_covariance
 from gsmap.evaluate.registration import pose_error
 from gsmap.map import reports
 from gsmap.map.stages import describe, optimize, register
@@ -156,6 +156,7 @@ def captures(args: argparse.Namespace, start: int) -> Iterator[tuple[int, Walk, 
                 made = make_captures(
                     int(np.random.default_rng([args.seed, piece, i, 4]).integers(1 << 30)),
                     1,
+                    first=number,
                     steps=0,
                     num_frames=args.frames,
                     num_gaussians=args.gaussians,
@@ -286,7 +287,7 @@ def judged(m: gsmap.map.Map, rows: list[dict[str, Any]]) -> dict[str, str]:
 
     edges = [e for e in m.edge_rows() if {e.target, e.source} <= set(truth)]
     kinds: Counter[tuple[bool, bool]] = Counter()
-    found = set()
+    found, edges_off, edges_inside = set(), [], 0
     for edge in edges:
         if edge.status != "accepted" or edge.S_target_source is None:
             continue
@@ -296,6 +297,10 @@ def judged(m: gsmap.map.Map, rows: list[dict[str, Any]]) -> dict[str, str]:
         kinds[right, edge.used] += 1
         if right:
             found.add(frozenset((edge.target, edge.source)))
+            edges_off.append(error.centroid_m)
+            if edge.information is not None:
+                told = nees_of_edge(edge.S_target_source, edge.information, true)
+                edges_inside += bool(told.value <= chi2.ppf(0.9973, told.dof))
     by_room: dict[tuple[int, int], list[str]] = {}
     for s, rooms in seen.items():
         for room in rooms:
@@ -304,6 +309,8 @@ def judged(m: gsmap.map.Map, rows: list[dict[str, Any]]) -> dict[str, str]:
     out["pairs tried"] = f"{len(edges)}, {len(edges) / len(truth):.1f} a capture"
     out["right edges: used, not used"] = f"{kinds[True, True]}, {kinds[True, False]}"
     out["wrong edges: used, not used"] = f"{kinds[False, True]}, {kinds[False, False]}"
+    out["right edges: off from the truth, m"] = quantiles(edges_off)
+    out["right edges within 3 of their sigma (99.7 % if honest)"] = f"{edges_inside} of {len(edges_off)}"
     out["pairs that share a room: all, accepted and right"] = f"{len(share)}, {len(share & found)}"
 
     graph = m.store.revisions.get()

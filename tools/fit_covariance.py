@@ -4,7 +4,7 @@ A trainer's bias, or a sensor whose depths are a percent off, bends a capture so
 the residuals show little. Made captures know the truth: places are filmed, their depths bent as depth cameras bend them
 (a scale, a term in the depth's square, a lens, colour and depth some pixels apart, noise; each drawn for each capture,
 times a level), and laid out as Gaussians, in part under poses that wander, and trained on such frames; others are
-trained on perfect frames. Two models are of largest likelihood, errors taken for normally distributed: of the measured
+trained on perfect frames, or laid on them sparsely. Two models are of largest likelihood, errors taken for normally distributed: of the measured
 scale, and then, that scale known, of the rigid pose. Places that are only tested on are not fitted. No given capture
 takes part.
 
@@ -42,12 +42,12 @@ from gsmap.describe.unit import estimate_unit_m, working_unit_m
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import Similarities
 from gsmap.ingest import read_captures
-from gsmap.register import Params
+from gsmap.register import Params, SceneView
 from gsmap.register.covariance import Conditioning, Hidden, condition, swayed
 from gsmap.register.metres import believe
 from gsmap.register.refiners import colored_icp
 from gsmap.register.surface import Surface
-from gsmap.types import Cameras, Gaussians, Sim3
+from gsmap.types import Cameras, Gaussians, SceneGraph, Sim3
 from gsmap_synthetic import make_captures, write_captures
 from gsmap_synthetic.capture import Frames, default_routes, film, unused_doors, walk
 from gsmap_synthetic.court import court_captures
@@ -58,12 +58,14 @@ TRAINED = -1.0  # on perfect frames; other levels lay Gaussians on bent depths
 COURT = -2.0  # the same, outdoors and seen from far
 WANDERED = -3.0  # half as bent, by cameras that are a centimetre off along the way
 FILMED = -4.0  # the same, trained on these frames, as people's captures are
-KINDS = {TRAINED: "trained", COURT: "court", WANDERED: "wandered", FILMED: "filmed"}
+SPARSE = -5.0  # perfect depths, few Gaussians, a hand's breadth or two apart
+KINDS = {TRAINED: "trained", COURT: "court", WANDERED: "wandered", FILMED: "filmed", SPARSE: "sparse"}
 FITTED = {
     TRAINED: (501, 502, 503),
     COURT: (401, 402),
     WANDERED: (711, 712, 713, 714),
     FILMED: (731, 732, 733, 734),
+    SPARSE: (751, 752, 753, 754),
     0.0: (631,),
     0.25: (621, 650, 652, 654),
     0.5: (611, 612, 660, 662, 664),
@@ -75,6 +77,7 @@ TESTED = {
     COURT: (403,),
     WANDERED: (721, 722, 723, 724),
     FILMED: (741, 742, 743, 744),
+    SPARSE: (761, 762, 763, 764),
     0.0: (632,),
     0.25: (622, 651, 653, 655),
     0.5: (613, 661, 663, 665),
@@ -86,6 +89,7 @@ DRAWN = {
     COURT: (404,),
     WANDERED: (725, 726),
     FILMED: (745, 746, 747),
+    SPARSE: (765, 766),
     0.25: (656,),
     0.5: (666,),
     0.7: (676,),
@@ -130,6 +134,9 @@ def made(cache: Path, level: float, seed: int) -> Path:
         elif level == COURT:
             sizes = {"num_gaussians": 60_000, "size_px": (240, 180)}
             write_captures(folder, court_captures(seed, 6, steps=150, vary_exposure=True, **sizes))
+        elif level == SPARSE:
+            sizes = {"num_frames": 14, "num_gaussians": 3000, "size_px": (96, 72)}
+            write_captures(folder, make_captures(seed, 4, steps=0, **sizes))
         elif level in (WANDERED, FILMED):
             write_captures(folder, bent_captures(0.5, seed, wander_m=0.01, steps=150 * (level == FILMED)))
         else:
@@ -227,9 +234,8 @@ def pairs_of(folder: Path, cache: Path) -> list[Pair]:
         for read in reads:
             truth = json.loads((folder / "truth" / f"{read.name}.json").read_text())["T_scene_world"]
             metres = Sim3.from_matrix(np.array(truth))
-            captures.append(
-                (Surface.of(read.gaussians, working_m), Sim3(metres.rotation, metres.translation * working_m))
-            )
+            view = SceneView(read.name, read.gaussians, read.cameras, SceneGraph(read.name))
+            captures.append((view.surface(working_m), Sim3(metres.rotation, metres.translation * working_m)))
         pairs = [
             _pair(*a, *b, RIGHT_M * working_m, seed) for seed, (a, b) in enumerate(itertools.combinations(captures, 2))
         ]

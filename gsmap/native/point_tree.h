@@ -32,24 +32,32 @@ class PointTree {
         return x * x + y * y + z * z;
     }
 
-    // The nearest point closer than the bound; of equally near ones the first.
-    Neighbour nearest(const double *at, Neighbour bound) const {
+    struct Any {
+        bool operator()(int32_t) const { return true; }
+    };
+
+    // The nearest point closer than the bound that counts, by its row; of equally near ones the first.
+    template <class Counts = Any> Neighbour nearest(const double *at, Neighbour bound, const Counts &counts = {}) const {
         if (size()) {
             double away[3] = {0, 0, 0};
-            search(0, at, away, 0, bound, [](Neighbour &best, const Neighbour &found) { best = std::min(best, found); });
+            search(0, at, away, 0, bound, [&](Neighbour &best, const Neighbour &found) {
+                if (found < best && counts(found.row)) best = found;
+            });
         }
         return bound;
     }
-    // Up to k nearest points whose squared distance is below a bound, nearest first; returns how many.
-    int nearest(const double *at, int k, Neighbour *out, double bound = __builtin_inf()) const {
+    // Up to k nearest points that count and whose squared distance is below a bound, nearest first; returns how many.
+    template <class Counts = Any>
+    int nearest(const double *at, int k, Neighbour *out, double bound = __builtin_inf(), const Counts &counts = {}) const {
         struct Best : Neighbour {
             Neighbour *list;
             int k, count;
         } best{{bound, -1}, out, k, 0};
         if (size() && k > 0) {
             double away[3] = {0, 0, 0};
-            search(0, at, away, 0, best, [](Best &b, const Neighbour &found) {
+            search(0, at, away, 0, best, [&](Best &b, const Neighbour &found) {
                 if (b.count == b.k ? !(found < b.list[b.k - 1]) : !(found.squared < b.squared)) return;
+                if (!counts(found.row)) return;
                 int i = b.count < b.k ? b.count++ : b.k - 1;
                 for (; i > 0 && found < b.list[i - 1]; --i) b.list[i] = b.list[i - 1];
                 b.list[i] = found;

@@ -17,6 +17,7 @@ namespace {
 constexpr int kBlock = 512;  // points of a task; sums are taken by block, so threads change no bit
 constexpr int kMostNeighbours = 64;
 constexpr double kBeyond = 1.5, kStill = 0.05;  // of the radius, see Partner
+constexpr double kOpposed = -0.5;  // cosine of two faces at which a cell is another surface: 120 degrees, for normals are noisy
 constexpr double kLeastNoise = 0.03;  // of the radius: planes that fit better than this leave colour its say
 
 using Rows = nb::ndarray<const int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
@@ -30,6 +31,13 @@ template <class Body> void over_blocks(int64_t n, const Body &body) {
 }
 
 double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+// Which cells a point may be laid on: not those whose other side was seen. A face of zeros is not known and opposes none;
+// null where no faces are known.
+struct Facing {
+    const double *faces, *own;
+    bool operator()(int32_t row) const { return !own || dot(faces + 3 * std::size_t(row), own) > kOpposed; }
+};
 
 // The unit vector of least spread of a symmetric matrix (xx, xy, xz, yy, yz, zz), by cyclic Jacobi rotations.
 void least_axis(const double *m, double *out) {
@@ -135,7 +143,7 @@ double median_distance(std::vector<double> values, double from) {
 // What a surface lays itself on: cells with their planes and lightness.
 struct Cells {
     const PointTree *tree;
-    const double *normals, *lightness, *gradients;
+    const double *normals, *lightness, *gradients, *faces;
 };
 
 // How pairs count; see gsmap/register/refiners/colored_icp.py.
@@ -168,8 +176,8 @@ struct Sums {
 struct Partner {
     double at[3], others, row;
 
-    // The nearest cell closer than the radius, or -1.
-    int32_t follow(const PointTree &tree, const double *moved, double radius) {
+    // The nearest cell closer than the radius that it may be laid on, or -1.
+    int32_t follow(const PointTree &tree, const double *moved, double radius, const Facing &facing) {
         const double step = std::sqrt(PointTree::squared(moved, at)), left = others - step;
         if (others >= 0 && (row < 0 ? left >= radius : left > 0)) {
             if (row < 0) return -1;
@@ -178,14 +186,14 @@ struct Partner {
         }
         std::copy_n(moved, 3, at);
         if (others < 0 || step > kStill * radius) {  // it moves far still: the second nearest would be sought in vain
-            const Neighbour best = tree.nearest(moved, Neighbour{radius * radius, -1});
+            const Neighbour best = tree.nearest(moved, Neighbour{radius * radius, -1}, facing);
             others = 0;
             row = best.row;
             return best.row;
         }
         const double reach = kBeyond * radius;
         Neighbour near[2];
-        const int found = tree.nearest(moved, 2, near, reach * reach);
+        const int found = tree.nearest(moved, 2, near, reach * reach, facing);
         others = found > 1 ? std::sqrt(near[1].squared) : reach;
         row = found ? near[0].row : -1;
         return found && near[0].squared < radius * radius ? near[0].row : -1;
@@ -207,8 +215,9 @@ struct Equations {
 
 // Pairs every point with the nearest cell, and sums the normal equations of plane distances and lightness differences.
 // `backward`: the points are the target's, laid on the source's cells, which a step of the source moves the other way.
-Equations equations(const Cells &onto, const double *points, const double *lightness, const int64_t *rows, int64_t n,
-                    Partner *partners, const double *pose, const double *centre, bool backward, const Weighing &how) {
+Equations equations(const Cells &onto, const double *points, const double *lightness, const double *faces,
+                    const int64_t *rows, int64_t n, Partner *partners, const double *pose, const double *centre,
+                    bool backward, const Weighing &how) {
     const int64_t blocks = (n + kBlock - 1) / kBlock;
     std::vector<std::vector<Pair>> found(blocks);
     std::vector<std::vector<double>> light(blocks);
@@ -218,7 +227,8 @@ Equations equations(const Cells &onto, const double *points, const double *light
             const double *p = points + 3 * rows[i];
             Pair pair;
             for (int a = 0; a < 3; ++a) pair.moved[a] = dot(pose + 4 * a, p) + pose[4 * a + 3];
-            pair.row = partners[i].follow(*onto.tree, pair.moved, how.radius);
+            const Facing facing{onto.faces, faces ? faces + 3 * rows[i] : nullptr};
+            pair.row = partners[i].follow(*onto.tree, pair.moved, how.radius, facing);
             if (pair.row < 0) continue;
             const double *cell = onto.tree->point(pair.row);
             for (int a = 0; a < 3; ++a) {
@@ -305,15 +315,19 @@ void bind_surface(nb::module_ &m) {
             nb::arg("points"))
         .def(
             "nearest",
-            [](const PointTree &tree, Points at, double radius) {
+            [](const PointTree &tree, Points at, double radius, std::optional<Points> faces, std::optional<Points> own) {
                 const int64_t n = int64_t(at.shape(0));
+                if (bool(faces) != bool(own)) throw std::invalid_argument("faces of both sides, or of none");
+                if (faces && (int64_t(faces->shape(0)) != tree.size() || own->shape(0) != at.shape(0)))
+                    throw std::invalid_argument("a tree's points and what is sought need a face each");
                 std::vector<double> distance(n);
                 std::vector<int64_t> row(n);
                 {
                     nb::gil_scoped_release release;
                     over_blocks(n, [&](int64_t, int64_t begin, int64_t end) {
                         for (int64_t i = begin; i < end; ++i) {
-                            const Neighbour best = tree.nearest(at.data() + 3 * i, Neighbour{radius * radius, -1});
+                            const Facing facing{faces ? faces->data() : nullptr, own ? own->data() + 3 * i : nullptr};
+                            const Neighbour best = tree.nearest(at.data() + 3 * i, Neighbour{radius * radius, -1}, facing);
                             distance[i] = best.row < 0 ? __builtin_inf() : std::sqrt(best.squared);
                             row[i] = std::max(best.row, 0);
                         }
@@ -321,8 +335,9 @@ void bind_surface(nb::module_ &m) {
                 }
                 return std::make_tuple(numpy_of(std::move(distance), {std::size_t(n)}), numpy_of(std::move(row), {std::size_t(n)}));
             },
-            nb::arg("at"), nb::arg("radius"),
-            "Distance (n,) to and row (n,) of the point nearest to each; inf and 0 where none is nearer than the radius.")
+            nb::arg("at"), nb::arg("radius"), nb::arg("faces") = nb::none(), nb::arg("own") = nb::none(),
+            "Distance (n,) to and row (n,) of the point nearest to each; inf and 0 where none is nearer than the radius.\n"
+            "Points whose face (unit, zero where unknown) is opposed to the `own` of what seeks them are passed over.")
         .def(
             "neighbours",
             [](const PointTree &tree, int k) {
@@ -408,12 +423,15 @@ void bind_surface(nb::module_ &m) {
         "icp_equations",
         [](const PointTree &tree, Points normals, Numbers lightness, std::optional<Points> gradients, Points points,
            Numbers own_lightness, Rows rows, Kept partners, Frame pose, Vector centre, bool backward, double radius_m,
-           double width_m, double colour_weight) {
+           double width_m, double colour_weight, std::optional<Points> faces, std::optional<Points> own_faces) {
             const auto size = std::size_t(tree.size());
             if (normals.shape(0) != size || lightness.shape(0) != size || (gradients && gradients->shape(0) != size))
                 throw std::invalid_argument("a tree's points, normals, lightness and gradients must be as many");
             if (own_lightness.shape(0) != points.shape(0) || partners.shape(0) != rows.shape(0))
                 throw std::invalid_argument("points need a lightness each, rows a partner each");
+            if (bool(faces) != bool(own_faces)) throw std::invalid_argument("faces of both surfaces, or of none");
+            if (faces && (faces->shape(0) != size || own_faces->shape(0) != points.shape(0)))
+                throw std::invalid_argument("cells and points need a face each");
             for (std::size_t i = 0; i < rows.shape(0); ++i) {
                 if (rows.data()[i] < 0 || rows.data()[i] >= int64_t(points.shape(0)))
                     throw std::invalid_argument("a row that is no point");
@@ -424,8 +442,10 @@ void bind_surface(nb::module_ &m) {
             Equations out;
             {
                 nb::gil_scoped_release release;
-                out = equations({&tree, normals.data(), lightness.data(), gradients ? gradients->data() : nullptr},
-                                points.data(), own_lightness.data(), rows.data(), int64_t(rows.shape(0)),
+                out = equations({&tree, normals.data(), lightness.data(), gradients ? gradients->data() : nullptr,
+                                 faces ? faces->data() : nullptr},
+                                points.data(), own_lightness.data(), own_faces ? own_faces->data() : nullptr,
+                                rows.data(), int64_t(rows.shape(0)),
                                 reinterpret_cast<Partner *>(partners.data()), pose.data(), centre.data(), backward,
                                 {radius_m, width_m, gradients ? colour_weight : 0.0});
             }
@@ -441,10 +461,12 @@ void bind_surface(nb::module_ &m) {
         nb::arg("tree"), nb::arg("normals"), nb::arg("lightness"), nb::arg("gradients").none(), nb::arg("points"),
         nb::arg("own_lightness"), nb::arg("rows"), nb::arg("partners"), nb::arg("pose"), nb::arg("centre"),
         nb::arg("backward"), nb::arg("radius_m"), nb::arg("width_m"), nb::arg("colour_weight"),
+        nb::arg("faces") = nb::none(), nb::arg("own_faces") = nb::none(),
         "Normal equations (7, 7), (7,) over [rotation, translation, log scale] about `centre` of points laid on cells by a\n"
         "pose (3, 4), the number of pairs, the robust standard deviation of their plane distances, their mean (3,) less the\n"
         "centre and their root mean square distance from it. `partners` (n, 5), -1 at first, keep each row's nearest cell\n"
-        "from pose to pose, for one radius, and are written to.");
+        "from pose to pose, for one radius, and are written to. No point is laid on a cell whose face is opposed to its own\n"
+        "(`own_faces`, in the cells' frame, for as long as partners are kept).");
 }
 
 }  // namespace gsmap

@@ -44,6 +44,7 @@ class Hidden:
             swelling over the overlap's radius ...
         turn_by_shift: ... and rotations, over that radius, by this many times as much as those translations.
         most_swell: no sensor's metre is off by more than about this (logarithm of a scale).
+        least_m: no translation is known better than this, and no rotation over the overlap's radius.
     """
 
     shown: float = 0.655
@@ -56,6 +57,7 @@ class Hidden:
     shift_by_swell: float = 0.104
     turn_by_shift: float = 1.0
     most_swell: float = 0.02
+    least_m: float = 1e-4
 
 
 def _grey() -> Hidden:
@@ -274,7 +276,7 @@ def hidden_motion(field_m: float, radius_m: float, swell: float, hidden: Hidden)
         swell: logarithm of the scale that such errors make, measured, or its standard deviation.
     """
     own = hidden.shift_m * (field_m / hidden.field_m) ** hidden.field_power
-    shift = float(np.hypot(own, hidden.shift_by_swell * swell * radius_m))
+    shift = float(np.sqrt(own**2 + (hidden.shift_by_swell * swell * radius_m) ** 2 + hidden.least_m**2))
     return hidden.turn_by_shift * shift / radius_m, shift
 
 
@@ -288,10 +290,12 @@ def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks, 
     """
     chosen = source.sample(params.probe_points)
     points, centre = source.coarse[0][chosen], Sim3(np.eye(3), blocks.centroid)
+    faces = _faces(source, pose)
+    faces = None if faces is None else faces[chosen]
     spread = np.r_[np.full(3, 1 / blocks.radius_m), np.ones(3), 1 / blocks.radius_m]
     pulled = np.empty((7, 7))
     for k, step in enumerate(params.probe_m * np.diag(spread)):
-        ahead, behind = (_pull(target, points, retract(pose @ centre, x), centre, params) for x in (step, -step))
+        ahead, behind = (_pull(target, points, faces, retract(pose @ centre, x), centre, params) for x in (step, -step))
         pulled[k] = (ahead - behind) / (2 * step[k]) * len(source.coarse[0]) / len(chosen)
     hessian = blocks.hessian + 1e-9 * np.trace(blocks.hessian) / 7 * np.eye(7)
     root = np.linalg.cholesky(hessian)
@@ -304,11 +308,18 @@ def _pulled_back(target: Surface, source: Surface, pose: Sim3, blocks: _Blocks, 
     return measured
 
 
-def _pull(target: Surface, points: np.ndarray, centred: Sim3, centre: Sim3, params: Params) -> np.ndarray:
+def _faces(source: Surface, pose: Sim3) -> np.ndarray | None:
+    """(M, 3) which way the source's cells face in the target's frame, zeros where that is not known."""
+    return None if source.faces is None else source.faces @ pose.rotation.T
+
+
+def _pull(
+    target: Surface, points: np.ndarray, faces: np.ndarray | None, centred: Sim3, centre: Sim3, params: Params
+) -> np.ndarray:
     """(7,) gradient of the weighted squares of the distances to the planes, by a motion about a centre."""
     pose = centred @ centre.inverse()
     moved = pose.apply(points)
-    distance, row = target.nearest(moved, params.radius_m)
+    distance, row = target.nearest(moved, params.radius_m, faces)
     hit = np.flatnonzero(np.isfinite(distance))
     normals = target.normals[row[hit]]
     residual = (normals * (moved[hit] - target.coarse[0][row[hit]])).sum(1)
@@ -357,7 +368,7 @@ class _Blocks:
     def of(cls, target: Surface, source: Surface, pose: Sim3, params: Params) -> _Blocks | None:
         points, _ = source.coarse
         moved = pose.apply(points)
-        distance, row = target.nearest(moved, params.radius_m)
+        distance, row = target.nearest(moved, params.radius_m, _faces(source, pose))
         hit = np.flatnonzero(np.isfinite(distance))
         if len(hit) < _FEWEST:
             return None

@@ -33,7 +33,7 @@ class MetricScene:
 
     def surface(self) -> Surface:
         """The scene's surface in metres."""
-        return self.view.surface(self.unit_m, self.params.surface)
+        return self.view.surface(self.unit_m, self.params.surface, self.params.views)
 
     def views(self) -> Views:
         """The scene through its own cameras, and metres per unit; None without cameras."""

@@ -32,7 +32,9 @@ class SceneView:
     cameras: Cameras | None
     graph: SceneGraph
     scale_policy: str = "auto"
-    _surfaces: dict[tuple[float, surface.Params], Surface] = field(default_factory=dict, init=False, repr=False)
+    _surfaces: dict[tuple[float, surface.Params, ViewParams], Surface] = field(
+        default_factory=dict, init=False, repr=False
+    )
     _views: dict[ViewParams, ViewCache] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -44,14 +46,16 @@ class SceneView:
         """(3,) middle of the scene's content, in its frame."""
         return np.median(self.gaussians.means, axis=0) if len(self.gaussians) else np.zeros(3)
 
-    def surface(self, unit_m: float = 1.0, params: surface.Params | None = None) -> Surface:
+    def surface(
+        self, unit_m: float = 1.0, params: surface.Params | None = None, views: ViewParams | None = None
+    ) -> Surface:
         """The scene's surface in metres; the last two are kept, so a scene met by many others is prepared once."""
-        params = params or surface.Params()
-        key = (unit_m, params)
+        params, views = params or surface.Params(), views or ViewParams()
+        key = (unit_m, params, views)
         if key not in self._surfaces:
             while len(self._surfaces) > 1:
                 self._surfaces.pop(next(iter(self._surfaces)))
-            self._surfaces[key] = Surface.of(self.gaussians, unit_m, params, self.cameras)
+            self._surfaces[key] = Surface.of(self.gaussians, unit_m, params, self.cameras, self.views(views))
         return self._surfaces[key]
 
     def views(self, params: ViewParams | None = None) -> ViewCache | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +11,8 @@ import numpy as np
 from gsmap.geometry.cells import cell_means
 from gsmap.geometry.floaters import find_floaters
 from gsmap.geometry.sh import rgb_of_sh0
+from gsmap.register import facing
+from gsmap.register.view_cache import ViewCache
 from gsmap.types import Cameras, Gaussians
 
 _PLANE_NEIGHBOURS = 20  # cells, itself included, that a plane is laid through, as small_gicp does
@@ -29,6 +31,7 @@ class Params:
         stray_colour: floaters are told from the surface they touch by colours (RGB in [0, 1]) this unlike.
         max_scale_quantile: of the opaque Gaussians at least this share is surface, however coarse the scene is.
         resolution_m: points are averaged over cells of this size before they are aligned.
+        facing: how it is told which side of it a capture has seen.
     """
 
     min_opacity: float = 0.5
@@ -38,6 +41,7 @@ class Params:
     stray_colour: float = 0.3
     max_scale_quantile: float = 0.7
     resolution_m: float = 0.05
+    facing: facing.Params = field(default_factory=facing.Params)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,8 @@ class Surface:
         splats: the N Gaussians themselves, in metres, with their mean colour alone; None where only points are known.
         unit_m: metres per unit of the scene, under which the surface was made.
         gaussians, cameras: the whole scene in its own unit; None where only points are known.
+        views: the scene through its cameras, which say what side of it they saw; None without.
+        facing: how they do.
     """
 
     points: np.ndarray
@@ -60,6 +66,8 @@ class Surface:
     unit_m: float = 1.0
     gaussians: Gaussians | None = None
     cameras: Cameras | None = None
+    views: ViewCache | None = None
+    facing: facing.Params = field(default_factory=facing.Params)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -71,6 +79,7 @@ class Surface:
         unit_m: float = 1.0,
         params: Params | None = None,
         cameras: Cameras | None = None,
+        views: ViewCache | None = None,
     ) -> Surface:
         """The surface of a scene whose unit is ``unit_m`` metres."""
         params = params or Params()
@@ -95,7 +104,7 @@ class Surface:
             gaussians.logit_opacities[keep],
             gaussians.sh[keep, :1],
         )
-        return cls(points, colours, params.resolution_m, splats, unit_m, gaussians, cameras)
+        return cls(points, colours, params.resolution_m, splats, unit_m, gaussians, cameras, views, params.facing)
 
     def scaled(self, factor: float) -> Surface:
         """The same surface in a unit ``factor`` times smaller."""
@@ -148,7 +157,26 @@ class Surface:
         )
         return gradients
 
-    def nearest(self, points: np.ndarray, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Distance to and row of the nearest cell mean of each point; inf and 0 where none lies within the radius."""
-        distance, rows = self.tree.nearest(np.ascontiguousarray(points, dtype=np.float64), radius_m)
+    @cached_property
+    def faces(self) -> np.ndarray | None:
+        """(M, 3) the normals turned to the side that the scene's own cameras saw, zeros where that is not known; None
+        where it nowhere is."""
+        if self.views is None or not self.views.num_own or not self.facing.num_cameras or not len(self.coarse[0]):
+            return None
+        found = facing.faces(self.coarse[0], self.normals, self.tree, self.views, self.unit_m, self.facing)
+        return found if found.any() else None
+
+    def nearest(
+        self, points: np.ndarray, radius_m: float, faces: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Distance to and row of the nearest cell mean of each point; inf and 0 where none lies within the radius.
+
+        Args:
+            faces: (P, 3) of the points, in this surface's frame: cells that face the other way are passed over.
+        """
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        if faces is None or self.faces is None:
+            distance, rows = self.tree.nearest(points, radius_m)
+        else:
+            distance, rows = self.tree.nearest(points, radius_m, self.faces, np.ascontiguousarray(faces))
         return distance, rows

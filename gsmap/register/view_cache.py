@@ -99,6 +99,15 @@ class ViewCache:
             inside = own
         return _greedy(inside, count)
 
+    def views_of_sides(self, points: np.ndarray, normals: np.ndarray, count: int) -> list[int]:
+        """The scene's own cameras that together see most sides of some surface: points (N, 3), normals (N, 3)."""
+        rows = np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)
+        points, normals = points[rows], normals[rows]
+        seen = _visible(self._coarse[: self.num_own], points, self._nearest[: self.num_own])
+        towards = self.cameras.T_frame_camera[: self.num_own, None, :3, 3] - points
+        front = (towards * normals).sum(2) > 0
+        return _greedy(np.concatenate([seen & front, seen & ~front], axis=1), count)
+
     @cached_property
     def _coarse(self) -> Cameras:
         return self.cameras.resized(self.params.selection_px)

@@ -55,6 +55,7 @@ def make_captures(
     place: Place | None = None,
     paths: Sequence[np.ndarray] | None = None,
     far: float = np.inf,
+    first: int = 0,
     progress: Progress | None = None,
 ) -> list[DemoCapture]:
     """Build the place of ``seed`` and capture it ``num_captures`` times, each in its own random frame.
@@ -75,6 +76,8 @@ def make_captures(
         place: a place already built, instead of the one of ``seed``.
         paths: (C, 4, 4) camera poses of each capture, instead of walks along routes.
         far: depths greater than this (metres) are unknown, as to a scanner; nothing is laid there.
+        first: number of the first capture, where those of one place are made in several calls: two of one number walk
+            the same steps.
 
     Raises:
         ConfigError: counts that do not fit together, or a route without doorways.
@@ -89,15 +92,16 @@ def make_captures(
             f"{num_captures} captures need as many routes and scales, got {len(routes)} and {len(scales)}"
         )
     out = []
-    for i, (route, scale) in enumerate(zip(routes, scales, strict=True)):
+    for made, (route, scale) in enumerate(zip(routes, scales, strict=True)):
+        i = first + made
         rng = np.random.default_rng([seed, i, 8])
         gain, gamma = (rng.uniform(0.85, 1.15), rng.uniform(0.9, 1.15)) if vary_exposure else (1.0, 1.0)
-        name = f"capture_{chr(ord('a') + i)}" if num_captures <= 26 else f"capture_{i:03d}"
+        name = f"capture_{chr(ord('a') + i)}" if first + num_captures <= 26 else f"capture_{i:03d}"
 
-        def step(fraction: float, text: str, start: float = i) -> None:
+        def step(fraction: float, text: str, start: float = made) -> None:
             report(0.05 + 0.95 * (start + fraction) / num_captures, text)
 
-        poses = paths[i] if paths else walk(place, route, num_frames, seed=i)
+        poses = paths[made] if paths else walk(place, route, num_frames, seed=i)
         shut = unused_doors(place, route) if shut_doors and not paths else ()
         filming = _part(step, 0.0, 0.3)
         frames = film(place, poses, size_px=size_px, shut=shut, gain=gain, gamma=gamma, name=name, progress=filming)

@@ -89,7 +89,7 @@ def two_pose_world(seed=0, first=40, second=30, extra=20) -> tuple[NodeWorld, Si
     return world, motion @ world.S_target_source
 
 
-def _texture(points: np.ndarray, seed: int) -> np.ndarray:
+def texture(points: np.ndarray, seed: int) -> np.ndarray:
     """(N, 3) colours in [0, 1] that vary over decimetres, the same wherever a point is sampled twice."""
     rng = np.random.default_rng(seed)
     waves, phases = rng.normal(size=(3, 8, 3)) * 5, rng.uniform(0, 6, (3, 8))
@@ -166,7 +166,7 @@ def splat_world(
             p = np.concatenate([p[half], HALF_TURN.apply(p[half])])
         p = p[inside(p)]
         turned = symmetric & (p[:, 0] > HALF_TURN.translation[0] / 2)
-        colours = _texture(np.where(turned[:, None], HALF_TURN.apply(p), p) if symmetric else p, room)
+        colours = texture(np.where(turned[:, None], HALF_TURN.apply(p), p) if symmetric else p, room)
         p = p + rng.normal(size=p.shape) * noise_m
         sh = ((colours - 0.5) / 0.28209479177387814)[:, None]
         n = len(p)

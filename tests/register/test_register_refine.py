@@ -23,7 +23,7 @@ from gsmap.register.surface import Params as SurfaceParams
 from gsmap.register.surface import Surface
 from gsmap.types import Gaussians, Proposal, Sim3
 
-_NONE = Hidden(shown=1.0, by_colour=0.0, swell_by_colour=0.0, shift_m=0.0, swell_m=0.0, shift_by_swell=0.0)
+_NONE = Hidden(shown=1.0, by_colour=0.0, swell_by_colour=0.0, shift_m=0.0, swell_m=0.0, shift_by_swell=0.0, least_m=0.0)
 NOTHING_HIDDEN = CovarianceParams(hidden=_NONE, hidden_grey=_NONE)
 
 
@@ -272,6 +272,7 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
         turn_by_shift=0.5,
         field_m=0.004,
         field_power=2.0,
+        least_m=0.003,
     )
     bare, found = (condition(target, source, pose, p) for p in (NOTHING_HIDDEN, CovarianceParams(hidden=hidden)))
     growth = (bare.field_m / 0.004) ** 2
@@ -284,7 +285,7 @@ def test_what_leaves_no_residual_is_added_where_residuals_are_large(world, surfa
         (swell, found.of_scaled(1.0) - bare.of_scaled(1.0)),
         (0.01, found.of_rigid(1.0, -0.01, 0.0, None) - bare.of_rigid(1.0, -0.01, 0.0, None)),
     ):
-        shift = np.hypot(growth * 0.02, 0.4 * told * radius)
+        shift = np.sqrt((growth * 0.02) ** 2 + (0.4 * told * radius) ** 2 + 0.003**2)
         assert np.allclose(np.sqrt(np.diag(added)[:6]), np.r_[np.full(3, 0.5 * shift / radius), np.full(3, shift)])
     assert found.log_scale_sigma == pytest.approx(np.hypot(bare.log_scale_sigma, swell))
     assert np.sqrt(found.of_scaled(1.0)[6, 6]) == pytest.approx(found.log_scale_sigma)

@@ -11,7 +11,7 @@ from gsmap.geometry.rotations import retract
 from gsmap.methods.refiner import Surface
 from gsmap.types import Sim3
 
-VERSION = 3
+VERSION = 4
 SCALES = True
 
 _WIDTH = 0.3  # of the radius: distances to planes of this count a quarter
@@ -68,7 +68,7 @@ def refine(
     of its own spread, so that what is measured better counts more. The source's exposure (gain and offset) is fitted
     along, so a change of it costs nothing. The target's cells are laid on the source's planes as well, half of
     ``max_points`` each way: that averages the errors of both surfaces' planes, and one way alone prefers a source that
-    is too small, whose points all come nearer to some surface.
+    is too small, whose points all come nearer to some surface. A cell is not laid on one whose other side was seen.
     """
     params = params or Params()
     pose = start
@@ -83,7 +83,8 @@ def refine(
             if radius > _HARDLY_FINER * last:
                 continue
         last = radius
-        there, back = _Laid(target, source, count // 2), _Laid(source, target, count // 2, backward=True)
+        there = _Laid(target, source, count // 2, pose)
+        back = _Laid(source, target, count // 2, pose.inverse(), backward=True)
         for _ in range(params.iterations):
             # About the centroid of the pairs rotation, translation and scale hardly mix, wherever the origin lies.
             found = there.equations(pose, centre, radius, params)
@@ -128,10 +129,13 @@ class _Equations:
 class _Laid:
     """Cells of one surface laid on another by a pose, each on the nearest within one radius; what is known is kept."""
 
-    def __init__(self, onto: Surface, moving: Surface, count: int, *, backward: bool = False) -> None:
+    def __init__(self, onto: Surface, moving: Surface, count: int, start: Sim3, *, backward: bool = False) -> None:
         self._onto, self._moving, self._backward = onto, moving, backward
         self._rows = moving.sample(count)
         self._partners = np.full((len(self._rows), 5), -1.0)
+        # Turned once: from pose to pose faces turn by less than anything that is told by them.
+        known = onto.faces is not None and moving.faces is not None
+        self._faces = (onto.faces, moving.faces @ start.rotation.T) if known else (None, None)
 
     def equations(self, pose: Sim3, centre: np.ndarray, radius_m: float, params: Params) -> _Equations:
         """Under a pose that takes what moves into the frame of the other, for a step about ``centre`` (source frame).
@@ -157,5 +161,7 @@ class _Laid:
             radius_m=radius_m,
             width_m=_WIDTH * radius_m,
             colour_weight=params.colour_weight,
+            faces=self._faces[0],
+            own_faces=self._faces[1],
         )
         return _Equations(*found)
