@@ -13,7 +13,8 @@ from gsmap.optimize.measurements import Measurements
 from gsmap.optimize.params import Params
 from gsmap.optimize.state import State
 from gsmap.optimize.structure import component_labels
-from gsmap.optimize.survey import Component, tie_component
+from gsmap.optimize.survey import tie_component
+from gsmap.optimize.survey_system import Component
 from gsmap.types import PoseGraph, Sim3
 from gsmap.types.progress import Progress
 from gsmap.types.world import Survey, WorldTie

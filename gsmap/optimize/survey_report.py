@@ -1,0 +1,237 @@
+"""What a solved component says of each observation, and of where it lies in the world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from gsmap.optimize.survey_system import Active, Factor, System, Tests
+from gsmap.optimize.survey_terms import Terms, Unknowns
+from gsmap.types.world import Residual, Survey, WorldFrame, WorldTie
+
+
+def active_of(system: System, tie: WorldTie) -> Active:
+    """What an answer was solved from."""
+    out = tie.left_out()
+    terms = system.terms
+    names = (
+        [("point", p.name, "") for p in terms.points],
+        [("image", f"{i.point} in {i.image}", i.scene) for i in terms.images],
+        [("fix", f.name, f.scene) for f in terms.fixes],
+        [("bar", b.name, b.scenes[0]) for b in terms.bars],
+    )
+    points, images, fixes, bars = (
+        np.array([name not in out for name in some], dtype=bool) & use
+        for some, use in zip(names, system.usable, strict=True)
+    )
+    return points, images, fixes, bars
+
+
+def report(
+    system: System, x: Unknowns, active: Active, factor: Factor, index: int, frame: WorldFrame | None
+) -> WorldTie:
+    """The tie with all residuals."""
+    tests = system.tests(x, active, factor)
+    rows = _point_rows(system, x, active, factor, tests)
+    rows += (
+        _image_rows(system, x, active, tests)
+        + _fix_rows(system, x, active, tests)
+        + _bar_rows(system, x, active, tests)
+    )
+    covariance = world_covariance(system, factor)
+    factor_of = _variance_factor(system, x, active, tests)
+    notes = []
+    if factor_of > 1:
+        notes.append(
+            f"observations and edges disagree by {np.sqrt(factor_of):.2g} times what they claim: the covariance "
+            "is widened by that"
+        )
+    if sum(float(tests.redundancies[kind].sum()) for kind in (0, 2, 3)) < system.params.min_checks:
+        notes.append("hardly anything checks these observations: a blunder in one of them could not be told")
+    world = x.world.item(0)
+    return WorldTie(
+        index,
+        world,
+        covariance * factor_of,
+        world.scale,
+        float(np.sqrt(covariance[6, 6] * factor_of)),
+        frame,
+        tuple(rows),
+        notes=tuple(notes),
+    )
+
+
+def lengths_only(system: System, index: int, survey: Survey, missing: str) -> WorldTie:
+    """What scale bars alone tell, where positions do not determine the rest: the metre, and nothing else."""
+    terms = system.terms
+    rows = [Residual("point", p.name, "", "check" if p.check else "unused", reason=missing) for p in terms.points]
+    rows += [Residual("fix", f.name, f.scene, "unused", reason=missing) for f in terms.fixes]
+    if not terms.bars:
+        return WorldTie(index, frame=survey.frame, residuals=tuple(rows), problem=missing)
+    logs, variances = [], []
+    for bar in terms.bars:
+        poses = [system.scenes.item(terms._row[scene]) for scene in bar.scenes]
+        across = float(np.linalg.norm(poses[0].apply(bar.points[0]) - poses[1].apply(bar.points[1])))
+        picked = sum((s * pose.scale) ** 2 for s, pose in zip(bar.point_sigmas, poses, strict=True))
+        logs.append(np.log(bar.length_m / across))
+        variances.append((bar.sigma_m / bar.length_m) ** 2 + picked / across**2)
+    log, use = _agreed(np.array(logs), np.array(variances), system.params.gate_probability)
+    weights = use / np.array(variances)
+    sigma = float(weights.sum() ** -0.5)
+    free = int(use.sum()) - 1
+    off = float((weights * (np.array(logs) - log) ** 2).sum())
+    if free > 0 and off > chi2.ppf(system.params.gate_probability, free):
+        sigma *= float(np.sqrt(off / free))
+    for bar, one, variance, used in zip(terms.bars, logs, variances, use, strict=True):
+        error = bar.length_m * (np.exp(log - one) - 1)
+        rows.append(
+            Residual(
+                "bar", bar.name, bar.scenes[0], "used" if used else "outlier", (float(error),),
+                (float(bar.length_m * np.sqrt(variance)),), reason="" if used else "the other bars contradict it",
+            )
+        )  # fmt: skip
+    return WorldTie(index, None, None, float(np.exp(log)), sigma, survey.frame, tuple(rows), problem=missing)
+
+
+def world_covariance(system: System, factor: Factor) -> np.ndarray:
+    """(7, 7) of ``S_world_map`` with the anchor's scene taken as exact."""
+    joint = factor.joint([system.own.anchor])
+    back = system.scenes[np.array([system.own.anchor])]
+    # W X: on the scene's side the steps of both add; then back to the map's side.
+    to_scene, to_map = back.inverse().adjoint()[0], back.adjoint()[0]
+    both = np.concatenate([to_scene, np.eye(7)], axis=1)
+    out: np.ndarray = to_map @ both @ joint @ both.T @ to_map.T
+    return out
+
+
+def _variance_factor(system: System, x: Unknowns, active: Active, tests: Tests) -> float:
+    """How much larger residuals are than they claim, where chance does not explain it; at least 1."""
+    terms = system.terms.observations(x)
+    total = sum(float(t.squares[a].sum()) for t, a in zip(terms, active, strict=True))
+    count = sum(int(t.residuals.shape[1] * a.sum()) for t, a in zip(terms, active, strict=True))
+    count -= int(
+        sum(3 - (2 if i.depth is None else 3) for i, a in zip(system.terms.images, active[1], strict=True) if a)
+    )
+    unknown = 7 + 3 * len({int(k) for k in system.terms.image_points[active[1]]})
+    free = count - unknown
+    if free <= 0 or total <= chi2.ppf(system.params.gate_probability, free):
+        return 1.0
+    return total / free
+
+
+def _point_rows(system: System, x: Unknowns, active: Active, factor: Factor, tests: Tests) -> list[Residual]:
+    show = active[1] | (system.is_check[system.terms.image_points] if len(system.terms.images) else active[1])
+    met, picking, told = system.terms.triangulated(x, show)
+    at = replace(x, points=met)
+    images = system.terms.observations(at)[1]
+    rows = []
+    for k, point in enumerate(system.terms.points):
+        use = "check" if point.check else "used" if active[0][k] else "outlier"
+        error: tuple[float, ...] = ()
+        sigma: tuple[float, ...] = ()
+        statistic, dof, reason = _given(tests.statistics[0][k], tests.dofs[0][k]), int(tests.dofs[0][k]), ""
+        if told[k]:
+            off = met[k] - point.position
+            covariance = picking[k] + _carried(system, k, images, picking[k], factor, show)
+            error = (float(off[0]), float(off[1]), float(off[2]))
+            s = np.sqrt(np.maximum(0, np.diag(covariance)))
+            sigma = (float(s[0]), float(s[1]), float(s[2]))
+            if point.check:
+                h, v = point.sigma_m
+                statistic, dof = float(off @ np.linalg.solve(covariance + np.diag([h, h, v]) ** 2, off)), 3
+        elif point.check or not active[0][k]:
+            reason = "no two photos show it, and no surface was rendered where one does"
+        if use == "outlier" and not reason:
+            reason = "it contradicts the other observations"
+        rows.append(Residual("point", point.name, "", use, error, sigma, (), statistic, dof, reason))
+    return rows
+
+
+def _carried(
+    system: System, k: int, images: Terms, picking: np.ndarray, factor: Factor, show: np.ndarray
+) -> np.ndarray:
+    """(3, 3) what a triangulated point gets from poses that are not exact."""
+    mine = np.flatnonzero((system.terms.image_points == k) & show & images.valid)
+    some = Terms(
+        "image", images.residuals[mine], tuple((f[mine], J[mine]) for f, J in images.parts), images.valid[mine]
+    )
+    J = some.rows(system.size).reshape(-1, system.size)
+    by_point = slice(system.terms.columns.points + 3 * k, system.terms.columns.points + 3 * k + 3)
+    own = J[:, by_point].copy()
+    J[:, by_point] = 0
+    carry = -picking @ own.T @ J
+    out: np.ndarray = carry @ factor.solve(carry.T)
+    return (out + out.T) / 2
+
+
+def _image_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list[Residual]:
+    checked = system.is_check[system.terms.image_points] if len(system.terms.images) else active[1]
+    met, _, told = system.terms.triangulated(x, active[1] | checked)
+    points = np.where((told & ~active[0])[:, None], met, x.points)
+    errors = system.terms.image_errors_px(replace(x, points=points))
+    rows = []
+    for k, image in enumerate(system.terms.images):
+        use = "check" if checked[k] else "used" if active[1][k] else "outlier"
+        reason = "it contradicts the other observations" if use == "outlier" else ""
+        statistic = None if checked[k] or system.lone[k] else _given(tests.statistics[1][k], tests.dofs[1][k])
+        error = (float(errors[k, 0]), float(errors[k, 1])) if abs(errors[k]).max() < 1e6 else ()
+        rows.append(
+            Residual(
+                "image", f"{image.point} in {image.image}", image.scene, use, (), (), error, statistic,
+                int(tests.dofs[1][k]), reason,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _fix_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list[Residual]:
+    rows = []
+    at = x.world.item(0).apply(system.terms.fix_points(x.scenes))
+    for k, fix in enumerate(system.terms.fixes):
+        use = "used" if active[2][k] else "outlier"
+        off = at[k] - fix.position
+        h, v = np.hypot(fix.sigma_m, fix.common_sigma_m)
+        v = np.hypot(v, fix.sea_level_sigma_m)
+        rows.append(
+            Residual(
+                "fix", fix.name, fix.scene, use, (float(off[0]), float(off[1]), float(off[2])),
+                (float(h), float(h), float(v)), (), _given(tests.statistics[2][k], tests.dofs[2][k]),
+                int(tests.dofs[2][k]), "" if active[2][k] else "it contradicts the other observations",
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _bar_rows(system: System, x: Unknowns, active: Active, tests: Tests) -> list[Residual]:
+    rows = []
+    terms = system.terms.observations(x)[3]
+    for k, bar in enumerate(system.terms.bars):
+        use = "used" if active[3][k] else "outlier"
+        own = (system.terms._row[bar.scenes[0]], system.terms._row[bar.scenes[1]])
+        ends = [x.scenes.item(row).apply(bar.points[e]) for e, row in enumerate(own)]
+        length = float(np.linalg.norm(ends[0] - ends[1]) * np.exp(x.world.log_scales[0]))
+        off = length - bar.length_m
+        sigma = abs(off / terms.residuals[k, 0]) if terms.residuals[k, 0] else bar.sigma_m
+        rows.append(
+            Residual(
+                "bar", bar.name, bar.scenes[0], use, (off,), (float(sigma),), (),
+                _given(tests.statistics[3][k], tests.dofs[3][k]), int(tests.dofs[3][k]),
+                "" if active[3][k] else "it contradicts the other observations",
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _agreed(logs: np.ndarray, variances: np.ndarray, probability: float) -> tuple[float, np.ndarray]:
+    """The mean of those that agree, and which do: where three or more are there, those far from the median go."""
+    use = np.ones(len(logs), dtype=bool)
+    if len(logs) >= 3:
+        use = (logs - np.median(logs)) ** 2 <= chi2.ppf(probability, 1) * (variances + np.median(variances))
+    weights = use / variances
+    return float((weights * logs).sum() / weights.sum()), use
+
+
+def _given(value: float, dof: int) -> float | None:
+    return float(value) if dof > 0 and np.isfinite(value) else None
