@@ -9,6 +9,7 @@ it, and a cell is not laid on one that faces the other way.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class Params:
 
 
 def faces(
-    points: np.ndarray, normals: np.ndarray, tree: object, views: ViewCache, unit_m: float, params: Params | None = None
+    points: np.ndarray, normals: np.ndarray, tree: Any, views: ViewCache, unit_m: float, params: Params | None = None
 ) -> np.ndarray:
     """The normals turned to where the capture's own cameras saw the cells from.
 
@@ -94,12 +95,12 @@ def _decided(front: np.ndarray, back: np.ndarray, clear: float) -> np.ndarray:
     return decided
 
 
-def _filled(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: object, params: Params) -> np.ndarray:
+def _filled(side: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: Any, params: Params) -> np.ndarray:
     """(M,) sides, those not known taken from level neighbours."""
     unknown = np.flatnonzero(side == 0)
     if not len(unknown) or len(unknown) == len(side):
         return side
-    _, rows = tree.neighbours(params.num_neighbours)  # type: ignore[attr-defined]
+    _, rows = tree.neighbours(params.num_neighbours)
     near = rows[unknown]
     there = near < len(points)
     near = np.where(there, near, 0)
