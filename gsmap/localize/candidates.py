@@ -108,6 +108,8 @@ def candidates(
         at = pixels[matches.feature]
         sets = [np.arange(len(at)), *(np.flatnonzero(matches.view == view) for view in np.unique(matches.view))]
         for rows in sets:
+            if len(np.unique(matches.feature[rows])) < params.min_inliers:
+                continue
             pose = resection.resect(at[rows], matches.points[rows], intrinsics_px, size_px, focal_sigma, params)
             if pose is None:
                 continue

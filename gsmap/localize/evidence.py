@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
+from gsmap.localize.filters import means
 from gsmap.localize.looks import Look, smaller
 
 
@@ -76,8 +76,8 @@ def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Compariso
     rows = slice(params.half_px, rgb.shape[0] - params.half_px, params.step_px)
     columns = slice(params.half_px, rgb.shape[1] - params.half_px, params.step_px)
     size = 2 * params.half_px + 1
-    mean = uniform_filter(grey, size)
-    variance = np.maximum(uniform_filter(grey * grey, size) - mean**2, 0)
+    mean = means(grey, size)
+    variance = np.maximum(means(grey * grey, size) - mean**2, 0)
     best = np.full(grey[rows, columns].shape, -np.inf, np.float32)
     judged = np.zeros(best.shape, bool)
     seen, blocked = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
@@ -87,11 +87,11 @@ def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Compariso
         opaque = one.alpha > 0.9
         seen |= opaque
         blocked |= opaque & (one.depth_m < params.near_m)
-        other = uniform_filter(one.grey, size)
-        spread = np.maximum(uniform_filter(one.grey**2, size) - other**2, 0)
-        both = uniform_filter(grey * one.grey, size) - mean * other
+        other = means(one.grey, size)
+        spread = np.maximum(means(one.grey**2, size) - other**2, 0)
+        both = means(grey * one.grey, size) - mean * other
         correlation = both / np.sqrt(np.maximum(variance * spread, 1e-12))
-        whole = uniform_filter(opaque.astype(np.float32), size) > 0.95
+        whole = means(opaque.astype(np.float32), size) > 0.95
         tells = whole & (np.maximum(variance, spread) > params.min_structure**2) & (np.minimum(variance, spread) > 4e-5)
         correlation = np.where(tells, correlation, -np.inf)[rows, columns]
         better = correlation > best
@@ -109,7 +109,7 @@ def compare_coarsely(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> 
 
 
 def _patches(rgb: np.ndarray, params: Params) -> np.ndarray:
-    return np.stack([uniform_filter(rgb[..., c], 2 * params.half_px + 1) for c in range(3)], axis=-1)
+    return means(rgb, 2 * params.half_px + 1)
 
 
 def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from PIL import Image
-from scipy.ndimage import gaussian_filter
 
 from gsmap.localize import covariance, evidence, matching, probability, verdict
 from gsmap.localize.candidates import Candidate, candidates, matches_by_component, near_to
 from gsmap.localize.features import quantised, turns
+from gsmap.localize.filters import blurred
 from gsmap.localize.looks import GREY
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
@@ -178,7 +178,7 @@ def photo_features(picture: Picture, extractor: Extractor, smooth_px: Sequence[f
     """Features of a photo, without what is finer than renders are: of each of some degrees of that."""
     parts = []
     for smooth in smooth_px:
-        rgb = gaussian_filter(picture.rgb, (smooth, smooth, 0)) if smooth > 0 else picture.rgb
+        rgb = blurred(picture.rgb, smooth) if smooth > 0 else picture.rgb
         parts.append(extractor.extract((rgb * 255 + 0.5).astype(np.uint8)))
     turned = [part.angles_rad for part in parts if part.angles_rad is not None]
     return Keypoints(

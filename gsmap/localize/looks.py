@@ -17,8 +17,8 @@ GREY = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601
 def smaller(image: np.ndarray, by: int) -> np.ndarray:
     """(H // by, W // by, ...) float32 means of blocks of an image (H, W, ...)."""
     height, width = (n // by for n in image.shape[:2])
-    blocks = image[: height * by, : width * by].reshape(height, by, width, by, *image.shape[2:])
-    out: np.ndarray = blocks.mean((1, 3), dtype=np.float32)
+    rows = image[: height * by, : width * by].reshape(height, by, -1).sum(1, dtype=np.float32)  # whole rows: quicker
+    out: np.ndarray = rows.reshape(height, width, by, *image.shape[2:]).sum(2) / np.float32(by * by)
     return out
 
 
