@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap._native import laid as native_laid
 from gsmap.localize import resection
-from gsmap.localize.filters import blurred, means
+from gsmap.localize.filters import blurred, means, slopes
 from gsmap.localize.looks import Look
 
 
@@ -94,8 +94,8 @@ def align(
 
     Args:
         rgb: (H, W, 3) float32 in [0, 1].
-        one: a render of this size, from the pose that is given; of one scene, for where two disagree by a centimetre
-            the pose would lie between them.
+        one: a render of this size, from near the pose that is given; of one scene, for where two disagree by a
+            centimetre the pose would lie between them.
         intrinsics_px: (4,) of this size.
         blur_px: of this round, at this size.
         focal: its expected value and ``focal_sigma``, where it is free.
@@ -107,8 +107,8 @@ def align(
     if len(pixels) < params.min_points:
         return nothing
     laid = _Laid(
-        np.concatenate([photo, *np.gradient(photo, axis=(0, 1))], axis=2),
-        one.points(pixels, T_metric_camera, intrinsics_px),
+        np.concatenate([photo, slopes(photo).reshape(*photo.shape[:2], 6)], axis=2),
+        one.points(pixels),
         shown,
         slope,
         trust,
@@ -245,20 +245,19 @@ def _pixels(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Those of a render that are laid over a photo: where (K, 2), colours (K, 3), slopes (K, 2, 3), trust (K,)."""
     band = _band(one.rgb, one.alpha > params.min_alpha, blur, params.band)
-    slopes = np.stack(np.gradient(band, axis=(0, 1)), axis=2)  # (H, W, 2, 3)
-    contrast = np.sqrt((slopes**2).sum((2, 3)))
+    slope = slopes(band)
+    contrast = np.sqrt(np.einsum("hwdc,hwdc->hw", slope, slope))
     width = 2 * round(params.around_px * blur / 2) + 1
     relative = contrast / (means(contrast, width) + 1e-4)
     relative[~_smooth(one, params)] = 0
     count = min(params.max_points, int((relative > 0).sum()))
     rows = np.sort(np.argpartition(-relative.ravel(), max(count - 1, 0))[:count])
     row, column = np.divmod(rows, relative.shape[1])
-    both, mine, theirs = (
-        means((a * b).sum(2), width)[row, column] for a, b in ((photo, band), (photo, photo), (band, band))
-    )
+    products = [np.einsum("hwc,hwc->hw", a, b) for a, b in ((photo, band), (photo, photo), (band, band))]
+    both, mine, theirs = means(np.stack(products, axis=2), width)[row, column].T
     agree = both / np.sqrt(np.maximum(mine * theirs, 1e-12))
     trust = np.clip(agree.astype(np.float64), params.least_trust, 1.0) ** params.trust
-    return np.stack([column + 0.5, row + 0.5], axis=1), band[row, column], slopes[row, column], trust
+    return np.stack([column + 0.5, row + 0.5], axis=1), band[row, column], slope[row, column], trust
 
 
 def _smooth(one: Look, params: Params) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap._native import highest as native_highest
+from gsmap._native import slopes as native_slopes
 from gsmap._native import smoothed
 
 
@@ -23,9 +24,9 @@ def blurred(image: np.ndarray, sigma_px: float, truncate: float = 4.0, *, reflec
     return _smoothed(image, weights / weights.sum(), reflect)
 
 
-def means(image: np.ndarray, size_px: int, *, reflect: bool = True) -> np.ndarray:
-    """Means over squares of ``size_px`` (odd) around every pixel."""
-    return _smoothed(image, np.full(size_px, 1 / size_px), reflect)
+def means(image: np.ndarray, size_px: int, *, reflect: bool = True, first: int = 0, step: int = 1) -> np.ndarray:
+    """Means over squares of ``size_px`` (odd) around every pixel, or around those of ``[first::step, first::step]``."""
+    return _smoothed(image, np.full(size_px, 1 / size_px), reflect, first, step)
 
 
 def highest(image: np.ndarray, size_px: int) -> np.ndarray:
@@ -39,9 +40,15 @@ def lowest(image: np.ndarray, size_px: int) -> np.ndarray:
     return -highest(-image, size_px)
 
 
-def _smoothed(image: np.ndarray, weights: np.ndarray, reflect: bool) -> np.ndarray:
-    out: np.ndarray = smoothed(_deep(image), weights.astype(np.float32), reflect)
-    return out.reshape(image.shape)
+def slopes(image: np.ndarray) -> np.ndarray:
+    """(H, W, 2, ...) how an image changes from row to row and from column to column, by central differences."""
+    out: np.ndarray = native_slopes(_deep(image))
+    return out.reshape(*image.shape[:2], 2, *image.shape[2:])
+
+
+def _smoothed(image: np.ndarray, weights: np.ndarray, reflect: bool, first: int = 0, step: int = 1) -> np.ndarray:
+    out: np.ndarray = smoothed(_deep(image), weights.astype(np.float32), reflect, first, step)
+    return out.reshape(*out.shape[:2], *image.shape[2:])
 
 
 def _deep(image: np.ndarray) -> np.ndarray:

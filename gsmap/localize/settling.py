@@ -24,12 +24,16 @@ class Params:
         near_px: ... and those of the last ones, which have its full size.
         max_scenes: that are rendered, those with most matches first.
         min_found: fewer patches say nothing of the pose.
+        again_px: scenes are rendered again once what they show has moved by more than this ...
+        again_blurs: ... or, where renders are laid over the photo, by more than so many times their blur.
     """
 
     far_px: int = 32
     near_px: int = 6
     max_scenes: int = 3
     min_found: int = 8
+    again_px: float = 0.25
+    again_blurs: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +74,8 @@ class Settled:
         points: (K, 3) their places, metres.
         scene: (K,) int, whose patches they are, among ``looks``.
         tried: how many patches were looked for in the last round.
-        looks: renders from the pose; none where nothing was found from the first.
+        looks: renders from the pose, or from so near that it makes no difference; none where nothing was found from
+            the first.
     """
 
     T_metric_camera: np.ndarray
@@ -112,10 +117,10 @@ def settle(
     half = picture.halved()
 
     looks = look(scenes, pose, lens / 2, half.size_px, lifting)
-    patches = _found_again(half, 0.5, looks, pose, lens, params.far_px, tracks)
+    patches = _found_again(half, 0.5, looks, params.far_px, tracks)
     if len(patches.pixels) >= params.min_found:  # some of what was found far away is wrong
-        again = resection.resect(patches.pixels, patches.points, lens, picture.size_px, 0.0, poses)
-        start = pose if again is None else again.T_map_camera
+        sure = resection.resect(patches.pixels, patches.points, lens, picture.size_px, 0.0, poses)
+        start = pose if sure is None else sure.T_map_camera
         rough = resection.refine(patches.pixels, patches.points, start, lens, poses, focal=free)
         pose, lens = rough.T_map_camera, rough.intrinsics_px
 
@@ -127,13 +132,14 @@ def settle(
     best = int(np.argmax(counts))
     aligned = None
     for blur in laying.blur_px:
-        (one,) = look([scenes[best]], pose, lens / 2, half.size_px, lifting)
+        looks = look([scenes[best]], pose, lens / 2, half.size_px, lifting, looks, params.again_blurs * blur / 2)
+        (one,) = looks
         laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
         if len(laid.pixels):
             aligned, pose, lens = laid, laid.T_metric_camera, 2 * laid.intrinsics_px
 
     looks = look(scenes, pose, lens, picture.size_px, lifting)
-    patches = _found_again(picture, 1.0, looks, pose, lens, params.near_px, tracks)
+    patches = _found_again(picture, 1.0, looks, params.near_px, tracks)
     told = None if aligned is None else covariance.of_aligned(aligned, half.size_px, known, picture.focal_sigma)
     fit: resection.Refined | None = None
     if len(patches.pixels) >= params.min_found:
@@ -156,7 +162,7 @@ def settle(
         patches.points,
         patches.scene,
         patches.tried,
-        look(scenes, pose, lens, picture.size_px, lifting),
+        look(scenes, pose, lens, picture.size_px, lifting, looks, params.again_px),
     )
 
 
@@ -194,8 +200,6 @@ def _found_again(
     seen: Picture,
     factor: float,
     looks: Sequence[Look],
-    pose: np.ndarray,
-    lens: np.ndarray,
     reach_px: int,
     tracks: tracking.Params,
 ) -> _Patches:
@@ -206,7 +210,7 @@ def _found_again(
         keep = hits.found
         tried += len(keep)
         found.append(hits.photo_px[keep] / factor)
-        places.append(one.points(hits.render_px[keep], pose, lens * factor))
+        places.append(one.points(hits.render_px[keep]))
         whose.append(np.full(int(keep.sum()), place))
     return _Patches(np.concatenate(found), np.concatenate(places), np.concatenate(whose), tried)
 

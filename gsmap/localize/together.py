@@ -169,7 +169,7 @@ def _lifted(
     points, known = np.zeros((len(pixels), 3)), np.zeros(len(pixels), bool)
     for one in looks:
         new = one.sound[row, column] & ~known
-        points[new] = one.points(pixels[new], best.settled.T_metric_camera, best.settled.intrinsics_px)
+        points[new] = one.points(pixels[new])
         known |= new
     rows = np.flatnonzero(known)
     return points[rows], rows

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from gsmap.localize.filters import blurred, highest, means
+from gsmap.localize.filters import blurred, highest, means, slopes
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _corners(grey: np.ndarray, usable: np.ndarray, params: Params) -> tuple[np.n
     """Rows and columns of the pixels around which most varies in every direction, one a cell."""
     half = params.half_px
     smooth = blurred(grey, 0.8)
-    gy, gx = np.gradient(smooth)
+    gy, gx = np.moveaxis(slopes(smooth), 2, 0)
     size = 2 * half - 1
     a, b, c = np.moveaxis(means(np.stack([gx * gx, gx * gy, gy * gy], axis=2), size), 2, 0)
     weakest = (a + c) / 2 - np.sqrt(np.maximum(((a - c) / 2) ** 2 + b * b, 0))

@@ -16,6 +16,7 @@ void bind_merging(nb::module_ &);
 void bind_parts(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_sift(nb::module_ &);
+void bind_signatures(nb::module_ &);
 void bind_stopping(nb::module_ &);
 void bind_surroundings(nb::module_ &);
 void bind_surface(nb::module_ &);
@@ -35,6 +36,7 @@ NB_MODULE(_native, m) {
     gsmap::bind_parts(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_sift(m);
+    gsmap::bind_signatures(m);
     gsmap::bind_stopping(m);
     gsmap::bind_surroundings(m);
     gsmap::bind_surface(m);

@@ -126,6 +126,7 @@ struct Kernels {
     // Of local features: extrema among three levels of a picture, and slopes as lengths and angles.
     int (*peaks)(const float *const *rows, float bar, int from, int to, int32_t *found);
     void (*polar)(const float *dx, const float *dy, int count, float *length, float *angle);
+    int64_t (*near)(uint64_t mine, const uint64_t *theirs, int64_t count, int most, int32_t *which, uint8_t *differ);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

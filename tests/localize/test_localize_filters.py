@@ -36,6 +36,18 @@ def test_windows_are_as_scipy_has_them(shape, instruction_set):
     assert np.array_equal(filters.lowest(image, 7), ndimage.minimum_filter(image, [7 if p else 1 for p in plane]))
 
 
+def test_windows_around_some_pixels_are_those_of_all():
+    image = np.random.default_rng(1).random((37, 53, 2)).astype(np.float32)
+    some = filters.means(image, 7, first=3, step=8)
+    assert some.shape == (5, 7, 2)
+    assert np.array_equal(some, filters.means(image, 7)[3::8, 3::8])
+
+
+def test_slopes_are_central_differences():
+    image = np.random.default_rng(1).random((7, 9, 3)).astype(np.float32)
+    assert np.allclose(filters.slopes(image), np.stack(np.gradient(image, axis=(0, 1)), axis=2), atol=1e-6)
+
+
 @pytest.mark.parametrize("focal", [None, (180.0, 0.2)])
 def test_a_step_is_the_sum_over_its_points(focal):
     rng = np.random.default_rng(2)
