@@ -62,6 +62,7 @@ class Aligned:
         residuals: (K, 3) of their colours.
         weights: (K, 3) of those.
         jacobian: (K, 3, 6 or 7) of the colours by the pose, as in `gsmap.localize.resection.Refined`.
+        agreement: mean of what the points were trusted before the pose was moved; NaN of none.
     """
 
     T_metric_camera: np.ndarray
@@ -70,6 +71,7 @@ class Aligned:
     residuals: np.ndarray
     weights: np.ndarray
     jacobian: np.ndarray
+    agreement: float = np.nan
 
 
 def agreements(rgb: np.ndarray, looks: Sequence[Look], blur_px: float, params: Params) -> np.ndarray:
@@ -125,7 +127,7 @@ def align(
     # Slopes of the render alone: the photo's noise has slopes as well, which would pass for information.
     without = replace(state, seen=np.concatenate([state.seen[:, :3], gain * slope.reshape(-1, 6)], axis=1))
     differ, weights, J = _linear(without, shown, slope, gain, scale)
-    return Aligned(pose, lens, state.pixels, differ, weights, J)
+    return Aligned(pose, lens, state.pixels, differ, weights, J, float(trust.mean()))
 
 
 def _descended(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from PIL import Image
 
-from gsmap.localize import covariance, evidence, matching, probability, verdict
+from gsmap.localize import covariance, evidence, matching, probability, resection, verdict
 from gsmap.localize.candidates import Candidate, candidates, matches_by_component, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.filters import blurred
@@ -150,10 +150,20 @@ def judged_poses(
             sure = max((one.probability for one in out), default=0.0) >= params.sure
             if sure and candidate.num_inliers < params.rival_inliers * out[0].candidate.num_inliers:
                 break
-            out.append(judged_pose(picture, candidate, scenes, params))
+            if not any(_settles_at(candidate, one, picture, params) for one in out):
+                out.append(judged_pose(picture, candidate, scenes, params))
         if max((one.probability for one in out), default=0.0) >= params.verdict.min_probability:
             break
     return sorted(out, key=lambda one: -one.probability), why
+
+
+def _settles_at(candidate: Candidate, found: Judged, picture: Picture, params: Params) -> bool:
+    """Whether a rough pose is that of a place that was found: most of its matches agree with the sharp pose as well."""
+    if found.probability < params.verdict.min_probability or candidate.component != found.candidate.component:
+        return False
+    settled = (found.settled.T_metric_camera, found.settled.intrinsics_px, picture.size_px)
+    agree = resection.agreeing(candidate.pixels, candidate.points, *settled, params.resection)
+    return bool(agree.sum() > len(agree) / 2)
 
 
 def _rough_poses(

@@ -24,6 +24,8 @@ class Params:
         near_px: ... and those of the last ones, which have its full size.
         max_scenes: that are rendered, those with most matches first.
         min_found: fewer patches say nothing of the pose.
+        min_agreement: where a render that was laid over the photo once agrees with it less than this when it is laid
+            over it again, the photo shows another place; made places say where (``tools/fit_localize.py``).
         again_px: scenes are rendered again once what they show has moved by more than this ...
         again_blurs: ... or, where renders are laid over the photo, by more than so many times their blur.
     """
@@ -32,7 +34,8 @@ class Params:
     near_px: int = 6
     max_scenes: int = 3
     min_found: int = 8
-    again_px: float = 0.25
+    min_agreement: float = 0.12
+    again_px: float = 0.5
     again_blurs: float = 0.5
 
 
@@ -135,6 +138,8 @@ def settle(
         looks = look([scenes[best]], pose, lens / 2, half.size_px, lifting, looks, params.again_blurs * blur / 2)
         (one,) = looks
         laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
+        if aligned is not None and laid.agreement < params.min_agreement:
+            return _nowhere(pose, lens)
         if len(laid.pixels):
             aligned, pose, lens = laid, laid.T_metric_camera, 2 * laid.intrinsics_px
 
@@ -152,7 +157,7 @@ def settle(
         at, _ = project(patches.points, np.linalg.inv(pose), lens)
         fit = replace(fit, residuals_px=patches.pixels - at)
     if told is None:
-        return Settled(pose, lens, None, None, patches.pixels, patches.points, patches.scene, patches.tried, [])
+        return _nowhere(pose, lens)
     return Settled(
         pose,
         lens,
@@ -164,6 +169,11 @@ def settle(
         patches.tried,
         look(scenes, pose, lens, picture.size_px, lifting, looks, params.again_px),
     )
+
+
+def _nowhere(pose: np.ndarray, lens: np.ndarray) -> Settled:
+    """What is said of a pose from which the map shows something else than the photo."""
+    return Settled(pose, lens, None, None, np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, int), 0, [])
 
 
 def _between(
