@@ -327,7 +327,7 @@ def retrieval_alone(held: World) -> Localise:
         localizer = held.localizer
         index = localizer.index.only(allowed)
         picture, _ = prepared(photo, localizer.params)
-        found = photo_features(picture, localizer.extractor, [localizer.params.matching.smooth_px])
+        found = photo_features(picture, localizer.extractor, localizer.params.matching.smooth_px)
         views = most_alike(index, found, picture.intrinsics_px, 1, localizer.params.retrieval)
         if not views:
             return Placement(photo.name, "no view is like it"), time.process_time() - began

@@ -20,8 +20,6 @@ from gsmap.localize.settling import Picture, Settled, inliers, settle
 from gsmap.methods.extractor import Extractor
 from gsmap.types.localization import Keypoints, Photo, Placement
 
-_FIRST, _BOTH = (1.0,), (1.0, 0.0)  # times `matching.Params.smooth_px`
-
 
 @dataclass(frozen=True, eq=False)
 class Judged:
@@ -138,8 +136,11 @@ def judged_poses(
     out: list[Judged] = []
     why = ""
     smooth = params.matching.smooth_px
-    for views, factors in ((params.matching.views, _FIRST), (params.matching.more_views, _BOTH)):
-        found = photo_features(picture, extractor, [smooth * factor for factor in factors])
+    parts: list[Keypoints] = []
+    # First what is as fine as renders are; where that places it nowhere, more views, and what is finer as well.
+    for views, finer in ((params.matching.views, smooth), (params.matching.more_views, 0.0)):
+        parts.append(photo_features(picture, extractor, finer))
+        found = _together(parts)
         if len(found) < params.resection.min_inliers:
             return [], f"it shows too little: {len(found)} features"
         rough, most = _rough_poses(picture, found, index, scenes, replace(params.matching, views=views), params)
@@ -184,12 +185,13 @@ def _rough_poses(
     return rough, max((len(one.feature) for one in matches.values()), default=0)
 
 
-def photo_features(picture: Picture, extractor: Extractor, smooth_px: Sequence[float]) -> Keypoints:
-    """Features of a photo, without what is finer than renders are: of each of some degrees of that."""
-    parts = []
-    for smooth in smooth_px:
-        rgb = blurred(picture.rgb, smooth) if smooth > 0 else picture.rgb
-        parts.append(extractor.extract((rgb * 255 + 0.5).astype(np.uint8)))
+def photo_features(picture: Picture, extractor: Extractor, smooth_px: float) -> Keypoints:
+    """Features of a photo, without what is finer than renders are."""
+    rgb = blurred(picture.rgb, smooth_px) if smooth_px > 0 else picture.rgb
+    return extractor.extract((rgb * 255 + 0.5).astype(np.uint8))
+
+
+def _together(parts: Sequence[Keypoints]) -> Keypoints:
     turned = [part.angles_rad for part in parts if part.angles_rad is not None]
     return Keypoints(
         np.concatenate([part.pixels for part in parts]),

@@ -73,7 +73,7 @@ class Look:
             return np.inf
         pixels = np.stack([column, row], axis=1) * float(_EVERY) + 0.5
         at, depth = project(self.points(pixels), np.linalg.inv(T_metric_camera), intrinsics_px)
-        return float(np.quantile(np.where(depth > 0, np.linalg.norm(at - pixels, axis=1), np.inf), _MOST))
+        return float(np.quantile(np.where(depth > 0, np.linalg.norm(at - pixels, axis=1), 1e9), _MOST))
 
 
 def look(

@@ -25,7 +25,7 @@ class Params:
 
     smooth_px: float = 1.2
     views: int = 24
-    more_views: int = 60
+    more_views: int = 120
     max_ratio: float = 0.85
     max_distance: float = 0.9
     max_turn: int = 18

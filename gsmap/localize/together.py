@@ -90,7 +90,7 @@ def _shot(
     photo: Photo, index: ViewIndex, scenes: Mapping[str, PlacedFeatures], extractor: Extractor, params: Params
 ) -> _Shot:
     picture, scale = prepared(photo, params)
-    found = photo_features(picture, extractor, [0.0])  # photos hold what renders do not
+    found = photo_features(picture, extractor, 0.0)  # photos hold what renders do not
     described = matching.Described(quantised(found.descriptors), turns(found))
     judged, why = judged_poses(picture, index, scenes, extractor, params)
     return _Shot(photo, picture, scale, found, described, judged, why)
