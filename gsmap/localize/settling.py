@@ -34,7 +34,7 @@ class Params:
     near_px: int = 6
     max_scenes: int = 3
     min_found: int = 8
-    min_agreement: float = 0.12
+    min_agreement: float = 0.1
     again_px: float = 0.5
     again_blurs: float = 0.5
 
