@@ -5,6 +5,7 @@
     python tools/fit_localize.py PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
     python tools/fit_localize.py PLACES sigma --cache FOLDER     # says which `localize.covariance` fits best
     python tools/fit_localize.py PLACES agreement --cache FOLDER # what a `localize.settling.min_agreement` costs
+    python tools/fit_localize.py PLACES placed --cache FOLDER    # says what photos of these are placed, and their cost
     python tools/fit_localize.py PLACES test --cache FOLDER      # says how both do on places that they have not seen
 
 Everything comes from made places (`gsmap_synthetic`).
@@ -422,6 +423,34 @@ def fit_sigma(found: list[Place], params: Params) -> None:
         print(f"likelihood {likely_:.2f}: {settings}; NEES {middle:.1f}, 90th {most:.1f}")
 
 
+# --- placed ----------------------------------------------------------------------------------------------------------
+
+
+def place_all(found: list[Place], params: Params) -> None:
+    """Every photo in its own place, and every fourth in another one."""
+    extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
+    indexes = {place.seed: index_of(place.scenes, params) for place in found}
+    for elsewhere in (False, True):
+        answers, seconds = [], []
+        for number, place in enumerate(found):
+            other = found[(number + elsewhere) % len(found)]
+            scenes = {scene.scene: scene for scene in other.scenes}
+            for told in place.photos[:: 4 if elsewhere else 1]:
+                began = time.process_time()
+                said = localizing.localize_photo(place.photo(told), indexes[other.seed], scenes, extractor, params)
+                seconds.append(time.process_time() - began)
+                wrong = False
+                if said.T_map_camera is not None:
+                    apart = np.linalg.inv(np.array(told["T_world_camera"])) @ said.T_map_camera
+                    turn = np.degrees(np.linalg.norm(rotation_vectors(apart[:3, :3])[0]))
+                    wrong = elsewhere or turn > WRONG_DEG or np.linalg.norm(apart[:3, 3]) > WRONG_M
+                answers.append((said.is_placed, wrong))
+        placed, wrong = np.sum(answers, axis=0)
+        where = "in another place" if elsewhere else "in their own places"
+        cost = f"{np.mean(seconds):.2f} CPU s on average, {np.median(seconds):.2f} in the median"
+        print(f"{len(answers)} photographs {where}: {placed} placed, {wrong} wrong; {cost}", flush=True)
+
+
 # --- agreement -------------------------------------------------------------------------------------------------------
 
 
@@ -484,7 +513,7 @@ def save(model: Odds) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
-    parser.add_argument("what", choices=("words", "sigma", "agreement", "verdict", "test"))
+    parser.add_argument("what", choices=("words", "sigma", "agreement", "placed", "verdict", "test"))
     parser.add_argument("--cache", type=Path, required=True)
     args = parser.parse_args()
     params = Params()
@@ -496,6 +525,9 @@ def main() -> int:
         return 0
     if args.what == "agreement":
         fit_agreement(places(args.places, "fit", args.cache, params), params)
+        return 0
+    if args.what == "placed":
+        place_all(places(args.places, "test", args.cache, params), params)
         return 0
     split = "fit" if args.what == "verdict" else "test"
     kept = args.cache / f"judged-{split}.pickle"
