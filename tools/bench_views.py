@@ -47,7 +47,7 @@ class Asked:
 
     def __init__(self, place: Place, told: dict, params: Params, extractor) -> None:
         self.picture, _ = prepared(place.photo(told), params)
-        self.found = photo_features(self.picture, extractor, [params.matching.smooth_px])
+        self.found = photo_features(self.picture, extractor, params.matching.smooth_px)
         self.right: dict[tuple[str, int], int] = {}
         mine, truth = Described(quantised(self.found.descriptors), turns(self.found)), np.array(told["T_world_camera"])
         for scene in place.scenes:

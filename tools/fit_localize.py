@@ -4,6 +4,8 @@
     python tools/fit_localize.py PLACES words --cache FOLDER     # writes gsmap/localize/words.npz
     python tools/fit_localize.py PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
     python tools/fit_localize.py PLACES sigma --cache FOLDER     # says which `localize.covariance` fits best
+    python tools/fit_localize.py PLACES agreement --cache FOLDER # what a `localize.settling.min_agreement` costs
+    python tools/fit_localize.py PLACES placed --cache FOLDER    # says what photos of these are placed, and their cost
     python tools/fit_localize.py PLACES test --cache FOLDER      # says how both do on places that they have not seen
 
 Everything comes from made places (`gsmap_synthetic`).
@@ -36,7 +38,7 @@ from scipy.optimize import minimize
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
-from gsmap.localize import features, localizing, probability, settling, words
+from gsmap.localize import aligning, features, localizing, probability, settling, words
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
@@ -118,7 +120,7 @@ def fit_words(found: list[Place], params: Params) -> None:
     asking: dict[str, np.ndarray] = {}
     for place in found:
         pictures = [localizing.prepared(place.photo(told), params)[0] for told in place.photos]
-        smooth = [params.matching.smooth_px]
+        smooth = params.matching.smooth_px
         asking[place.seed] = np.concatenate(
             [localizing.photo_features(picture, extractor, smooth).descriptors for picture in pictures]
         )
@@ -421,6 +423,80 @@ def fit_sigma(found: list[Place], params: Params) -> None:
         print(f"likelihood {likely_:.2f}: {settings}; NEES {middle:.1f}, 90th {most:.1f}")
 
 
+# --- placed ----------------------------------------------------------------------------------------------------------
+
+
+def place_all(found: list[Place], params: Params) -> None:
+    """Every photo in its own place, and every fourth in another one."""
+    extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
+    indexes = {place.seed: index_of(place.scenes, params) for place in found}
+    for elsewhere in (False, True):
+        answers, seconds = [], []
+        for number, place in enumerate(found):
+            other = found[(number + elsewhere) % len(found)]
+            scenes = {scene.scene: scene for scene in other.scenes}
+            for told in place.photos[:: 4 if elsewhere else 1]:
+                began = time.process_time()
+                said = localizing.localize_photo(place.photo(told), indexes[other.seed], scenes, extractor, params)
+                seconds.append(time.process_time() - began)
+                wrong = False
+                if said.T_map_camera is not None:
+                    apart = np.linalg.inv(np.array(told["T_world_camera"])) @ said.T_map_camera
+                    turn = np.degrees(np.linalg.norm(rotation_vectors(apart[:3, :3])[0]))
+                    wrong = elsewhere or turn > WRONG_DEG or np.linalg.norm(apart[:3, 3]) > WRONG_M
+                answers.append((said.is_placed, wrong))
+        placed, wrong = np.sum(answers, axis=0)
+        where = "in another place" if elsewhere else "in their own places"
+        cost = f"{np.mean(seconds):.2f} CPU s on average, {np.median(seconds):.2f} in the median"
+        print(f"{len(answers)} photographs {where}: {placed} placed, {wrong} wrong; {cost}", flush=True)
+
+
+# --- agreement -------------------------------------------------------------------------------------------------------
+
+
+def fit_agreement(found: list[Place], params: Params) -> None:
+    """How well renders agree with a photo that they were laid over, from right poses and from wrong ones.
+
+    Of every other photo in its own place and in another one; a pose's agreement is the least of those that are asked.
+    """
+    extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
+    params = replace(params, max_candidates=4, sure=2.0, settling=replace(params.settling, min_agreement=-1.0))
+    align, judge, asked = aligning.align, localizing.judged_pose, []
+
+    def noted(*args, **kwargs):
+        laid = align(*args, **kwargs)
+        asked.append(laid.agreement)
+        return laid
+
+    aligning.align = noted
+    rows: list[tuple[float, bool, bool]] = []  # agreement, right, and placed
+    for number, place in enumerate(found):
+        for told, other in ((t, o) for t in place.photos[::2] for o in (place, found[(number + 1) % len(found)])):
+            picture, _ = localizing.prepared(place.photo(told), params)
+            scenes = {scene.scene: scene for scene in other.scenes}
+            index = index_of(other.scenes, params)
+
+            def judged(*args, told=told, other=other, place=place):
+                asked.clear()
+                one = judge(*args)
+                kind = "found" if other is place else "elsewhere"
+                (deg, metres), _ = errors(one, np.array(told["T_world_camera"]), kind)
+                right = deg < RIGHT_DEG and metres < RIGHT_M
+                least = min(asked[1:], default=np.nan)
+                rows.append((least, right, one.probability >= params.verdict.min_probability))
+                return one
+
+            localizing.judged_pose = judged
+            localizing.judged_poses(picture, index, scenes, extractor, params)
+    localizing.judged_pose, aligning.align = judge, align
+    agreement, right, placed = (np.array(column) for column in zip(*rows, strict=True))
+    print(f"{right.sum()} right poses, {(right & placed).sum()} of them placed, {(~right).sum()} wrong ones")
+    for bar in (0.06, 0.08, 0.1, 0.12, 0.15, 0.2):
+        under = agreement < bar
+        lost = f"{(under & right).sum()} right poses under it, {(under & right & placed).sum()} of them placed"
+        print(f"  min_agreement {bar}: {lost}; {(under & ~right).sum()} wrong ones")
+
+
 def save(model: Odds) -> None:
     curves = {
         name: {
@@ -437,7 +513,7 @@ def save(model: Odds) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
-    parser.add_argument("what", choices=("words", "sigma", "verdict", "test"))
+    parser.add_argument("what", choices=("words", "sigma", "agreement", "placed", "verdict", "test"))
     parser.add_argument("--cache", type=Path, required=True)
     args = parser.parse_args()
     params = Params()
@@ -446,6 +522,12 @@ def main() -> int:
         return 0
     if args.what == "sigma":
         fit_sigma(places(args.places, "fit", args.cache, params), params)
+        return 0
+    if args.what == "agreement":
+        fit_agreement(places(args.places, "fit", args.cache, params), params)
+        return 0
+    if args.what == "placed":
+        place_all(places(args.places, "test", args.cache, params), params)
         return 0
     split = "fit" if args.what == "verdict" else "test"
     kept = args.cache / f"judged-{split}.pickle"

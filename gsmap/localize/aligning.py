@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, uniform_filter
 
+from gsmap._native import laid as native_laid
 from gsmap.localize import resection
+from gsmap.localize.filters import blurred, means, slopes
 from gsmap.localize.looks import Look
 
 
@@ -61,6 +62,7 @@ class Aligned:
         residuals: (K, 3) of their colours.
         weights: (K, 3) of those.
         jacobian: (K, 3, 6 or 7) of the colours by the pose, as in `gsmap.localize.resection.Refined`.
+        agreement: mean of what the points were trusted before the pose was moved; NaN of none.
     """
 
     T_metric_camera: np.ndarray
@@ -69,6 +71,7 @@ class Aligned:
     residuals: np.ndarray
     weights: np.ndarray
     jacobian: np.ndarray
+    agreement: float = np.nan
 
 
 def agreements(rgb: np.ndarray, looks: Sequence[Look], blur_px: float, params: Params) -> np.ndarray:
@@ -93,8 +96,8 @@ def align(
 
     Args:
         rgb: (H, W, 3) float32 in [0, 1].
-        one: a render of this size, from the pose that is given; of one scene, for where two disagree by a centimetre
-            the pose would lie between them.
+        one: a render of this size, from near the pose that is given; of one scene, for where two disagree by a
+            centimetre the pose would lie between them.
         intrinsics_px: (4,) of this size.
         blur_px: of this round, at this size.
         focal: its expected value and ``focal_sigma``, where it is free.
@@ -105,67 +108,123 @@ def align(
     pixels, shown, slope, trust = _pixels(photo, one, blur_px, params)
     if len(pixels) < params.min_points:
         return nothing
-    points = one.points(pixels, T_metric_camera, intrinsics_px)
-    planes = np.concatenate([photo, *np.gradient(photo, axis=(0, 1))], axis=2)  # value, along rows, along columns
-    size = (rgb.shape[1], rgb.shape[0])
-    dim = 6 if focal is None else 7
-
-    def at(pose: np.ndarray, lens: np.ndarray) -> _State:
-        minus, jacobian = resection.linearised(np.zeros((len(points), 2)), points, pose, lens, dim)
-        pixels = -minus
-        inside = (jacobian != 0).any((1, 2)) & (pixels > 1).all(1) & (pixels < np.array(size) - 1).all(1)
-        return _State(pose, lens, pixels, _sampled(planes, pixels), trust * inside, jacobian)
-
-    state = at(T_metric_camera, intrinsics_px)
-    gain = _gain(state.seen, shown, state.trust[:, None], params.max_gain)
+    laid = _Laid(
+        np.concatenate([photo, slopes(photo).reshape(*photo.shape[:2], 6)], axis=2),
+        one.points(pixels),
+        shown,
+        slope,
+        trust,
+        focal,
+    )
+    state = laid.state(T_metric_camera, intrinsics_px)
+    gain = _bounded(_gain(state.seen, shown, state.trust[:, None]), params.max_gain)
     left = np.abs(state.seen[:, :3] - gain * shown)[state.trust > 0]
     if len(left) < params.min_points:
         return nothing
     scale = params.doubt * max(1.4826 * float(np.median(left)), 1e-3)
+    pose, lens, gain = _descended(laid, T_metric_camera, intrinsics_px, gain, scale, params)
+    state = laid.state(pose, lens)
+    # Slopes of the render alone: the photo's noise has slopes as well, which would pass for information.
+    without = replace(state, seen=np.concatenate([state.seen[:, :3], gain * slope.reshape(-1, 6)], axis=1))
+    differ, weights, J = _linear(without, shown, slope, gain, scale)
+    return Aligned(pose, lens, state.pixels, differ, weights, J, float(trust.mean()))
+
+
+def _descended(
+    laid: _Laid, pose: np.ndarray, lens: np.ndarray, gain: float, scale: float, params: Params
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Pose, lens and gain from which no step is better."""
     damping = 1e-4
     for _ in range(params.iterations):
-        differ, weights, J = _linear(state, shown, slope, gain, scale)
-        A = np.einsum("kcd,kc,kce->de", J, weights, J, optimize=True)
-        b = -np.einsum("kcd,kc,kc->d", J, weights, differ, optimize=True)
-        if focal is not None and np.isfinite(focal[1]):
-            A[6, 6] += scale**2 / focal[1] ** 2
-            b[6] += scale**2 * np.log(focal[0] / state.lens[0]) / focal[1] ** 2
-        before = _cost(state, shown, gain, scale, focal)
+        now = laid.step(pose, lens, gain, scale)
         while damping <= 10.0:
-            step = np.linalg.solve(A + damping * np.diag(np.diag(A)) + 1e-9 * np.eye(dim), b)
-            lens = state.lens.copy()
-            if dim == 7:
-                lens[:2] *= np.exp(np.clip(step[6], -0.1, 0.1))
-            tried = at(resection.moved(state.pose, step[:6]), lens)
-            if _cost(tried, shown, gain, scale, focal) < before:
+            diagonal = damping * np.diag(np.diag(now.information)) + 1e-9 * np.eye(len(now.slope))
+            step = np.linalg.solve(now.information + diagonal, now.slope)
+            further = lens.copy()
+            if len(step) == 7:
+                further[:2] *= np.exp(np.clip(step[6], -0.1, 0.1))
+            tried = resection.moved(pose, step[:6])
+            then = laid.step(tried, further, gain, scale)
+            if then.cost < now.cost:
                 break
             damping = max(10 * damping, 1e-3)
         else:
             break
-        state, damping = tried, max(damping / 10, 1e-6)
-        gain = _gain(state.seen, shown, _linear(state, shown, slope, gain, scale)[1], params.max_gain)
+        pose, lens, damping = tried, further, max(damping / 10, 1e-6)
+        gain = _bounded(then.gain, params.max_gain)
         if np.abs(step[:3]).max() < 2e-5 and np.abs(step[3:6]).max() < 5e-5:
             break
-    # Slopes of the render alone: the photo's noise has slopes as well, which would pass for information.
-    without = replace(state, seen=np.concatenate([state.seen[:, :3], gain * slope.reshape(-1, 6)], axis=1))
-    differ, weights, J = _linear(without, shown, slope, gain, scale)
-    return Aligned(state.pose, state.lens, state.pixels, differ, weights, J)
+    return pose, lens, gain
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """What a pose is worth, and where a better one lies.
+
+    Args:
+        cost: the mean of Cauchy's loss over the points that lie in the photo.
+        gain: by which the render's band would be the photo's there.
+        information: (dim, dim) of the normal equations.
+        slope: (dim,) their right side.
+    """
+
+    cost: float
+    gain: float
+    information: np.ndarray
+    slope: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Laid:
+    """Points of a render, and the photo that they are laid over.
+
+    Args:
+        planes: (H, W, 9) float32 the photo's band: colours, their slopes along rows, and along columns.
+        points: (K, 3) where they lie in the map, metres.
+        shown: (K, 3) float32 colours of the render's band.
+        slope: (K, 2, 3) float32 of these, along rows and along columns.
+        trust: (K,) float64.
+        focal: of `align`.
+    """
+
+    planes: np.ndarray
+    points: np.ndarray
+    shown: np.ndarray
+    slope: np.ndarray
+    trust: np.ndarray
+    focal: tuple[float, float] | None
+
+    def step(self, pose: np.ndarray, lens: np.ndarray, gain: float, scale: float) -> _Step:
+        """From one pose; a focal length that is far from the expected one costs as well."""
+        told = (self.planes, self.points, self.shown, self.slope, self.trust)
+        cost, within, both, own, A, b = native_laid(*told, pose, lens, gain, scale, 6 if self.focal is None else 7)
+        if self.focal is not None and np.isfinite(self.focal[1]):
+            far = np.log(self.focal[0] / lens[0])
+            A[6, 6] += scale**2 / self.focal[1] ** 2
+            b[6] += scale**2 * far / self.focal[1] ** 2
+            cost += (far / self.focal[1]) ** 2
+        return _Step(cost / max(within, 1e-9), both / max(own, 1e-9), A, b)
+
+    def state(self, pose: np.ndarray, lens: np.ndarray) -> _State:
+        """The same of every point, for what is asked of them once."""
+        dim = 6 if self.focal is None else 7
+        minus, jacobian = resection.linearised(np.zeros((len(self.points), 2)), self.points, pose, lens, dim)
+        pixels, size = -minus, np.array(self.planes.shape[1::-1])
+        inside = (jacobian != 0).any((1, 2)) & (pixels > 1).all(1) & (pixels < size - 1).all(1)
+        return _State(pixels, _sampled(self.planes, pixels), self.trust * inside, jacobian)
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A pose that is tried.
+    """Points from one pose.
 
     Args:
-        pose, lens: (4, 4), (4,).
         pixels: (K, 2) where the points come to lie.
         seen: (K, 9) what the photo shows there: the band's colours, their slopes along rows, and along columns.
         trust: (K,) 0 where they lie outside.
         jacobian: (K, 2, dim) of the pixels.
     """
 
-    pose: np.ndarray
-    lens: np.ndarray
     pixels: np.ndarray
     seen: np.ndarray
     trust: np.ndarray
@@ -183,34 +242,24 @@ def _linear(
     return differ, weights, jacobian
 
 
-def _cost(state: _State, shown: np.ndarray, gain: float, scale: float, focal: tuple[float, float] | None) -> float:
-    """The mean of Cauchy's loss over the points that lie in the photo."""
-    differ = (state.seen[:, :3] - gain * shown) / scale
-    total = (state.trust[:, None] * np.log1p(differ**2)).sum()
-    if focal is not None and np.isfinite(focal[1]):
-        total += (np.log(focal[0] / state.lens[0]) / focal[1]) ** 2
-    return float(total / max(state.trust.sum(), 1e-9))
-
-
 def _pixels(
     photo: np.ndarray, one: Look, blur: float, params: Params
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Those of a render that are laid over a photo: where (K, 2), colours (K, 3), slopes (K, 2, 3), trust (K,)."""
     band = _band(one.rgb, one.alpha > params.min_alpha, blur, params.band)
-    slopes = np.stack(np.gradient(band, axis=(0, 1)), axis=2)  # (H, W, 2, 3)
-    contrast = np.sqrt((slopes**2).sum((2, 3)))
+    slope = slopes(band)
+    contrast = np.sqrt(np.einsum("hwdc,hwdc->hw", slope, slope))
     width = 2 * round(params.around_px * blur / 2) + 1
-    relative = contrast / (uniform_filter(contrast, width) + 1e-4)
+    relative = contrast / (means(contrast, width) + 1e-4)
     relative[~_smooth(one, params)] = 0
     count = min(params.max_points, int((relative > 0).sum()))
     rows = np.sort(np.argpartition(-relative.ravel(), max(count - 1, 0))[:count])
     row, column = np.divmod(rows, relative.shape[1])
-    both, mine, theirs = (
-        uniform_filter((a * b).sum(2), width)[row, column] for a, b in ((photo, band), (photo, photo), (band, band))
-    )
+    products = [np.einsum("hwc,hwc->hw", a, b) for a, b in ((photo, band), (photo, photo), (band, band))]
+    both, mine, theirs = means(np.stack(products, axis=2), width)[row, column].T
     agree = both / np.sqrt(np.maximum(mine * theirs, 1e-12))
-    trust = np.clip(agree, params.least_trust, 1.0) ** params.trust
-    return np.stack([column + 0.5, row + 0.5], axis=1), band[row, column], slopes[row, column], trust
+    trust = np.clip(agree.astype(np.float64), params.least_trust, 1.0) ** params.trust
+    return np.stack([column + 0.5, row + 0.5], axis=1), band[row, column], slope[row, column], trust
 
 
 def _smooth(one: Look, params: Params) -> np.ndarray:
@@ -233,14 +282,11 @@ def _band(rgb: np.ndarray, known: np.ndarray | None, blur: float, band: float) -
 
 
 def _blurred(rgb: np.ndarray, known: np.ndarray | None, sigma: float) -> np.ndarray:
-    width = (sigma, sigma, 0)
     if known is None:
-        out: np.ndarray = gaussian_filter(rgb, width, mode="nearest", truncate=3.0)
-        return out
-    share = known.astype(np.float32)
-    total = gaussian_filter(rgb * share[..., None], width, mode="nearest", truncate=3.0)
-    weight = gaussian_filter(share, sigma, mode="nearest", truncate=3.0)
-    out = total / np.maximum(weight, 1e-3)[..., None]
+        return blurred(rgb, sigma, 3.0, reflect=False)
+    share = known.astype(np.float32)[..., None]
+    both = blurred(np.concatenate([rgb * share, share], axis=2), sigma, 3.0, reflect=False)
+    out: np.ndarray = both[..., :3] / np.maximum(both[..., 3:], 1e-3)
     return out
 
 
@@ -257,7 +303,10 @@ def _sampled(planes: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return out
 
 
-def _gain(seen: np.ndarray, shown: np.ndarray, weights: np.ndarray, most: float) -> float:
+def _gain(seen: np.ndarray, shown: np.ndarray, weights: np.ndarray) -> float:
     """By what the render's band is multiplied to be the photo's."""
-    gain = (weights * seen[:, :3] * shown).sum() / max(float((weights * shown**2).sum()), 1e-9)
+    return float((weights * seen[:, :3] * shown).sum() / max(float((weights * shown**2).sum()), 1e-9))
+
+
+def _bounded(gain: float, most: float) -> float:
     return float(np.clip(gain, 1 / most, most))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class Candidate:
         intrinsics_px: (4,).
         num_inliers: different features of the photo that agree.
         scenes: ids, those with most of them first.
+        pixels, points: (K, 2), (K, 3) the matches that agree, metres.
     """
 
     component: int
@@ -29,6 +30,8 @@ class Candidate:
     intrinsics_px: np.ndarray
     num_inliers: int
     scenes: tuple[str, ...]
+    pixels: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +111,8 @@ def candidates(
         at = pixels[matches.feature]
         sets = [np.arange(len(at)), *(np.flatnonzero(matches.view == view) for view in np.unique(matches.view))]
         for rows in sets:
+            if len(np.unique(matches.feature[rows])) < params.min_inliers:
+                continue
             pose = resection.resect(at[rows], matches.points[rows], intrinsics_px, size_px, focal_sigma, params)
             if pose is None:
                 continue
@@ -115,7 +120,8 @@ def candidates(
             count = len(np.unique(matches.feature[agreeing]))
             if count >= params.min_inliers:
                 scenes = _by_support(matches, agreeing)
-                out.append(Candidate(component, pose.T_map_camera, pose.intrinsics_px, count, scenes))
+                agree = at[agreeing], matches.points[agreeing]
+                out.append(Candidate(component, pose.T_map_camera, pose.intrinsics_px, count, scenes, *agree))
     out.sort(key=lambda one: (-one.num_inliers, one.component))
     return _different(out, params)
 

@@ -160,7 +160,7 @@ def _points(one: Look, T_metric_camera: np.ndarray, lens: np.ndarray) -> np.ndar
     """(H, W, 3) places of all pixels of a look, metres."""
     height, width = one.grey.shape
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
-    return one.points(pixels, T_metric_camera, lens).reshape(height, width, 3)
+    return one.points(pixels).reshape(height, width, 3)
 
 
 def _uncertainty_px(depth_m: np.ndarray, covariance: np.ndarray, lens: np.ndarray) -> np.ndarray:

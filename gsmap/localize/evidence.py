@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
+from gsmap.localize.filters import means
 from gsmap.localize.looks import Look, smaller
 
 
@@ -73,43 +74,45 @@ class Comparison:
 def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Comparison:
     """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose."""
     grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
-    rows = slice(params.half_px, rgb.shape[0] - params.half_px, params.step_px)
-    columns = slice(params.half_px, rgb.shape[1] - params.half_px, params.step_px)
-    size = 2 * params.half_px + 1
-    mean = uniform_filter(grey, size)
-    variance = np.maximum(uniform_filter(grey * grey, size) - mean**2, 0)
-    best = np.full(grey[rows, columns].shape, -np.inf, np.float32)
+    # Of patches around every so many pixels: means of the photo, of its square, and of its colours.
+    around = partial(
+        _around, rows=rgb.shape[0] - 2 * params.half_px, columns=rgb.shape[1] - 2 * params.half_px, params=params
+    )
+    mean, square, photo_colour = around(grey), around(grey * grey), around(rgb)
+    variance = np.maximum(square - mean**2, 0)
+    best = np.full(mean.shape, -np.inf, np.float32)
     judged = np.zeros(best.shape, bool)
     seen, blocked = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
     shown = np.zeros((*best.shape, 3), np.float32)
-    photo_colour = _patches(rgb, params)[rows, columns]
     for one in looks:
         opaque = one.alpha > 0.9
         seen |= opaque
         blocked |= opaque & (one.depth_m < params.near_m)
-        other = uniform_filter(one.grey, size)
-        spread = np.maximum(uniform_filter(one.grey**2, size) - other**2, 0)
-        both = uniform_filter(grey * one.grey, size) - mean * other
+        other = around(one.grey)
+        spread = np.maximum(around(one.grey**2) - other**2, 0)
+        both = around(grey * one.grey) - mean * other
         correlation = both / np.sqrt(np.maximum(variance * spread, 1e-12))
-        whole = uniform_filter(opaque.astype(np.float32), size) > 0.95
+        whole = around(opaque.astype(np.float32)) > 0.95
         tells = whole & (np.maximum(variance, spread) > params.min_structure**2) & (np.minimum(variance, spread) > 4e-5)
-        correlation = np.where(tells, correlation, -np.inf)[rows, columns]
+        correlation = np.where(tells, correlation, -np.inf)
         better = correlation > best
-        shown[better] = _patches(one.rgb, params)[rows, columns][better]
+        shown[better] = around(one.rgb)[better]
         best = np.maximum(best, correlation)
-        judged |= tells[rows, columns]
+        judged |= tells
     best = np.where(judged, best, np.nan)
     return Comparison(best, float(seen.mean()), _chroma(photo_colour[judged], shown[judged]), float(blocked.mean()))
+
+
+def _around(image: np.ndarray, rows: int, columns: int, params: Params) -> np.ndarray:
+    """Means over the patches that are compared, those that lie wholly within the picture."""
+    found = means(image, 2 * params.half_px + 1, first=params.half_px, step=params.step_px)
+    return found[: -(-rows // params.step_px), : -(-columns // params.step_px)]
 
 
 def compare_coarsely(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Comparison:
     """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
     fewer = replace(params, step_px=params.half_px // 2)
     return compare(smaller(rgb, params.coarse), [one.smaller(params.coarse) for one in looks], fewer)
-
-
-def _patches(rgb: np.ndarray, params: Params) -> np.ndarray:
-    return np.stack([uniform_filter(rgb[..., c], 2 * params.half_px + 1) for c in range(3)], axis=-1)
 
 
 def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.localize import views
+from gsmap.localize.filters import highest, lowest
 from gsmap.methods.extractor import Extractor
 from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
@@ -107,13 +108,11 @@ def lifted(
 
 def sound_depth(shown: Rendered, params: Params | None = None) -> np.ndarray:
     """(H, W) depth where the surface is opaque and smooth, else 0."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
     params = params or Params()
     depth, size = shown.depth[0], 2 * params.around_px + 1
     solid = shown.alpha[0] > params.min_alpha
-    near = minimum_filter(np.where(solid, depth, 0), size)
-    far = maximum_filter(depth, size)
+    near = lowest(np.where(solid, depth, 0), size)
+    far = highest(depth, size)
     return np.where(solid & (far - near <= params.max_step * depth), depth, np.float32(0))
 
 

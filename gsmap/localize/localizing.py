@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from PIL import Image
-from scipy.ndimage import gaussian_filter
 
-from gsmap.localize import covariance, evidence, matching, probability, verdict
+from gsmap.localize import covariance, evidence, matching, probability, resection, verdict
 from gsmap.localize.candidates import Candidate, candidates, matches_by_component, near_to
 from gsmap.localize.features import quantised, turns
+from gsmap.localize.filters import blurred
 from gsmap.localize.looks import GREY
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
@@ -19,8 +19,6 @@ from gsmap.localize.retrieval import ViewIndex, most_alike
 from gsmap.localize.settling import Picture, Settled, inliers, settle
 from gsmap.methods.extractor import Extractor
 from gsmap.types.localization import Keypoints, Photo, Placement
-
-_FIRST, _BOTH = (1.0,), (1.0, 0.0)  # times `matching.Params.smooth_px`
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +136,11 @@ def judged_poses(
     out: list[Judged] = []
     why = ""
     smooth = params.matching.smooth_px
-    for views, factors in ((params.matching.views, _FIRST), (params.matching.more_views, _BOTH)):
-        found = photo_features(picture, extractor, [smooth * factor for factor in factors])
+    parts: list[Keypoints] = []
+    # First what is as fine as renders are; where that places it nowhere, more views, and what is finer as well.
+    for views, finer in ((params.matching.views, smooth), (params.matching.more_views, 0.0)):
+        parts.append(photo_features(picture, extractor, finer))
+        found = _together(parts)
         if len(found) < params.resection.min_inliers:
             return [], f"it shows too little: {len(found)} features"
         rough, most = _rough_poses(picture, found, index, scenes, replace(params.matching, views=views), params)
@@ -150,10 +151,20 @@ def judged_poses(
             sure = max((one.probability for one in out), default=0.0) >= params.sure
             if sure and candidate.num_inliers < params.rival_inliers * out[0].candidate.num_inliers:
                 break
-            out.append(judged_pose(picture, candidate, scenes, params))
+            if not any(_settles_at(candidate, one, picture, params) for one in out):
+                out.append(judged_pose(picture, candidate, scenes, params))
         if max((one.probability for one in out), default=0.0) >= params.verdict.min_probability:
             break
     return sorted(out, key=lambda one: -one.probability), why
+
+
+def _settles_at(candidate: Candidate, found: Judged, picture: Picture, params: Params) -> bool:
+    """Whether a rough pose is that of a place that was found: most of its matches agree with the sharp pose as well."""
+    if found.probability < params.verdict.min_probability or candidate.component != found.candidate.component:
+        return False
+    settled = (found.settled.T_metric_camera, found.settled.intrinsics_px, picture.size_px)
+    agree = resection.agreeing(candidate.pixels, candidate.points, *settled, params.resection)
+    return bool(agree.sum() > len(agree) / 2)
 
 
 def _rough_poses(
@@ -174,12 +185,13 @@ def _rough_poses(
     return rough, max((len(one.feature) for one in matches.values()), default=0)
 
 
-def photo_features(picture: Picture, extractor: Extractor, smooth_px: Sequence[float]) -> Keypoints:
-    """Features of a photo, without what is finer than renders are: of each of some degrees of that."""
-    parts = []
-    for smooth in smooth_px:
-        rgb = gaussian_filter(picture.rgb, (smooth, smooth, 0)) if smooth > 0 else picture.rgb
-        parts.append(extractor.extract((rgb * 255 + 0.5).astype(np.uint8)))
+def photo_features(picture: Picture, extractor: Extractor, smooth_px: float) -> Keypoints:
+    """Features of a photo, without what is finer than renders are."""
+    rgb = blurred(picture.rgb, smooth_px) if smooth_px > 0 else picture.rgb
+    return extractor.extract((rgb * 255 + 0.5).astype(np.uint8))
+
+
+def _together(parts: Sequence[Keypoints]) -> Keypoints:
     turned = [part.angles_rad for part in parts if part.angles_rad is not None]
     return Keypoints(
         np.concatenate([part.pixels for part in parts]),

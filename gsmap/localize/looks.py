@@ -7,18 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.geometry.projection import project
 from gsmap.localize import features
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.render import render
 
+_EVERY, _MOST = (
+    12,
+    0.9,
+)  # of the pixels of a render every so many are asked whether they moved, and so large a share of them
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601
 
 
 def smaller(image: np.ndarray, by: int) -> np.ndarray:
     """(H // by, W // by, ...) float32 means of blocks of an image (H, W, ...)."""
     height, width = (n // by for n in image.shape[:2])
-    blocks = image[: height * by, : width * by].reshape(height, by, width, by, *image.shape[2:])
-    out: np.ndarray = blocks.mean((1, 3), dtype=np.float32)
+    rows = image[: height * by, : width * by].reshape(height, by, -1).sum(1, dtype=np.float32)  # whole rows: quicker
+    out: np.ndarray = rows.reshape(height, width, by, *image.shape[2:]).sum(2) / np.float32(by * by)
     return out
 
 
@@ -33,6 +38,8 @@ class Look:
         alpha: (H, W) float32.
         depth_m: (H, W) float32 along the axis, 0 where nothing is.
         sound: (H, W) bool: opaque, and not at an edge in depth.
+        T_metric_camera: (4, 4) camera-to-component, metres.
+        intrinsics_px: (4,) of this size.
     """
 
     scene: str
@@ -41,21 +48,32 @@ class Look:
     alpha: np.ndarray
     depth_m: np.ndarray
     sound: np.ndarray
+    T_metric_camera: np.ndarray
+    intrinsics_px: np.ndarray
 
     def smaller(self, by: int) -> Look:
         """The same, so many times smaller; sound is what is not wholly empty."""
         alpha = smaller(self.alpha, by)
-        rgb, depth = smaller(self.rgb, by), smaller(self.depth_m, by)
-        return Look(self.scene, rgb, smaller(self.grey, by), alpha, depth, alpha > 0)
+        rgb, grey, depth = (smaller(image, by) for image in (self.rgb, self.grey, self.depth_m))
+        return Look(self.scene, rgb, grey, alpha, depth, alpha > 0, self.T_metric_camera, self.intrinsics_px / by)
 
-    def points(self, pixels: np.ndarray, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray) -> np.ndarray:
+    def points(self, pixels: np.ndarray) -> np.ndarray:
         """(K, 3) places in the map, in metres, of pixels (K, 2) of the render."""
         column, row = pixels.astype(np.int64).T
         z = self.depth_m[row, column].astype(np.float64)
-        fx, fy, cx, cy = intrinsics_px
+        fx, fy, cx, cy = self.intrinsics_px
         local = np.stack([(pixels[:, 0] - cx) / fx * z, (pixels[:, 1] - cy) / fy * z, z], axis=1)
-        out: np.ndarray = local @ T_metric_camera[:3, :3].T + T_metric_camera[:3, 3]
+        out: np.ndarray = local @ self.T_metric_camera[:3, :3].T + self.T_metric_camera[:3, 3]
         return out
+
+    def moved_px(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray) -> float:
+        """How far most of what it shows lies from there through another camera; inf where it shows nothing."""
+        row, column = np.nonzero(self.alpha[::_EVERY, ::_EVERY] > 0.5)
+        if not len(row):
+            return np.inf
+        pixels = np.stack([column, row], axis=1) * float(_EVERY) + 0.5
+        at, depth = project(self.points(pixels), np.linalg.inv(T_metric_camera), intrinsics_px)
+        return float(np.quantile(np.where(depth > 0, np.linalg.norm(at - pixels, axis=1), 1e9), _MOST))
 
 
 def look(
@@ -64,13 +82,24 @@ def look(
     intrinsics_px: np.ndarray,
     size_px: tuple[int, int],
     params: features.Params,
+    known: Sequence[Look] = (),
+    within_px: float = 0.0,
 ) -> list[Look]:
-    """Every scene through one camera of the map; each alone, for two captures laid over each other blur each other."""
+    """Every scene through one camera of the map; each alone, for two captures laid over each other blur each other.
+
+    Args:
+        known: renders of this size; what has not moved by more than ``within_px`` since is not rendered again.
+    """
+    still = {one.scene: one for one in known if one.moved_px(T_metric_camera, intrinsics_px) <= within_px}
     out = []
     for one in scenes:
+        if one.scene in still:
+            out.append(still[one.scene])
+            continue
         camera = one.camera(T_metric_camera, intrinsics_px, size_px)
         shown = render(one.gaussians, camera, dominant_id=False, backend="native")
         rgb = np.clip(np.nan_to_num(shown.colour[0]), 0, 1)
         depth = shown.depth[0] * np.float32(one.S_metric_scene.scale)
-        out.append(Look(one.scene, rgb, rgb @ GREY, shown.alpha[0], depth, features.sound_depth(shown, params) > 0))
+        sound = features.sound_depth(shown, params) > 0
+        out.append(Look(one.scene, rgb, rgb @ GREY, shown.alpha[0], depth, sound, T_metric_camera, intrinsics_px))
     return out

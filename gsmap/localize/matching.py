@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -24,7 +25,7 @@ class Params:
 
     smooth_px: float = 1.2
     views: int = 24
-    more_views: int = 60
+    more_views: int = 120
     max_ratio: float = 0.85
     max_distance: float = 0.9
     max_turn: int = 18
@@ -42,6 +43,12 @@ class Described:
     descriptors: np.ndarray
     angles: np.ndarray
 
+    @cached_property
+    def floats(self) -> np.ndarray:
+        """(N, D) float32 of about unit length."""
+        out: np.ndarray = self.descriptors.astype(np.float32) / 254
+        return out
+
 
 def matched(photo: Described, view: Described, params: Params) -> tuple[np.ndarray, np.ndarray]:
     """Mutual nearest neighbours of a photo's features in a view, that stand out from the view's others.
@@ -51,7 +58,7 @@ def matched(photo: Described, view: Described, params: Params) -> tuple[np.ndarr
     """
     if len(photo.angles) < 2 or len(view.angles) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    products = _floats(photo) @ _floats(view).T
+    products = photo.floats @ view.floats.T
     best = products.argmax(axis=1)
     rows = np.flatnonzero(products.argmax(axis=0)[best] == np.arange(len(best)))
     columns = best[rows]
@@ -75,9 +82,4 @@ def _held_alike(photo: np.ndarray, view: np.ndarray, max_turn: int) -> np.ndarra
     window = np.arange(-max_turn, max_turn + 1)
     mode = int(np.argmax(counts[(np.arange(256)[:, None] + window) % 256].sum(1)))
     out: np.ndarray = np.abs((turn - np.uint8(mode)).astype(np.int8).astype(int)) <= max_turn
-    return out
-
-
-def _floats(described: Described) -> np.ndarray:
-    out: np.ndarray = described.descriptors.astype(np.float32) / 254
     return out

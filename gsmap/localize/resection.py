@@ -78,7 +78,8 @@ def resect(
     options.estimate_focal_length = free
     options.ransac.max_error = params.max_error_px * max(size_px) / 480
     options.ransac.max_num_trials = params.max_trials
-    options.ransac.min_inlier_ratio = 0.01
+    # As many trials as find a pose that so few agree with; where matches are few, that is soon.
+    options.ransac.min_inlier_ratio = max(0.01, min(params.min_inliers / len(pixels), 1.0))
     options.ransac.confidence = 0.9999
     options.ransac.random_seed = 1
     found = pycolmap.estimate_absolute_pose(pixels.astype(np.float64), points.astype(np.float64), camera, options)

@@ -15,6 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from gsmap._native import near_signatures
 from gsmap.geometry.rotations import matrices_to_quats, multiply_quats
 from gsmap.localize.words import VERSION, Words, words_for
 from gsmap.methods import RecipeKey
@@ -258,14 +259,11 @@ def _near(segment: Segment, probes: _Probes, max_signs: int) -> Iterator[tuple[n
         low, high = int(starts[at[mine[0]]]), int(starts[at[mine[-1]] + 1])
         rows = np.ascontiguousarray(segment.rows(low, high))
         theirs = np.ascontiguousarray(rows[:, _SIGNS]).view("<u8")[:, 0]
-        hits: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        for k in mine:
-            begin, end = int(starts[at[k]]) - low, int(starts[at[k] + 1]) - low
-            differ = np.bitwise_count(probes.signs[first[k] : last[k], None] ^ theirs[begin:end])
-            who, which = np.nonzero(differ <= max_signs)
-            hits.append((probes.feature[first[k] + who], differ[who, which].astype(np.int64), which + begin))
-        feature, differ, which = (np.concatenate([hit[k] for hit in hits]) for k in range(3))
-        yield feature, differ, rows[which]
+        sizes = (last - first)[mine]
+        asking = np.concatenate([np.arange(first[k], last[k]) for k in mine])
+        begin, end = (np.repeat(starts[at[mine] + k], sizes) - low for k in range(2))
+        who, which, differ = near_signatures(probes.signs[asking], begin, end, theirs, max_signs)
+        yield probes.feature[asking[who]], differ, rows[which]
 
 
 def _by_feature(matches: _Matches) -> np.ndarray:

@@ -24,12 +24,19 @@ class Params:
         near_px: ... and those of the last ones, which have its full size.
         max_scenes: that are rendered, those with most matches first.
         min_found: fewer patches say nothing of the pose.
+        min_agreement: where a render that was laid over the photo once agrees with it less than this when it is laid
+            over it again, the photo shows another place; made places say where (``tools/fit_localize.py``).
+        again_px: scenes are rendered again once what they show has moved by more than this ...
+        again_blurs: ... or, where renders are laid over the photo, by more than so many times their blur.
     """
 
     far_px: int = 32
     near_px: int = 6
     max_scenes: int = 3
     min_found: int = 8
+    min_agreement: float = 0.1
+    again_px: float = 0.5
+    again_blurs: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +77,8 @@ class Settled:
         points: (K, 3) their places, metres.
         scene: (K,) int, whose patches they are, among ``looks``.
         tried: how many patches were looked for in the last round.
-        looks: renders from the pose; none where nothing was found from the first.
+        looks: renders from the pose, or from so near that it makes no difference; none where nothing was found from
+            the first.
     """
 
     T_metric_camera: np.ndarray
@@ -112,10 +120,10 @@ def settle(
     half = picture.halved()
 
     looks = look(scenes, pose, lens / 2, half.size_px, lifting)
-    patches = _found_again(half, 0.5, looks, pose, lens, params.far_px, tracks)
+    patches = _found_again(half, 0.5, looks, params.far_px, tracks)
     if len(patches.pixels) >= params.min_found:  # some of what was found far away is wrong
-        again = resection.resect(patches.pixels, patches.points, lens, picture.size_px, 0.0, poses)
-        start = pose if again is None else again.T_map_camera
+        sure = resection.resect(patches.pixels, patches.points, lens, picture.size_px, 0.0, poses)
+        start = pose if sure is None else sure.T_map_camera
         rough = resection.refine(patches.pixels, patches.points, start, lens, poses, focal=free)
         pose, lens = rough.T_map_camera, rough.intrinsics_px
 
@@ -127,13 +135,16 @@ def settle(
     best = int(np.argmax(counts))
     aligned = None
     for blur in laying.blur_px:
-        (one,) = look([scenes[best]], pose, lens / 2, half.size_px, lifting)
+        looks = look([scenes[best]], pose, lens / 2, half.size_px, lifting, looks, params.again_blurs * blur / 2)
+        (one,) = looks
         laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
+        if aligned is not None and laid.agreement < params.min_agreement:
+            return _nowhere(pose, lens)
         if len(laid.pixels):
             aligned, pose, lens = laid, laid.T_metric_camera, 2 * laid.intrinsics_px
 
     looks = look(scenes, pose, lens, picture.size_px, lifting)
-    patches = _found_again(picture, 1.0, looks, pose, lens, params.near_px, tracks)
+    patches = _found_again(picture, 1.0, looks, params.near_px, tracks)
     told = None if aligned is None else covariance.of_aligned(aligned, half.size_px, known, picture.focal_sigma)
     fit: resection.Refined | None = None
     if len(patches.pixels) >= params.min_found:
@@ -146,7 +157,7 @@ def settle(
         at, _ = project(patches.points, np.linalg.inv(pose), lens)
         fit = replace(fit, residuals_px=patches.pixels - at)
     if told is None:
-        return Settled(pose, lens, None, None, patches.pixels, patches.points, patches.scene, patches.tried, [])
+        return _nowhere(pose, lens)
     return Settled(
         pose,
         lens,
@@ -156,8 +167,13 @@ def settle(
         patches.points,
         patches.scene,
         patches.tried,
-        look(scenes, pose, lens, picture.size_px, lifting),
+        look(scenes, pose, lens, picture.size_px, lifting, looks, params.again_px),
     )
+
+
+def _nowhere(pose: np.ndarray, lens: np.ndarray) -> Settled:
+    """What is said of a pose from which the map shows something else than the photo."""
+    return Settled(pose, lens, None, None, np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, int), 0, [])
 
 
 def _between(
@@ -194,8 +210,6 @@ def _found_again(
     seen: Picture,
     factor: float,
     looks: Sequence[Look],
-    pose: np.ndarray,
-    lens: np.ndarray,
     reach_px: int,
     tracks: tracking.Params,
 ) -> _Patches:
@@ -206,7 +220,7 @@ def _found_again(
         keep = hits.found
         tried += len(keep)
         found.append(hits.photo_px[keep] / factor)
-        places.append(one.points(hits.render_px[keep], pose, lens * factor))
+        places.append(one.points(hits.render_px[keep]))
         whose.append(np.full(int(keep.sum()), place))
     return _Patches(np.concatenate(found), np.concatenate(places), np.concatenate(whose), tried)
 

@@ -90,7 +90,7 @@ def _shot(
     photo: Photo, index: ViewIndex, scenes: Mapping[str, PlacedFeatures], extractor: Extractor, params: Params
 ) -> _Shot:
     picture, scale = prepared(photo, params)
-    found = photo_features(picture, extractor, [0.0])  # photos hold what renders do not
+    found = photo_features(picture, extractor, 0.0)  # photos hold what renders do not
     described = matching.Described(quantised(found.descriptors), turns(found))
     judged, why = judged_poses(picture, index, scenes, extractor, params)
     return _Shot(photo, picture, scale, found, described, judged, why)
@@ -169,7 +169,7 @@ def _lifted(
     points, known = np.zeros((len(pixels), 3)), np.zeros(len(pixels), bool)
     for one in looks:
         new = one.sound[row, column] & ~known
-        points[new] = one.points(pixels[new], best.settled.T_metric_camera, best.settled.intrinsics_px)
+        points[new] = one.points(pixels[new])
         known |= new
     rows = np.flatnonzero(known)
     return points[rows], rows

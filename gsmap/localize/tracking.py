@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import gaussian_filter, maximum_filter, uniform_filter
+
+from gsmap.localize.filters import blurred, highest, means, slopes
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,8 @@ def track(render: np.ndarray, usable: np.ndarray, photo: np.ndarray, reach_px: i
     products = irfft2(rfft2(windows, (length, length)) * np.conj(rfft2(patches, (length, length))), (length, length))
     span = 2 * reach_px + 1
     products = products[:, :span, :span]
-    mean = uniform_filter(photo, side, mode="nearest")
-    spread = np.sqrt(np.maximum(uniform_filter(photo**2, side, mode="nearest") - mean**2, 0)) * side
+    mean = means(photo, side, reflect=False)
+    spread = np.sqrt(np.maximum(means(photo**2, side, reflect=False) - mean**2, 0)) * side
     near = np.arange(-reach_px, reach_px + 1)
     spread = np.pad(spread, reach_px, mode="constant")[
         row[:, None, None] + reach_px + near[:, None], column[:, None, None] + reach_px + near
@@ -100,15 +101,15 @@ def track(render: np.ndarray, usable: np.ndarray, photo: np.ndarray, reach_px: i
 def _corners(grey: np.ndarray, usable: np.ndarray, params: Params) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pixels around which most varies in every direction, one a cell."""
     half = params.half_px
-    smooth = gaussian_filter(grey, 0.8)
-    gy, gx = np.gradient(smooth)
+    smooth = blurred(grey, 0.8)
+    gy, gx = np.moveaxis(slopes(smooth), 2, 0)
     size = 2 * half - 1
-    a, b, c = uniform_filter(gx * gx, size), uniform_filter(gx * gy, size), uniform_filter(gy * gy, size)
+    a, b, c = np.moveaxis(means(np.stack([gx * gx, gx * gy, gy * gy], axis=2), size), 2, 0)
     weakest = (a + c) / 2 - np.sqrt(np.maximum(((a - c) / 2) ** 2 + b * b, 0))
     weakest[~usable] = 0
     edge = half + 1
     weakest[:edge], weakest[-edge:], weakest[:, :edge], weakest[:, -edge:] = 0, 0, 0, 0
-    peak = (weakest == maximum_filter(weakest, params.cell_px)) & (weakest > (params.min_structure / half) ** 2)
+    peak = (weakest == highest(weakest, params.cell_px)) & (weakest > (params.min_structure / half) ** 2)
     row, column = np.nonzero(peak)
     order = np.argsort(-weakest[row, column], kind="stable")[: params.max_patches]
     return row[order], column[order]

@@ -8,11 +8,15 @@ namespace nb = nanobind;
 namespace gsmap {
 void bind_cells(nb::module_ &);
 void bind_correspondences(nb::module_ &);
+void bind_filters(nb::module_ &);
 void bind_fit(nb::module_ &);
 void bind_landmarks(nb::module_ &);
+void bind_laying(nb::module_ &);
 void bind_merging(nb::module_ &);
 void bind_parts(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
+void bind_sift(nb::module_ &);
+void bind_signatures(nb::module_ &);
 void bind_stopping(nb::module_ &);
 void bind_surroundings(nb::module_ &);
 void bind_surface(nb::module_ &);
@@ -24,11 +28,15 @@ NB_MODULE(_native, m) {
     nb::set_leak_warnings(false);  // a view kept alive by an autograd graph at exit is no leak
     gsmap::bind_cells(m);
     gsmap::bind_correspondences(m);
+    gsmap::bind_filters(m);
     gsmap::bind_fit(m);
     gsmap::bind_landmarks(m);
+    gsmap::bind_laying(m);
     gsmap::bind_merging(m);
     gsmap::bind_parts(m);
     gsmap::bind_rasteriser(m);
+    gsmap::bind_sift(m);
+    gsmap::bind_signatures(m);
     gsmap::bind_stopping(m);
     gsmap::bind_surroundings(m);
     gsmap::bind_surface(m);

@@ -120,6 +120,13 @@ struct Kernels {
     // One correspondence against those after it: which agree, and which bin of log scales each pair votes for (or -1).
     void (*agree)(const Correspondences &, int i, const AgreeTest &, uint8_t *ok);
     void (*vote)(const Correspondences &, int i, const VoteTest &, int32_t *bin);
+    // Rows of `count` numbers: their weighted sum, and the highest of each.
+    void (*weigh)(const float *const *rows, const float *weights, int n, int64_t count, float *out);
+    void (*highest)(const float *const *rows, int n, int64_t count, float *out);
+    // Of local features: extrema among three levels of a picture, and slopes as lengths and angles.
+    int (*peaks)(const float *const *rows, float bar, int from, int to, int32_t *found);
+    void (*polar)(const float *dx, const float *dy, int count, float *length, float *angle);
+    int64_t (*near)(uint64_t mine, const uint64_t *theirs, int64_t count, int most, int32_t *which, uint8_t *differ);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

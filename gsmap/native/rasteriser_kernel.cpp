@@ -1,9 +1,11 @@
 // Compiled once per instruction set: GSMAP_ISA is the namespace and name, the compiler's flags choose the vectors.
 #include "correspondences_kernel.h"
+#include "filters_kernel.h"
 #include "fit_kernel.h"
 #include "rasteriser_blend.h"
 #include "rasteriser_blend_backward.h"
 #include "rasteriser_project_backward.h"
+#include "signatures_kernel.h"
 
 #define GSMAP_STRING_(x) #x
 #define GSMAP_STRING(x) GSMAP_STRING_(x)
@@ -13,5 +15,6 @@
 static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend, GSMAP_ISA::blend_limit,
                                      GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
                                      GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::ssim, GSMAP_ISA::agree,
-                                     GSMAP_ISA::vote};
+                                     GSMAP_ISA::vote, GSMAP_ISA::weigh, GSMAP_ISA::highest,
+                                     GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::near};
 const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;

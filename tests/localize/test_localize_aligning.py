@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -46,7 +48,7 @@ def _seen(pose: np.ndarray, lens: np.ndarray = LENS) -> tuple[np.ndarray, np.nda
 def _look(pose: np.ndarray, blur: float = 0.0, lens: np.ndarray = LENS) -> Look:
     rgb, depth = _seen(pose, lens)
     rgb = gaussian_filter(rgb, (blur, blur, 0)) if blur else rgb
-    return Look("a", rgb, rgb @ GREY, np.ones_like(depth), depth, depth > 0)
+    return Look("a", rgb, rgb @ GREY, np.ones_like(depth), depth, depth > 0, pose, lens)
 
 
 def _pose(turn_deg: list[float], at: list[float]) -> np.ndarray:
@@ -109,14 +111,14 @@ def test_a_slanted_floor_is_smooth_and_a_step_is_an_edge():
     assert smooth[5:-5, 5:-5].mean() > 0.97  # all but the line where floor and wall meet
     stepped = look.depth_m.copy()
     stepped[:, :100] *= 0.7  # nearer
-    smooth = aligning._smooth(Look("a", look.rgb, look.grey, look.alpha, stepped, look.sound), PARAMS)
+    smooth = aligning._smooth(replace(look, depth_m=stepped), PARAMS)
     assert not smooth[20:60, 98:102].any()
     assert smooth[20:60, 10:90].all()
 
 
 def test_where_little_is_known_the_pose_stays_as_it_was():
     look = _look(START)
-    bare = Look("a", look.rgb, look.grey, np.zeros_like(look.alpha), look.depth_m, look.sound)
+    bare = replace(look, alpha=np.zeros_like(look.alpha))
     laid = aligning.align(_seen(TRUE)[0], bare, START, LENS, 4.0, PARAMS)
     assert not len(laid.pixels)
     assert np.array_equal(laid.T_metric_camera, START)
@@ -146,9 +148,12 @@ def test_a_blurred_render_explains_the_coarse_picture_and_little_else():
     photo = (0.5 + 0.1 * fine / fine.std() + 0.1 * coarse / coarse.std()).clip(0, 1)
     shown = gaussian_filter(photo, (5, 5, 0))
     flat = np.full(shown.shape[:2], 2.0, np.float32)
-    look, params = Look("a", shown, shown @ GREY, np.ones_like(flat), flat, flat > 0), evidence.Params()
+    look, params = (
+        Look("a", shown, shown @ GREY, np.ones_like(flat), flat, flat > 0, np.eye(4), LENS),
+        evidence.Params(),
+    )
     assert evidence.compare_coarsely(photo, [look], params).explained(params.agree) > 0.95
     assert evidence.compare(photo, [look], params).explained(0.8) < 0.5
     other = np.ascontiguousarray(shown[::-1, ::-1])
-    elsewhere = Look("a", other, other @ GREY, np.ones_like(flat), flat, flat > 0)
+    elsewhere = replace(look, rgb=other, grey=other @ GREY)
     assert evidence.compare_coarsely(photo, [elsewhere], params).explained(params.agree) < 0.4

@@ -1,0 +1,102 @@
+"""What is not done twice or in vain: renders that hardly moved, places that were found, places that look otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsmap import _native
+from gsmap.geometry.projection import project
+from gsmap.localize import Params, localizing, looks
+from gsmap.localize.candidates import Candidate
+from gsmap.localize.features import Params as Features
+from gsmap.localize.resection import moved
+
+PARAMS = Params()
+
+
+@pytest.fixture(scope="module")
+def judged(world):
+    """A photograph's picture, its true pose (metres), and what is found from nearly there."""
+    picture, _ = localizing.prepared(world.photos[1], PARAMS)
+    start = moved(world.poses[1], np.array([0.01, -0.01, 0.0, 0.03, 0.0, -0.02]))
+    candidate = Candidate(0, start, picture.intrinsics_px, 40, ("scene",))
+    return picture, localizing.judged_pose(picture, candidate, {"scene": world.placed}, PARAMS)
+
+
+def test_a_render_is_made_again_once_it_has_moved(world, judged):
+    picture, found = judged
+    pose, lens, size = found.settled.T_metric_camera, picture.intrinsics_px, picture.size_px
+    (one,) = looks.look([world.placed], pose, lens, size, Features())
+    assert one.moved_px(pose, lens) < 0.01
+    turned = moved(pose, np.array([0.0, 2 / lens[0], 0, 0, 0, 0]))  # two pixels to the side
+    assert one.moved_px(turned, lens) == pytest.approx(2, rel=0.5)
+    (same,) = looks.look([world.placed], turned, lens, size, Features(), [one], 4.0)
+    (other,) = looks.look([world.placed], turned, lens, size, Features(), [one], 1.0)
+    assert same is one
+    assert other is not one
+    assert np.array_equal(other.T_metric_camera, turned)
+
+
+def test_a_look_knows_where_its_pixels_lie(world, judged):
+    picture, found = judged
+    (one,) = looks.look(
+        [world.placed], found.settled.T_metric_camera, picture.intrinsics_px, picture.size_px, Features()
+    )
+    row, column = np.nonzero(one.sound[::40, ::40])
+    pixels = np.stack([column, row], axis=1) * 40 + 0.5
+    at, depth = project(one.points(pixels), np.linalg.inv(one.T_metric_camera), one.intrinsics_px)
+    assert len(pixels) > 20
+    assert np.allclose(at, pixels, atol=1e-6)
+    assert np.allclose(depth, one.depth_m[row * 40, column * 40], rtol=1e-5)
+
+
+def test_where_the_map_shows_something_else_nothing_is_looked_into_further(world, judged, monkeypatch):
+    picture, found = judged
+    assert found.probability > 0.9
+    away = world.poses[1].copy()
+    away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1.0, -1.0])  # it looks the other way
+    sizes = []
+    look = localizing.settle.__globals__["look"]
+    monkeypatch.setitem(localizing.settle.__globals__, "look", lambda *a: (sizes.append(a[3]), look(*a))[1])
+    wrong = Candidate(0, away, picture.intrinsics_px, 8, ("scene",))
+    one = localizing.judged_pose(picture, wrong, {"scene": world.placed}, PARAMS)
+    assert one.covariance is None
+    assert one.probability < 0.05
+    assert picture.size_px not in sizes  # never rendered in full
+
+
+def test_matches_of_a_place_that_was_found_are_not_looked_into_again(judged):
+    picture, found = judged
+    settled = found.settled
+    pixels, _ = project(settled.points, np.linalg.inv(settled.T_metric_camera), settled.intrinsics_px)
+    rough = Candidate(0, moved(settled.T_metric_camera, np.full(6, 0.5)), picture.intrinsics_px, 20, ("scene",))
+    same = replace(rough, pixels=pixels, points=settled.points)
+    other = replace(rough, pixels=pixels, points=settled.points + np.array([3.0, 0, 0]))
+    assert localizing._settles_at(same, found, picture, PARAMS)
+    assert not localizing._settles_at(other, found, picture, PARAMS)
+    assert not localizing._settles_at(replace(same, component=1), found, picture, PARAMS)
+    assert not localizing._settles_at(same, replace(found, probability=0.5), picture, PARAMS)
+
+
+@pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
+def test_signatures_that_differ_in_few_signs_are_found_in_order(name):
+    if _native.use_instruction_set(name) != name:
+        pytest.skip(f"no {name} here")
+    rng = np.random.default_rng(0)
+    theirs = rng.integers(0, 2**63, 300, dtype=np.uint64)
+    mine = theirs[rng.integers(0, 300, 40)] ^ rng.integers(0, 2**9, 40, dtype=np.uint64)
+    begin = rng.integers(0, 50, 40)
+    end = begin + rng.integers(100, 250, 40)
+    told = np.array(_native.near_signatures(mine, begin, end, theirs, 6))
+    _native.use_instruction_set("best")
+    want = [
+        (k, i, differ)
+        for k in range(40)
+        for i in range(begin[k], end[k])
+        if (differ := int(np.bitwise_count(mine[k] ^ theirs[i]))) <= 6
+    ]
+    assert len(want) > 5
+    assert told.T.tolist() == [list(one) for one in want]
