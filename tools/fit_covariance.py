@@ -4,7 +4,7 @@ A trainer's bias, or a sensor whose depths are a percent off, bends a capture so
 the residuals show little. Made captures know the truth: places are filmed, their depths bent as depth cameras bend them
 (a scale, a term in the depth's square, a lens, colour and depth some pixels apart, noise; each drawn for each capture,
 times a level), and laid out as Gaussians, in part under poses that wander, and trained on such frames; others are
-trained on perfect frames, or laid on them sparsely. Two models are of largest likelihood, errors taken for normally distributed: of the measured
+trained on perfect frames, or laid on them sparsely (tested only). Two models are of largest likelihood, errors taken for normally distributed: of the measured
 scale, and then, that scale known, of the rigid pose. Places that are only tested on are not fitted. No given capture
 takes part.
 
@@ -65,7 +65,6 @@ FITTED = {
     COURT: (401, 402),
     WANDERED: (711, 712, 713, 714),
     FILMED: (731, 732, 733, 734),
-    SPARSE: (751, 752, 753, 754),
     0.0: (631,),
     0.25: (621, 650, 652, 654),
     0.5: (611, 612, 660, 662, 664),
@@ -77,7 +76,7 @@ TESTED = {
     COURT: (403,),
     WANDERED: (721, 722, 723, 724),
     FILMED: (741, 742, 743, 744),
-    SPARSE: (761, 762, 763, 764),
+    SPARSE: (751, 752, 753, 754, 761, 762, 763, 764),
     0.0: (632,),
     0.25: (622, 651, 653, 655),
     0.5: (613, 661, 663, 665),
