@@ -62,10 +62,16 @@ class _Checked(TypeDecorator[Any]):
             raise InputError(f"{self.where} must be {self.what}, got {_short(value)}")
         return value
 
-    def process_result_value(self, value: Any, dialect: Any) -> Any:
-        if value is not None and not (isinstance(value, str) and self.fits(value)):
-            raise _corrupt(self.where, value, self.what)
-        return value
+    def result_processor(self, dialect: Any, coltype: Any) -> Callable[[Any], Any] | None:
+        # In place of `process_result_value`: a map has millions of values, and a call around each is half its cost.
+        fits, where, what = self.fits, self.where, self.what
+
+        def checked(value: Any) -> Any:
+            if value is None or (isinstance(value, str) and fits(value)):
+                return value
+            raise _corrupt(where, value, what)
+
+        return checked
 
     def coerce_compared_value(self, op: Any, value: Any) -> TypeEngine[Any]:
         return Text()
@@ -145,8 +151,8 @@ class Line(_Checked):
     def fits(self, value: str) -> bool:
         return not control_characters(value, lines=self.lines)
 
-    def process_result_value(self, value: Any, dialect: Any) -> Any:
-        return value
+    def result_processor(self, dialect: Any, coltype: Any) -> None:
+        return None
 
 
 class Lines(Line):
