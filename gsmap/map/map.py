@@ -346,7 +346,7 @@ class Map(AbstractContextManager["Map"]):
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
         with at_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-            describe(self.store, unthinned(self.scenes()), self.settings, self._progress)
+            describe(self.store, unthinned(self.store.scenes.brief()), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
             # Poses may tell of new neighbours, and their edges of new poses.
             while solve(self.store, self.settings, self._progress):

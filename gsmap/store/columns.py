@@ -69,7 +69,7 @@ class _Checked(TypeDecorator[Any]):
         def checked(value: Any) -> Any:
             if value is None or (isinstance(value, str) and fits(value)):
                 return value
-            raise _corrupt(where, value, what)
+            raise corrupt(where, value, what)
 
         return checked
 
@@ -192,9 +192,9 @@ class Json(TypeDecorator[Any]):
         try:
             found = json.loads(value)
         except (ValueError, TypeError, RecursionError) as error:
-            raise _corrupt(self.where, value, "JSON") from error
+            raise corrupt(self.where, value, "JSON") from error
         if self.fits is not None and not self.fits(found):
-            raise _corrupt(self.where, value, f"JSON of {self.fits.__name__.strip('_').replace('_', ' ')}")
+            raise corrupt(self.where, value, f"JSON of {self.fits.__name__.strip('_').replace('_', ' ')}")
         return found
 
 
@@ -349,7 +349,8 @@ def _numbers(value: Any, *shape: int) -> bool:
     return isinstance(value, list) and len(value) == shape[0] and all(_numbers(item, *shape[1:]) for item in value)
 
 
-def _corrupt(where: str, value: Any, what: str) -> CorruptError:
+def corrupt(where: str, value: Any, what: str) -> CorruptError:
+    """What to tell of a value that gsmap cannot have written."""
     return CorruptError(
         f"the catalog holds {_short(value)} in {where}, which is not {what}: gsmap did not write that; "
         "restore the catalog from a backup, and do not trust a map that was sent to you so"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -13,8 +13,8 @@ from sqlalchemy import (
     Connection,
     LargeBinary,
     Row,
-    Select,
     case,
+    exists,
     func,
     insert,
     null,
@@ -229,7 +229,7 @@ class Registrations:
         accepted = registrations.c.status == "accepted" if usable else None
         with self._catalog.read() as connection:
             rows = _choose(connection, _LEAN, silent_if=accepted)
-            made = [Standing(**_stands(choice)) for choice in _living(connection, rows)]
+            made = [Standing(*_stands(choice)) for choice in _living(connection, rows)]
         return sorted((one for one in made if one.usable or not usable), key=lambda one: (one.target, one.source))
 
     def tried(self) -> list[Tried]:
@@ -243,7 +243,7 @@ class Registrations:
                 keys.setdefault(row.pair, set()).add(row.key)
         made = [
             Tried(
-                **_stands(choice),
+                *_stands(choice),
                 keys=frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
                 disagreement=float((choice.row.evidence or {}).get("disagreement", np.nan)),
             )
@@ -251,10 +251,18 @@ class Registrations:
         ]
         return sorted(made, key=lambda one: (one.target, one.source))
 
-    def usable(self) -> list[StoredRegistration]:
-        """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source)."""
+    def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
+        """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
+
+        Args:
+            among: only those both of whose scenes (ids) are among these.
+        """
+        inside = None
+        if among is not None:
+            some = sorted(among)
+            inside = registrations.c.target.in_(some) & registrations.c.source.in_(some)
         with self._catalog.read() as connection:
-            found = _current(connection, silent_if=registrations.c.status == "accepted")
+            found = _current(connection, inside, silent_if=registrations.c.status == "accepted")
         found = [one for one in found if one.is_usable]
         return sorted(found, key=lambda one: (one.registration.target, one.registration.source))
 
@@ -403,6 +411,11 @@ _LEAN = (
     *(registrations.c[name] for name in _PARTS),
     (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed"),
 )
+_SAME_PAIR = registrations.alias()
+_OUTDATED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
+_FIRST = (
+    select(func.min(_SAME_PAIR.c.number)).where(_SAME_PAIR.c.pair == registrations.c.pair).scalar_subquery()
+).label("first")
 _EVIDENCE = case((registrations.c.status == "accepted", registrations.c.evidence)).label("evidence")
 
 
@@ -412,7 +425,7 @@ def _current(
     silent_if: ColumnElement[bool] | None = None,
     columns: Sequence[ColumnElement[Any]] = _FULL,
 ) -> list[StoredRegistration]:
-    return _stored_all(_living(connection, _choose(connection, columns, of, silent_if)))
+    return _stored_all(_living(connection, _choose(connection, columns, of, silent_if, in_order=True)))
 
 
 def _living(connection: Connection, chosen: Iterable[_Choice]) -> list[_Choice]:
@@ -425,22 +438,23 @@ def _choose(
     columns: Sequence[ColumnElement[Any]],
     of: ColumnElement[bool] | None = None,
     silent_if: ColumnElement[bool] | None = None,
+    *,
+    in_order: bool = False,
 ) -> list[_Choice]:
-    """The current row of every pair, by the pair's first row.
+    """The current row of every pair.
 
     Of a pair on which nobody ever spoke it is the newest, which the index of pairs tells without reading the others.
 
     Args:
         of: only pairs all of whose rows meet this.
         silent_if: pairs on which nobody spoke only if their current row meets this.
+        in_order: by the pair's first row; else in any order.
     """
     spoken = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
     wanted = true() if of is None else of
-    ends = select(func.min(registrations.c.number).label("first"), func.max(registrations.c.number).label("newest"))
-    silent = ends.where(wanted, registrations.c.pair.not_in(spoken)).group_by(registrations.c.pair).subquery()
-    query: Select[Any] = select(*columns, silent.c.first).join(silent, silent.c.newest == registrations.c.number)
-    rows = connection.execute(query if silent_if is None else query.where(silent_if)).all()
-    found = [(row.first, _Choice(row, None)) for row in rows]
+    silent = select(*columns, *([_FIRST] if in_order else ())).where(registrations.c.pair.not_in(spoken), ~_OUTDATED)
+    rows = connection.execute(silent.where(wanted, true() if silent_if is None else silent_if)).all()
+    found = [(row.first if in_order else 0, _Choice(row, None)) for row in rows]
 
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
     every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(spoken))).all()
@@ -451,19 +465,18 @@ def _choose(
         current, word = _decide(history, words.get(pair, []))
         if current is not None:
             found.append((history[0].number, _Choice(current, word)))
-    return [chosen for _, chosen in sorted(found, key=lambda item: item[0])]
+    return [chosen for _, chosen in (sorted(found, key=lambda item: item[0]) if in_order else found)]
 
 
 def _may_be_used(status: str, review: str | None) -> bool:
     return review == "confirm" or (status == "accepted" and review != "reject")
 
 
-def _stands(chosen: _Choice) -> dict[str, Any]:
-    """The fields of `Standing`."""
+def _stands(chosen: _Choice) -> tuple[Any, ...]:
+    """The fields of `Standing`, in their order."""
     row, review = chosen.row, None if chosen.word is None else chosen.word.review
     usable = bool(row.posed) and _may_be_used(row.status, review)
-    own = {name: getattr(row, name) for name in ("number", "target", "source", "status", "key", "recipe")}
-    return own | {"review": review, "usable": usable}
+    return row.number, row.target, row.source, row.status, row.key, row.recipe, review, usable
 
 
 def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:

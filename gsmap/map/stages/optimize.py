@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -17,7 +18,8 @@ from gsmap.map.sharing import POLL_S
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
-from gsmap.types import Edge, PoseGraph, Prior, Scene
+from gsmap.store.scenes import BriefScene
+from gsmap.types import Edge, PoseGraph, Prior
 from gsmap.types.plain import canonical
 from gsmap.types.progress import StageProgress
 from gsmap.types.world import Survey
@@ -48,7 +50,7 @@ class PoseBasis:
 @of_one_state
 def pose_basis(store: Store, settings: Settings) -> PoseBasis:
     """Read what names the poses; a few statements, and microseconds a scene."""
-    living, priors = store.scenes.list(), store.priors.list()
+    living, priors = store.scenes.brief(), store.priors.list()
     captured = {scene.id: None if scene.captured_at is None else parsed(scene.captured_at) for scene in living}
     hours = settings.optimize.aliasing.same_visit_h
     named, same_visits = [], set()
@@ -58,7 +60,7 @@ def pose_basis(store: Store, settings: Settings) -> PoseBasis:
         named.append(f"{one.key or one.number} {one.review}" + " same visit" * same)
         if same:
             same_visits.add((one.target, one.source))
-    ups = _ups(store, living, {key.digest for key in graph_keys(store, living, settings).values()})
+    ups = _ups(store, living, settings)
     told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
     recipe = solver.recipe_key(settings.optimize)
     observed = store.world.survey()
@@ -105,10 +107,14 @@ def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool
     return a is not None and b is not None and abs(a - b).total_seconds() < 3600 * hours
 
 
-def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dict[str, np.ndarray]:
-    """What each scene's present graph (by key) says is up; where it has none yet, its newest one, or what that said."""
+def _ups(store: Store, living: Sequence[BriefScene], settings: Settings) -> dict[str, np.ndarray]:
+    """What each scene's present graph says is up; where it has none yet, its newest one, or what that said."""
+    said = store.graphs.says()
+    times = Counter(graph.scene for graph in said)
+    several = [scene for scene in living if times[scene.id] > 1]
+    present = {key.digest for key in graph_keys(store, several, settings).values()} if several else set[str]()
     # Graphs come oldest first; the present one of a scene goes last.
-    chosen = {graph.scene: graph.up for graph in sorted(store.graphs.list(), key=lambda graph: graph.key in present)}
+    chosen = {graph.scene: graph.up for graph in sorted(said, key=lambda graph: graph.key in present)}
     of_thinned = {scene.id: scene.thinning.up for scene in living if scene.thinning is not None}
     return {scene: np.array(up) for scene, up in (of_thinned | chosen).items() if up is not None}
 

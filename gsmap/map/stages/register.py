@@ -23,6 +23,7 @@ from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
 from gsmap.store.registrations import StoredRegistration, Tried
+from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
 
@@ -38,7 +39,7 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     again without being computed. The target of a pair is the scene of lower id, however the pair was named: an edge is
     the same whichever scene came first.
     """
-    scenes = store.scenes.list()
+    scenes = store.scenes.brief()
     work = _Work(store, scenes, graph_keys(store, scenes, settings), settings, progress)
     if pairs == "auto":
         return _register_candidates(work)
@@ -60,7 +61,7 @@ class _Work:
     def __init__(
         self,
         store: Store,
-        scenes: Sequence[Scene],
+        scenes: Sequence[BriefScene],
         graphs: Mapping[str, RecipeKey],
         settings: Settings,
         progress: StageProgress,
@@ -320,7 +321,7 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
 
 def placed_scenes(store: Store) -> dict[str, Placed]:
     """Where scenes lie by the newest poses, for finding neighbours."""
-    bounds = {scene.id: scene.bounds for scene in store.scenes.list()}
+    bounds = store.scenes.bounds()
     placed = {}
     for scene, pose in store.revisions.poses().items():
         if scene in bounds:
