@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Row, Text, delete, insert, select, type_coerce
+from sqlalchemy import Connection, Row, Text, delete, func, insert, select, type_coerce
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
@@ -156,6 +156,16 @@ class Graphs:
 
     def _is_damaged(self, connection: Connection, group_id: str) -> bool:
         return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
+
+    def newest(self) -> str:
+        """When the newest graph was kept; empty where there is none."""
+        with self._catalog.read() as connection:
+            return connection.execute(select(func.max(graphs.c.created_at))).scalar_one() or ""
+
+    def scenes_after(self, created_at: str) -> set[str]:
+        """Ids of the scenes of which a graph was kept after a time."""
+        with self._catalog.read() as connection:
+            return set(connection.execute(select(graphs.c.scene).where(graphs.c.created_at > created_at)).scalars())
 
     def node_counts(self) -> dict[str, int]:
         """How many nodes the newest graph of each living scene has, by scene id."""

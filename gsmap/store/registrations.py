@@ -296,6 +296,13 @@ class Registrations:
         with self._catalog.read() as connection:
             return connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
 
+    def pairs_after(self, number: int) -> set[tuple[str, str]]:
+        """(lower, higher) by id of the pairs that were registered after the registration of a number."""
+        query = select(registrations.c.pair).where(registrations.c.number > number)
+        with self._catalog.read() as connection:
+            found = set(connection.execute(query).scalars())
+        return {(a, b) for a, b in (pair.split(":") for pair in found)}
+
     def history(self, a: str, b: str) -> list[StoredRegistration]:
         """Every registration of a pair, oldest first."""
         with self._catalog.read() as connection:

@@ -176,6 +176,13 @@ class Revisions:
         with self._catalog.read() as connection:
             return _outcomes(connection, newest & mine if scenes else newest)
 
+    def changed_after(self, number: int) -> tuple[set[str], set[tuple[str, str]]]:
+        """The scenes whose newest pose, and the (target, source) of the edges whose outcome, came after a revision."""
+        with self._catalog.read() as connection:
+            placed = connection.execute(select(poses.c.scene).where(poses.c.until.is_(None), poses.c.since > number))
+            judged = select(edges.c.target, edges.c.source).where(edges.c.until.is_(None), edges.c.since > number)
+            return set(placed.scalars()), {(row.target, row.source) for row in connection.execute(judged)}
+
     def undecided(self, number: int | None = None) -> PairsByRevision:
         """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)

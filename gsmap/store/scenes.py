@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -155,9 +155,15 @@ class Scenes:
             scene = _with_tags(connection, find(connection, new_id))
         return scene, True
 
-    def list(self, *, removed: bool = False) -> list[Scene]:
-        """The living scenes (or the removed ones) in the order they came."""
+    def list(self, *, removed: bool = False, among: Collection[str] | None = None) -> list[Scene]:
+        """The living scenes (or the removed ones) in the order they came.
+
+        Args:
+            among: only those of these ids.
+        """
         condition = scenes.c.removed_at.is_not(None) if removed else scenes.c.removed_at.is_(None)
+        if among is not None:
+            condition &= scenes.c.id.in_(sorted(among))
         with self._catalog.read() as connection:
             tags = facts.tags(connection)
             rows = connection.execute(select(scenes).where(condition).order_by(scenes.c.number))
