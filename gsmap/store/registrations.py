@@ -31,7 +31,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import not_ours
 from gsmap.store.matrices import matrices_of_bytes, poses_of_bytes
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
-from gsmap.store.schema import registrations, reviews
+from gsmap.store.schema import registrations, reviews, scenes
 from gsmap.types import Registration, Sim3
 from gsmap.types.plain import plain
 
@@ -145,33 +145,33 @@ class Registrations:
         Raises:
             InputError: a computed registration without a key, or a measurement with one or without a pose.
         """
-        r = registration
-        if (r.proposer == MANUAL) != (key is None):
-            raise InputError(f"a registration needs its recipe key, unless its proposer is {MANUAL!r}")
-        if r.proposer == MANUAL and r.status != "accepted":
-            raise InputError("a measured registration has status 'accepted', a pose and an information matrix")
+        _check_told(registration, key)
         with self._catalog.write() as connection:
-            row = {
-                "target": r.target,
-                "source": r.source,
-                "pair": _pair(connection, r.target, r.source),
-                "key": "" if key is None else key.digest,
-                "recipe": recipes.keep(connection, key),
-                "status": r.status,
-                "reason": r.reason,
-                "S_target_source": r.S_target_source,
-                "information": r.information,
-                "num_inliers": int(r.num_inliers),
-                "num_correspondences": int(r.num_correspondences),
-                "overlap": float(r.overlap),
-                "proposer": r.proposer,
-                "exact": int(r.exact),
-                "seconds": plain(r.seconds),
-                "evidence": plain(r.evidence),
-                "notes": list(r.notes),
-                "created_at": now(),
-            }
-            return self._insert(connection, row)
+            pair = _pair(connection, registration.target, registration.source)
+            return self._insert(connection, _row_of(registration, pair, key, recipes.keep(connection, key)))
+
+    def save_all(self, made: Sequence[tuple[Registration, RecipeKey]]) -> None:
+        """As `save`, of many that were computed, each with its key, in a few statements; scenes by their ids.
+
+        Raises:
+            InputError: as `save`; a registration of what is no scene, or of one scene alone. Nothing is kept then.
+        """
+        for registration, key in made:
+            _check_told(registration, key)
+        if not made:
+            return
+        wanted = {scene for registration, _ in made for scene in (registration.target, registration.source)}
+        with self._catalog.write() as connection:
+            known = recipes.kept(connection, scenes.c.id, wanted)
+            by_recipe = {key.recipe: key for _, key in made}
+            kept = {digest: recipes.keep(connection, key) for digest, key in by_recipe.items()}
+            rows = []
+            for registration, key in made:
+                a, b = sorted((registration.target, registration.source))
+                if a == b or not {a, b} <= known:
+                    raise InputError(f"a registration is of two scenes of the map, by their ids, got {a} and {b}")
+                rows.append(_row_of(registration, f"{a}:{b}", key, kept[key.recipe]))
+            connection.execute(insert(registrations), rows)
 
     def adopt(self, number: int) -> StoredRegistration:
         """Make an earlier registration the newest of its pair again, as if it had just been computed.
@@ -286,6 +286,17 @@ class Registrations:
             _, word = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
         return _stored_one(row, word)
 
+    def found(self, keys: Iterable[RecipeKey | str]) -> list[Registration]:
+        """The newest registration under each of the keys (or their digests) that has any, in the order of these."""
+        wanted = list(dict.fromkeys(digest for key in keys if (digest := recipes.digest_of(key))))
+        newest: dict[str, Row[Any]] = {}
+        with self._catalog.read() as connection:
+            for start in range(0, len(wanted), recipes.ASKED_AT_ONCE):
+                some = registrations.c.key.in_(wanted[start : start + recipes.ASKED_AT_ONCE])
+                query = select(registrations).where(some).order_by(registrations.c.number)
+                newest |= {row.key: row for row in connection.execute(query)}
+        return [_stored_one(newest[digest], None).registration for digest in wanted if digest in newest]
+
     def kept(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
         """Those of the keys (as digests) that a registration is kept under, made later than the one of a number."""
         with self._catalog.read() as connection:
@@ -383,6 +394,37 @@ def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> tuple[Row[Any] 
     else:
         chosen = max((row.number for row in rows if row.proposer != MANUAL), default=None)
     return next((row for row in rows if row.number == chosen), None), word
+
+
+def _check_told(r: Registration, key: RecipeKey | None) -> None:
+    """What a registration's row asks beside its figures; see `Registrations.save`."""
+    if (r.proposer == MANUAL) != (key is None):
+        raise InputError(f"a registration needs its recipe key, unless its proposer is {MANUAL!r}")
+    if r.proposer == MANUAL and r.status != "accepted":
+        raise InputError("a measured registration has status 'accepted', a pose and an information matrix")
+
+
+def _row_of(r: Registration, pair: str, key: RecipeKey | None, recipe: str | None) -> dict[str, Any]:
+    return {
+        "target": r.target,
+        "source": r.source,
+        "pair": pair,
+        "key": "" if key is None else key.digest,
+        "recipe": recipe,
+        "status": r.status,
+        "reason": r.reason,
+        "S_target_source": r.S_target_source,
+        "information": r.information,
+        "num_inliers": int(r.num_inliers),
+        "num_correspondences": int(r.num_correspondences),
+        "overlap": float(r.overlap),
+        "proposer": r.proposer,
+        "exact": int(r.exact),
+        "seconds": plain(r.seconds),
+        "evidence": plain(r.evidence),
+        "notes": list(r.notes),
+        "created_at": now(),
+    }
 
 
 def _pair(connection: Connection, a: str, b: str) -> str:

@@ -90,15 +90,15 @@ class _Work:
         }
         done = partial(store.registrations.kept, after=after)
         shared = SharedJobs(store, "register", "edge", jobs, edges, done, self.progress, again=again)
-        results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
+        made = shared.batches(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
         names = {scene.id: scene.name for scene in self.scenes}
         kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
-        with kept, closing(results):
-            for key, edge in results:
-                store.registrations.save(edge, self.key(*edges[key]))
-                shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
-        found = [store.registrations.find(key) for key in edges]
-        return [stored.registration for stored in found if stored is not None]
+        with kept, closing(made):
+            for batch in made:
+                store.registrations.save_all([(edge, self.key(*edges[key])) for key, edge in batch])
+                for key, edge in batch:
+                    shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
+        return store.registrations.found(edges)
 
 
 class _Known:
