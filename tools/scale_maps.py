@@ -37,6 +37,7 @@ from gsmap.store.schema import files, graphs, registrations, scene_facts, scenes
 from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Sim3
 
 NEAR, TRIED = 2, 10  # captures before it that a capture overlaps, and is tried with
+_REGISTER = register.register
 _SIGMAS = np.array([2e-4] * 3 + [1e-3] * 3 + [1e-3])
 
 
@@ -200,8 +201,9 @@ class Filled:
             lookup: which pairs are tried is asked of the map; else it is the captures before.
         """
         with mock.patch.object(describe, "run_jobs", self._describe):
-            if lookup:
-                with mock.patch.object(register, "run_jobs", self._register):
+            if lookup:  # within another one that looks nothing up, too
+                asks = mock.patch.object(register, "register", _REGISTER)
+                with asks, mock.patch.object(register, "run_jobs", self._register):
                     yield
             else:
                 with mock.patch.object(register, "register", self._register_new):

@@ -83,12 +83,13 @@ class SharedJobs:
                 yield from batch
 
     def batches(
-        self, run: Callable[[Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]], together_s: float = TOGETHER_S
+        self, run: Callable[[Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]], together_s: float | None = None
     ) -> Generator[list[tuple[str, Any]], None, None]:
-        """As `results`, with those that come within so many seconds of the last ones together, to be kept as one.
+        """As `results`, with those that come within some seconds (`TOGETHER_S`) of the last ones together.
 
         Whoever is killed loses that much work, who is interrupted or fails none.
         """
+        together_s = TOGETHER_S if together_s is None else together_s
         while self._todo:
             begun: list[str] = []
             batch: list[tuple[str, Any]] = []
