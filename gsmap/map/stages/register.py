@@ -22,7 +22,7 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import StoredRegistration, Tried
+from gsmap.store.registrations import Standing, StoredRegistration
 from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
@@ -114,49 +114,46 @@ class _Known:
     def __init__(self, work: _Work) -> None:
         self._work = work
         self._graphs = {scene: key.digest for scene, key in work.graphs.items()}
-        self._digests: dict[Pair, str] = {}  # of registrations, by (target, source)
-        self._standing = {directed(one.target, one.source): one for one in work.store.registrations.tried()}
-        if adopted := [pair for pair, one in self._standing.items() if self._adopt(one)]:
-            changed = {directed(one.target, one.source): one for one in work.store.registrations.tried()}
+        self._standing = self._read()
+        if adopted := [pair for pair, (one, current) in self._standing.items() if not current and self._adopt(one)]:
+            changed = self._read()
             self._standing |= {pair: changed[pair] for pair in adopted}
         bar = work.settings.optimize.aliasing.max_disagreement
-        current = {pair: one for pair, one in self._standing.items() if one.is_told or one.key in self._keys(one)}
         self.held = [
-            pair for pair, one in current.items() if one.usable and (one.is_told or not one.disagreement > bar)
+            pair
+            for pair, (one, current) in self._standing.items()
+            if current and one.usable and (one.is_told or not one.disagreement > bar)
         ]
         self.stale = sorted(
             pair
-            for pair, one in self._standing.items()
-            if pair not in current and set(pair) <= set(work.described) and not self.has(*pair)
+            for pair, (one, current) in self._standing.items()
+            if not current and all(scene in work.described for scene in pair) and not self._has(one)
         )
+
+    def _read(self) -> dict[Pair, tuple[Standing, bool]]:
+        """What stands of every pair, and whether it is what this recipe makes, or what a person told."""
+        return {
+            directed(one.target, one.source): (one, one.is_told or one.key in self._keys(one))
+            for one in self._work.store.registrations.tried()
+        }
 
     def has(self, a: str, b: str) -> bool:
         """Whether it has registered a pair."""
-        one = self._standing.get(directed(a, b))
-        return one is not None and self._has(one)
+        known = self._standing.get(directed(a, b))
+        return known is not None and self._has(known[0])
 
-    def pairs(self) -> set[Pair]:
-        """All that it has registered."""
-        return {pair for pair, one in self._standing.items() if self._has(one)}
-
-    def _has(self, one: Tried) -> bool:
+    def _has(self, one: Standing) -> bool:
         return any(key in one.keys for key in self._keys(one))
 
-    def _keys(self, one: Tried) -> Iterator[str]:
+    def _keys(self, one: Standing) -> Iterator[str]:
         """What the pair's registration would be kept under, in its own direction and in the other."""
-        if one.target in self._graphs and one.source in self._graphs:
-            yield self._digest(one.target, one.source)
-            yield self._digest(one.source, one.target)
+        target, source = self._graphs.get(one.target), self._graphs.get(one.source)
+        if target is not None and source is not None:
+            yield self._work.recipe.digest_of(target, source)
+            yield self._work.recipe.digest_of(source, target)
 
-    def _digest(self, target: str, source: str) -> str:
-        known = self._digests.get((target, source))
-        if known is None:
-            known = self._work.recipe.digest_of(self._graphs[target], self._graphs[source])
-            self._digests[target, source] = known
-        return known
-
-    def _adopt(self, one: Tried) -> bool:
-        if one.is_told or one.key in self._keys(one) or not self._has(one):
+    def _adopt(self, one: Standing) -> bool:
+        if not self._has(one):
             return False
         known = [self._work.store.registrations.find(key) for key in self._keys(one)]
         self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
@@ -185,8 +182,9 @@ def _register_candidates(work: _Work) -> list[Registration]:
     for pair in neighbours({s: at for s, at in placed_scenes(store).items() if s in work.described}, params):
         beside.setdefault(pair[0], []).append(pair)
     bar = work.settings.optimize.aliasing.max_disagreement
-    rounds = Rounds([*lists.values(), *beside.values()], known.pairs(), known.held, params)
-    rounds.tried |= set(known.stale)
+    proposed = [*lists.values(), *beside.values()]
+    tried = {pair for pairs in proposed for pair in pairs if known.has(*pair)}
+    rounds = Rounds(proposed, tried.union(known.stale), known.held, params)
     pairs, made = known.stale + rounds.next(), list[Registration]()
     while pairs:
         found = work.register(pairs, after=0)
