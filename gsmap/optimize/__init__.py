@@ -1,7 +1,8 @@
 """Edges in, one pose per scene out: robust, incremental, in as many components as the evidence ties together.
 
-`optimize` is the entry, and `grow` that of who knows that only scenes came; `recipe_key` names its answers; `diff` and `moved` compare two of them, `gravity_align` turns
-one upright, `kept_still` leaves alone what it did not change. Solvers (gtsam, networkx) load on first use.
+`optimize` is the entry, and `grow` that of who knows that only scenes came; `recipe_key` names its answers; `diff` and
+`moved` compare two of them, `gravity_align` turns one upright, `kept_still` leaves alone what it did not change.
+Solvers (gtsam, networkx) load on first use.
 """
 
 from __future__ import annotations

@@ -186,7 +186,8 @@ class Graphs:
             new = sorted(key for key, group_id in wanted if (key, group_id) not in self._said)
             for start in range(0, len(new), recipes.ASKED_AT_ONCE):
                 some = graphs.c.key.in_(new[start : start + recipes.ASKED_AT_ONCE])
-                for row in connection.execute(select(graphs.c.key, graphs.c.scene, graphs.c.group_id, _TEXT).where(some)):
+                unread = select(graphs.c.key, graphs.c.scene, graphs.c.group_id, _TEXT).where(some)
+                for row in connection.execute(unread):
                     self._said[row.key, row.group_id] = _says(row)
         return [self._said[one] for one in wanted]
 

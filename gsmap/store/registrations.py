@@ -14,6 +14,7 @@ from sqlalchemy import (
     Connection,
     LargeBinary,
     Row,
+    Text,
     case,
     exists,
     func,
@@ -447,8 +448,9 @@ _FULL = tuple(
 )
 _BRIEF = tuple(null().label(column.name) if column.name in ("evidence", "notes") else column for column in _FULL)
 _PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "status")
-_LEAN = (
-    *(registrations.c[name] for name in _PARTS),
+_LEAN = (  # as it lies: scenes that are none of the living ones are left out, and the rest is compared with
+    *(type_coerce(registrations.c[name], Text).label(name) for name in _PARTS[1:]),
+    registrations.c.number,
     (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed"),
 )
 _SAME_PAIR = registrations.alias()

@@ -43,7 +43,7 @@ _SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class BriefScene:
-    """What is asked of all scenes with every update; as in `Scene`, of which the rest takes ten times as long to read."""
+    """What every update asks of all scenes; as in `Scene`, of which the rest takes ten times as long to read."""
 
     id: str
     name: str
@@ -155,6 +155,20 @@ class Scenes:
             scene = _with_tags(connection, find(connection, new_id))
         return scene, True
 
+    def brief(self) -> list[BriefScene]:
+        """The living scenes in the order they came, without what takes long to read."""
+        columns = (scenes.c.id, scenes.c.name, scenes.c.scale_policy, scenes.c.captured_at, scenes.c.thinned)
+        query = select(*columns).where(scenes.c.removed_at.is_(None)).order_by(scenes.c.number)
+        with self._catalog.read() as connection:
+            rows = connection.execute(query).all()
+        return [BriefScene(row.id, row.name, row.scale_policy, row.captured_at, thinning_of(row.thinned)) for row in rows]
+
+    def bounds(self) -> dict[str, np.ndarray]:
+        """(2, 3) of every living scene by its id, as of `Scene`."""
+        query = select(scenes.c.id, scenes.c.bounds).where(scenes.c.removed_at.is_(None))
+        with self._catalog.read() as connection:
+            return {row.id: np.array(row.bounds) for row in connection.execute(query)}
+
     def list(self, *, removed: bool = False, among: Collection[str] | None = None) -> list[Scene]:
         """The living scenes (or the removed ones) in the order they came.
 
@@ -168,20 +182,6 @@ class Scenes:
             tags = facts.tags(connection)
             rows = connection.execute(select(scenes).where(condition).order_by(scenes.c.number))
             return [scene_of(row, tags.get(row.id, ())) for row in rows]
-
-    def brief(self) -> list[BriefScene]:
-        """The same of the living scenes, without what takes long to read."""
-        columns = (scenes.c.id, scenes.c.name, scenes.c.scale_policy, scenes.c.captured_at, scenes.c.thinned)
-        query = select(*columns).where(scenes.c.removed_at.is_(None)).order_by(scenes.c.number)
-        with self._catalog.read() as connection:
-            rows = connection.execute(query).all()
-        return [BriefScene(*row[:4], thinning_of(row[4])) for row in map(tuple, rows)]
-
-    def bounds(self) -> dict[str, np.ndarray]:
-        """(2, 3) of every living scene by its id, as of `Scene`."""
-        query = select(scenes.c.id, scenes.c.bounds).where(scenes.c.removed_at.is_(None))
-        with self._catalog.read() as connection:
-            return {row.id: np.array(row.bounds) for row in connection.execute(query)}
 
     def names(self) -> dict[str, str]:
         """The name of every scene by its id, removed ones included."""

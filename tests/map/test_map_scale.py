@@ -133,9 +133,11 @@ def test_who_is_stopped_keeps_the_pairs_that_are_done(alone: Filled, monkeypatch
             yield made
 
     before = alone.map.store.registrations.newest()
-    with pytest.raises(KeyboardInterrupt) as stopped, alone.standing_in(lookup=True):
+    pairs = [(alone.order[0], other) for other in alone.order[1:8]]
+    with alone.standing_in(lookup=True):
         monkeypatch.setattr(register, "run_jobs", stops)
-        alone.map.register([(alone.order[0], other) for other in alone.order[1:8]])
+        with pytest.raises(KeyboardInterrupt) as stopped:
+            alone.map.register(pairs)
     assert "3 of 7 pairs are registered and kept" in stopped.value.__notes__
     assert alone.map.store.registrations.newest() == before + done
     assert alone.map.store.leases.list() == []

@@ -20,7 +20,6 @@ from gsmap.store.scenes import BriefScene
 from gsmap.types import Scene
 from gsmap.types.progress import StageProgress
 
-
 AnyScene = TypeVar("AnyScene", Scene, BriefScene)
 
 
