@@ -235,10 +235,12 @@ class Registrations:
                 keys.setdefault(row.pair, set()).add(row.key)
         nothing: dict[str, float] = {}
         made = [
-            Standing(
-                *_stands(choice),
-                frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
-                float((choice.row.evidence or nothing).get("disagreement", np.nan)),
+            Standing._make(
+                (
+                    *_stands(choice),
+                    frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
+                    float((choice.row.evidence or nothing).get("disagreement", np.nan)),
+                )
             )
             for choice in chosen
         ]

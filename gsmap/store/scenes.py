@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import Connection, Row, insert, select, true, update
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.store import compact, facts
@@ -161,7 +161,9 @@ class Scenes:
         query = select(*columns).where(scenes.c.removed_at.is_(None)).order_by(scenes.c.number)
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
-        return [BriefScene(row.id, row.name, row.scale_policy, row.captured_at, thinning_of(row.thinned)) for row in rows]
+        return [
+            BriefScene(row.id, row.name, row.scale_policy, row.captured_at, thinning_of(row.thinned)) for row in rows
+        ]
 
     def bounds(self) -> dict[str, np.ndarray]:
         """(2, 3) of every living scene by its id, as of `Scene`."""
@@ -176,11 +178,10 @@ class Scenes:
             among: only those of these ids.
         """
         condition = scenes.c.removed_at.is_not(None) if removed else scenes.c.removed_at.is_(None)
-        if among is not None:
-            condition &= scenes.c.id.in_(sorted(among))
+        among_these = true() if among is None else scenes.c.id.in_(sorted(among))
         with self._catalog.read() as connection:
             tags = facts.tags(connection)
-            rows = connection.execute(select(scenes).where(condition).order_by(scenes.c.number))
+            rows = connection.execute(select(scenes).where(condition, among_these).order_by(scenes.c.number))
             return [scene_of(row, tags.get(row.id, ())) for row in rows]
 
     def names(self) -> dict[str, str]:

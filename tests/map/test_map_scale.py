@@ -177,6 +177,24 @@ def test_a_scene_placed_by_what_lies_around_it_lies_where_all_edges_put_it(
     assert answers[0] == answers[1]
 
 
+def test_all_is_solved_anew_where_an_older_edge_changed_as_well(alone: Filled) -> None:
+    m = alone.map
+    m.with_settings({"optimize.limits.full_scenes": 4, "optimize.growth": 1.0})
+    m.optimize()
+    names = m.store.scenes.names()
+    methods = []
+    for review in (False, True, False):
+        if review:
+            m.reject(f"{names[alone.order[2]]}:{names[alone.order[3]]}")
+        alone.add()
+        m.update()
+        graph = m.pose_graph()
+        assert graph is not None
+        methods.append(graph.provenance.method)
+    assert methods == ["incremental", "batch", "incremental"]
+    assert not {one.what for one in m.status().todo} & {"unsolved", "stale_poses"}
+
+
 def said(graph: PoseGraph) -> list[tuple[object, ...]]:
     """Poses and outcomes to the last bit."""
     placed = [

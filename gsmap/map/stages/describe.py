@@ -49,8 +49,8 @@ def describe(
         verify: read the graphs that are there, and make those again that are damaged, and try again those that were set
             aside; else none of them is read.
     """
-    keys = graph_keys(store, scenes, settings)
-    damaged = store.graphs.damaged(keys.values()) if verify else set()
+    keys: dict[str, RecipeKey] = graph_keys(store, scenes, settings)
+    damaged: set[str] = store.graphs.damaged(keys.values()) if verify else set()
     lacking = {*without_graph(store, keys), *(scene for scene, key in keys.items() if key.digest in damaged)}
     missing = [scene for scene in scenes if scene.id in lacking]
     specs = models.specs(store)
