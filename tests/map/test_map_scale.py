@@ -177,9 +177,14 @@ def test_a_scene_placed_by_what_lies_around_it_lies_where_all_edges_put_it(
     assert answers[0] == answers[1]
 
 
-def test_all_is_solved_anew_where_an_older_edge_changed_as_well(alone: Filled) -> None:
+def test_all_is_solved_anew_where_an_older_edge_changed_as_well(tmp_path: Path) -> None:
+    with filled(tmp_path / "long.gsmap", 40, tiny_pattern()) as alone:
+        _changes_with_a_scene(alone)
+
+
+def _changes_with_a_scene(alone: Filled) -> None:
     m = alone.map
-    m.with_settings({"optimize.limits.full_scenes": 4, "optimize.growth": 1.0})
+    m.with_settings({"optimize.limits.full_scenes": 10})
     m.optimize()
     names = m.store.scenes.names()
     methods = []
