@@ -140,10 +140,13 @@ def parts() -> AbstractContextManager[Spent]:
         ("describe", describe, "describe"),
         ("look up and register", register, "register"),
         ("poses: what names them", optimize, "pose_basis"),
-        ("poses: edges", optimize, "pose_inputs"),
+        ("poses: edges", optimize, "_edges"),
         ("poses: solve", optimize.solver, "optimize"),
+        ("poses: place", optimize.solver, "grow"),
         ("poses: keep still", optimize.solver, "kept_still"),
-        ("poses: save and load", optimize, "_optimize"),
+        ("poses: load", optimize, "_inputs"),
+        ("poses: save", optimize, "_optimize"),
+        ("poses: save", optimize, "_grow"),
         ("report", reports, "update_report"),
     ]
     return spent(steps)
@@ -152,7 +155,7 @@ def parts() -> AbstractContextManager[Spent]:
 def table(scenes: Sequence[int], rows: Sequence[dict[str, float]]) -> None:
     """A line for each figure, with the exponent of its growth over the last decade."""
     print(f"{'':52}" + "".join(f"{num:>12,}" for num in scenes) + "    exponent")
-    for name in rows[0]:
+    for name in dict.fromkeys(name for row in rows for name in row):
         values = [row.get(name, float("nan")) for row in rows]
         grown = ""
         if len(values) > 1 and min(values[-2:]) > 0:

@@ -181,7 +181,7 @@ PARTS = [
     ("solving", optimize.solver, "optimize"),
     ("keeping still", optimize.solver, "kept_still"),
     ("naming poses", optimize, "pose_basis"),
-    ("reading edges", optimize, "pose_inputs"),
+    ("reading edges", optimize, "_edges"),
     ("report", reports, "update_report"),
     ("loading graphs", Graphs, "load"),
 ]

@@ -37,6 +37,7 @@ from gsmap.store.schema import files, graphs, registrations, scene_facts, scenes
 from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Sim3
 
 NEAR, TRIED = 2, 10  # captures before it that a capture overlaps, and is tried with
+_REGISTER = register.register
 _SIGMAS = np.array([2e-4] * 3 + [1e-3] * 3 + [1e-3])
 
 
@@ -200,8 +201,9 @@ class Filled:
             lookup: which pairs are tried is asked of the map; else it is the captures before.
         """
         with mock.patch.object(describe, "run_jobs", self._describe):
-            if lookup:
-                with mock.patch.object(register, "run_jobs", self._register):
+            if lookup:  # within another one that looks nothing up, too
+                asks = mock.patch.object(register, "register", _REGISTER)
+                with asks, mock.patch.object(register, "run_jobs", self._register):
                     yield
             else:
                 with mock.patch.object(register, "register", self._register_new):
@@ -216,11 +218,11 @@ class Filled:
             finally:
                 counts["graphs"] = loaded.times["graphs"]
 
-    def _describe(self, job: Any, arguments: Any, *_: Any) -> Iterator[tuple[int, SceneGraph]]:
+    def _describe(self, job: Any, arguments: Any, *_: Any, **__: Any) -> Iterator[tuple[int, SceneGraph]]:
         for i, (_, scene, *_rest) in enumerate(arguments):
             yield i, replace(self.made.graph, scene_id=scene)
 
-    def _register(self, job: Any, arguments: Any, *_: Any) -> Iterator[tuple[int, Registration]]:
+    def _register(self, job: Any, arguments: Any, *_: Any, **__: Any) -> Iterator[tuple[int, Registration]]:
         place = {scene: k for k, scene in enumerate(self.order)}
         for i, (_, target, source, *_rest) in enumerate(arguments):
             yield i, self.edge(place[target[0]], place[source[0]])
@@ -231,19 +233,19 @@ class Filled:
         new = [k for k in range(self.num_tried, len(self.order)) if k]
         self.num_tried = len(self.order)
         keys = self.keys([self.order[i] for k in new for i in range(max(0, k - TRIED), k + 1)])
-        made = []
+        recipe, made = recipe_key(settings.register), []
         for k in new:
             for before in range(max(0, k - TRIED), k):
                 edge = self.edge(before, k)
-                key = recipe_key(settings.register).of(keys[edge.target].digest, keys[edge.source].digest)
-                store.registrations.save(edge, key)
-                made.append(edge)
-        return made
+                made.append((edge, recipe.of(keys[edge.target].digest, keys[edge.source].digest)))
+        store.registrations.save_all(made)
+        return [edge for edge, _ in made]
 
     def keys(self, ids: Sequence[str]) -> dict[str, RecipeKey]:
         """What names the graphs of scenes."""
         store = self.map.store
-        wanted = [scene for scene in store.scenes.list() if scene.id in set(ids)]
+        some = set(ids)
+        wanted = [scene for scene in store.scenes.brief() if scene.id in some]
         return describe.graph_keys(store, wanted, self.map.settings)
 
 

@@ -37,15 +37,16 @@ def command(
         captures = synthetic.make_captures(seed, progress=lambda fraction, text: draw("capture", fraction, text))
         synthetic.write_captures(root / "captures", captures)
         with gsmap.map.open_or_create(map_path, progress=progress) as m:
-            updated = m.update(root / "captures")
+            m.update(root / "captures")
+            scenes, edges = m.scene_rows(), m.edge_rows()
             exported = m.export(root / "tiles", tile_size_m=0)
             _draw(m, root / "map.png")
             truth = m.evaluate(root / "captures" / "truth")
     report = DemoReport(
         map=str(map_path),
         picture=str(root / "map.png"),
-        scenes=updated.scenes,
-        edges=updated.edges,
+        scenes=tuple(scenes),
+        edges=tuple(edges),
         tiles=exported.tiles,
         truth=truth,
     )

@@ -43,11 +43,30 @@ def command(
     if json:
         print_rows("update", report, json)
     else:
-        print_map(report.scenes, report.edges)
+        print_rows_of(report.scenes, report.edges)
+        if not report.scenes and not report.edges:
+            print("nothing is new")
+        if (newest := report.revision) is not None:
+            print(
+                f"the map has {newest.scenes} scenes in {newest.components} component{'s' * (newest.components != 1)}; "
+                f"{newest.edges_used} edges used, {newest.edges_tentative} tentative, {newest.edges_refused} refused"
+            )
 
 
 def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
-    """The closing tables: scenes placed, edges with reasons, and a line that sums them up."""
+    """The closing tables of a whole map, and a line that sums them up."""
+    print_rows_of(scenes, edges)
+    placed = [row for row in scenes if row.S_map_scene is not None]
+    components = {row.component for row in placed}
+    accepted = sum(row.status == "accepted" for row in edges)
+    print(
+        f"{len(placed)} of {len(scenes)} scenes placed in {len(components)} component{'s' * (len(components) != 1)}; "
+        f"{accepted} edges accepted, {len(edges) - accepted} not"
+    )
+
+
+def print_rows_of(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
+    """Tables of scenes and of edges with reasons, of which there may be none."""
     columns = {
         "name": "scene",
         "status": "status",
@@ -55,7 +74,8 @@ def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
         "num_gaussians": "Gaussians",
         "num_nodes": "nodes",
     }
-    print_table("scenes", columns, scenes)
+    if scenes:
+        print_table("scenes", columns, scenes)
     columns = {
         "pair": "pair",
         "status": "status",
@@ -64,11 +84,5 @@ def print_map(scenes: Sequence[SceneRow], edges: Sequence[EdgeRow]) -> None:
         "num_inliers": "inliers",
         "reason": "reason",
     }
-    print_table("edges", columns, edges)
-    placed = [row for row in scenes if row.S_map_scene is not None]
-    components = {row.component for row in placed}
-    accepted = sum(row.status == "accepted" for row in edges)
-    print(
-        f"{len(placed)} of {len(scenes)} scenes placed in {len(components)} component{'s' * (len(components) != 1)}; "
-        f"{accepted} edges accepted, {len(edges) - accepted} not"
-    )
+    if edges:
+        print_table("edges", columns, edges)

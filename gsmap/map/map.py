@@ -333,7 +333,7 @@ class Map(AbstractContextManager["Map"]):
         return reports.revision_row(self.store, number)
 
     def update(self, *captures: str | os.PathLike[str], captured_at: str | None = None) -> UpdateReport:
-        """Ingest the captures, then describe, register and optimize whatever is missing.
+        """Ingest the captures, then describe, register and optimize whatever is missing; says what that changed.
 
         Args:
             captured_at: as in `ingest`.
@@ -344,15 +344,16 @@ class Map(AbstractContextManager["Map"]):
 
         if captured_at is not None and not captures:
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
+        before = reports.mark(self.store)
         with at_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
-            describe(self.store, unthinned(self.scenes()), self.settings, self._progress)
+            describe(self.store, unthinned(self.store.scenes.brief()), self.settings, self._progress)
             register(self.store, "auto", self.settings, self._progress)
             # Poses may tell of new neighbours, and their edges of new poses.
             while solve(self.store, self.settings, self._progress):
                 if not register(self.store, "auto", self.settings, self._progress):
                     break
-        return reports.update_report(self.store, ingested, self.metres())
+        return reports.update_report(self.store, ingested, before, self.metres)
 
     def set_prior(self, prior: Prior) -> PriorRow | None:
         """Tell where a scene lies (GPS, survey, an anchor), in place of what was told before; see `Prior`.

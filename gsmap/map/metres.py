@@ -32,22 +32,21 @@ def map_metres(store: Store, settings: Settings, graph: PoseGraph | None) -> dic
 
     What is known of a scene that was removed since still counts, as long as the poses are those it took part in.
     """
-    told, scenes = store.scenes.told_metres(), {scene.id: scene for scene in store.scenes.list()}
-    guesses = {stored.scene: stored.unit_m for stored in store.graphs.list()}  # oldest first: the newest stays
+    told, policies = store.scenes.told_metres(), {scene.id: scene.scale_policy for scene in store.scenes.brief()}
+    guesses = {graph.scene: graph.unit_m for graph in store.graphs.says()}  # oldest first: the newest stays
     components: dict[int, list[tuple[SceneUnit, ScenePose]]] = {}
     low, high = settings.describe.unit.plausible_m
     for pose in graph.poses.values() if graph else ():
-        scene = scenes.get(pose.scene)
-        if scene is None:
+        policy, guess = policies.get(pose.scene), guesses.get(pose.scene)
+        if policy is None:
             try:
-                scene = store.scenes.get(pose.scene)
+                policy = store.scenes.get(pose.scene).scale_policy
             except NotFoundError:
                 continue  # forgotten, and all that was said of it
-        policy, guess = scene.scale_policy, guesses.get(scene.id)
         if guess is not None and not (math.isfinite(guess) and guess > 0):
             guess = None
         unit = SceneUnit(
-            told=told.get(scene.id),
+            told=told.get(pose.scene),
             in_metres=policy == "known",
             # As registration takes it (`gsmap.describe.unit.landmark_units`): metres, where that is plausible.
             may_be_metres=policy == "auto" and guess is not None and low < guess < high,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence, Sized
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from typing import Any
 
 from gsmap.engine import SetAside
@@ -23,6 +23,9 @@ _WORTH_S = 1.0
 """How much work is leased in one transaction: jobs of several seconds one by one, so that none lies idle in one process
 while another has nothing to do; hundreds of quick ones a few at a time, so that leasing them costs little."""
 _AT_MOST = 16
+
+TOGETHER_S = 1.0
+"""Results of quick jobs that come within it are kept in one transaction: each by itself costs a dozen statements."""
 
 POLL_S = 0.5
 """How often those who wait look whether the others have finished or dropped something; one small read each time."""
@@ -63,7 +66,7 @@ class SharedJobs:
             self._leave_out(again)
         self._ours: list[str] = []
         self._saved: list[str] = []  # still leased
-        self._count, self._began = 0, time.monotonic()
+        self._came, self._began = 0, time.monotonic()
 
     def results(
         self, run: Callable[[Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
@@ -75,15 +78,41 @@ class SharedJobs:
         Args:
             run: does jobs by their arguments, and takes those one by one as it has room (`gsmap.engine.run_jobs`).
         """
+        with closing(self.batches(run, 0.0)) as batches:
+            for batch in batches:
+                yield from batch
+
+    def batches(
+        self, run: Callable[[Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]], together_s: float | None = None
+    ) -> Generator[list[tuple[str, Any]], None, None]:
+        """As `results`, with those that come within some seconds (`TOGETHER_S`) of the last ones together.
+
+        Whoever is killed loses that much work, who is interrupted or fails none.
+        """
+        together_s = TOGETHER_S if together_s is None else together_s
         while self._todo:
             begun: list[str] = []
+            batch: list[tuple[str, Any]] = []
+            since = time.monotonic()
             running = run(_Counted(self._begin(begun), self._todo))
             try:
                 for index, result in running:
                     if isinstance(result, SetAside):
                         self._put_aside(begun[index], result.reason)
-                    else:
-                        yield begun[index], result
+                        continue
+                    self._came += 1
+                    batch.append((begun[index], result))
+                    if time.monotonic() - since >= together_s:
+                        yield batch
+                        batch, since = [], time.monotonic()
+                if batch:
+                    yield batch
+            except GeneratorExit:
+                raise
+            except BaseException:
+                if batch:
+                    yield batch
+                raise
             finally:
                 if isinstance(running, Generator):
                     running.close()  # its workers end now, and not when somebody collects what is left of it
@@ -95,7 +124,6 @@ class SharedJobs:
         """The result of a job is in the catalog."""
         self._ours.remove(key)
         self._saved.append(key)
-        self._count += 1
         self._tell(text)
 
     def _leave_out(self, again: bool) -> None:
@@ -139,7 +167,7 @@ class SharedJobs:
             return {self._lease(key) for key in self._settled([lease.partition(" ")[2] for lease in leases])}
 
         while self._todo:
-            worth = int(_WORTH_S * self._count / (time.monotonic() - self._began + 1e-3))
+            worth = int(_WORTH_S * self._came / (time.monotonic() - self._began + 1e-3))
             taken = self._leases.take(
                 [self._lease(key) for key in self._todo],
                 self._stage,
@@ -168,7 +196,7 @@ class SharedJobs:
     def _wait(self) -> None:
         """Until all is done, or others have dropped something."""
         told: set[str] = set()
-        while True:
+        while self._todo:
             for key in self._settled(list(self._todo)):
                 del self._todo[key]
             holders = {lease.what: lease for lease in self._leases.list()}

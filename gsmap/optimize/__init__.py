@@ -1,7 +1,8 @@
 """Edges in, one pose per scene out: robust, incremental, in as many components as the evidence ties together.
 
-`optimize` is the entry, `recipe_key` names its answers; `diff` and `moved` compare two of them, `gravity_align` turns
-one upright, `kept_still` leaves alone what it did not change. Solvers (gtsam, networkx) load on first use.
+`optimize` is the entry, and `grow` that of who knows that only scenes came; `recipe_key` names its answers; `diff` and
+`moved` compare two of them, `gravity_align` turns one upright, `kept_still` leaves alone what it did not change.
+Solvers (gtsam, networkx) load on first use.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ __all__ = [
     "check_priors",
     "diff",
     "gravity_align",
+    "grow",
     "joint_covariance",
     "kept_still",
     "motion",
     "moved",
     "optimize",
     "recipe_key",
+    "surroundings",
 ]
 
 
@@ -72,11 +75,38 @@ def optimize(
     # What is summed, numbered or tried first may decide what is close: by content, not by who came first.
     edges = sorted(edges, key=lambda edge: (edge.target, edge.source))
     priors = sorted(priors, key=lambda prior: prior.scene)
-    if previous is not None and params.growth > 0 and len(scene_ids) > params.limits.full_scenes:
+    if previous is not None:
         placed = place_new(scene_ids, edges, priors, previous, params, survey or Survey())
         if placed is not None:
             return placed
     return solve_batch(scene_ids, edges, priors, previous, params, progress, survey or Survey())
+
+
+def surroundings(
+    scene_ids: Sequence[str], pairs: Sequence[tuple[str, str]], previous: PoseGraph, params: Params
+) -> tuple[set[str], set[str]]:
+    """The scenes that placing the new ones in the last answer looks at, and the outermost of them, in which nothing may
+    move without a look further; none where everything is solved anew.
+
+    Args:
+        pairs: (target, source) of all edges that `optimize` would be given.
+    """
+    from gsmap.optimize.incremental import surroundings
+
+    return surroundings(scene_ids, pairs, previous, params)
+
+
+def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, params: Params) -> PoseGraph | None:
+    """What `optimize` answers where it can place the new scenes in the last answer; None where it cannot.
+
+    For who knows that nothing else has changed: edges between old scenes, priors, observations.
+
+    Args:
+        edges: those among the `surroundings`, by (target, source).
+    """
+    from gsmap.optimize.incremental import grow
+
+    return grow(scene_ids, edges, previous, params)
 
 
 def joint_covariance(

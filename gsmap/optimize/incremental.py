@@ -39,23 +39,69 @@ def place_new(
     ``params.growth`` since the last one, or when a new scene ties components together, closes a long loop or comes with
     edges that are in doubt. Poses placed here are provisional: only the surroundings of a new scene give way to it.
     """
-    if previous.provenance.recipe != recipe_key(params).recipe:
-        return None
-    known = set(previous.poses)
-    new = [scene for scene in scene_ids if scene not in known]
-    solved = previous.provenance.batch_scenes
-    if not new or len(known) + len(new) != len(scene_ids) or len(set(scene_ids)) != len(scene_ids):
-        return None
-    if len(scene_ids) > (1 + params.growth) * solved or any(p.scene not in known for p in priors):
-        return None
-    if survey.scenes() - known:
+    new = _to_place(scene_ids, previous, params)
+    if not new or not {*survey.scenes(), *(prior.scene for prior in priors)} <= set(previous.poses):
         return None
     fresh = set(new)
     old = [e for e in edges if e.target not in fresh and e.source not in fresh]
-    measured = fingerprint(old, priors, survey)
-    if f"{measured % 2**64:016x}" != previous.provenance.measured:
+    if f"{fingerprint(old, priors, survey) % 2**64:016x}" != previous.provenance.measured:
         return None
-    measured += fingerprint([e for e in edges if e.target in fresh or e.source in fresh])
+    return _place_all(scene_ids, new, edges, previous, params)
+
+
+def grow(scene_ids: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, params: Params) -> PoseGraph | None:
+    """As `place_new`, of a caller who knows that all measurements between old scenes, priors and observations are those
+    of the previous answer.
+
+    Args:
+        edges: those between the `surroundings`; the others are not asked for.
+    """
+    new = _to_place(scene_ids, previous, params)
+    return _place_all(scene_ids, new, edges, previous, params) if new else None
+
+
+def surroundings(
+    scene_ids: Sequence[str], pairs: Sequence[tuple[str, str]], previous: PoseGraph, params: Params
+) -> tuple[set[str], set[str]]:
+    """The scenes that placing the new ones looks at, with two rings around them, and the outer of these.
+
+    So an edge of any scene but those of the outer ring is one between two of these scenes, and who finds nothing moved
+    in the outer ring (`kept_still` may let more give way) has looked far enough. Empty where only a full solve will do.
+
+    Args:
+        pairs: (target, source) of all edges that may be used.
+    """
+    reached = set(_to_place(scene_ids, previous, params))
+    ties = {pair for pair in pairs if not reached.isdisjoint(pair)}
+    ties |= {pair for pair, outcome in previous.outcomes.items() if outcome.use != "unused"}
+    beside: dict[str, list[str]] = {}
+    for a, b in ties:
+        beside.setdefault(a, []).append(b)
+        beside.setdefault(b, []).append(a)
+    ring = set(reached)
+    for _ in range(1 + params.neighbourhood + 2):
+        ring = {b for a in ring for b in beside.get(a, ())} - reached
+        reached |= ring
+    return reached, ring
+
+
+def _to_place(scene_ids: Sequence[str], previous: PoseGraph, params: Params) -> list[str]:
+    """The new scenes; none where there are none, or they may not be placed one by one."""
+    known, provenance = previous.poses, previous.provenance
+    new = [scene for scene in scene_ids if scene not in known]
+    if provenance.recipe != recipe_key(params).recipe or not provenance.measured or params.growth <= 0:
+        return []
+    if len(known) + len(new) != len(scene_ids) or len(set(scene_ids)) != len(scene_ids):
+        return []
+    many = params.limits.full_scenes < len(scene_ids) <= (1 + params.growth) * provenance.batch_scenes
+    return new if many else []
+
+
+def _place_all(
+    scene_ids: Sequence[str], new: Sequence[str], edges: Sequence[Edge], previous: PoseGraph, params: Params
+) -> PoseGraph | None:
+    fresh = set(new)
+    old = [e for e in edges if e.target not in fresh and e.source not in fresh]
     answer = previous
     taken = [e for e in old if previous.use(e.target, e.source) != "unused"]
     for scene in new:
@@ -69,6 +115,8 @@ def place_new(
             return None
         answer = placed
         taken += [e for e in own if answer.use(e.target, e.source) != "unused"]
+    measured = int(previous.provenance.measured, 16)
+    measured += fingerprint([e for e in edges if e.target in fresh or e.source in fresh])
     provenance = replace(previous.provenance, method="incremental", measured=f"{measured % 2**64:016x}")
     return replace(answer, poses={s: answer.poses[s] for s in scene_ids}, provenance=provenance)
 

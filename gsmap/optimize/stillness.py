@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,12 +30,16 @@ def kept_still(answer: PoseGraph, previous: PoseGraph | None, edges: Sequence[Ed
 
     Args:
         previous: the last answer; None keeps nothing.
-        edges: those that the answer rests on.
+        edges: those that the answer rests on; at least those of all scenes whose pose is not the very object of before,
+            and of those beside them that give way.
         params: ``still_sigmas`` and ``still_variance``.
     """
     if previous is None or not answer.poses:
         return answer
-    graph = _Both.of(answer, previous, [e for e in edges if answer.use(e.target, e.source) != "unused"])
+    used = [e for e in edges if answer.use(e.target, e.source) != "unused"]
+    # Where new scenes were placed one by one, all but a few poses are the very ones of before.
+    changed = {scene for scene, pose in answer.poses.items() if previous.poses.get(scene) is not pose}
+    graph = _Both.of(answer, previous, changed.union(*((e.target, e.source) for e in used)), used)
     still = graph.still(answer, params.still_sigmas)
     poses = dict(answer.poses)
     for row, S_map_scene in graph.beside(still, params.still_sigmas).items():
@@ -72,8 +76,8 @@ class _Both:
     component: np.ndarray
 
     @classmethod
-    def of(cls, answer: PoseGraph, previous: PoseGraph, edges: Sequence[Edge]) -> _Both:
-        scenes = sorted(scene for scene, pose in answer.poses.items() if pose.S_map_scene is not None)
+    def of(cls, answer: PoseGraph, previous: PoseGraph, among: Collection[str], edges: Sequence[Edge]) -> _Both:
+        scenes = sorted(s for s in among if s in answer.poses and answer.poses[s].S_map_scene is not None)
         row = {scene: k for k, scene in enumerate(scenes)}
         now = [answer.poses[scene].S_map_scene for scene in scenes]
         then = [previous.poses.get(scene) for scene in scenes]
@@ -158,10 +162,14 @@ def _kept(pose: ScenePose, before: ScenePose, variance: float) -> ScenePose:
         root = np.sqrt(np.maximum(np.diag(covariance), 0))
         if (np.abs(covariance - before.covariance) <= variance * root[:, None] * root[None]).all():
             covariance = before.covariance
+    if covariance is before.covariance and (pose.component, pose.status) == (before.component, before.status):
+        return before  # itself: who compares the two answers need not look at its numbers
     return replace(pose, S_map_scene=before.S_map_scene, covariance=covariance)
 
 
 def _kept_outcome(outcome: EdgeOutcome, before: EdgeOutcome | None, variance: float) -> EdgeOutcome:
+    if outcome is before:
+        return outcome
     now, then = outcome.residual_chi2, None if before is None else before.residual_chi2
     if now is None or then is None or abs(now - then) > variance * (1 + then):
         return outcome

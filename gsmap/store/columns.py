@@ -62,10 +62,16 @@ class _Checked(TypeDecorator[Any]):
             raise InputError(f"{self.where} must be {self.what}, got {_short(value)}")
         return value
 
-    def process_result_value(self, value: Any, dialect: Any) -> Any:
-        if value is not None and not (isinstance(value, str) and self.fits(value)):
-            raise _corrupt(self.where, value, self.what)
-        return value
+    def result_processor(self, dialect: Any, coltype: Any) -> Callable[[Any], Any] | None:
+        # In place of `process_result_value`: a map has millions of values, and a call around each is half its cost.
+        fits, where, what = self.fits, self.where, self.what
+
+        def checked(value: Any) -> Any:
+            if value is None or (isinstance(value, str) and fits(value)):
+                return value
+            raise corrupt(where, value, what)
+
+        return checked
 
     def coerce_compared_value(self, op: Any, value: Any) -> TypeEngine[Any]:
         return Text()
@@ -145,8 +151,8 @@ class Line(_Checked):
     def fits(self, value: str) -> bool:
         return not control_characters(value, lines=self.lines)
 
-    def process_result_value(self, value: Any, dialect: Any) -> Any:
-        return value
+    def result_processor(self, dialect: Any, coltype: Any) -> None:
+        return None
 
 
 class Lines(Line):
@@ -186,9 +192,9 @@ class Json(TypeDecorator[Any]):
         try:
             found = json.loads(value)
         except (ValueError, TypeError, RecursionError) as error:
-            raise _corrupt(self.where, value, "JSON") from error
+            raise corrupt(self.where, value, "JSON") from error
         if self.fits is not None and not self.fits(found):
-            raise _corrupt(self.where, value, f"JSON of {self.fits.__name__.strip('_').replace('_', ' ')}")
+            raise corrupt(self.where, value, f"JSON of {self.fits.__name__.strip('_').replace('_', ' ')}")
         return found
 
 
@@ -343,7 +349,8 @@ def _numbers(value: Any, *shape: int) -> bool:
     return isinstance(value, list) and len(value) == shape[0] and all(_numbers(item, *shape[1:]) for item in value)
 
 
-def _corrupt(where: str, value: Any, what: str) -> CorruptError:
+def corrupt(where: str, value: Any, what: str) -> CorruptError:
+    """What to tell of a value that gsmap cannot have written."""
     return CorruptError(
         f"the catalog holds {_short(value)} in {where}, which is not {what}: gsmap did not write that; "
         "restore the catalog from a backup, and do not trust a map that was sent to you so"

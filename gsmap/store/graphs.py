@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Row, delete, insert, select
+from sqlalchemy import Connection, Row, Text, delete, func, insert, select, type_coerce
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.arrays import Arrays, digest
 from gsmap.store.catalog import Catalog, now
+from gsmap.store.columns import a_direction, corrupt
 from gsmap.store.explained import NOT_KEPT, explained
 from gsmap.store.graph_content import from_arrays, shapes_of, to_arrays
 from gsmap.store.groups import manifest, num_bytes, publish, unless_pruned, unname
@@ -49,12 +51,23 @@ class StoredGraph:
         return sum(self.layers.values())
 
 
+@dataclass(frozen=True)
+class GraphSays:
+    """What a graph says of its scene's frame; as in `StoredGraph`."""
+
+    key: str
+    scene: str
+    unit_m: float
+    up: tuple[float, ...] | None
+
+
 class Graphs:
     """The scene graphs of a map, of each scene one for every key that it was described under."""
 
     def __init__(self, catalog: Catalog, arrays: Arrays) -> None:
         self._catalog = catalog
         self._arrays = arrays
+        self._said: dict[tuple[str, str], GraphSays] = {}  # by key and arrays, which do not change
 
     def save(self, graph: SceneGraph, key: RecipeKey) -> StoredGraph:
         """Keep a graph; another one under the same key takes its place, the same again mends damaged bytes.
@@ -144,6 +157,16 @@ class Graphs:
     def _is_damaged(self, connection: Connection, group_id: str) -> bool:
         return bool(self._arrays.problems(KIND, group_id, manifest(connection, group_id)))
 
+    def newest(self) -> str:
+        """When the newest graph was kept; empty where there is none."""
+        with self._catalog.read() as connection:
+            return connection.execute(select(func.max(graphs.c.created_at))).scalar_one() or ""
+
+    def scenes_after(self, created_at: str) -> set[str]:
+        """Ids of the scenes of which a graph was kept after a time."""
+        with self._catalog.read() as connection:
+            return set(connection.execute(select(graphs.c.scene).where(graphs.c.created_at > created_at)).scalars())
+
     def node_counts(self) -> dict[str, int]:
         """How many nodes the newest graph of each living scene has, by scene id."""
         query = select(graphs.c.scene, graphs.c.num_nodes).join(scenes, scenes.c.id == graphs.c.scene)
@@ -151,11 +174,43 @@ class Graphs:
             rows = connection.execute(query.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at))
             return {row.scene: row.num_nodes for row in rows}
 
+    def says(self) -> list[GraphSays]:
+        """What the graphs of all living scenes say of their frames, oldest first.
+
+        An update asks this several times, so what was read once is remembered.
+        """
+        alive = select(graphs.c.key, graphs.c.group_id).join(scenes, scenes.c.id == graphs.c.scene)
+        query = alive.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at)
+        with self._catalog.read() as connection:
+            wanted = [(row.key, row.group_id) for row in connection.execute(query)]
+            new = sorted(key for key, group_id in wanted if (key, group_id) not in self._said)
+            for start in range(0, len(new), recipes.ASKED_AT_ONCE):
+                some = graphs.c.key.in_(new[start : start + recipes.ASKED_AT_ONCE])
+                unread = select(graphs.c.key, graphs.c.scene, graphs.c.group_id, _TEXT).where(some)
+                for row in connection.execute(unread):
+                    self._said[row.key, row.group_id] = _says(row)
+        return [self._said[one] for one in wanted]
+
     def list(self) -> list[StoredGraph]:
         """The graphs of all living scenes, oldest first."""
         query = select(graphs).join(scenes, scenes.c.id == graphs.c.scene).where(scenes.c.removed_at.is_(None))
         with self._catalog.read() as connection:
             return [_stored(row) for row in connection.execute(query.order_by(graphs.c.created_at))]
+
+
+_TEXT = type_coerce(graphs.c.about, Text).label("about")
+
+
+def _says(row: Row[Any]) -> GraphSays:
+    """From its text: what a graph is beside its arrays is a hundred numbers, of which these four are asked for."""
+    try:
+        about = json.loads(row.about)
+        up, unit_m = about["up"], about["unit_m"]
+        if isinstance(unit_m, (int, float)) and (up is None or a_direction(up)):
+            return GraphSays(row.key, row.scene, float(unit_m), None if up is None else tuple(up))
+    except (ValueError, TypeError, KeyError, RecursionError):
+        pass
+    raise corrupt("graphs.about", row.about, "JSON of a graph")
 
 
 def _stored(row: Row[Any]) -> StoredGraph:

@@ -36,6 +36,7 @@ HEARTBEAT_S = 15.0
 """How often a process renews what it holds, in one small transaction: three may fail (a writer that keeps the lock, a
 server that restarts) before anything is lost."""
 
+_AT_ONCE = 1000  # rows in one statement: a database takes some ten thousand values
 _PATIENCE_S = 1.0  # for the writer lock, to give leases back: who ends must not wait, and what stays runs out
 
 
@@ -217,10 +218,11 @@ class Leases:
             "expires_at": _text(now + timedelta(seconds=self._lease_s)),
         }
         insert = sqlite_dialect.insert if self._catalog.is_sqlite else postgresql.insert
-        ours: set[str] = set()
-        for what in sorted(whats):  # in one order for all, or two servers' connections wait for each other
-            made = insert(leases).values({"what": what, **row}).on_conflict_do_nothing().returning(leases.c.what)
-            ours.update(connection.execute(made).scalars())
+        # In one order for all, or two servers' connections wait for each other.
+        ordered, ours = [{"what": what, **row} for what in sorted(whats)], set[str]()
+        for start in range(0, len(ordered), _AT_ONCE):
+            some = insert(leases).values(ordered[start : start + _AT_ONCE])
+            ours |= set(connection.execute(some.on_conflict_do_nothing().returning(leases.c.what)).scalars())
         return [what for what in whats if what in ours]
 
     def _judged(self, connection: Connection, now: datetime) -> tuple[list[Lease], list[Lease]]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 from sqlalchemy import (
@@ -13,8 +14,9 @@ from sqlalchemy import (
     Connection,
     LargeBinary,
     Row,
-    Select,
+    Text,
     case,
+    exists,
     func,
     insert,
     null,
@@ -31,7 +33,7 @@ from gsmap.store.catalog import Catalog, now
 from gsmap.store.columns import not_ours
 from gsmap.store.matrices import matrices_of_bytes, poses_of_bytes
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
-from gsmap.store.schema import registrations, reviews
+from gsmap.store.schema import registrations, reviews, scenes
 from gsmap.types import Registration, Sim3
 from gsmap.types.plain import plain
 
@@ -74,12 +76,13 @@ class StoredRegistration:
         return posed and _may_be_used(self.registration.status, self.review)
 
 
-@dataclass(frozen=True)
-class Standing:
+class Standing(NamedTuple):  # of every pair of a map, with every update: a tuple is made in a tenth of the time
     """What counts of a pair, without its figures: all that decides whether it is used; see `StoredRegistration`.
 
     Args:
         usable: as `StoredRegistration.is_usable`.
+        keys: of all that was computed for the pair; of `Registrations.tried` alone.
+        disagreement: of what both scenes saw, by what counts; NaN where that is not known. As ``keys``.
     """
 
     number: int
@@ -90,6 +93,8 @@ class Standing:
     recipe: str | None
     review: str | None
     usable: bool
+    keys: frozenset[str] = frozenset()
+    disagreement: float = float("nan")
 
     @property
     def manual(self) -> bool:
@@ -100,19 +105,6 @@ class Standing:
     def is_told(self) -> bool:
         """Whether a person measured or confirmed it."""
         return self.manual or self.review == "confirm"
-
-
-@dataclass(frozen=True)
-class Tried(Standing):
-    """What counts of a pair, and what else was computed for it.
-
-    Args:
-        keys: of all that was computed.
-        disagreement: of what both scenes saw, by what counts; NaN where that is not known.
-    """
-
-    keys: frozenset[str]
-    disagreement: float
 
 
 @dataclass(frozen=True)
@@ -145,33 +137,33 @@ class Registrations:
         Raises:
             InputError: a computed registration without a key, or a measurement with one or without a pose.
         """
-        r = registration
-        if (r.proposer == MANUAL) != (key is None):
-            raise InputError(f"a registration needs its recipe key, unless its proposer is {MANUAL!r}")
-        if r.proposer == MANUAL and r.status != "accepted":
-            raise InputError("a measured registration has status 'accepted', a pose and an information matrix")
+        _check_told(registration, key)
         with self._catalog.write() as connection:
-            row = {
-                "target": r.target,
-                "source": r.source,
-                "pair": _pair(connection, r.target, r.source),
-                "key": "" if key is None else key.digest,
-                "recipe": recipes.keep(connection, key),
-                "status": r.status,
-                "reason": r.reason,
-                "S_target_source": r.S_target_source,
-                "information": r.information,
-                "num_inliers": int(r.num_inliers),
-                "num_correspondences": int(r.num_correspondences),
-                "overlap": float(r.overlap),
-                "proposer": r.proposer,
-                "exact": int(r.exact),
-                "seconds": plain(r.seconds),
-                "evidence": plain(r.evidence),
-                "notes": list(r.notes),
-                "created_at": now(),
-            }
-            return self._insert(connection, row)
+            pair = _pair(connection, registration.target, registration.source)
+            return self._insert(connection, _row_of(registration, pair, key, recipes.keep(connection, key)))
+
+    def save_all(self, made: Sequence[tuple[Registration, RecipeKey]]) -> None:
+        """As `save`, of many that were computed, each with its key, in a few statements; scenes by their ids.
+
+        Raises:
+            InputError: as `save`; a registration of what is no scene, or of one scene alone. Nothing is kept then.
+        """
+        for registration, key in made:
+            _check_told(registration, key)
+        if not made:
+            return
+        wanted = {scene for registration, _ in made for scene in (registration.target, registration.source)}
+        with self._catalog.write() as connection:
+            known = recipes.kept(connection, scenes.c.id, wanted)
+            by_recipe = {key.recipe: key for _, key in made}
+            kept = {digest: recipes.keep(connection, key) for digest, key in by_recipe.items()}
+            rows = []
+            for registration, key in made:
+                a, b = sorted((registration.target, registration.source))
+                if a == b or not {a, b} <= known:
+                    raise InputError(f"a registration is of two scenes of the map, by their ids, got {a} and {b}")
+                rows.append(_row_of(registration, f"{a}:{b}", key, kept[key.recipe]))
+            connection.execute(insert(registrations), rows)
 
     def adopt(self, number: int) -> StoredRegistration:
         """Make an earlier registration the newest of its pair again, as if it had just been computed.
@@ -229,10 +221,10 @@ class Registrations:
         accepted = registrations.c.status == "accepted" if usable else None
         with self._catalog.read() as connection:
             rows = _choose(connection, _LEAN, silent_if=accepted)
-            made = [Standing(**_stands(choice)) for choice in _living(connection, rows)]
-        return sorted((one for one in made if one.usable or not usable), key=lambda one: (one.target, one.source))
+            made = [Standing(*_stands(choice)) for choice in _living(connection, rows)]
+        return sorted((one for one in made if one.usable or not usable), key=_ends_of)
 
-    def tried(self) -> list[Tried]:
+    def tried(self) -> list[Standing]:
         """The same of every pair, with what else was computed for it: what registering asks."""
         repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
         again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
@@ -241,20 +233,31 @@ class Registrations:
             chosen = _living(connection, _choose(connection, (*_LEAN, _EVIDENCE)))
             for row in connection.execute(again):
                 keys.setdefault(row.pair, set()).add(row.key)
+        nothing: dict[str, float] = {}
         made = [
-            Tried(
-                **_stands(choice),
-                keys=frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
-                disagreement=float((choice.row.evidence or {}).get("disagreement", np.nan)),
+            Standing._make(
+                (
+                    *_stands(choice),
+                    frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
+                    float((choice.row.evidence or nothing).get("disagreement", np.nan)),
+                )
             )
             for choice in chosen
         ]
-        return sorted(made, key=lambda one: (one.target, one.source))
+        return sorted(made, key=_ends_of)
 
-    def usable(self) -> list[StoredRegistration]:
-        """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source)."""
+    def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
+        """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
+
+        Args:
+            among: only those both of whose scenes (ids) are among these.
+        """
+        inside = None
+        if among is not None:
+            some = sorted(among)
+            inside = registrations.c.target.in_(some) & registrations.c.source.in_(some)
         with self._catalog.read() as connection:
-            found = _current(connection, silent_if=registrations.c.status == "accepted")
+            found = _current(connection, inside, silent_if=registrations.c.status == "accepted")
         found = [one for one in found if one.is_usable]
         return sorted(found, key=lambda one: (one.registration.target, one.registration.source))
 
@@ -278,6 +281,17 @@ class Registrations:
             _, word = _decide(_rows_of(connection, row.pair), _reviews_of(connection, row.pair))
         return _stored_one(row, word)
 
+    def found(self, keys: Iterable[RecipeKey | str]) -> list[Registration]:
+        """The newest registration under each of the keys (or their digests) that has any, in the order of these."""
+        wanted = list(dict.fromkeys(digest for key in keys if (digest := recipes.digest_of(key))))
+        newest: dict[str, Row[Any]] = {}
+        with self._catalog.read() as connection:
+            for start in range(0, len(wanted), recipes.ASKED_AT_ONCE):
+                some = registrations.c.key.in_(wanted[start : start + recipes.ASKED_AT_ONCE])
+                query = select(registrations).where(some).order_by(registrations.c.number)
+                newest |= {row.key: row for row in connection.execute(query)}
+        return [_stored_one(newest[digest], None).registration for digest in wanted if digest in newest]
+
     def kept(self, keys: Iterable[RecipeKey | str], *, after: int = 0) -> set[str]:
         """Those of the keys (as digests) that a registration is kept under, made later than the one of a number."""
         with self._catalog.read() as connection:
@@ -287,6 +301,13 @@ class Registrations:
         """Number of the newest registration; 0 where there is none."""
         with self._catalog.read() as connection:
             return connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
+
+    def pairs_after(self, number: int) -> set[tuple[str, str]]:
+        """(lower, higher) by id of the pairs that were registered after the registration of a number."""
+        query = select(registrations.c.pair).where(registrations.c.number > number)
+        with self._catalog.read() as connection:
+            found = set(connection.execute(query).scalars())
+        return {(a, b) for a, b in (pair.split(":") for pair in found)}
 
     def history(self, a: str, b: str) -> list[StoredRegistration]:
         """Every registration of a pair, oldest first."""
@@ -338,8 +359,7 @@ class Registrations:
         return _stored_one(stored, word)
 
 
-@dataclass(frozen=True)
-class _Choice:
+class _Choice(NamedTuple):
     """A pair's current row, and the review that stands on it."""
 
     row: Row[Any]
@@ -368,6 +388,37 @@ def _decide(rows: Sequence[Row[Any]], said: Iterable[Review]) -> tuple[Row[Any] 
     else:
         chosen = max((row.number for row in rows if row.proposer != MANUAL), default=None)
     return next((row for row in rows if row.number == chosen), None), word
+
+
+def _check_told(r: Registration, key: RecipeKey | None) -> None:
+    """What a registration's row asks beside its figures; see `Registrations.save`."""
+    if (r.proposer == MANUAL) != (key is None):
+        raise InputError(f"a registration needs its recipe key, unless its proposer is {MANUAL!r}")
+    if r.proposer == MANUAL and r.status != "accepted":
+        raise InputError("a measured registration has status 'accepted', a pose and an information matrix")
+
+
+def _row_of(r: Registration, pair: str, key: RecipeKey | None, recipe: str | None) -> dict[str, Any]:
+    return {
+        "target": r.target,
+        "source": r.source,
+        "pair": pair,
+        "key": "" if key is None else key.digest,
+        "recipe": recipe,
+        "status": r.status,
+        "reason": r.reason,
+        "S_target_source": r.S_target_source,
+        "information": r.information,
+        "num_inliers": int(r.num_inliers),
+        "num_correspondences": int(r.num_correspondences),
+        "overlap": float(r.overlap),
+        "proposer": r.proposer,
+        "exact": int(r.exact),
+        "seconds": plain(r.seconds),
+        "evidence": plain(r.evidence),
+        "notes": list(r.notes),
+        "created_at": now(),
+    }
 
 
 def _pair(connection: Connection, a: str, b: str) -> str:
@@ -399,10 +450,16 @@ _FULL = tuple(
 )
 _BRIEF = tuple(null().label(column.name) if column.name in ("evidence", "notes") else column for column in _FULL)
 _PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "status")
-_LEAN = (
-    *(registrations.c[name] for name in _PARTS),
+_LEAN = (  # as it lies: scenes that are none of the living ones are left out, and the rest is compared with
+    *(type_coerce(registrations.c[name], Text).label(name) for name in _PARTS[1:]),
+    registrations.c.number,
     (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed"),
 )
+_SAME_PAIR = registrations.alias()
+_OUTDATED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
+_FIRST = (
+    select(func.min(_SAME_PAIR.c.number)).where(_SAME_PAIR.c.pair == registrations.c.pair).scalar_subquery()
+).label("first")
 _EVIDENCE = case((registrations.c.status == "accepted", registrations.c.evidence)).label("evidence")
 
 
@@ -412,7 +469,7 @@ def _current(
     silent_if: ColumnElement[bool] | None = None,
     columns: Sequence[ColumnElement[Any]] = _FULL,
 ) -> list[StoredRegistration]:
-    return _stored_all(_living(connection, _choose(connection, columns, of, silent_if)))
+    return _stored_all(_living(connection, _choose(connection, columns, of, silent_if, in_order=True)))
 
 
 def _living(connection: Connection, chosen: Iterable[_Choice]) -> list[_Choice]:
@@ -425,22 +482,23 @@ def _choose(
     columns: Sequence[ColumnElement[Any]],
     of: ColumnElement[bool] | None = None,
     silent_if: ColumnElement[bool] | None = None,
+    *,
+    in_order: bool = False,
 ) -> list[_Choice]:
-    """The current row of every pair, by the pair's first row.
+    """The current row of every pair.
 
     Of a pair on which nobody ever spoke it is the newest, which the index of pairs tells without reading the others.
 
     Args:
         of: only pairs all of whose rows meet this.
         silent_if: pairs on which nobody spoke only if their current row meets this.
+        in_order: by the pair's first row; else in any order.
     """
     spoken = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
     wanted = true() if of is None else of
-    ends = select(func.min(registrations.c.number).label("first"), func.max(registrations.c.number).label("newest"))
-    silent = ends.where(wanted, registrations.c.pair.not_in(spoken)).group_by(registrations.c.pair).subquery()
-    query: Select[Any] = select(*columns, silent.c.first).join(silent, silent.c.newest == registrations.c.number)
-    rows = connection.execute(query if silent_if is None else query.where(silent_if)).all()
-    found = [(row.first, _Choice(row, None)) for row in rows]
+    silent = select(*columns, *([_FIRST] if in_order else ())).where(registrations.c.pair.not_in(spoken), ~_OUTDATED)
+    rows = connection.execute(silent.where(wanted, true() if silent_if is None else silent_if)).all()
+    found = [(row.first if in_order else 0, _Choice(row, None)) for row in rows]
 
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
     every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(spoken))).all()
@@ -451,19 +509,21 @@ def _choose(
         current, word = _decide(history, words.get(pair, []))
         if current is not None:
             found.append((history[0].number, _Choice(current, word)))
-    return [chosen for _, chosen in sorted(found, key=lambda item: item[0])]
+    return [chosen for _, chosen in (sorted(found, key=lambda item: item[0]) if in_order else found)]
 
 
 def _may_be_used(status: str, review: str | None) -> bool:
     return review == "confirm" or (status == "accepted" and review != "reject")
 
 
-def _stands(chosen: _Choice) -> dict[str, Any]:
-    """The fields of `Standing`."""
+_ends_of = attrgetter("target", "source")
+
+
+def _stands(chosen: _Choice) -> tuple[Any, ...]:
+    """The fields of `Standing`, in their order."""
     row, review = chosen.row, None if chosen.word is None else chosen.word.review
     usable = bool(row.posed) and _may_be_used(row.status, review)
-    own = {name: getattr(row, name) for name in ("number", "target", "source", "status", "key", "recipe")}
-    return own | {"review": review, "usable": usable}
+    return row.number, row.target, row.source, row.status, row.key, row.recipe, review, usable
 
 
 def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:

@@ -8,7 +8,7 @@ around its number, so that reading one costs no chain of others, and forgetting 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -87,15 +87,24 @@ class Revisions:
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
 
-    def save(self, graph: PoseGraph, key: RecipeKey | None = None, note: str = "") -> int:
+    def save(
+        self,
+        graph: PoseGraph,
+        key: RecipeKey | None = None,
+        note: str = "",
+        after: tuple[int, PoseGraph] | None = None,
+    ) -> int:
         """Add a revision; returns its number. All its scenes must be known.
 
         Args:
             key: its recipe, and all that it was solved from; None where it was not solved but made up.
             note: why it was made.
+            after: number and answer of the revision that it was made from. As long as that is the newest, what is the
+                very same object in both is not compared again.
         """
         with self._catalog.write() as connection:
-            number = 1 + (connection.execute(select(func.max(revisions.c.number))).scalar() or 0)
+            newest = _newest(connection) or 0
+            number = 1 + newest
             row = {
                 "number": number,
                 "key": "" if key is None else key.digest,
@@ -107,7 +116,12 @@ class Revisions:
                 "note": note,
                 "created_at": now(),
             }
-            put(connection, row, lines_of(graph))
+            if after is None or after[0] != newest:
+                put(connection, row, lines_of(graph))
+            else:
+                differs = _differing(graph, after[1])
+                connection.execute(insert(revisions), {**row, **_counts(graph)})
+                _write(connection, number, lines_of(graph, differs), differs)
         return number
 
     def current(self) -> int | None:
@@ -176,6 +190,13 @@ class Revisions:
         with self._catalog.read() as connection:
             return _outcomes(connection, newest & mine if scenes else newest)
 
+    def changed_after(self, number: int) -> tuple[set[str], set[tuple[str, str]]]:
+        """The scenes whose newest pose, and the (target, source) of the edges whose outcome, came after a revision."""
+        with self._catalog.read() as connection:
+            placed = connection.execute(select(poses.c.scene).where(poses.c.until.is_(None), poses.c.since > number))
+            judged = select(edges.c.target, edges.c.source).where(edges.c.until.is_(None), edges.c.since > number)
+            return set(placed.scalars()), {(row.target, row.source) for row in connection.execute(judged)}
+
     def undecided(self, number: int | None = None) -> PairsByRevision:
         """(target, source) of the edges that nothing could decide, by revision; of one revision or of all."""
         query = select(edges.c.target, edges.c.source, edges.c.since, edges.c.until).where(edges.c.undecided == 1)
@@ -198,6 +219,9 @@ _NEWEST = select(revisions).order_by(revisions.c.number.desc()).limit(1)
 _ENDS: dict[str, tuple[str, ...]] = {"poses": ("scene",), "edges": ("target", "source")}
 Lines = Mapping[str, Mapping[tuple[str, ...], tuple[Any, ...]]]
 """Of each table the rows of one revision: what follows ``until``, by scene, or by target and source."""
+Among = Mapping[str, Collection[tuple[str, ...]]]
+"""Of each table the scene, or target and source, of some rows."""
+_FEW = 1000  # scenes that one query names; beyond, all rows are read
 
 
 def put(connection: Connection, row: Mapping[str, Any], lines: Lines | None) -> None:
@@ -206,12 +230,19 @@ def put(connection: Connection, row: Mapping[str, Any], lines: Lines | None) -> 
     Args:
         lines: None of one that was dropped elsewhere, of which no more is left than its row.
     """
-    number = row["number"]
-    connection.execute(insert(revisions), dict(row) if lines is None else {**row, **_counts(lines)})
-    if lines is None:
-        return
+    connection.execute(insert(revisions), dict(row) if lines is None else {**row, **_counts_of_lines(lines)})
+    if lines is not None:
+        _write(connection, row["number"], lines)
+
+
+def _write(connection: Connection, number: int, lines: Lines, among: Among | None = None) -> None:
+    """End the rows that no longer hold from a revision on, and add those that begin to.
+
+    Args:
+        among: only these may do so; all where None.
+    """
     for table in (poses, edges):
-        wanted, standing = lines[table.name], _standing(connection, table)
+        wanted, standing = lines[table.name], _standing(connection, table, None if among is None else among[table.name])
         ended = [ends for ends, (_, values) in standing.items() if wanted.get(ends) != values]
         begun = [ends for ends, values in wanted.items() if ends not in standing or standing[ends][1] != values]
         names = _ENDS[table.name]
@@ -233,8 +264,24 @@ def put(connection: Connection, row: Mapping[str, Any], lines: Lines | None) -> 
             connection.execute(insert(table), made)
 
 
-def lines_of(graph: PoseGraph) -> Lines:
-    """What a revision's tables hold of an answer."""
+def _differing(graph: PoseGraph, before: PoseGraph) -> Among:
+    """What two answers do not share as the very same objects."""
+    return {
+        "poses": {
+            (scene,)
+            for scene in graph.poses.keys() | before.poses.keys()
+            if graph.poses.get(scene) is not before.poses.get(scene)
+        },
+        "edges": {
+            ends
+            for ends in graph.outcomes.keys() | before.outcomes.keys()
+            if graph.outcomes.get(ends) is not before.outcomes.get(ends)
+        },
+    }
+
+
+def lines_of(graph: PoseGraph, among: Among | None = None) -> Lines:
+    """What a revision's tables hold of an answer, or of some of its scenes and edges."""
     return {
         "poses": {
             (scene,): (
@@ -244,6 +291,7 @@ def lines_of(graph: PoseGraph) -> Lines:
                 None if pose.covariance is None else covariance_bytes(pose.covariance),
             )
             for scene, pose in graph.poses.items()
+            if among is None or (scene,) in among["poses"]
         },
         "edges": {
             ends: (
@@ -253,6 +301,7 @@ def lines_of(graph: PoseGraph) -> Lines:
                 int(outcome.undecided),
             )
             for ends, outcome in graph.outcomes.items()
+            if among is None or ends in among["edges"]
         },
     }
 
@@ -307,8 +356,15 @@ def _where(connection: Connection, table: Table, number: int) -> ColumnElement[b
     return table.c.until.is_(None) if number == _newest(connection) else _holds(table, number)
 
 
-def _standing(connection: Connection, table: Table) -> dict[tuple[str, ...], tuple[int, tuple[Any, ...]]]:
-    return _rows(connection, table, table.c.until.is_(None))
+def _standing(
+    connection: Connection, table: Table, among: Collection[tuple[str, ...]] | None = None
+) -> dict[tuple[str, ...], tuple[int, tuple[Any, ...]]]:
+    where, firsts = table.c.until.is_(None), sorted({ends[0] for ends in among or ()})
+    if among is None or len(firsts) > _FEW:
+        found = _rows(connection, table, where)
+    else:
+        found = _rows(connection, table, where & table.c[0].in_(firsts))
+    return found if among is None else {ends: row for ends, row in found.items() if ends in among}
 
 
 def _rows(
@@ -325,17 +381,27 @@ def _as_it_lies(column: Any) -> Any:
     return type_coerce(column, LargeBinary).label(column.name) if isinstance(column.type, Numbers) else column
 
 
-def _counts(lines: Lines) -> dict[str, int]:
-    placed = lines["poses"].values()
-    uses = Counter(use for use, *_ in lines["edges"].values())
+def _counts_of_lines(lines: Lines) -> dict[str, int]:
+    placed = [(pose is not None, component) for pose, component, *_ in lines["poses"].values()]
+    return _counted(placed, [(use, undecided) for use, _, _, undecided in lines["edges"].values()])
+
+
+def _counts(graph: PoseGraph) -> dict[str, int]:
+    placed = [(pose.S_map_scene is not None, pose.component) for pose in graph.poses.values()]
+    return _counted(placed, [(outcome.use, outcome.undecided) for outcome in graph.outcomes.values()])
+
+
+def _counted(placed: Sequence[tuple[bool, int]], judged: Sequence[tuple[str, int]]) -> dict[str, int]:
+    """What a revision knows of itself: of whether each scene has a pose, and its component; of edges' uses."""
+    uses = Counter(use for use, _ in judged)
     counts = (
         len(placed),
-        sum(pose is not None for pose, *_ in placed),
-        len({component for _, component, *_ in placed}),
+        sum(has_pose for has_pose, _ in placed),
+        len({component for _, component in placed}),
         uses["used"],
         uses["tentative"],
         uses["unused"],
-        sum(undecided for *_, undecided in lines["edges"].values()),
+        sum(undecided for _, undecided in judged),
     )
     return dict(zip(REVISION_COUNTS, counts, strict=True))
 

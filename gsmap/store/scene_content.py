@@ -46,15 +46,16 @@ def scene_of(row: Row[Any], tags: tuple[str, ...]) -> Scene:
         cameras_synthesised=bool(row.cameras_synthesised),
         antialiased=bool(row.antialiased),
         tags=tags,
-        thinning=_thinning(row),
+        thinning=thinning_of(row.thinned),
     )
 
 
-def _thinning(row: Row[Any]) -> Thinning | None:
-    if row.thinned is None:
+def thinning_of(value: dict[str, Any] | None) -> Thinning | None:
+    """How a scene is kept, from its column."""
+    if value is None:
         return None
-    up = row.thinned["up"]
-    return Thinning(row.thinned["at"], row.thinned["num_gaussians"], None if up is None else tuple(up))
+    up = value["up"]
+    return Thinning(value["at"], value["num_gaussians"], None if up is None else tuple(up))
 
 
 def shapes_of(row: Row[Any]) -> dict[str, Shape]:

@@ -197,7 +197,7 @@ def test_every_verb_prints_its_object_as_json(verb: str, gsmap_run: Callable[[st
     assert done.code == 0, done.stderr
     data = done.json
     assert next(iter(data)) == "schema"
-    assert data["schema"] == 1
+    assert data["schema"] == 2
     shape = OBJECTS[verb]
     names = [field.name for field in fields(shape.type)]
     if isinstance(shape, Many | Maybe):

@@ -109,8 +109,8 @@ def test_a_verb_cannot_print_another_row_than_it_declares() -> None:
         json_object("init", rows.ViewReport(url="x"))
     with pytest.raises(TypeError, match="one InitReport"):
         json_object("init", [])
-    assert json_object("prior", None) == {"schema": 1, "prior": None}
-    assert json_object("models list", []) == {"schema": 1, "models": []}
+    assert json_object("prior", None) == {"schema": 2, "prior": None}
+    assert json_object("models list", []) == {"schema": 2, "models": []}
 
 
 def test_tables_shorten_digests_and_escape_markup(capsys: pytest.CaptureFixture[str]) -> None:

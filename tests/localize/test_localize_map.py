@@ -81,7 +81,7 @@ def test_the_command_line_answers_in_json(made, capsys) -> None:
         run(["-q", "localize", str(folder / "m.gsmap"), str(folder / "photo.png"), "--intrinsics", lens, "--json"])
     assert not ended.value.code
     told = json.loads(capsys.readouterr().out)
-    assert told["schema"] == 1
+    assert told["schema"] == 2
     assert [row["status"] for row in told["results"]] == ["placed"]
     assert np.array(told["results"][0]["covariance"]).shape == (6, 6)
 

@@ -187,7 +187,7 @@ def test_update_ends_whatever_people_said_and_settings_are(
     site.add_edge("hall:attic:east", Sim3(np.eye(3), np.array([2.0, 0, 0])), np.full(7, 0.1))
     report = site.with_settings(values).update()
     assert report.revision is not None
-    kept = {frozenset((row.target_name, row.source_name)): (row.review, row.proposer) for row in report.edges}
+    kept = {frozenset((row.target_name, row.source_name)): (row.review, row.proposer) for row in site.edge_rows()}
     assert kept[frozenset(("hall", "stairs"))] == ("confirm", "graph:objects")
     assert kept[frozenset(("hall", "attic:east"))] == (None, "manual")
     made = len(tried)

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from gsmap.methods import RecipeKey
+from gsmap.methods import RecipeKey, text_digest
+from gsmap.types.plain import canonical
 
 
 @dataclass(frozen=True)
@@ -59,3 +60,10 @@ def test_the_recipe_is_told_without_its_inputs():
         "settings": {"params": {"bar": 0.5, "names": ["a"]}},
         "backend": "native",
     }
+
+
+@pytest.mark.parametrize(
+    "inputs", [("s1", "s2"), ("a" * 32, "auto"), ('a","b',), ("é", "b"), ("a b", ""), ("a:b",), ()]
+)
+def test_a_digest_is_that_of_the_canonical_text(inputs):
+    assert KEY.digest_of(*inputs) == KEY.of(*inputs).digest == text_digest(canonical([KEY.recipe, list(inputs)]))

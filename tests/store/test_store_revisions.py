@@ -1,16 +1,18 @@
 """A revision adds what differs from the one before; prune gives its room back; what is read of one is exact."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
+from sqlalchemy import select
 from store_samples import key, make_cameras, make_gaussians
 
-from gsmap.errors import NotFoundError
+from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store, matrices
-from gsmap.types import EdgeOutcome, PoseGraph, Registration, ScenePose, Sim3
+from gsmap.store.schema import edges, graphs, poses
+from gsmap.types import EdgeOutcome, PoseGraph, Registration, SceneGraph, ScenePose, Sim3
 
 NUM = 12
 
@@ -197,6 +199,16 @@ def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
         assert one.keys == {stored.key for stored in history} - {""}
     usable = store.registrations.usable()
     assert [one.number for one in usable] == [one.number for one in standing if one.usable]
+    some = ids[1:4]
+    among = [one.number for one in store.registrations.usable(some)]
+    assert among == [one.number for one in standing if one.usable and {one.target, one.source} <= set(some)]
+    assert 0 < len(among) < len(usable)
+    half = store.registrations.newest() // 2
+    assert store.registrations.pairs_after(half) == {
+        (a, b)
+        for a, b in combinations(sorted(ids), 2)
+        if any(r.number > half for r in store.registrations.history(a, b))
+    }
     of_one = {one.number for one in store.registrations.current_of(ids[1])}
     assert of_one == {one.number for pair, one in alone.items() if ids[1] in pair}
     pairs = sorted(alone)[:4]
@@ -215,3 +227,88 @@ def test_numbers_come_back_to_the_last_bit():
     assert back.is_rigid == S.is_rigid
     np.testing.assert_array_equal(matrices.matrix_of_bytes(matrices.matrix_bytes(matrix)), matrix)
     np.testing.assert_array_equal(matrices.covariance_of_bytes(matrices.covariance_bytes(matrix)), matrix)
+
+
+def test_registrations_are_kept_together_as_one_by_one(store):
+    rng = np.random.default_rng(7)
+    ids = sorted(scene.id for scene in store.scenes.list())[:4]
+    made = []
+    for k, (a, b) in enumerate(combinations(ids, 2)):
+        pose = {} if k % 2 else {"S_target_source": some_pose(rng), "information": covariance(rng)}
+        status = "no_match" if k % 2 else "accepted"
+        evidence = {"disagreement": 0.1 * k}
+        made.append((Registration(a, b, status, evidence=evidence, **pose), key("register", a, b, turn=k % 3)))
+    one_by_one = [store.registrations.save(*one) for one in made]
+    newest = store.registrations.newest()
+    store.registrations.save_all(made)
+    assert store.registrations.newest() == newest + len(made)
+    found = store.registrations.found([name for _, name in made])
+    for saved, (registration, _), read in zip(one_by_one, made, found, strict=True):
+        last = store.registrations.history(registration.target, registration.source)[-1]
+        assert (last.key, last.recipe, last.number > newest) == (saved.key, saved.recipe, True)
+        assert read.evidence == last.registration.evidence == saved.registration.evidence
+        if registration.information is not None:
+            np.testing.assert_array_equal(last.registration.information, registration.information)
+            assert matrices.pose_bytes(read.S_target_source) == matrices.pose_bytes(registration.S_target_source)
+    assert [one.source for one in store.registrations.found(["0" * 32, made[1][1], made[0][1]])] == [ids[2], ids[1]]
+    for wrong in ((made[0][0], None), (Registration(ids[0], "0" * 32, "no_match"), made[0][1])):
+        with pytest.raises(InputError):
+            store.registrations.save_all([made[1], wrong])
+    assert store.registrations.newest() == newest + len(made)
+    store.registrations.save_all([])
+
+
+def test_a_revision_made_from_the_newest_writes_the_rows_of_one_that_is_compared(tmp_path, store):
+    """What is the very same object in both answers need not be looked at; unless another was saved meanwhile."""
+    rows = []
+    for trusting in (False, True):
+        with Store.create(tmp_path / f"{trusting}.gsmap") as other:
+            for k in range(NUM):
+                other.scenes.add(make_gaussians(n=8, seed=k), make_cameras(1), name=f"s{k:02d}")
+            last = None
+            for graph in histories(other, np.random.default_rng(8)):
+                number = other.revisions.save(graph, after=(last if trusting else None))
+                same(other.revisions.get(), graph)
+                scenes, pairs = other.revisions.changed_after(number - 1)
+                before = PoseGraph({}) if last is None else last[1]
+                assert scenes == {s for s, pose in graph.poses.items() if before.poses.get(s) is not pose}
+                assert pairs >= {p for p, out in graph.outcomes.items() if p not in before.outcomes}
+                last = (number, graph)
+            with other.catalog.read() as connection:
+                counted = [connection.execute(select(t).order_by(*t.c[:3])).all() for t in (poses, edges)]
+                listed = [vars(one) | {"created_at": ""} for one in other.revisions.list()]
+            rows.append(([list(map(str, of_one)) for of_one in counted], listed))
+            stale = last
+            moved = PoseGraph({s: ScenePose(s, Sim3.identity(), 0, "placed") for s in last[1].poses})
+            other.revisions.save(moved)
+            other.revisions.save(stale[1], after=stale)
+            same(other.revisions.get(), stale[1])
+    assert rows[0] == rows[1]
+
+
+def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
+    for scene in store.scenes.list():
+        up = None if scene.name == "s01" else np.array([0.0, 0.6, 0.8])
+        store.graphs.save(SceneGraph(scene.id, {}, up, 0.5), key("describe", scene.id))
+    store.scenes.edit("s02", captured_at="2026-05-31T14:00:00+02:00")
+    store.scenes.remove("s03")
+    for _ in range(2):  # the second time from memory
+        said = store.graphs.says()
+        listed = store.graphs.list()
+        assert [(g.key, g.scene, g.unit_m, g.up) for g in said] == [(g.key, g.scene, g.unit_m, g.up) for g in listed]
+        graph = SceneGraph(store.scenes.list()[0].id, {}, np.array([1.0, 0, 0]), 2.0)
+        store.graphs.save(graph, key("describe", graph.scene_id))  # in place of what was said
+    assert {g.unit_m for g in store.graphs.says()} == {0.5, 2.0}
+    names = ("id", "name", "scale_policy", "captured_at", "thinning")
+    assert [[getattr(one, name) for name in names] for one in store.scenes.brief()] == [
+        [getattr(one, name) for name in names] for one in store.scenes.list()
+    ]
+    assert {scene.id: scene.bounds.tolist() for scene in store.scenes.list()} == {
+        scene: box.tolist() for scene, box in store.scenes.bounds().items()
+    }
+    some = [scene.id for scene in store.scenes.list()[2:4]]
+    assert [scene.id for scene in store.scenes.list(among=some)] == some
+    with store.catalog.write() as connection:
+        connection.execute(graphs.update().where(graphs.c.scene == some[0]).values(about={"up": [1, "x", 0]}))
+    with Store.open(store.folder, "r") as other, pytest.raises(CorruptError, match=r"graphs\.about"):
+        other.graphs.says()

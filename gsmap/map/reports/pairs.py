@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from gsmap.map.dates import is_after, parsed
@@ -55,12 +55,20 @@ def edge_rows(
 
 
 @of_one_state
+def edges_of_pairs(store: Store, pairs: Collection[tuple[str, str]]) -> list[EdgeRow]:
+    """The current edges of some pairs of scenes (ids), by the pair's first registration."""
+    if not pairs:
+        return []
+    scenes = {scene for pair in pairs for scene in pair}
+    return _edge_rows(store, store.registrations.current_of_pairs(pairs), *sorted(scenes))
+
+
+@of_one_state
 def rows_of_edges(store: Store, made: Iterable[Registration]) -> list[EdgeRow]:
     """The current edges of the pairs of these registrations, in their order."""
     made = list(made)
-    current = store.registrations.current_of_pairs((edge.target, edge.source) for edge in made)
-    scenes = {scene for edge in made for scene in (edge.target, edge.source)}
-    rows = {frozenset((row.target, row.source)): row for row in _edge_rows(store, current, *sorted(scenes))}
+    found = edges_of_pairs(store, [(edge.target, edge.source) for edge in made])
+    rows = {frozenset((row.target, row.source)): row for row in found}
     return [rows[frozenset((edge.target, edge.source))] for edge in made]
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gsmap.map.dates import is_after, parsed
 from gsmap.map.metres import metres_of_scenes
 from gsmap.map.one_state import of_one_state
 from gsmap.map.reports.common import names, refs, scenes_by_id
-from gsmap.map.reports.pairs import edge_rows
+from gsmap.map.reports.pairs import edges_of_pairs
 from gsmap.map.reports.scenes import scene_rows
 from gsmap.store import Store
 from gsmap.store.revisions import Revision
@@ -98,13 +99,37 @@ def pose_change_rows(store: Store, before: int, after: int, settings: Settings) 
     ]
 
 
+@dataclass(frozen=True)
+class Mark:
+    """How far a map's history had come: its newest revision, registration (0 before the first) and graph (its time)."""
+
+    revision: int
+    registration: int
+    graph: str
+
+
 @of_one_state
-def update_report(store: Store, ingested: Sequence[IngestRow], metres: Mapping[int, Metre]) -> UpdateReport:
-    """What an update took in, and the map as it is now."""
+def mark(store: Store) -> Mark:
+    """How far its history has come."""
+    return Mark(store.revisions.current() or 0, store.registrations.newest(), store.graphs.newest())
+
+
+@of_one_state
+def update_report(
+    store: Store, ingested: Sequence[IngestRow], since: Mark, metres: Callable[[], Mapping[int, Metre]]
+) -> UpdateReport:
+    """What an update took in, and what of the map has changed since; nothing is read of the rest.
+
+    Args:
+        metres: tells those of every component of the newest poses.
+    """
+    scenes, pairs = store.revisions.changed_after(since.revision)
+    scenes |= store.graphs.scenes_after(since.graph) | {row.scene for row in ingested if row.new or row.dated}
+    pairs |= store.registrations.pairs_after(since.registration)
     newest = store.revisions.current()
     return UpdateReport(
         ingested=tuple(ingested),
-        scenes=tuple(scene_rows(store, metres=metres)),
-        edges=tuple(edge_rows(store)),
+        scenes=tuple(scene_rows(store, metres=metres() if scenes else None, among=scenes)),
+        edges=tuple(edges_of_pairs(store, pairs)),
         revision=None if newest is None else revision_row(store, newest),
     )

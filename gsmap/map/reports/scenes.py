@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -28,10 +28,12 @@ def scene_rows(
     tag: str | None = None,
     as_of: str | None = None,
     metres: Mapping[int, Metre] | None = None,
+    among: Collection[str] | None = None,
 ) -> list[SceneRow]:
     """The living scenes, oldest first.
 
     Args:
+        among: only those of these ids; nothing is read of the others.
         component: only those of this one.
         status: only those of this one, see `SceneRow`.
         after: ISO 8601; only those captured (or else ingested) after it.
@@ -45,12 +47,14 @@ def scene_rows(
     one_of(status, SCENE_STATUSES)
     since = None if after is None else parsed(after)
     until = None if as_of is None else last_of(as_of)
-    placed, nodes = store.revisions.poses(), store.graphs.node_counts()
+    if among is not None and not among:
+        return []
+    placed, nodes = store.revisions.poses(*(among or ())), store.graphs.node_counts()
     said = store.scenes.latest_notes()
     _, found = world_positions(store, placed)
     rows = [
         row_of_scene(scene, placed, nodes.get(scene.id), said.get(scene.id, ""), metres, found)
-        for scene in store.scenes.list()
+        for scene in store.scenes.list(among=among)
     ]
     return [
         row

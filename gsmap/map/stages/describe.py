@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from typing import TypeVar
 
 from gsmap.describe import recipe_key
 from gsmap.engine import run_jobs
@@ -15,11 +16,14 @@ from gsmap.map.sharing import SharedJobs, noting
 from gsmap.methods import RecipeKey
 from gsmap.render import backend
 from gsmap.store import Store
+from gsmap.store.scenes import BriefScene
 from gsmap.types import Scene
 from gsmap.types.progress import StageProgress
 
+AnyScene = TypeVar("AnyScene", Scene, BriefScene)
 
-def graph_keys(store: Store, scenes: Sequence[Scene], settings: Settings) -> dict[str, RecipeKey]:
+
+def graph_keys(store: Store, scenes: Sequence[AnyScene], settings: Settings) -> dict[str, RecipeKey]:
     """What names each scene's graph under these settings, by scene id: content and scale policy are its inputs."""
     recipe = recipe_key(settings.describe, models.specs(store))
     return {scene.id: recipe.of(scene.id, scene.scale_policy) for scene in scenes}
@@ -31,13 +35,13 @@ def without_graph(store: Store, keys: Mapping[str, RecipeKey]) -> list[str]:
     return [scene for scene, key in keys.items() if key.digest not in present]
 
 
-def unthinned(scenes: Sequence[Scene]) -> list[Scene]:
+def unthinned(scenes: Sequence[AnyScene]) -> list[AnyScene]:
     """Those of the scenes that are described unasked: newer ones stand for a thinned one."""
     return [scene for scene in scenes if scene.thinning is None]
 
 
 def describe(
-    store: Store, scenes: Sequence[Scene], settings: Settings, progress: StageProgress, *, verify: bool = False
+    store: Store, scenes: Sequence[AnyScene], settings: Settings, progress: StageProgress, *, verify: bool = False
 ) -> dict[str, RecipeKey]:
     """Make the graphs that are missing; returns the key of each scene's graph, but of those that were set aside.
 
@@ -45,8 +49,8 @@ def describe(
         verify: read the graphs that are there, and make those again that are damaged, and try again those that were set
             aside; else none of them is read.
     """
-    keys = graph_keys(store, scenes, settings)
-    damaged = store.graphs.damaged(keys.values()) if verify else set()
+    keys: dict[str, RecipeKey] = graph_keys(store, scenes, settings)
+    damaged: set[str] = store.graphs.damaged(keys.values()) if verify else set()
     lacking = {*without_graph(store, keys), *(scene for scene, key in keys.items() if key.digest in damaged)}
     missing = [scene for scene in scenes if scene.id in lacking]
     specs = models.specs(store)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime
+from functools import cached_property
 
 import numpy as np
 
@@ -17,8 +19,9 @@ from gsmap.map.sharing import POLL_S
 from gsmap.map.stages.describe import graph_keys
 from gsmap.methods import RecipeKey
 from gsmap.store import Store
-from gsmap.types import Edge, PoseGraph, Prior, Scene
-from gsmap.types.plain import canonical
+from gsmap.store.scenes import BriefScene
+from gsmap.types import Edge, PoseGraph, Prior
+from gsmap.types.plain import canonical, of_plain
 from gsmap.types.progress import StageProgress
 from gsmap.types.world import Survey
 from gsmap.world.survey import in_frame
@@ -30,41 +33,54 @@ class PoseBasis:
 
     Args:
         scenes: ids, in the order they came.
-        same_visits: (target, source) of the edges between captures that are known to be of about one time.
+        named: what names each edge that may be used, by (target, source), in their order.
+        same_visits: those of them between captures that are known to be of about one time.
         priors: outside knowledge.
         ups: (3,) direction against gravity in the scene's frame, by scene id, where it is known.
         observed: what was observed of the world, as it was told.
-        key: the recipe with all of these, and the edges that may be used, as its inputs.
+        recipe: how they are solved.
     """
 
     scenes: list[str]
+    named: dict[tuple[str, str], str]
     same_visits: set[tuple[str, str]]
     priors: list[Prior]
     ups: dict[str, np.ndarray]
     observed: Survey
-    key: RecipeKey
+    recipe: RecipeKey
+
+    @cached_property
+    def key(self) -> RecipeKey:
+        """The recipe with all of these as its inputs."""
+        return self.key_of(self.scenes)
+
+    def key_of(self, scenes: Collection[str]) -> RecipeKey:
+        """The same of some of the scenes, as if the map had no others."""
+        some = set(scenes)
+        named = [name for (a, b), name in self.named.items() if a in some and b in some]
+        told = [(p.scene, p.S_map_scene.matrix(), p.sigmas, p.up, p.up_sigma_rad) for p in self.priors]
+        ups = of_plain({scene: up.tolist() for scene, up in self.ups.items() if scene in some})
+        # As it was told: the same key wherever PROJ is another.
+        seen = [canonical(self.observed)] if self.observed else []
+        mine = [scene for scene in self.scenes if scene in some]
+        return self.recipe.of(*mine, *named, canonical(told), ups, *seen)
 
 
 @of_one_state
 def pose_basis(store: Store, settings: Settings) -> PoseBasis:
     """Read what names the poses; a few statements, and microseconds a scene."""
-    living, priors = store.scenes.list(), store.priors.list()
+    living, priors = store.scenes.brief(), store.priors.list()
     captured = {scene.id: None if scene.captured_at is None else parsed(scene.captured_at) for scene in living}
     hours = settings.optimize.aliasing.same_visit_h
-    named, same_visits = [], set()
+    named, same_visits = {}, set()
     # By id, not in the order in which workers happened to finish: the same key whenever they were made.
     for one in store.registrations.standing(usable=True):
         same = _is_same_visit(captured[one.target], captured[one.source], hours)
-        named.append(f"{one.key or one.number} {one.review}" + " same visit" * same)
+        named[one.target, one.source] = f"{one.key or one.number} {one.review}" + " same visit" * same
         if same:
             same_visits.add((one.target, one.source))
-    ups = _ups(store, living, {key.digest for key in graph_keys(store, living, settings).values()})
-    told = [(prior.scene, prior.S_map_scene.matrix(), prior.sigmas, prior.up, prior.up_sigma_rad) for prior in priors]
-    recipe = solver.recipe_key(settings.optimize)
-    observed = store.world.survey()
-    seen = [canonical(observed)] if observed else []  # as it was told: the same key wherever PROJ is another
-    key = recipe.of(*(scene.id for scene in living), *named, canonical(told), canonical(ups), *seen)
-    return PoseBasis([scene.id for scene in living], same_visits, priors, ups, observed, key)
+    ups, recipe = _ups(store, living, settings), solver.recipe_key(settings.optimize)
+    return PoseBasis([scene.id for scene in living], named, same_visits, priors, ups, store.world.survey(), recipe)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +99,17 @@ class PoseInputs(PoseBasis):
 @of_one_state
 def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
     """Read what decides the poses."""
-    basis = pose_basis(store, settings)
-    edges = [
+    return _with_edges(store, pose_basis(store, settings))
+
+
+def _with_edges(store: Store, basis: PoseBasis) -> PoseInputs:
+    own = {field.name: getattr(basis, field.name) for field in fields(basis)}
+    return PoseInputs(**own, edges=_edges(store, basis), survey=in_frame(basis.observed))
+
+
+def _edges(store: Store, basis: PoseBasis, among: Collection[str] | None = None) -> list[Edge]:
+    """The edges that may be used, or those of them among some scenes."""
+    return [
         Edge(
             target=stored.registration.target,
             source=stored.registration.source,
@@ -94,10 +119,39 @@ def pose_inputs(store: Store, settings: Settings) -> PoseInputs:
             disagreement=stored.registration.evidence.get("disagreement", float("nan")),
             same_visit=(stored.registration.target, stored.registration.source) in basis.same_visits,
         )
-        for stored in store.registrations.usable()
+        for stored in store.registrations.usable(among)
         if stored.registration.S_target_source is not None and stored.registration.information is not None
     ]
-    return PoseInputs(**vars(basis), edges=edges, survey=in_frame(basis.observed))
+
+
+@dataclass(frozen=True, eq=False)
+class _Growth:
+    """What placing new scenes in the newest answer asks, where nothing else has come or gone since that.
+
+    Args:
+        basis: what names the poses then.
+        revision, previous: the newest answer.
+        inside, rim: scenes that it looks at, and the outermost of them (`gsmap.optimize.surroundings`).
+        edges: those among both that may be used.
+    """
+
+    basis: PoseBasis
+    revision: int
+    previous: PoseGraph
+    inside: set[str]
+    rim: set[str]
+    edges: list[Edge]
+
+
+@of_one_state
+def _inputs(store: Store, settings: Settings) -> PoseInputs | _Growth:
+    """Read what decides the poses: of a map that only has grown, what lies around the new scenes."""
+    basis, newest = pose_basis(store, settings), store.revisions.newest()
+    if newest is not None and (previous := store.revisions.get(newest.number)) is not None:
+        near, rim = solver.surroundings(basis.scenes, list(basis.named), previous, settings.optimize)
+        if near and basis.key_of(previous.poses).digest == newest.key:
+            return _Growth(basis, newest.number, previous, near - rim, rim, _edges(store, basis, near))
+    return _with_edges(store, basis)
 
 
 def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool:
@@ -105,10 +159,14 @@ def _is_same_visit(a: datetime | None, b: datetime | None, hours: float) -> bool
     return a is not None and b is not None and abs(a - b).total_seconds() < 3600 * hours
 
 
-def _ups(store: Store, living: Sequence[Scene], present: Collection[str]) -> dict[str, np.ndarray]:
-    """What each scene's present graph (by key) says is up; where it has none yet, its newest one, or what that said."""
+def _ups(store: Store, living: Sequence[BriefScene], settings: Settings) -> dict[str, np.ndarray]:
+    """What each scene's present graph says is up; where it has none yet, its newest one, or what that said."""
+    said = store.graphs.says()
+    times = Counter(graph.scene for graph in said)
+    several = [scene for scene in living if times[scene.id] > 1]
+    present = {key.digest for key in graph_keys(store, several, settings).values()} if several else set[str]()
     # Graphs come oldest first; the present one of a scene goes last.
-    chosen = {graph.scene: graph.up for graph in sorted(store.graphs.list(), key=lambda graph: graph.key in present)}
+    chosen = {graph.scene: graph.up for graph in sorted(said, key=lambda graph: graph.key in present)}
     of_thinned = {scene.id: scene.thinning.up for scene in living if scene.thinning is not None}
     return {scene: np.array(up) for scene, up in (of_thinned | chosen).items() if up is not None}
 
@@ -120,13 +178,30 @@ def optimize(store: Store, settings: Settings, progress: StageProgress) -> int:
 
 def _optimize(store: Store, given: PoseInputs, settings: Settings, progress: StageProgress) -> int:
     progress("optimize", 0.0, "poses")
-    previous: PoseGraph | None = store.revisions.get()
-    fixed = {prior.scene for prior in given.priors}
-    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, settings.optimize, survey=given.survey)
-    answer = solver.gravity_align(answer, given.ups, fixed=fixed, params=settings.optimize.gravity)
-    number = store.revisions.save(solver.kept_still(answer, previous, given.edges, settings.optimize), given.key)
+    params, previous = settings.optimize, store.revisions.get()
+    answer = solver.optimize(given.scenes, given.edges, given.priors, previous, params, survey=given.survey)
+    answer = solver.kept_still(_upright(answer, given, params), previous, given.edges, params)
+    number = store.revisions.save(answer, given.key)
     progress("optimize", 1.0, f"revision {number}")
     return number
+
+
+def _upright(answer: PoseGraph, basis: PoseBasis, params: solver.Params) -> PoseGraph:
+    return solver.gravity_align(answer, basis.ups, {prior.scene for prior in basis.priors}, params.gravity)
+
+
+def _grow(store: Store, given: _Growth, settings: Settings, progress: StageProgress) -> bool:
+    """Place the new scenes as `_optimize` would, whether that can be done by what lies around them."""
+    basis, params = given.basis, settings.optimize
+    answer = solver.grow(basis.scenes, given.edges, given.previous, params)
+    if answer is None:
+        return False
+    answer = solver.kept_still(_upright(answer, basis, params), given.previous, given.edges, params)
+    if any(pose is not given.previous.poses.get(s) for s, pose in answer.poses.items() if s not in given.inside):
+        return False  # more gave way, or all were turned upright: that asks more edges
+    number = store.revisions.save(answer, basis.key, after=(given.revision, given.previous))
+    progress("optimize", 1.0, f"revision {number}")
+    return True
 
 
 def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
@@ -138,9 +213,12 @@ def solve(store: Store, settings: Settings, progress: StageProgress) -> bool:
     while not _is_of(store, pose_basis(store, settings)):
         if store.leases.try_hold("poses", "optimize"):
             try:
-                given = pose_inputs(store, settings)
-                if not _is_of(store, given):
-                    _optimize(store, given, settings, progress)
+                given = _inputs(store, settings)
+                if not _is_of(store, given.basis if isinstance(given, _Growth) else given):
+                    if isinstance(given, _Growth) and not _grow(store, given, settings, progress):
+                        given = pose_inputs(store, settings)
+                    if isinstance(given, PoseInputs):
+                        _optimize(store, given, settings, progress)
             finally:
                 store.leases.release(["poses"])
             return True

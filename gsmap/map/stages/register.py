@@ -22,7 +22,8 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import StoredRegistration, Tried
+from gsmap.store.registrations import Standing, StoredRegistration
+from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
 
@@ -38,7 +39,7 @@ def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProg
     again without being computed. The target of a pair is the scene of lower id, however the pair was named: an edge is
     the same whichever scene came first.
     """
-    scenes = store.scenes.list()
+    scenes = store.scenes.brief()
     work = _Work(store, scenes, graph_keys(store, scenes, settings), settings, progress)
     if pairs == "auto":
         return _register_candidates(work)
@@ -60,7 +61,7 @@ class _Work:
     def __init__(
         self,
         store: Store,
-        scenes: Sequence[Scene],
+        scenes: Sequence[BriefScene],
         graphs: Mapping[str, RecipeKey],
         settings: Settings,
         progress: StageProgress,
@@ -89,15 +90,15 @@ class _Work:
         }
         done = partial(store.registrations.kept, after=after)
         shared = SharedJobs(store, "register", "edge", jobs, edges, done, self.progress, again=again)
-        results = shared.results(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
+        made = shared.batches(lambda arguments: run_jobs(register_scenes, arguments, settings.engine, quick=True))
         names = {scene.id: scene.name for scene in self.scenes}
         kept = noting(lambda: f"{shared.num_kept()} of {len(jobs)} pairs are registered and kept")
-        with kept, closing(results):
-            for key, edge in results:
-                store.registrations.save(edge, self.key(*edges[key]))
-                shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
-        found = [store.registrations.find(key) for key in edges]
-        return [stored.registration for stored in found if stored is not None]
+        with kept, closing(made):
+            for batch in made:
+                store.registrations.save_all([(edge, self.key(*edges[key])) for key, edge in batch])
+                for key, edge in batch:
+                    shared.saved(key, f"{names[edge.target]}-{names[edge.source]}: {edge.status}")
+        return store.registrations.found(edges)
 
 
 class _Known:
@@ -113,49 +114,48 @@ class _Known:
     def __init__(self, work: _Work) -> None:
         self._work = work
         self._graphs = {scene: key.digest for scene, key in work.graphs.items()}
-        self._digests: dict[Pair, str] = {}  # of registrations, by (target, source)
-        self._standing = {directed(one.target, one.source): one for one in work.store.registrations.tried()}
-        if adopted := [pair for pair, one in self._standing.items() if self._adopt(one)]:
-            changed = {directed(one.target, one.source): one for one in work.store.registrations.tried()}
+        self._standing = self._read()
+        if adopted := [pair for pair, (one, current) in self._standing.items() if not current and self._adopt(one)]:
+            changed = self._read()
             self._standing |= {pair: changed[pair] for pair in adopted}
         bar = work.settings.optimize.aliasing.max_disagreement
-        current = {pair: one for pair, one in self._standing.items() if one.is_told or one.key in self._keys(one)}
         self.held = [
-            pair for pair, one in current.items() if one.usable and (one.is_told or not one.disagreement > bar)
+            pair
+            for pair, (one, current) in self._standing.items()
+            if current and one.usable and (one.is_told or not one.disagreement > bar)
         ]
         self.stale = sorted(
             pair
-            for pair, one in self._standing.items()
-            if pair not in current and set(pair) <= set(work.described) and not self.has(*pair)
+            for pair, (one, current) in self._standing.items()
+            if not current and all(scene in work.described for scene in pair) and not self._has(one)
         )
+
+    def _read(self) -> dict[Pair, tuple[Standing, bool]]:
+        """What stands of every pair, and whether it is what this recipe makes, or what a person told."""
+        found, name, graphs = {}, self._work.recipe.digest_of, self._graphs
+        for one in self._work.store.registrations.tried():
+            a, b = one.target, one.source
+            current = not one.key or (a in graphs and b in graphs and one.key == name(graphs[a], graphs[b]))
+            found[(a, b) if a < b else (b, a)] = (one, current or one.is_told or one.key in self._keys(one))
+        return found
 
     def has(self, a: str, b: str) -> bool:
         """Whether it has registered a pair."""
-        one = self._standing.get(directed(a, b))
-        return one is not None and self._has(one)
+        known = self._standing.get(directed(a, b))
+        return known is not None and self._has(known[0])
 
-    def pairs(self) -> set[Pair]:
-        """All that it has registered."""
-        return {pair for pair, one in self._standing.items() if self._has(one)}
-
-    def _has(self, one: Tried) -> bool:
+    def _has(self, one: Standing) -> bool:
         return any(key in one.keys for key in self._keys(one))
 
-    def _keys(self, one: Tried) -> Iterator[str]:
+    def _keys(self, one: Standing) -> Iterator[str]:
         """What the pair's registration would be kept under, in its own direction and in the other."""
-        if one.target in self._graphs and one.source in self._graphs:
-            yield self._digest(one.target, one.source)
-            yield self._digest(one.source, one.target)
+        target, source = self._graphs.get(one.target), self._graphs.get(one.source)
+        if target is not None and source is not None:
+            yield self._work.recipe.digest_of(target, source)
+            yield self._work.recipe.digest_of(source, target)
 
-    def _digest(self, target: str, source: str) -> str:
-        known = self._digests.get((target, source))
-        if known is None:
-            known = self._work.recipe.digest_of(self._graphs[target], self._graphs[source])
-            self._digests[target, source] = known
-        return known
-
-    def _adopt(self, one: Tried) -> bool:
-        if one.is_told or one.key in self._keys(one) or not self._has(one):
+    def _adopt(self, one: Standing) -> bool:
+        if not self._has(one):
             return False
         known = [self._work.store.registrations.find(key) for key in self._keys(one)]
         self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
@@ -184,8 +184,9 @@ def _register_candidates(work: _Work) -> list[Registration]:
     for pair in neighbours({s: at for s, at in placed_scenes(store).items() if s in work.described}, params):
         beside.setdefault(pair[0], []).append(pair)
     bar = work.settings.optimize.aliasing.max_disagreement
-    rounds = Rounds([*lists.values(), *beside.values()], known.pairs(), known.held, params)
-    rounds.tried |= set(known.stale)
+    proposed = [*lists.values(), *beside.values()]
+    tried = {pair for pairs in proposed for pair in pairs if known.has(*pair)}
+    rounds = Rounds(proposed, tried.union(known.stale), known.held, params)
     pairs, made = known.stale + rounds.next(), list[Registration]()
     while pairs:
         found = work.register(pairs, after=0)
@@ -320,7 +321,7 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
 
 def placed_scenes(store: Store) -> dict[str, Placed]:
     """Where scenes lie by the newest poses, for finding neighbours."""
-    bounds = {scene.id: scene.bounds for scene in store.scenes.list()}
+    bounds = store.scenes.bounds()
     placed = {}
     for scene, pose in store.revisions.poses().items():
         if scene in bounds:

@@ -13,7 +13,7 @@ from gsmap.types.notebook import html_facts, html_table
 from gsmap.types.plain import plain
 from gsmap.types.sim3 import Sim3
 
-SCHEMA = 1
+SCHEMA = 2
 """The number under ``schema`` in everything that ``--json`` prints; raised when a key goes or changes its meaning."""
 
 

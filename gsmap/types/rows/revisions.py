@@ -102,13 +102,13 @@ class PoseChangeRow(Row):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UpdateReport(Row):
-    """What an update took in, and the map as it is then.
+    """What an update took in and changed; ``gsmap list MAP scenes`` and ``edges`` have the whole map.
 
     Args:
         ingested: the captures given.
-        scenes: all scenes of the map.
-        edges: the current edge of every pair that was tried.
-        revision: the newest revision; null where there is none.
+        scenes: those that came, were described, or whose pose or status changed.
+        edges: the current edge of every pair that was registered, or whose use changed.
+        revision: the newest revision, with how many scenes and edges it has; null where there is none.
     """
 
     ingested: tuple[IngestRow, ...]
