@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap._native import PointTree
 from gsmap.compare.components import components
 
 _BIN_M = 0.03
@@ -19,19 +20,12 @@ _MOST_PLANES = 24
 _NORMAL_OF = 12  # neighbours
 
 
-def normals_of(points: np.ndarray, tree: cKDTree | None = None) -> np.ndarray:
-    """(M, 3) unit normals of a surface in cells; signs mean nothing.
-
-    Args:
-        tree: of the points, where there is one already.
-    """
+def normals_of(points: np.ndarray) -> np.ndarray:
+    """(M, 3) unit normals of a surface in cells; signs mean nothing."""
     if len(points) < 4:
         return np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    near = points[(tree or cKDTree(points)).query(points, k=min(_NORMAL_OF, len(points)))[1]]
-    near = near - near.mean(1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
-    out: np.ndarray = axes[:, :, 0]
-    return out
+    normals: np.ndarray = PointTree(np.ascontiguousarray(points, np.float64)).normals(_NORMAL_OF)
+    return normals
 
 
 def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray:
