@@ -112,6 +112,7 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             np.clip(rgb_of_sh0(one.gaussians.sh[:, 0]), 0, 1),
             found.thing,
             found.state >= REPAINTED,
+            found.framed,
         )
         for one, found in zip(both, evidence, strict=True)
     )

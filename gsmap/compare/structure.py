@@ -14,6 +14,7 @@ _LEVEL_M2, _WALL_M2 = 4.0, 0.5  # a smaller plane is a table or a cupboard
 _REACH_M = 0.16  # cells of one plane are linked over such gaps
 _WALL_M = 1.8  # a wall is at least this high, and ...
 _TO_CEILING_M = 0.2  # ... comes this close to the ceiling, where there is one
+_THROUGH_M = 0.15  # from one face of a wall between rooms to the other
 _PIECE_M2 = 0.1  # of a wall that furniture hides, pieces at least so large are looked at
 _BESIDE_M = 0.3  # what lies so close to a wall, in its plane, is wall
 _MOST_PLANES = 24
@@ -50,10 +51,14 @@ def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray
     for yaw in _directions(normals[upright]):
         way = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         along = np.abs(normals[upright] @ way) > 0.94
+        faces: list[float] = []
         for offset in _peaks(points[upright[along]] @ way, _WALL_M2 / cell_m**2):
             on = (np.abs(points @ way - offset) < _THICK_M) & (np.abs(normals @ way) > 0.8) & (label < 0)
-            rows = _wall(points, np.flatnonzero(on), ceiling, cell_m)
+            # A wall's other face need not be seen up to the ceiling: nothing else of that height is so thin.
+            thin = any(abs(offset - face) < _THROUGH_M for face in faces)
+            rows = _wall(points, np.flatnonzero(on), np.inf if thin else ceiling, cell_m)
             if len(rows):
+                faces.append(offset)
                 label[rows] = found
                 found += 1
             if found >= _MOST_PLANES:
