@@ -4,9 +4,9 @@ A trainer's bias, or a sensor whose depths are a percent off, bends a capture so
 the residuals show little. Made captures know the truth: places are filmed, their depths bent as depth cameras bend them
 (a scale, a term in the depth's square, a lens, colour and depth some pixels apart, noise; each drawn for each capture,
 times a level), and laid out as Gaussians, in part under poses that wander, and trained on such frames; others are
-trained on perfect frames, or laid on them sparsely (tested only). Two models are of largest likelihood, errors taken for normally distributed: of the measured
-scale, and then, that scale known, of the rigid pose. Places that are only tested on are not fitted. No given capture
-takes part.
+trained on perfect frames, or laid on them sparsely (tested only). Two models are of largest likelihood, errors taken
+for normally distributed: of the measured scale, and then, that scale known, of the rigid pose. Places that are only
+tested on are not fitted. No given capture takes part.
 
     python tools/fit_covariance.py --cache FOLDER
     python tools/fit_covariance.py --cache FOLDER --test house kitchen_splats

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap._native import FeatureTree
 from gsmap.change.params import Params
 from gsmap.change.poses import about_up, features, settled, voted
 from gsmap.change.sides import Side
@@ -64,12 +65,12 @@ class _Capture:
     cells: Cells
     looks: Looks
     things: list[Thing]
-    tree: Any
+    tree: FeatureTree
 
     @classmethod
     def of(cls, side: Side, cells: Cells, looks: Looks, things: Sequence[Thing]) -> _Capture:
         loose = np.flatnonzero(cells.plane < 0)
-        return cls(side, cells, looks, list(things), cKDTree(_features(side, loose)))
+        return cls(side, cells, looks, list(things), FeatureTree(_features(side, loose)))
 
     def points(self, thing: Thing) -> np.ndarray:
         return self.side.points[thing.cells]
@@ -283,11 +284,10 @@ def _targets(there: _Capture, points: np.ndarray) -> np.ndarray:
     return out
 
 
-def _near(moving: np.ndarray, tree: Any, pose: Sim3) -> float:
+def _near(moving: np.ndarray, tree: FeatureTree, pose: Sim3) -> float:
     """How close cells come to cells of their colour, in [0, 1]."""
     moved = np.concatenate([pose.apply(moving[:, :3]), moving[:, 3:]], axis=1)
-    distance, _ = tree.query(moved, distance_upper_bound=0.1)
-    return float((1 - np.minimum(distance, 0.1) / 0.1).mean())
+    return float((1 - np.minimum(tree.distances(moved, 0.1), 0.1) / 0.1).mean())
 
 
 def _differ(a: Sim3, b: Sim3, points: np.ndarray) -> bool:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap._native import beyond_ranges
 from gsmap.change.params import Params
 from gsmap.change.poses import tints
 from gsmap.compare import Comparison, Looks, Pictured, View
-from gsmap.compare.colours import FLOOR, Balance
-from gsmap.compare.neighbourhoods import ranges
+from gsmap.compare.colours import FLOOR, Balance, logarithms
 from gsmap.compare.structure import normals_of
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.sh import rgb_of_sh0
@@ -62,7 +62,7 @@ class Side:
     @cached_property
     def normals(self) -> np.ndarray:
         """(M, 3) unit normals; signs mean nothing."""
-        return normals_of(self.points, self.tree)
+        return normals_of(self.points)
 
     def around(self, values: np.ndarray, radius_m: float) -> np.ndarray:
         """(M, ...) sums of values over the cells within a radius of each."""
@@ -147,17 +147,14 @@ def _add(
 def _colour(a: np.ndarray, b: np.ndarray, line: Balance, limits: tuple[float, float]):
     """Differences of colour (H, W, 3), two of chroma and one of lightness, and how far they go beyond what a shift by
     a pixel explains (H, W), as multiples of the limits."""
-    log_a = np.log(np.clip(a, 0, 1) + np.float32(FLOOR)) * line.slope.astype(np.float32) + line.offset.astype(
-        np.float32
-    )
-    log_b = np.log(np.clip(b, 0, 1) + np.float32(FLOOR))
+    log_a = logarithms(a) * line.slope.astype(np.float32) + line.offset.astype(np.float32)
+    log_b = logarithms(b)
     bright = np.minimum(np.exp(np.maximum(log_a.max(-1), log_b.max(-1))), 1)
     plain = _opponent(log_b - log_a, bright)
     # A texture that is off by a pixel, or blurred in one of the captures, stays within what the other shows around.
     strengths = []
     for x, y in ((log_a, log_b), (log_b, log_a)):
-        low, high = ranges(x)
-        beyond = _opponent(y - np.clip(y, low, high), bright)
+        beyond = _opponent(beyond_ranges(x, y), bright)
         strengths.append(np.maximum(np.abs(beyond[..., :2]).max(-1) / limits[0], np.abs(beyond[..., 2]) / limits[1]))
     return plain, np.minimum(*strengths)
 

@@ -19,7 +19,7 @@ from gsmap.compare.looks import Looks, View, look
 from gsmap.compare.neighbourhoods import grown, ranges
 from gsmap.compare.params import Params
 
-VERSION = 3
+VERSION = 4
 """Raised whenever two captures come out otherwise for the same input."""
 
 __all__ = [

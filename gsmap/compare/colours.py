@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.compare.neighbourhoods import over_3x3
+from gsmap._native import tones_apart
 from gsmap.compare.params import Params
 
 FLOOR = 0.03  # added before logarithms: what is darker is noise
@@ -53,11 +53,15 @@ class Balance:
         Args:
             both: (H, W) bool, pixels that show one surface; others explain nothing.
         """
-        log_a, log_b = (np.log(np.clip(v, 0, 1) + np.float32(FLOOR)) for v in (a, b))
-        log_a = log_a * self.slope.astype(np.float32) + self.offset.astype(np.float32)
-        bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
-        apart = [_apart(x, y, both) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True)]
-        return np.stack(apart[:2], axis=-1), apart[2]
+        apart, brightest = tones_apart(
+            a=logarithms(a),
+            b=logarithms(b),
+            both=both,
+            slope=self.slope.astype(np.float32),
+            offset=self.offset.astype(np.float32),
+        )
+        apart *= np.minimum(np.exp(brightest), 1)[..., None]
+        return np.ascontiguousarray(apart[..., :2]), np.ascontiguousarray(apart[..., 2])
 
     def left_over(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Differences of single colours (K, 3): chroma (K, 2) and lightness (K,)."""
@@ -66,6 +70,12 @@ class Balance:
         bright = np.minimum(np.exp(_largest(np.maximum(log_a, log_b))), 1)
         red, blue, light = ((y - x) * bright for x, y in zip(_tones(log_a), _tones(log_b), strict=True))
         return np.stack([red, blue], axis=-1), light
+
+
+def logarithms(colour: np.ndarray) -> np.ndarray:
+    """Of colours (..., 3) float32, as they are compared."""
+    out: np.ndarray = np.log(np.clip(colour, 0, 1) + np.float32(FLOOR))
+    return out
 
 
 def _largest(values: np.ndarray) -> np.ndarray:
@@ -78,15 +88,6 @@ def _tones(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Red over green, blue over green, and lightness, of logarithms of colours (..., 3)."""
     red, green, blue = logs[..., 0], logs[..., 1], logs[..., 2]
     return red - green, blue - green, (red + green + blue) / 3
-
-
-def _apart(a: np.ndarray, b: np.ndarray, both: np.ndarray) -> np.ndarray:
-    """(H, W) by how much b lies above a (below: negative), beyond the ranges of both over 3 x 3 pixels."""
-    infinite = np.float32(1e3)  # beyond all logarithms of colours
-    low_a, low_b = (over_3x3(np.where(both, v, infinite), np.minimum) for v in (a, b))
-    high_a, high_b = (over_3x3(np.where(both, v, -infinite), np.maximum) for v in (a, b))
-    out: np.ndarray = np.where(both, np.maximum(low_b - high_a, 0) + np.minimum(high_b - low_a, 0), 0)
-    return out
 
 
 IDENTITY = Balance(np.ones(3), np.zeros(3), 0.0, 0.0)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap._native import add_colours, count_looks
 from gsmap.compare.colours import Balance, balance, differ
 from gsmap.compare.evidence import REPAINTED, Evidence, Tally
 from gsmap.compare.looks import Looks, Placed, View, place, view_of
@@ -111,6 +112,7 @@ def compare(older: Looks, newer: Looks, params: Params | None = None) -> Compari
             np.clip(rgb_of_sh0(one.gaussians.sh[:, 0]), 0, 1),
             found.thing,
             found.state >= REPAINTED,
+            found.framed,
         )
         for one, found in zip(both, evidence, strict=True)
     )
@@ -190,37 +192,54 @@ def _outcomes(
 
 
 def _count(tally: Tally, at: Placed, picture: Pictured, sure: np.ndarray, tolerance: tuple[float, float]) -> None:
-    """Where the Gaussians of one capture lie in a view of the other."""
+    """Where the Gaussians of one capture lie in a view of the other, and its colours of those on its surface."""
     view, (base, share) = picture.own, tolerance
-    near, far = view.near[at.row, at.column], view.far[at.row, at.column]
-    gap = base + share * at.z
-    known = view.solid[at.row, at.column]
-    through = known & (at.z < near - gap)
-    hidden = known & (at.z > far + gap)
-    # Where depths jump within a few pixels, lying somewhere between proves nothing.
-    on = known & ~through & ~hidden & (far - near < 4 * gap)
-    tally.through[at.index[through]] += 1
-    tally.hidden[at.index[hidden]] += 1
-    grazed = view.opaque[at.row, at.column] & (at.z < view.depth[at.row, at.column] - gap)
-    tally.grazed[at.index[grazed]] += 1
-    tally.on_surface[at.index[on]] += 1
-    tally.covered[at.index[on & picture.covered[at.row, at.column]]] += 1
-    looked = through | on
-    tally.sure[at.index[looked & sure[at.row, at.column]]] += 1
-    tally.sharpness[at.index[looked]] += view.pixels_a_metre(at.z[looked]) ** 2
-    _add_colour(tally, at, on, picture)
+    count_looks(
+        at.index,
+        at.row,
+        at.column,
+        at.z,
+        near=view.near,
+        far=view.far,
+        depth=view.depth,
+        solid=view.solid,
+        opaque=view.opaque,
+        sure=sure,
+        covered=picture.covered,
+        one=picture.one,
+        chroma=picture.chroma,
+        lightness=picture.lightness,
+        focal=float(view.camera.intrinsics_px[0, 0]),
+        base=base,
+        share=share,
+        through=tally.through,
+        on_surface=tally.on_surface,
+        hidden=tally.hidden,
+        grazed=tally.grazed,
+        behind=tally.covered,
+        well=tally.sure,
+        sharpness=tally.sharpness,
+        colour_seen=tally.colour_seen,
+        chroma_sum=tally.chroma,
+        lightness_sum=tally.lightness,
+    )
 
 
 def _count_colour(tally: Tally, at: Placed, picture: Pictured, tolerance: tuple[float, float]) -> None:
     """What a capture's own view says of the colours of its own Gaussians."""
     base, share = tolerance
-    _add_colour(tally, at, np.abs(at.z - picture.own.depth[at.row, at.column]) <= base + share * at.z, picture)
-
-
-def _add_colour(tally: Tally, at: Placed, on: np.ndarray, picture: Pictured) -> None:
-    row, column, index = at.row[on], at.column[on], at.index[on]
-    one = picture.one[row, column]
-    row, column, index = row[one], column[one], index[one]
-    tally.colour_seen[index] += 1
-    tally.chroma[index] += picture.chroma[row, column]
-    tally.lightness[index] += picture.lightness[row, column]
+    add_colours(
+        at.index,
+        at.row,
+        at.column,
+        at.z,
+        depth=picture.own.depth,
+        one=picture.one,
+        chroma=picture.chroma,
+        lightness=picture.lightness,
+        base=base,
+        share=share,
+        colour_seen=tally.colour_seen,
+        chroma_sum=tally.chroma,
+        lightness_sum=tally.lightness,
+    )

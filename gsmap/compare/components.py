@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+
+from gsmap._native import clusters
 
 
 def components(points: np.ndarray, reach_m: float, kind: np.ndarray | None = None) -> np.ndarray:
-    """(N,) label of the cluster of each point (N, 3): those within reach of each other are of one.
+    """(N,) int64 label of the cluster of each point (N, 3): those within reach of each other are of one. Labels count
+    from 0 in the order of the clusters' first points.
 
     Args:
-        kind: (N,) of each point; those of different kinds are never linked.
+        kind: (N,) integers; points of different kinds are never linked.
     """
-    if not len(points):
-        return np.zeros(0, np.int64)
-    pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray")
-    if kind is not None:
-        pairs = pairs[kind[pairs[:, 0]] == kind[pairs[:, 1]]]
-    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
-    labels: np.ndarray = connected_components(graph, directed=False)[1].astype(np.int64)
+    kind = None if kind is None else np.ascontiguousarray(kind, np.int64)
+    labels: np.ndarray = clusters(np.ascontiguousarray(points, np.float64), reach_m, kind)
     return labels
 
 

@@ -27,6 +27,7 @@ class Evidence:
         colour_seen: (N,) int32 views, of either capture, in which its colour could be compared.
         chroma, lightness: (N, 2) and (N,) float32 means, over these views, of by how much the newer's colour differs.
         thing: (N,) int64 what it hangs together with off floors, ceilings and walls; -1 for what is on these.
+        framed: (N,) bool what lies by one of these without being part of it.
         state: (N,) int8, one of the five, after neighbours have voted.
     """
 
@@ -39,6 +40,7 @@ class Evidence:
     chroma: np.ndarray
     lightness: np.ndarray
     thing: np.ndarray
+    framed: np.ndarray
     state: np.ndarray
 
 
@@ -83,7 +85,14 @@ class Tally:
             others: (M, 3) of the other capture's Gaussians that are part of a surface.
             views: how many the other capture has.
         """
-        from gsmap.compare.things import Doubts, clear, kin, rooted, things  # with scipy: naming a recipe has none
+        from gsmap.compare.things import (
+            Doubts,
+            by_shell,
+            clear,
+            kin,
+            rooted,
+            things,
+        )  # with scipy: naming a recipe has none
 
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often
@@ -112,13 +121,14 @@ class Tally:
         shell = np.where(state == GONE, -1, shell)
         thing = things(points, shell, params)
         changed, judged, hidden = state >= REPAINTED, state >= SAME, state == HIDDEN
-        doubts = Doubts(points, shell, thing, changed, gone | painted, judged, hidden, differs)
+        framed = by_shell(points, shell, params)
+        doubts = Doubts(points, shell, thing, changed, gone | painted, judged, hidden, differs, framed)
         stands = rooted(doubts, params)
         state[doubts.changed & ~stands] = unchanged[doubts.changed & ~stands]
         # Whole things, of what turned out to have changed.
         state[kin(replace(doubts, changed=stands), params) & (state < REPAINTED)] = REPAINTED
         counts = self.through, self.on_surface, self.hidden, self.sure, self.sharpness, self.colour_seen
-        return Evidence(*counts, chroma, lightness, thing, state)
+        return Evidence(*counts, chroma, lightness, thing, framed, state)
 
     def _geometry(self, near: _Neighbours, params: Params) -> np.ndarray:
         through, on = near.sums(self.through), near.sums(self.on_surface)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap._native import place_points
 from gsmap.compare.neighbourhoods import extremes, shrunk
 from gsmap.compare.params import Params
-from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.voxels import voxel_labels
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
@@ -126,12 +126,18 @@ def own_cameras(scene: PlacedScene, params: Params) -> list[Cameras]:
 
 def place(points: np.ndarray, view: View, nearest_m: float) -> Placed:
     """Points (N, 3) in a view, those alone that lie in the picture and beyond ``nearest_m``."""
-    T, size_px = view.camera.T_camera_frame[0], view.camera.sizes_px[0]
-    before = np.flatnonzero(points @ T[2, :3].astype(points.dtype) + points.dtype.type(T[2, 3]) > nearest_m)
-    pixels, z = project(points[before], T, view.camera.intrinsics_px[0])
-    inside = np.flatnonzero(in_image(pixels, z, size_px, near=nearest_m))
-    column, row = pixels[inside].astype(np.int32).T
-    return Placed(before[inside].astype(np.int32), row, column, z[inside])
+    camera = view.camera
+    width, height = (int(v) for v in camera.sizes_px[0])
+    return Placed(
+        *place_points(
+            points=np.ascontiguousarray(points, np.float32),
+            pose=np.ascontiguousarray(camera.T_camera_frame[0], np.float64),
+            lens=np.ascontiguousarray(camera.intrinsics_px[0], np.float64),
+            width=width,
+            height=height,
+            nearest=nearest_m,
+        )
+    )
 
 
 def _view(gaussians: Gaussians, camera: Cameras, params: Params) -> tuple[View, np.ndarray]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap._native import depth_ranges
+
 
 def extremes(depth: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) lowest and highest opaque depth over 3 x 3 pixels; inf and -inf where nothing is opaque."""
-    low = np.where(opaque, depth, np.float32(np.inf))
-    high = np.where(opaque, depth, np.float32(-np.inf))
-    return over_3x3(low, np.minimum), over_3x3(high, np.maximum)
+    found: tuple[np.ndarray, np.ndarray] = depth_ranges(depth=np.ascontiguousarray(depth), opaque=opaque)
+    return found
 
 
 def shrunk(mask: np.ndarray) -> np.ndarray:

@@ -38,6 +38,9 @@ class Params:
         kin_share: of a thing of which this share has changed,
         kin_colour: what differs by this multiple of what counts, and is tied to it, has changed too,
         beside_m: and so has what is so near to it that most of its neighbours on the thing changed.
+        by_shell_m: what lies so near to a floor, ceiling or wall may be a frame or a board of it, and goes along with a
+            thing only where it lies among what changed of that, or outside of its hull by no more than
+        beyond_m: this.
         most_share: of a thing of which this share has changed, what is left is a piece of it, or another thing that
             stood beside. It goes along if its Gaussians reach, in the mean,
         piece_score: this score: 1 for one that has, in the colours that changed on the thing, some as near as
@@ -73,6 +76,8 @@ class Params:
     kin_share: float = 0.2
     kin_colour: float = 0.2
     beside_m: float = 0.15
+    by_shell_m: float = 0.1
+    beyond_m: float = 0.05
     most_share: float = 0.5
     piece_score: float = 0.7
     alike: float = 0.05

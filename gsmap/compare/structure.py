@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsmap._native import PointTree
 from gsmap.compare.components import components
 
 _BIN_M = 0.03
@@ -13,25 +14,19 @@ _LEVEL_M2, _WALL_M2 = 4.0, 0.5  # a smaller plane is a table or a cupboard
 _REACH_M = 0.16  # cells of one plane are linked over such gaps
 _WALL_M = 1.8  # a wall is at least this high, and ...
 _TO_CEILING_M = 0.2  # ... comes this close to the ceiling, where there is one
+_THROUGH_M = 0.15  # from one face of a wall between rooms to the other
 _PIECE_M2 = 0.1  # of a wall that furniture hides, pieces at least so large are looked at
 _BESIDE_M = 0.3  # what lies so close to a wall, in its plane, is wall
 _MOST_PLANES = 24
 _NORMAL_OF = 12  # neighbours
 
 
-def normals_of(points: np.ndarray, tree: cKDTree | None = None) -> np.ndarray:
-    """(M, 3) unit normals of a surface in cells; signs mean nothing.
-
-    Args:
-        tree: of the points, where there is one already.
-    """
+def normals_of(points: np.ndarray) -> np.ndarray:
+    """(M, 3) unit normals of a surface in cells; signs mean nothing."""
     if len(points) < 4:
         return np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    near = points[(tree or cKDTree(points)).query(points, k=min(_NORMAL_OF, len(points)))[1]]
-    near = near - near.mean(1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
-    out: np.ndarray = axes[:, :, 0]
-    return out
+    normals: np.ndarray = PointTree(np.ascontiguousarray(points, np.float64)).normals(_NORMAL_OF)
+    return normals
 
 
 def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray:
@@ -56,10 +51,14 @@ def planes(points: np.ndarray, normals: np.ndarray, cell_m: float) -> np.ndarray
     for yaw in _directions(normals[upright]):
         way = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         along = np.abs(normals[upright] @ way) > 0.94
+        faces: list[float] = []
         for offset in _peaks(points[upright[along]] @ way, _WALL_M2 / cell_m**2):
             on = (np.abs(points @ way - offset) < _THICK_M) & (np.abs(normals @ way) > 0.8) & (label < 0)
-            rows = _wall(points, np.flatnonzero(on), ceiling, cell_m)
+            # A wall's other face need not be seen up to the ceiling: nothing else of that height is so thin.
+            thin = any(abs(offset - face) < _THROUGH_M for face in faces)
+            rows = _wall(points, np.flatnonzero(on), np.inf if thin else ceiling, cell_m)
             if len(rows):
+                faces.append(offset)
                 label[rows] = found
                 found += 1
             if found >= _MOST_PLANES:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from gsmap.compare.components import components
 from gsmap.compare.params import Params
@@ -19,6 +19,7 @@ from gsmap.compare.structure import normals_of, planes
 from gsmap.geometry.cells import cell_labels, group_means
 
 _CELL_M = 0.05  # of the surface in which planes are looked for
+_FEWEST = 5  # points that have a hull
 _ASKED = 5  # of the nearest that were judged
 
 
@@ -50,6 +51,11 @@ def things(points: np.ndarray, shell: np.ndarray, params: Params) -> np.ndarray:
     return out
 
 
+def by_shell(points: np.ndarray, shell: np.ndarray, params: Params) -> np.ndarray:
+    """(N,) bool, what lies by a floor, ceiling or wall without being part of it, as frames of doors and windows do."""
+    return (shell < 0) & ~clear(points, points[shell >= 0], params.by_shell_m)
+
+
 @dataclass(frozen=True, eq=False)
 class Doubts:
     """What is known of each of N Gaussians of a capture before things are weighed.
@@ -63,6 +69,7 @@ class Doubts:
         judged: (N,) bool, seen by the other capture.
         hidden: (N,) bool, behind what the other capture shows.
         differs: (N,) of the colour, as a multiple of what counts.
+        framed: (N,) bool, see `by_shell`.
     """
 
     points: np.ndarray
@@ -73,6 +80,7 @@ class Doubts:
     judged: np.ndarray
     hidden: np.ndarray
     differs: np.ndarray
+    framed: np.ndarray
 
 
 def rooted(doubts: Doubts, params: Params) -> np.ndarray:
@@ -99,7 +107,8 @@ def rooted(doubts: Doubts, params: Params) -> np.ndarray:
 
 def kin(doubts: Doubts, params: Params) -> np.ndarray:
     """(N,) bool, the changed and what changed with them: of things much of which changed, what differs a little and is
-    tied to what changed, and what most of those about it on the thing did."""
+    tied to what changed, and what most of those about it on the thing did. A door's frame hangs together with what
+    stands before it, and does not go along."""
     thing, loose = doubts.thing, np.flatnonzero(doubts.thing >= 0)
     count = int(thing.max(initial=-1)) + 1
     out = doubts.changed.copy()
@@ -121,6 +130,11 @@ def kin(doubts: Doubts, params: Params) -> np.ndarray:
     mine[of_these] = True
     out[_with_most(doubts, mine & doubts.judged, mine & ~doubts.judged & ~out, out, params.beside_m)] = True
     out[_with_most(doubts, mine, mine & ~out, out, params.beside_m)] = True
+    asked = np.flatnonzero(out & ~doubts.changed & doubts.framed)
+    for k in np.unique(thing[asked]):
+        rows = asked[thing[asked] == k]
+        changed = doubts.points[doubts.changed & (thing == k)]
+        out[rows[~between(doubts.points[rows], changed, params.beyond_m)]] = False
     return out
 
 
@@ -132,12 +146,14 @@ class Side:
         points, colours: (N, 3), colours in [0, 1].
         thing: (N,) see `things`.
         changed: (N,) bool.
+        framed: (N,) bool, see `by_shell`.
     """
 
     points: np.ndarray
     colours: np.ndarray
     thing: np.ndarray
     changed: np.ndarray
+    framed: np.ndarray
 
     def share(self) -> np.ndarray:
         """(N,) of the thing of each Gaussian the share that changed; 0 for what is part of none."""
@@ -163,14 +179,33 @@ def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
         left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
         if not len(left) or not len(other.points):
             continue
-        score = params.new_weight * new[cKDTree(other.points).query(one.points[left])[1]]
+        nearest = cKDTree(other.points).query(one.points[left])[1]
+        stays = np.zeros(len(left), dtype=bool)
+        for k in np.unique(thing[left[one.framed[left]]]):
+            # What was pushed along shows itself between what changed in both captures.
+            beside = np.unique(other.thing[nearest[thing[left] == k]])
+            theirs = other.points[other.changed & np.isin(other.thing, beside[beside >= 0])]
+            changed = np.concatenate([one.points[one.changed & (thing == k)], theirs])
+            rows = np.flatnonzero((thing[left] == k) & one.framed[left])
+            stays[rows] = ~between(one.points[left[rows]], changed, params.beyond_m)
+        score = params.new_weight * new[nearest]
         for k in np.unique(thing[left]):
             changed, rows = one.colours[one.changed & (thing == k)], np.flatnonzero(thing[left] == k)
             if len(changed) >= max(_ASKED, params.min_roots):
                 score[rows] += cKDTree(changed).query(one.colours[left[rows]], _ASKED)[0][:, -1] < params.alike
         label = components(one.points[left], params.link_m, thing[left])
-        out[left[(np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]]] = True
+        goes = (np.bincount(label, score) >= params.piece_score * np.bincount(label))[label]
+        out[left[goes & ~stays]] = True
     return found
+
+
+def between(points: np.ndarray, others: np.ndarray, beyond_m: float) -> np.ndarray:
+    """(N,) bool, which points (N, 3) lie in the convex hull of others (M, 3), or at most so far beyond its planes."""
+    if len(others) < _FEWEST or not len(points):
+        return np.zeros(len(points), dtype=bool)
+    planes = ConvexHull(others.astype(np.float64), qhull_options="QJ").equations
+    out: np.ndarray = (points @ planes[:, :3].T + planes[:, 3]).max(1) <= beyond_m
+    return out
 
 
 def clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Literal
 
@@ -53,21 +53,32 @@ class Settled:
     behind: list[np.ndarray]
     rivals: list[Gaussians]
     losers: list[Gaussians]
+    _flagged: dict[int, tuple[Gaussians, int]] = field(default_factory=dict)
 
     def overruled_pixels(self, scene: int, camera: Cameras, longest_side_px: int = 240) -> np.ndarray:
         """(H, W) bool, where a picture of a scene from a camera (1) shows what is not so, or does not show what is."""
-        disputed = Gaussians.concatenate([self.losers[scene], self.rivals[scene]])
+        flagged, count = self._flagged_of(scene)
         width, height = (int(v) for v in camera.sizes_px[0])
         small = camera.resized(longest_side_px)
-        if not len(disputed) or not share_in_view(small, disputed.means)[0]:
+        if not count or not share_in_view(small, flagged.means[:count])[0]:
             return np.zeros((height, width), dtype=bool)
-        shows = _share_of_pixels(disputed, self.scenes[scene].gaussians, small) > _SHOWS
+        shows = render(flagged, small, depth=False, dominant_id=False).colour[0, ..., 0] > _SHOWS
         # A Gaussian's skirts reach beyond the pixels in which it shows.
         shows = compare.grown(shows)
         rows = ((np.arange(height) + 0.5) * shows.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * shows.shape[1] / width).astype(int)
         out: np.ndarray = shows[np.ix_(rows, columns)]
         return out
+
+    def _flagged_of(self, scene: int) -> tuple[Gaussians, int]:
+        """What is disputed of a scene, white, then the rest of it, black, and how many these are; kept for one scene,
+        as pictures are asked for scene by scene."""
+        if scene not in self._flagged:
+            self._flagged.clear()
+            disputed = Gaussians.concatenate([self.losers[scene], self.rivals[scene]])
+            parts = [_in_grey(disputed, 1.0), _in_grey(self.scenes[scene].gaussians, 0.0)]
+            self._flagged[scene] = Gaussians.concatenate(parts), len(disputed)
+        return self._flagged[scene]
 
     def is_disputed(self, scene: int) -> bool:
         """Whether any picture of a scene may show what is not so, or not show what is."""
@@ -256,13 +267,9 @@ def _in_one_exposure(looks: Looks, exposure: compare.Balance | None) -> Looks:
     return replace(looks, scene=_left(looks.scene, np.ones(len(looks.gaussians), dtype=bool), exposure))
 
 
-def _share_of_pixels(these: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
-    """(H, W) share of each pixel's light that comes from some Gaussians, seen among others."""
-    flag = sh0_of_rgb(np.ones((len(these), 1, 3), np.float32))
-    dark = sh0_of_rgb(np.zeros((len(others), 1, 3), np.float32))
-    together = Gaussians.concatenate([replace(these, sh=flag), replace(others, sh=dark)])
-    out: np.ndarray = render(together, camera, depth=False, dominant_id=False).colour[0, ..., 0]
-    return out
+def _in_grey(gaussians: Gaussians, value: float) -> Gaussians:
+    """All of them in one grey, in [0, 1], from wherever they are seen."""
+    return replace(gaussians, sh=sh0_of_rgb(np.full((len(gaussians), 1, 3), value, np.float32)))
 
 
 def _none(scene: PlacedScene) -> Gaussians:

@@ -7,13 +7,16 @@ namespace nb = nanobind;
 
 namespace gsmap {
 void bind_cells(nb::module_ &);
+void bind_clusters(nb::module_ &);
 void bind_correspondences(nb::module_ &);
 void bind_filters(nb::module_ &);
 void bind_fit(nb::module_ &);
 void bind_landmarks(nb::module_ &);
 void bind_laying(nb::module_ &);
 void bind_merging(nb::module_ &);
+void bind_moves(nb::module_ &);
 void bind_parts(nb::module_ &);
+void bind_pictures(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_sift(nb::module_ &);
 void bind_signatures(nb::module_ &);
@@ -27,13 +30,16 @@ NB_MODULE(_native, m) {
     bind_clique(m);
     nb::set_leak_warnings(false);  // a view kept alive by an autograd graph at exit is no leak
     gsmap::bind_cells(m);
+    gsmap::bind_clusters(m);
     gsmap::bind_correspondences(m);
     gsmap::bind_filters(m);
     gsmap::bind_fit(m);
     gsmap::bind_landmarks(m);
     gsmap::bind_laying(m);
     gsmap::bind_merging(m);
+    gsmap::bind_moves(m);
     gsmap::bind_parts(m);
+    gsmap::bind_pictures(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_sift(m);
     gsmap::bind_signatures(m);

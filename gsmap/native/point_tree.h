@@ -1,4 +1,4 @@
-// A k-d tree of points: their nearest neighbours, the same whatever the order of the search.
+// A k-d tree of points of so many numbers: their nearest neighbours, the same whatever the order of the search.
 #pragma once
 #include <algorithm>
 #include <cstdint>
@@ -13,23 +13,24 @@ struct Neighbour {
     bool operator<(const Neighbour &o) const { return squared < o.squared || (squared == o.squared && row < o.row); }
 };
 
-class PointTree {
+template <int kAxes> class Tree {
   public:
-    // Copies n rows (x, y, z) of finite numbers.
-    PointTree(const double *points, int32_t n) : points_(points, points + 3 * std::size_t(n)), rows_(n) {
+    // Copies n rows of finite numbers.
+    Tree(const double *points, int32_t n) : points_(points, points + kAxes * std::size_t(n)), rows_(n) {
         std::iota(rows_.begin(), rows_.end(), 0);
         if (n) build(0, n);
-        sorted_.resize(3 * std::size_t(n));
-        for (int32_t i = 0; i < n; ++i) std::copy_n(point(rows_[i]), 3, &sorted_[3 * std::size_t(i)]);
+        sorted_.resize(kAxes * std::size_t(n));
+        for (int32_t i = 0; i < n; ++i) std::copy_n(point(rows_[i]), kAxes, &sorted_[kAxes * std::size_t(i)]);
     }
     int32_t size() const { return int32_t(rows_.size()); }
     // Rows, those near each other together.
     const std::vector<int32_t> &order() const { return rows_; }
-    const double *point(int32_t row) const { return &points_[3 * std::size_t(row)]; }
+    const double *point(int32_t row) const { return &points_[kAxes * std::size_t(row)]; }
 
     static double squared(const double *a, const double *b) {
-        const double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2];
-        return x * x + y * y + z * z;
+        double sum = 0;
+        for (int k = 0; k < kAxes; ++k) sum += (a[k] - b[k]) * (a[k] - b[k]);
+        return sum;
     }
 
     struct Any {
@@ -39,7 +40,7 @@ class PointTree {
     // The nearest point closer than the bound that counts, by its row; of equally near ones the first.
     template <class Counts = Any> Neighbour nearest(const double *at, Neighbour bound, const Counts &counts = {}) const {
         if (size()) {
-            double away[3] = {0, 0, 0};
+            double away[kAxes] = {};
             search(0, at, away, 0, bound, [&](Neighbour &best, const Neighbour &found) {
                 if (found < best && counts(found.row)) best = found;
             });
@@ -54,7 +55,7 @@ class PointTree {
             int k, count;
         } best{{bound, -1}, out, k, 0};
         if (size() && k > 0) {
-            double away[3] = {0, 0, 0};
+            double away[kAxes] = {};
             search(0, at, away, 0, best, [&](Best &b, const Neighbour &found) {
                 if (b.count == b.k ? !(found < b.list[b.k - 1]) : !(found.squared < b.squared)) return;
                 if (!counts(found.row)) return;
@@ -79,14 +80,15 @@ class PointTree {
         const int32_t at = int32_t(nodes_.size());
         nodes_.push_back({0, begin, end, 0, 0});
         if (end - begin <= kLeaf) return at;
-        double low[3] = {__builtin_inf(), __builtin_inf(), __builtin_inf()}, high[3] = {-low[0], -low[0], -low[0]};
+        double low[kAxes], high[kAxes];
+        std::fill_n(low, kAxes, __builtin_inf()), std::fill_n(high, kAxes, -__builtin_inf());
         for (int32_t i = begin; i < end; ++i)
-            for (int a = 0; a < 3; ++a) {
+            for (int a = 0; a < kAxes; ++a) {
                 low[a] = std::min(low[a], point(rows_[i])[a]);
                 high[a] = std::max(high[a], point(rows_[i])[a]);
             }
         int axis = 0;
-        for (int a = 1; a < 3; ++a)
+        for (int a = 1; a < kAxes; ++a)
             if (high[a] - low[a] > high[axis] - low[axis]) axis = a;
         const int32_t middle = begin + (end - begin) / 2;
         std::nth_element(rows_.begin() + begin, rows_.begin() + middle, rows_.begin() + end, [&](int32_t i, int32_t j) {
@@ -108,7 +110,7 @@ class PointTree {
         const Node &n = nodes_[node];
         if (!n.right) {
             for (int32_t i = n.begin; i < n.end; ++i) {
-                const Neighbour found{squared(at, &sorted_[3 * std::size_t(i)]), rows_[i]};
+                const Neighbour found{squared(at, &sorted_[kAxes * std::size_t(i)]), rows_[i]};
                 if (found.squared <= best.squared) take(best, found);
             }
             return;
@@ -128,5 +130,7 @@ class PointTree {
     std::vector<int32_t> rows_;
     std::vector<Node> nodes_;
 };
+
+using PointTree = Tree<3>;
 
 }  // namespace gsmap

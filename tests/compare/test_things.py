@@ -5,7 +5,7 @@ import numpy as np
 from gsmap.compare import GONE, SAME, Params
 from gsmap.compare.colours import IDENTITY
 from gsmap.compare.evidence import Tally
-from gsmap.compare.things import Doubts, Side, kin, remnants, rooted, shells, things
+from gsmap.compare.things import Doubts, Side, by_shell, kin, remnants, rooted, shells, things
 
 PARAMS = Params()
 UP = np.array([0.0, 0.0, 1.0])
@@ -19,7 +19,7 @@ def sheet(low, high, z=0.0, spacing=0.04):
 
 def doubts(points, **masks):
     """Nothing changed and all of it seen, but for what is said otherwise."""
-    given = {name: np.zeros(len(points), dtype=bool) for name in ("changed", "sure", "hidden")}
+    given = {name: np.zeros(len(points), dtype=bool) for name in ("changed", "sure", "hidden", "framed")}
     given |= {"judged": np.ones(len(points), dtype=bool), "differs": np.zeros(len(points))}
     given |= {"shell": np.full(len(points), -1)}
     given |= masks
@@ -85,8 +85,9 @@ def test_what_most_about_it_changed_on_its_thing_is_not_left_behind():
 RED, WHITE = (0.7, 0.1, 0.1), (0.9, 0.9, 0.9)
 
 
-def side(points, changed, colour=RED):
-    return Side(points, np.broadcast_to(colour, points.shape), np.zeros(len(points), int), changed)
+def side(points, changed, colour=RED, framed=None):
+    framed = np.zeros(len(points), bool) if framed is None else framed
+    return Side(points, np.broadcast_to(colour, points.shape), np.zeros(len(points), int), changed, framed)
 
 
 def test_a_sofa_that_was_pushed_along_takes_with_it_where_it_still_shows_itself():
@@ -106,9 +107,36 @@ def test_a_sofa_that_was_pushed_along_takes_with_it_where_it_still_shows_itself(
     new = side(points + 0.01 * UP, np.ones(len(points), bool))
     np.testing.assert_array_equal(remnants((side(points, went, colours), new), PARAMS)[0], ~went)
     # Walls are no things, and of nothing nothing is left.
-    wall = Side(points, np.broadcast_to(RED, points.shape), np.full(len(points), -1), went)
+    wall = Side(points, np.broadcast_to(RED, points.shape), np.full(len(points), -1), went, np.zeros_like(went))
     assert not remnants((wall, new), PARAMS)[0].any()
     assert not remnants((side(points, went), side(points[:0], went[:0])), PARAMS)[0].any()
+
+
+def test_the_frame_of_a_door_stays_when_the_shelf_before_it_goes():
+    points = sheet((0, 0), (1.2, 0.4))
+    shelf = points[:, 0] < 0.8
+    frame = points[:, 0] > points[shelf, 0].max() + PARAMS.beyond_m
+    none = side(points + 0.01 * UP, np.zeros(len(points), bool))
+    # Of its colour, and as dimly lit since; yet it lies by a wall, and beyond all that changed.
+    for framed, stays in ((frame, frame), (~frame, np.zeros(len(points), bool))):
+        left = remnants((side(points, shelf, framed=framed), none), PARAMS)[0]
+        np.testing.assert_array_equal(left, ~shelf & ~stays)
+        known = doubts(points, changed=shelf, differs=np.full(len(points), 0.5), framed=framed)
+        np.testing.assert_array_equal(kin(known, PARAMS), ~stays)
+    # What lies by a wall between where a thing stood and where it stands now is the thing's.
+    now = side(points + np.array([0.4, 0, 0.01]), np.ones(len(points), bool))
+    np.testing.assert_array_equal(remnants((side(points, shelf, framed=frame), now), PARAMS)[0], ~shelf)
+
+
+def test_what_lies_by_the_floor_without_being_part_of_it():
+    floor, feet, seat = (
+        sheet((0, 0), (1, 1)),
+        sheet((0.2, 0.2), (0.3, 0.3), z=0.08),
+        sheet((0.2, 0.2), (0.8, 0.8), z=0.4),
+    )
+    points = np.concatenate([floor, feet, seat])
+    shell = np.where(points[:, 2] == 0, 0, -1)
+    np.testing.assert_array_equal(by_shell(points, shell, PARAMS), points[:, 2] == 0.08)
 
 
 def test_what_can_be_looked_through_is_not_gone_where_the_other_shows_a_surface():
@@ -153,3 +181,14 @@ def test_the_floor_is_shell_and_what_stands_on_it_is_not():
     assert (b == a[0]).all()
     none = shells([(older[:0], shows[:0]), (newer[:0], shows[:0])])
     assert [len(one) for one in none] == [0, 0]
+
+
+def test_a_wall_is_seen_from_both_sides():
+    floor, ceiling = sheet((0, 0), (4, 4), spacing=0.05), sheet((0, 0), (4, 4), z=2.5, spacing=0.05)
+    face = sheet((0, 0), (4, 2.5), spacing=0.05)[:, [2, 0, 1]]  # at x = 0, all the way up
+    low = face[face[:, 2] < 2.2]
+    for through, wall in ((0.1, True), (0.4, False)):
+        other = low + np.array([through, 0, 0])
+        points = np.concatenate([floor[floor[:, 0] > 0.6], ceiling, face, other])
+        found = shells([(points, np.ones(len(points), bool))])[0][-len(other) :]
+        assert ((found >= 0).mean() > 0.9) == wall
