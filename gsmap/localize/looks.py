@@ -12,10 +12,8 @@ from gsmap.localize import features
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.render import render
 
-_EVERY, _MOST = (
-    12,
-    0.9,
-)  # of the pixels of a render every so many are asked whether they moved, and so large a share of them
+_EVERY = 12  # of a render's rows and columns every so many are asked whether they moved ...
+_MOST = 0.9  # ... and so large a share of them counts
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601
 
 
