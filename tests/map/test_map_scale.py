@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 from scale_maps import TRIED, Filled, filled, tiny_pattern
@@ -134,8 +135,8 @@ def test_who_is_stopped_keeps_the_pairs_that_are_done(alone: Filled, monkeypatch
 
     before = alone.map.store.registrations.newest()
     pairs = [(alone.order[0], other) for other in alone.order[1:8]]
-    with alone.standing_in(lookup=True):
-        monkeypatch.setattr(register, "run_jobs", stops)
+    # Undone in the order in which they were made: the other way round one would stay.
+    with alone.standing_in(lookup=True), mock.patch.object(register, "run_jobs", stops):
         with pytest.raises(KeyboardInterrupt) as stopped:
             alone.map.register(pairs)
     assert "3 of 7 pairs are registered and kept" in stopped.value.__notes__
