@@ -136,9 +136,9 @@ def test_who_is_stopped_keeps_the_pairs_that_are_done(alone: Filled, monkeypatch
     before = alone.map.store.registrations.newest()
     pairs = [(alone.order[0], other) for other in alone.order[1:8]]
     # Undone in the order in which they were made: the other way round one would stay.
-    with alone.standing_in(lookup=True), mock.patch.object(register, "run_jobs", stops):
-        with pytest.raises(KeyboardInterrupt) as stopped:
-            alone.map.register(pairs)
+    stopping = mock.patch.object(register, "run_jobs", stops)
+    with alone.standing_in(lookup=True), stopping, pytest.raises(KeyboardInterrupt) as stopped:
+        alone.map.register(pairs)
     assert "3 of 7 pairs are registered and kept" in stopped.value.__notes__
     assert alone.map.store.registrations.newest() == before + done
     assert alone.map.store.leases.list() == []
