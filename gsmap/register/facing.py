@@ -28,6 +28,7 @@ class Params:
             Tukey's biweight.
         clear: a side is known where at least this share of what cameras say is not contradicted by the rest.
         fill_rounds: cells that no camera sees take the side of the neighbours that lie level with them, so many times.
+        min_alpha: where a camera's render is fainter, it shows nothing.
         num_neighbours: neighbours asked ...
         level: ... whose normal is this near to the cell's own (cosine) ...
         level_m: ... and which lie no farther from the cell's plane than this.
@@ -37,6 +38,7 @@ class Params:
     reach_m: float = 0.08
     clear: float = 0.5
     fill_rounds: int = 2
+    min_alpha: float = 0.5
     num_neighbours: int = 10
     level: float = 0.8
     level_m: float = 0.03
@@ -71,11 +73,12 @@ def _seen(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(M,) how much the cameras saw of each cell's front (where its normal points) and of its back."""
     front, back = np.zeros((2, len(points)))
-    for row in views.views_of_sides(points / unit_m, normals, params.num_cameras):
+    own = points / unit_m
+    for row in views.views_of_sides(own, normals, params.num_cameras):
         camera = views.cameras[[row]]
         shown = views.render(row)
-        depth = np.where(shown.alpha[0] > 0.5, shown.depth[0], np.inf) * unit_m
-        pixels, z = project(points / unit_m, camera.T_camera_frame[0], camera.intrinsics_px[0])
+        depth = np.where(shown.alpha[0] > params.min_alpha, shown.depth[0], np.inf) * unit_m
+        pixels, z = project(own, camera.T_camera_frame[0], camera.intrinsics_px[0])
         at = np.flatnonzero(in_image(pixels, z, camera.sizes_px[0]))
         column, line = np.floor(pixels[at]).astype(np.int64).T
         off = (z[at] * unit_m - depth[line, column]) / params.reach_m
