@@ -85,14 +85,8 @@ class Tally:
             others: (M, 3) of the other capture's Gaussians that are part of a surface.
             views: how many the other capture has.
         """
-        from gsmap.compare.things import (
-            Doubts,
-            by_shell,
-            clear,
-            kin,
-            rooted,
-            things,
-        )  # with scipy: naming a recipe has none
+        # With scipy: naming a recipe has none.
+        from gsmap.compare.things import Doubts, by_shell, clear, kin, rooted, things
 
         often = np.maximum(self.colour_seen, 1).astype(np.float32)
         chroma, lightness = self.chroma / often[:, None], self.lightness / often

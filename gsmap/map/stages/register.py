@@ -132,12 +132,10 @@ class _Known:
 
     def _read(self) -> dict[Pair, tuple[Standing, bool]]:
         """What stands of every pair, and whether it is what this recipe makes, or what a person told."""
-        found, name, graphs = {}, self._work.recipe.digest_of, self._graphs
-        for one in self._work.store.registrations.tried():
-            a, b = one.target, one.source
-            current = not one.key or (a in graphs and b in graphs and one.key == name(graphs[a], graphs[b]))
-            found[(a, b) if a < b else (b, a)] = (one, current or one.is_told or one.key in self._keys(one))
-        return found
+        return {
+            directed(one.target, one.source): (one, one.is_told or one.key in self._keys(one))
+            for one in self._work.store.registrations.tried()
+        }
 
     def has(self, a: str, b: str) -> bool:
         """Whether it has registered a pair."""
