@@ -12,7 +12,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -95,3 +95,14 @@ def shared_data() -> Path:
     if root is None:
         pytest.skip("needs real captures: set GSMAP_SHARED_DATA to a folder holding house/, kitchen_splats/, formats/")
     return root
+
+
+@pytest.fixture(params=["baseline", "avx2", "avx512"])
+def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Every set of kernels that this machine can run: a map may be opened by another one, which runs fewer."""
+    from gsmap import _native
+
+    if _native.use_instruction_set(request.param) != request.param:
+        pytest.skip(f"this machine cannot run {request.param}")
+    yield request.param
+    _native.use_instruction_set("best")

@@ -81,17 +81,14 @@ def test_matches_of_a_place_that_was_found_are_not_looked_into_again(judged):
     assert not localizing._settles_at(same, replace(found, probability=0.5), picture, PARAMS)
 
 
-@pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
-def test_signatures_that_differ_in_few_signs_are_found_in_order(name):
-    if _native.use_instruction_set(name) != name:
-        pytest.skip(f"no {name} here")
+@pytest.mark.usefixtures("instruction_set")
+def test_signatures_that_differ_in_few_signs_are_found_in_order():
     rng = np.random.default_rng(0)
     theirs = rng.integers(0, 2**63, 300, dtype=np.uint64)
     mine = theirs[rng.integers(0, 300, 40)] ^ rng.integers(0, 2**9, 40, dtype=np.uint64)
     begin = rng.integers(0, 50, 40)
     end = begin + rng.integers(100, 250, 40)
     told = np.array(_native.near_signatures(mine, begin, end, theirs, 6))
-    _native.use_instruction_set("best")
     want = [
         (k, i, differ)
         for k in range(40)

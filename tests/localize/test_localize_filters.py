@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from gsmap import _native
 from gsmap.geometry.rotations import exp_so3
 from gsmap.localize import aligning, filters, resection
-
-
-@pytest.fixture(params=["baseline", "avx2", "avx512"])
-def instruction_set(request):
-    if _native.use_instruction_set(request.param) != request.param:
-        pytest.skip(f"no {request.param} here")
-    yield request.param
-    _native.use_instruction_set("best")
 
 
 @pytest.mark.parametrize("shape", [(37, 53), (9, 70, 3), (1, 5), (40, 2, 2)])

@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from gsmap import _native
 from gsmap.localize.extractors import sift
 
 
@@ -37,14 +36,11 @@ def _reference(grey: np.ndarray, params: sift.Params) -> tuple[np.ndarray, np.nd
         return pycolmap.Sift(options, pycolmap.Device.cpu).extract(grey)
 
 
-@pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("params", [sift.Params(), sift.Params(max_features=150), sift.Params(doubled=False)])
-def test_features_are_those_of_colmap(params, name):
-    if _native.use_instruction_set(name) != name:
-        pytest.skip(f"no {name} here")
+def test_features_are_those_of_colmap(params):
     grey = _picture()
     found = sift.make({}, params).extract(np.repeat(grey[..., None], 3, axis=2))
-    _native.use_instruction_set("best")
     want, descriptors = _reference(grey, params)
     assert len(want) > 50
     assert abs(len(found) - len(want)) <= 0.01 * len(want) + 1
