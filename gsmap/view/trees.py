@@ -255,12 +255,12 @@ class _Builder:
     def _write(self, content: Gaussians, name: str) -> tuple[str, np.ndarray]:
         """Write the file of a tile; its uri, and the box (2, 3) of what it draws."""
         staged = self.folder / CONTENT_FOLDER / f"{name}.glb"
-        box = tiles3d.write_content(staged, content)
+        tiles3d.write_content(staged, content)
         with open(staged, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         uri = f"{CONTENT_FOLDER}/{name}-{digest[:16]}.glb"
         staged.rename(self.folder / uri)
-        return uri, box
+        return uri, tiles3d.box_of(content)
 
 
 def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
