@@ -15,6 +15,16 @@ using Values = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device:
 
 constexpr double kMaxOpacity = 0.9999;  // as in gsmap/geometry/voxels.py
 
+constexpr double kPi = 3.141592653589793;
+
+// Mean area of the shadows of an ellipsoid, from the logarithms of its semi-axes: a quarter of its surface (Cauchy), by
+// Thomsen's formula.
+inline double shadow(double a, double b, double c) {
+    constexpr double kThomsen = 1.6075;
+    a = std::exp(kThomsen * a), b = std::exp(kThomsen * b), c = std::exp(kThomsen * c);
+    return kPi * std::pow((a * b + a * c + b * c) / 3, 1 / kThomsen);
+}
+
 // Gaussians as they were given.
 struct Given {
     const float *means, *quats, *log_scales, *logits;
@@ -42,6 +52,9 @@ struct Given {
                 for (int k = 0; k < 3; ++k) s[at] += R[3 * row + k] * R[3 * column + k];
             }
         return largest;
+    }
+    double shadow(int64_t i) const {
+        return gsmap::shadow(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]);
     }
     double opacity(int64_t i) const { return 1 / (1 + std::exp(-double(logits[i]))); }
 };

@@ -20,8 +20,6 @@ namespace {
 using Labels = nb::ndarray<const int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Coefficients = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
-constexpr double kPi = 3.141592653589793;
-
 // Sums over the members of groups, each weighted by its share of the group's mass.
 struct Moments {
     std::vector<double> masses, means, covariances, sh;
@@ -44,7 +42,7 @@ struct Moments {
                 }
                 mass.clear();
                 for (int64_t r = begin[g]; r < begin[g + 1]; ++r) {
-                    mass.push_back(optical_depth(given.opacity(rows[r])) * shadow(&given.log_scales[3 * rows[r]]) + 1e-30);
+                    mass.push_back(optical_depth(given.opacity(rows[r])) * given.shadow(rows[r]) + 1e-30);
                     masses[g] += mass.back();
                 }
                 heaviest[g] = rows[begin[g] + (std::max_element(mass.begin(), mass.end()) - mass.begin())];
@@ -66,14 +64,6 @@ struct Moments {
                 for (int k = 0; k < 9; ++k) covariances[9 * g + k] = sum[kOf[k]];
             }
         });
-    }
-
-    // Mean area of an ellipsoid's shadows: a quarter of its surface (Cauchy), by Thomsen's formula.
-    static double shadow(const float *log_scales) {
-        constexpr double kThomsen = 1.6075;
-        double power[3];
-        for (int k = 0; k < 3; ++k) power[k] = std::exp(kThomsen * log_scales[k]);
-        return kPi * std::pow((power[0] * power[1] + power[0] * power[2] + power[1] * power[2]) / 3, 1 / kThomsen);
     }
 };
 

@@ -23,7 +23,6 @@ using Covariances = nb::ndarray<const double, nb::shape<-1, 6>, nb::c_contig, nb
 using Pairs = nb::ndarray<const int32_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 
 constexpr double kColourOfBase = 0.28209479177387814;  // spherical harmonic of degree 0
-constexpr double kPi = 3.141592653589793;
 
 // A number for a cost and its pair, in the order of both: floats that are not negative sort as their bits do.
 uint64_t key_of(float cost, uint32_t pair) {
@@ -39,14 +38,18 @@ double area_of(const double *s) {
 double determinant(const double *s) {
     return s[0] * (s[3] * s[5] - s[4] * s[4]) + s[1] * (s[2] * s[4] - s[1] * s[5]) + s[2] * (s[1] * s[4] - s[2] * s[3]);
 }
-// The largest eigenvalue of a covariance.
-double largest(const double *s) {
+// The eigenvalues of a covariance, the largest first.
+void eigenvalues(const double *s, double *out) {
     const double off = s[1] * s[1] + s[2] * s[2] + s[4] * s[4], mean = (s[0] + s[3] + s[5]) / 3;
     const double a = s[0] - mean, b = s[3] - mean, c = s[5] - mean;
     const double spread = std::sqrt((a * a + b * b + c * c + 2 * off) / 6);
-    if (!(spread > 0)) return mean;
+    std::fill_n(out, 3, mean);
+    if (!(spread > 0)) return;
     const double n[6] = {a / spread, s[1] / spread, s[2] / spread, b / spread, s[4] / spread, c / spread};
-    return mean + 2 * spread * std::cos(std::acos(std::clamp(determinant(n) / 2, -1.0, 1.0)) / 3);
+    const double angle = std::acos(std::clamp(determinant(n) / 2, -1.0, 1.0)) / 3;
+    out[0] = mean + 2 * spread * std::cos(angle);
+    out[2] = mean + 2 * spread * std::cos(angle + 2 * kPi / 3);
+    out[1] = 3 * mean - out[0] - out[2];
 }
 
 // Strength and root of a blob that is drawn with this opacity, blurred by a variance.
@@ -172,8 +175,12 @@ std::vector<int32_t> one_round(Left &left, const double *centre, const Rules &ru
         int32_t lowest = left.lowest[i];
         if (with[i] >= 0) {
             merge(blob, left.blobs[with[i]]);
-            opacity = std::min(-std::expm1(-blob.mass / std::max(area_of(blob.covariance), 1e-300)), kMaxOpacity);
-            size = float(largest(blob.covariance));
+            double variances[3];
+            eigenvalues(blob.covariance, variances);
+            size = float(variances[0]);
+            for (double &variance : variances) variance = std::log(std::max(variance, 1e-20)) / 2;
+            const double area = shadow(variances[0], variances[1], variances[2]);
+            opacity = std::min(-std::expm1(-blob.mass / area), kMaxOpacity);
             lowest = std::min(lowest, left.lowest[with[i]]);
             into[with[i]] = kept;
         }
@@ -216,7 +223,7 @@ std::vector<int64_t> labels_of(const Given &given, const float *base, const doub
             blob.mean[k] = given.means[3 * int64_t(row) + k];
             blob.colour[k] = 0.5 + kColourOfBase * base[3 * int64_t(row) + k];
         }
-        blob.mass = optical_depth(left.opacities[i]) * area_of(blob.covariance) + 1e-30;
+        blob.mass = optical_depth(left.opacities[i]) * given.shadow(row) + 1e-30;
         blob.weight = weights ? weights[row] : 1.0;
         at[row] = int32_t(i);
     }

@@ -3,7 +3,7 @@
 A scene lies in the store along a space-filling curve, so that every cell of an octree is a range of its rows. The tree
 is made in one pass over them, from the leaves up, each level by merging what shares a cell of a grid, moments kept
 (`gsmap.geometry.voxels`): a second or two of CPU a million, where the pairwise merging of an export
-(`gsmap.geometry.decimate`) takes twenty. Memory is bounded by eight tiles a level.
+(`gsmap.geometry.decimate`) takes five. Memory is bounded by eight tiles a level.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def plainly_merged(g: Gaussians, count: int) -> np.ndarray:
 
     means, S, opacities = g.means.astype(np.float64), covariances(g), g.opacities.astype(np.float64)
     colours = np.c_[rgb_of_sh0(g.sh[:, 0]).astype(np.float64), np.full(len(g), rules._COVER)]
-    masses = optical_depths(g) * lights(S, opacities, 0)[2]
+    masses = optical_depths(g) * projected_areas(g.scales)
     members = [[i] for i in range(len(g))]
     while len(means) > count:
         apart = ((means[:, None] - means) ** 2).sum(2)
@@ -86,6 +86,8 @@ def plainly_merged(g: Gaussians, count: int) -> np.ndarray:
         M = w * S[i] + (1 - w) * S[j] + w * (1 - w) * d[:, :, None] * d[:, None]
         total = masses[i] + masses[j]
         opacity = np.minimum(1 - np.exp(-total / lights(M, total, 0)[2]), 0.9999)
+        shadows = projected_areas(np.sqrt(np.linalg.eigvalsh(M)))
+        drawn = np.minimum(1 - np.exp(-total / shadows), 0.9999)
         variance = blur**2 * np.eye(3)
         light, det, _ = lights(S, opacities, blur)
         merged_light, merged_det, _ = lights(M, opacity, blur)
@@ -117,7 +119,7 @@ def plainly_merged(g: Gaussians, count: int) -> np.ndarray:
         for p in chosen:
             a, b = pairs[p]
             means[a] = share[p] * means[a] + (1 - share[p]) * means[b]
-            S[a], masses[a], opacities[a], colours[a] = M[p], total[p], opacity[p], cz[p]
+            S[a], masses[a], opacities[a], colours[a] = M[p], total[p], drawn[p], cz[p]
             members[a] += members[b]
         kept = np.setdiff1d(np.arange(len(means)), pairs[chosen, 1])
         means, S, masses, opacities, colours = (v[kept] for v in (means, S, masses, opacities, colours))
@@ -258,7 +260,7 @@ def test_the_kernel_refuses_what_does_not_fit_together():
         ([0, 0, 9, 1], "without members"),
     ):
         with pytest.raises(ValueError, match=said):
-            group_moments(*arrays, g.sh[:, 0], np.array(wrong))
+            group_moments(*arrays, g.sh[:, 0], np.array(wrong, np.int64))
 
 
 def test_the_cost_is_the_energy_of_the_difference():

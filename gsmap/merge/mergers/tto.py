@@ -28,7 +28,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 6
+VERSION = 5
 STEPS: str | None = "steps"
 RENDERS = True
 
