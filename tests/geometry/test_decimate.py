@@ -274,7 +274,9 @@ def test_the_cost_is_the_energy_of_the_difference():
         opacity = 1e-3  # thin: transmittances add
         mass = np.full(2, -np.log1p(-opacity) * area)
         colours = np.array([[1.0, 1, 1], [colour, colour, colour]])
-        return float(pair_costs(means, round_, mass, np.full(2, opacity), colours, np.int32([[0, 1]]), 0.0, 0.0)[0])
+        return float(
+            pair_costs(means, round_, mass, np.full(2, opacity), colours, np.array([[0, 1]], np.int32), 0.0, 0.0)[0]
+        )
 
     scale = 1e-6 * np.pi * 3
     assert cost(0, 1) < 1e-3 * scale
