@@ -1,6 +1,7 @@
 """A made city of many million Gaussians in one file: ingest, 3D Tiles, and one more capture; CPU seconds and memory.
 
-    python tools/bench_city.py [--millions 100] [--sh-degree 0] [--merge union] [--tile-size 50] [--folder DIR]
+    python tools/bench_city.py [--millions 100] [--sh-degree 0] [--merge union] [--tile-size 50] [--views N]
+        [--folder DIR]
 
 Every step runs in a process of its own, so that its peak memory is its own. The city is written as an INRIA .ply of one
 scene (`gsmap_synthetic.city`), which is not counted. The capture that comes later is one block of 20 m, made anew.
@@ -35,6 +36,7 @@ def main() -> None:
     parser.add_argument("--sh-degree", type=int, default=0)
     parser.add_argument("--merge", default="union")
     parser.add_argument("--tile-size", type=float, default=50.0, help="metres")
+    parser.add_argument("--views", type=int, help="that a level is fitted to; 0: merged only; by default as exports do")
     parser.add_argument("--folder", type=Path, help="where to work, and to stay; a temporary folder else")
     parser.add_argument("--step", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -82,6 +84,8 @@ def run_step(arguments: argparse.Namespace) -> dict:
         what = f"{len(own)} Gaussians"
     else:
         with gsmap.open(folder / "city.gsmap") as m:
+            if arguments.views is not None:
+                m.with_settings({"export.levels.views": arguments.views})
             report = m.export(
                 folder / "tiles", format="3dtiles", merge=arguments.merge, tile_size_m=arguments.tile_size
             )

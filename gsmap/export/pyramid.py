@@ -70,7 +70,7 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What a folder's present tree says of a level; see `Drawn`. No boxes: the file is to be read for them."""
+    """What a folder's present tree says of a level or a tile; see `Drawn`. Without boxes the file is read for them."""
 
     error_m: float
     extras: Mapping[str, float]
@@ -91,8 +91,12 @@ class Layout(Protocol):
         """What decides how a level's file is written."""
         ...
 
-    def tile(self, folder: Path, tile: Tile) -> tuple[str, int, np.ndarray]:
-        """The uri of a tile's file in a tree, how many Gaussians it holds, and the box (2, 3) of what they draw."""
+    def tile(self, folder: Path, tile: Tile, known: Mapping[str, Known]) -> tuple[str, int, np.ndarray]:
+        """The uri of a tile's file in a tree, how many Gaussians it holds, and the box (2, 3) of what they draw.
+
+        Args:
+            known: what the folder's present tree says, by uri, which may be of an earlier content of the file.
+        """
         ...
 
     def level_uri(self, name: str) -> str:
@@ -108,7 +112,7 @@ class Layout(Protocol):
         ...
 
     def known(self, folder: Path) -> dict[str, Known]:
-        """The levels that the folder's present tree names, by uri; none where it is not ours."""
+        """The levels, and tiles, that the folder's present tree names, by uri; none where it is not ours."""
         ...
 
 
@@ -191,7 +195,7 @@ class _Maker:
     Args:
         folder: of the component.
         layout: of its files.
-        known: levels that the folder's present tree names.
+        known: levels and tiles that the folder's present tree names.
         cameras, levels: see `gsmap.export.levels`.
     """
 
@@ -202,7 +206,7 @@ class _Maker:
     levels: Params
 
     def tile(self, tile: Tile) -> Drawn:
-        uri, count, box = self.layout.tile(self.folder, tile)
+        uri, count, box = self.layout.tile(self.folder, tile, self.known)
         return Drawn(uri, tile.sha256, np.asarray(tile.bounds, np.float64), (count,), box[None])
 
     def parent(self, children: list[Drawn], height: int) -> Drawn:

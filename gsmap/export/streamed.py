@@ -62,7 +62,7 @@ class StreamedSog:
     file_name: str = FILE_NAME
     key: str = f"sog {sog.VERSION}"
 
-    def tile(self, folder: Path, tile: Tile) -> tuple[str, int, np.ndarray]:
+    def tile(self, folder: Path, tile: Tile, known: Mapping[str, Known]) -> tuple[str, int, np.ndarray]:
         bundle = folder / Path(tile.path).name
         uri = self.level_uri(tile.sha256[:24])
         if not is_file(folder / uri):

@@ -79,8 +79,16 @@ class Tiles3D:
     def key(self) -> str:
         return str(self.compressed)
 
-    def tile(self, folder: Path, tile: Tile) -> tuple[str, int, np.ndarray]:
+    def tile(self, folder: Path, tile: Tile, known: Mapping[str, Known]) -> tuple[str, int, np.ndarray]:
         uri = Path(tile.path).name
+        there = known.get(uri)
+        # What was written before the tree is what the tree was written of.
+        if (
+            there is not None
+            and there.boxes is not None
+            and _written_ns(folder / uri) < _written_ns(folder / FILE_NAME)
+        ):
+            return uri, tile.num_gaussians, there.boxes[0]
         found = self.read(folder / uri)
         return uri, len(found), tiles3d.box_of(found)
 
@@ -114,6 +122,10 @@ class Tiles3D:
         except (OSError, *MALFORMED, CorruptError):
             return {}  # none yet, or not ours: everything is made again
         return found
+
+
+def _written_ns(path: Path) -> int:
+    return path.stat().st_mtime_ns
 
 
 def _node(drawn: Drawn) -> TileNode:

@@ -136,7 +136,8 @@ def pack(
     streams = _encode(header, g, sh_bits)
     fields = (_MAGIC, version, len(g), header.degree, header.fractional_bits, header.flags)
     if version == 3:
-        squeeze = zlib.compressobj(wbits=31, level=3)
+        # Runs only: of quantised numbers longer matches are chance, and looking for them costs three times as much.
+        squeeze = zlib.compressobj(wbits=31, strategy=zlib.Z_RLE)
         parts = [squeeze.compress(struct.pack("<4sIIBBBB", *fields, 0))]
         parts += [squeeze.compress(stream.data) for stream in streams]
         return b"".join([*parts, squeeze.flush()])

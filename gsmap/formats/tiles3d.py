@@ -110,12 +110,11 @@ def write(
     write_tileset(path, root, transform=transform, compressed=compressed)
 
 
-def write_content(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: bool = True) -> np.ndarray:
-    """Write one tile's GLB; returns the box (2, 3) of its Gaussians, widened by three standard deviations."""
+def write_content(path: str | os.PathLike[str], gaussians: Gaussians, *, compressed: bool = True) -> None:
+    """Write one tile's GLB."""
     require_writable(path, gaussians)
     writer = glb.write_packed if compressed else glb.write_world
     writer(path, gaussians, np.linalg.inv(_Y_UP_TO_Z_UP))
-    return box_of(gaussians)
 
 
 def read_content(path: str | os.PathLike[str]) -> Gaussians:

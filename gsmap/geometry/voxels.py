@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap._native import group_moments
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
@@ -83,42 +84,27 @@ def merge_groups(gaussians: Gaussians, labels: np.ndarray) -> tuple[Gaussians, n
     Args:
         labels: (N,) integers in [0, M), each used at least once; the result is in their order.
     """
-    labels = np.asarray(labels)
+    labels = np.ascontiguousarray(labels, dtype=np.int64)
     if len(labels) != len(gaussians):
         raise InputError(f"{len(labels)} labels for {len(gaussians)} Gaussians")
     if len(labels) == 0:
         return gaussians, np.zeros(0, dtype=np.int64)
-    counts = np.bincount(labels)
-    mass = optical_depths(gaussians) * projected_areas(gaussians.scales) + 1e-30
-    # Sorted by group, heaviest last, ties by row: the last of each group is its heaviest.
-    order = np.lexsort((np.arange(len(labels))[::-1], mass, labels))
-    heaviest = order[np.cumsum(counts) - 1]
+    sh = gaussians.sh.reshape(len(gaussians), -1)
+    counts, heaviest, total, means, covariance, averaged = group_moments(
+        gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, sh, labels
+    )
     merged = gaussians[heaviest]
     crowded = np.flatnonzero(counts > 1)
     if len(crowded) == 0:
         return merged, heaviest
-
-    rows = order[np.repeat(counts > 1, counts)]
-    starts = np.concatenate([[0], np.cumsum(counts[crowded])[:-1]])
-    group = np.repeat(np.arange(len(crowded)), counts[crowded])
-    total = np.add.reduceat(mass[rows], starts)
-    weight = mass[rows] / total[group]
-
-    def average(values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(values * weight.reshape(-1, *[1] * (values.ndim - 1)), starts, axis=0)
-
-    means = average(gaussians.means[rows].astype(np.float64))
-    spread = gaussians.means[rows] - means[group]
-    covariance = average(covariances(gaussians[rows]) + spread[:, :, None] * spread[:, None, :])
-    quats, scales = _principal_axes(covariance)
-    opacity = -np.expm1(-total / projected_areas(scales))
+    quats, scales = _principal_axes(covariance[crowded])
+    opacity = -np.expm1(-total[crowded] / projected_areas(scales))
     opacity = np.clip(opacity, 1e-6, _MAX_OPACITY)
-
-    merged.means[crowded] = means
+    merged.means[crowded] = means[crowded]
     merged.quats[crowded] = quats
     merged.log_scales[crowded] = np.log(scales)
     merged.logit_opacities[crowded] = np.log(opacity) - np.log1p(-opacity)
-    merged.sh[crowded] = average(gaussians.sh[rows].astype(np.float64))
+    merged.sh[crowded] = averaged[crowded].reshape(len(crowded), -1, 3)
     return merged, heaviest
 
 

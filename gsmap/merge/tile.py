@@ -120,7 +120,8 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
     if rows is not None:
         around_m = reading.looking_m + reading.reach_m + float((bounds[1] - bounds[0]).max())
         sights = partial(_sights, scene, around_m, rows, keys_of(read.means)[inner])
-    return PlacedScene(gaussians[inner], cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
+    inner_gaussians = gaussians if inner.all() else gaussians[inner]
+    return PlacedScene(inner_gaussians, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
 
 
 def _sights(

@@ -11,6 +11,7 @@ void bind_clusters(nb::module_ &);
 void bind_correspondences(nb::module_ &);
 void bind_filters(nb::module_ &);
 void bind_fit(nb::module_ &);
+void bind_groups(nb::module_ &);
 void bind_landmarks(nb::module_ &);
 void bind_laying(nb::module_ &);
 void bind_merging(nb::module_ &);
@@ -34,6 +35,7 @@ NB_MODULE(_native, m) {
     gsmap::bind_correspondences(m);
     gsmap::bind_filters(m);
     gsmap::bind_fit(m);
+    gsmap::bind_groups(m);
     gsmap::bind_landmarks(m);
     gsmap::bind_laying(m);
     gsmap::bind_merging(m);

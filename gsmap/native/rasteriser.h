@@ -4,6 +4,7 @@
 #include <cstdint>
 
 #include "correspondences.h"
+#include "merging.h"
 
 namespace gsmap {
 
@@ -127,6 +128,11 @@ struct Kernels {
     int (*peaks)(const float *const *rows, float bar, int from, int to, int32_t *found);
     void (*polar)(const float *dx, const float *dy, int count, float *length, float *angle);
     int64_t (*near)(uint64_t mine, const uint64_t *theirs, int64_t count, int most, int32_t *which, uint8_t *differ);
+    // What it costs to draw one in place of each pair, blurred by a variance.
+    void (*pair_costs)(const Blob *, Pair *, int64_t count, double blur, double cover);
+    // The nearest of the points of a leaf: those of another one are looked at, and in the end only the k nearest left.
+    float (*find_nearest)(const Leaf &of, const Leaf &among, int k, Search &);
+    float (*settle_nearest)(const Leaf &of, int k, Search &);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

@@ -300,7 +300,8 @@ class Scenes:
         a, b, c = out.log_scales.T
         reach = _SIGMAS * np.exp(np.maximum(np.maximum(a, b), c))
         x, y, z = ((p >= low[k] - reach) & (p <= high[k] + reach) for k, p in enumerate(out.means.T))
-        return out[x & y & z]
+        near = x & y & z
+        return out if near.all() else out[near]
 
     def source(self, ref: str) -> GaussianSource:
         """A scene's Gaussians (Morton order), read a few chunks at a time.

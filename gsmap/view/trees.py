@@ -3,7 +3,7 @@
 A scene lies in the store along a space-filling curve, so that every cell of an octree is a range of its rows. The tree
 is made in one pass over them, from the leaves up, each level by merging what shares a cell of a grid, moments kept
 (`gsmap.geometry.voxels`): a second or two of CPU a million, where the pairwise merging of an export
-(`gsmap.geometry.decimate`) takes twenty. Memory is bounded by eight tiles a level.
+(`gsmap.geometry.decimate`) takes five. Memory is bounded by eight tiles a level.
 """
 
 from __future__ import annotations
@@ -255,12 +255,12 @@ class _Builder:
     def _write(self, content: Gaussians, name: str) -> tuple[str, np.ndarray]:
         """Write the file of a tile; its uri, and the box (2, 3) of what it draws."""
         staged = self.folder / CONTENT_FOLDER / f"{name}.glb"
-        box = tiles3d.write_content(staged, content)
+        tiles3d.write_content(staged, content)
         with open(staged, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         uri = f"{CONTENT_FOLDER}/{name}-{digest[:16]}.glb"
         staged.rename(self.folder / uri)
-        return uri, box
+        return uri, tiles3d.box_of(content)
 
 
 def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:

@@ -169,3 +169,45 @@ def test_a_tileset_says_how_its_levels_look_and_keeps_them(tmp_path, monkeypatch
     write_tilesets(tmp_path, tiles, 1.0, cameras=lambda component: None, levels=replace(QUICK, steps=61))
     assert len(made) == 2
     assert "extras" not in json.loads(file.read_text())["root"]
+
+
+def test_a_tile_that_did_not_change_is_not_read_again_to_tell_its_box(tmp_path, monkeypatch):
+    from gsmap.export.tileset import Tiles3D, write_tilesets
+    from gsmap.formats import tiles3d
+    from gsmap.types import Sim3, Tile
+
+    g = picture_wall(400)
+    (tmp_path / "component_0").mkdir()
+    (tmp_path / "tiles.json").write_text("{}")
+    tiles = []
+    for i in range(8):
+        path = f"component_0/{i}.glb"
+        tiles3d.write_content(tmp_path / path, g[i::8])
+        bounds = np.array([[i, 0, 0], [i + 1, 1, 1]], float)
+        tiles.append(Tile(f"k{i}", 0, bounds, {"0" * 32: Sim3.identity()}, 50, {}, False, path, f"digest {i}", ()))
+    read = []
+    whole = Tiles3D.read
+    monkeypatch.setattr(Tiles3D, "read", lambda self, path: read.append(path.name) or whole(self, path))
+
+    def boxes() -> dict[str, np.ndarray]:
+        """Of the tiles, by name, in a tree written over them."""
+        (file,) = write_tilesets(tmp_path, tiles, 1.0, levels=replace(QUICK, views=0))
+        todo, found = [json.loads(file.read_text())["root"]], {}
+        while todo:
+            node = todo.pop()
+            todo += node.get("children", [])
+            found[node["content"]["uri"]] = np.array(node["boundingVolume"]["box"])
+        return {name: box for name, box in found.items() if "/" not in name}
+
+    first = boxes()
+    assert set(first) == {f"{i}.glb" for i in range(8)} <= set(read)
+    moved = replace(g[7::8], means=g[7::8].means + np.float32(2))
+    tiles3d.write_content(tmp_path / tiles[7].path, moved)
+    tiles[7] = replace(tiles[7], sha256="another")
+    read.clear()
+    second = boxes()
+    # It, its neighbour, and the levels above: of three.
+    assert {name for name in read if len(name) < 8} == {"6.glb", "7.glb"}
+    np.testing.assert_allclose(second["7.glb"][:3], first["7.glb"][:3] + 2, atol=1e-3)
+    for i in range(7):
+        np.testing.assert_allclose(second[f"{i}.glb"], first[f"{i}.glb"], atol=1e-9)

@@ -178,10 +178,9 @@ def test_the_root_stands_upright_or_where_it_is_put(tmp_path):
 def test_tiles_written_one_by_one_with_transforms_and_both_refinements(tmp_path):
     """The way of a large map; and a foreign tileset with placed tiles, several contents and ADD."""
     near, far = random_gaussians(30, degree=1), random_gaussians(20, degree=0, seed=1)
-    boxes = [
+    for name, g in (("near.glb", near), ("far.glb", far)):
         tiles3d.write_content(tmp_path / name, g, compressed=False)
-        for name, g in (("near.glb", near), ("far.glb", far))
-    ]
+    boxes = [tiles3d.box_of(g) for g in (near, far)]
     box = np.stack([np.minimum(*[b[0] for b in boxes]), np.maximum(*[b[1] for b in boxes])])
     leaves = (TileNode(boxes[0], 0.0, "near.glb"), TileNode(boxes[1], 0.0, "far.glb"))
     tiles3d.write_tileset(tmp_path / "tileset.json", TileNode(box, 1.0, None, leaves))
