@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
@@ -14,6 +14,7 @@ from sqlalchemy import (
     Connection,
     LargeBinary,
     Row,
+    Select,
     Text,
     case,
     exists,
@@ -81,8 +82,6 @@ class Standing(NamedTuple):  # of every pair of a map, with every update: a tupl
 
     Args:
         usable: as `StoredRegistration.is_usable`.
-        keys: of all that was computed for the pair; of `Registrations.tried` alone.
-        disagreement: of what both scenes saw, by what counts; NaN where that is not known. As ``keys``.
     """
 
     number: int
@@ -93,8 +92,6 @@ class Standing(NamedTuple):  # of every pair of a map, with every update: a tupl
     recipe: str | None
     review: str | None
     usable: bool
-    keys: frozenset[str] = frozenset()
-    disagreement: float = float("nan")
 
     @property
     def manual(self) -> bool:
@@ -105,6 +102,25 @@ class Standing(NamedTuple):  # of every pair of a map, with every update: a tupl
     def is_told(self) -> bool:
         """Whether a person measured or confirmed it."""
         return self.manual or self.review == "confirm"
+
+
+class Tried(NamedTuple):
+    """What counts of a pair of scenes, living or not, and what was computed for it.
+
+    Args:
+        pair: both ids with a colon between them, the lower first.
+        key: of what counts, as of `StoredRegistration`.
+        is_told, usable: as of `Standing`.
+        disagreement: of what both scenes saw, by what counts; NaN where that is not known, or it was not accepted.
+        keys: of all that was computed for the pair.
+    """
+
+    pair: str
+    key: str
+    is_told: bool
+    usable: bool
+    disagreement: float
+    keys: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -127,6 +143,7 @@ class Registrations:
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
+        self._disagreement: dict[tuple[int, str], float] = {}
 
     def save(self, registration: Registration, key: RecipeKey | None = None) -> StoredRegistration:
         """Add a registration to its pair's history; it is the pair's current one from now on, unless a person spoke.
@@ -224,27 +241,41 @@ class Registrations:
             made = [Standing(*_stands(choice)) for choice in _living(connection, rows)]
         return sorted((one for one in made if one.usable or not usable), key=_ends_of)
 
-    def tried(self) -> list[Standing]:
-        """The same of every pair, with what else was computed for it: what registering asks."""
+    def tried(self) -> list[Tried]:
+        """The same of every pair, with what else was computed for it, in any order: what registering asks.
+
+        It asks this twice an update, so what was taken from evidence is remembered.
+        """
         repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
         again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
-        keys: dict[str, set[str]] = {}
         with self._catalog.read() as connection:
-            chosen = _living(connection, _choose(connection, (*_LEAN, _EVIDENCE)))
-            for row in connection.execute(again):
-                keys.setdefault(row.pair, set()).add(row.key)
-        nothing: dict[str, float] = {}
-        made = [
-            Standing._make(
-                (
-                    *_stands(choice),
-                    frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
-                    float((choice.row.evidence or nothing).get("disagreement", np.nan)),
-                )
-            )
-            for choice in chosen
-        ]
-        return sorted(made, key=_ends_of)
+            keys: dict[str, set[str]] = {}
+            for pair, key in connection.execute(again):
+                keys.setdefault(pair, set()).add(key)
+            spoken = _spoken(connection, (*_TRIED, _PROPOSER), true())
+            made = [self._tried(*row, None, keys) for row in map(tuple, connection.execute(_silent(_TRIED)))]
+        return made + [self._tried(*tuple(one.row)[:-1], one.word, keys) for _, one in spoken]
+
+    def _tried(
+        self, number: int, pair: str, key: str, status: str, posed: bool, evidence: str | None,
+        word: Review | None, keys: Mapping[str, set[str]],
+    ) -> Tried:  # fmt: skip
+        disagreement = float("nan")
+        if evidence is not None:
+            known = self._disagreement.get((number, key))
+            if known is None:
+                said = registrations.c.evidence.type.process_result_value(evidence, None) or {}
+                known = self._disagreement[number, key] = float(said.get("disagreement", np.nan))
+            disagreement = known
+        review = None if word is None else word.review
+        return Tried(
+            pair,
+            key,
+            review == "confirm" or not key,
+            bool(posed) and _may_be_used(status, review),
+            disagreement,
+            frozenset(keys[pair] - {""}) if pair in keys else frozenset((key,) if key else ()),
+        )
 
     def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
@@ -450,17 +481,21 @@ _FULL = tuple(
 )
 _BRIEF = tuple(null().label(column.name) if column.name in ("evidence", "notes") else column for column in _FULL)
 _PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "status")
+_POSED = (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed")
 _LEAN = (  # as it lies: scenes that are none of the living ones are left out, and the rest is compared with
     *(type_coerce(registrations.c[name], Text).label(name) for name in _PARTS[1:]),
     registrations.c.number,
-    (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed"),
+    _POSED,
 )
 _SAME_PAIR = registrations.alias()
 _OUTDATED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
 _FIRST = (
     select(func.min(_SAME_PAIR.c.number)).where(_SAME_PAIR.c.pair == registrations.c.pair).scalar_subquery()
 ).label("first")
-_EVIDENCE = case((registrations.c.status == "accepted", registrations.c.evidence)).label("evidence")
+_EVIDENCE = case((registrations.c.status == "accepted", type_coerce(registrations.c.evidence, Text))).label("evidence")
+_OF_TRIED = ("pair", "key", "status")
+_TRIED = (registrations.c.number, *(column for column in _LEAN if column.name in _OF_TRIED), _POSED, _EVIDENCE)
+_PROPOSER = type_coerce(registrations.c.proposer, Text).label("proposer")
 
 
 def _current(
@@ -494,22 +529,38 @@ def _choose(
         silent_if: pairs on which nobody spoke only if their current row meets this.
         in_order: by the pair's first row; else in any order.
     """
-    spoken = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
     wanted = true() if of is None else of
-    silent = select(*columns, *([_FIRST] if in_order else ())).where(registrations.c.pair.not_in(spoken), ~_OUTDATED)
+    silent = _silent((*columns, _FIRST) if in_order else columns)
     rows = connection.execute(silent.where(wanted, true() if silent_if is None else silent_if)).all()
-    found = [(row.first if in_order else 0, _Choice(row, None)) for row in rows]
+    if not in_order:
+        return [_Choice(row, None) for row in rows] + [chosen for _, chosen in _spoken(connection, columns, wanted)]
+    found = [(row.first, _Choice(row, None)) for row in rows]
+    return [chosen for _, chosen in sorted(found + _spoken(connection, columns, wanted), key=lambda item: item[0])]
 
+
+_SPOKEN = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
+
+
+def _silent(columns: Sequence[ColumnElement[Any]]) -> Select[Any]:
+    """The newest row of every pair on which nobody ever spoke."""
+    return select(*columns).where(registrations.c.pair.not_in(_SPOKEN), ~_OUTDATED)
+
+
+def _spoken(
+    connection: Connection, columns: Sequence[ColumnElement[Any]], wanted: ColumnElement[bool]
+) -> list[tuple[int, _Choice]]:
+    """What counts of every other pair that has any, each behind the number of the pair's first row."""
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
-    every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(spoken))).all()
+    every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(_SPOKEN))).all()
     said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all() if every else ()
     words = {pair: [_review(row) for row in of_pair] for pair, of_pair in groupby(said, lambda row: str(row.pair))}
+    found = []
     for pair, of_pair in groupby(every, lambda row: str(row.pair)):
         history = list(of_pair)
         current, word = _decide(history, words.get(pair, []))
         if current is not None:
             found.append((history[0].number, _Choice(current, word)))
-    return [chosen for _, chosen in (sorted(found, key=lambda item: item[0]) if in_order else found)]
+    return found
 
 
 def _may_be_used(status: str, review: str | None) -> bool:

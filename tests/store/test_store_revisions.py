@@ -190,13 +190,17 @@ def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
         )
         assert one.usable == stored.is_usable
     assert store.registrations.standing(usable=True) == [one for one in standing if one.usable]
-    tried = store.registrations.tried()
-    assert [(one.number, one.review, one.usable) for one in tried] == [
-        (one.number, one.review, one.usable) for one in standing
-    ]
-    for one in tried:
-        history = store.registrations.history(one.target, one.source)
-        assert one.keys == {stored.key for stored in history} - {""}
+    living = {":".join(sorted(ends)) for ends in alone}
+    tried = {one.pair: one for one in store.registrations.tried() if one.pair in living}
+    assert set(tried) == living
+    for pair, stored in alone.items():
+        one = tried[":".join(pair)]
+        assert (one.key, one.usable) == (stored.key, stored.is_usable)
+        assert one.is_told == (stored.manual or stored.review == "confirm")
+        disagreement = stored.registration.evidence.get("disagreement", float("nan"))
+        accepted = stored.registration.status == "accepted"
+        assert np.array_equal(one.disagreement, disagreement if accepted else float("nan"), equal_nan=True)
+        assert one.keys == {stored.key for stored in store.registrations.history(*pair)} - {""}
     usable = store.registrations.usable()
     assert [one.number for one in usable] == [one.number for one in standing if one.usable]
     some = ids[1:4]
