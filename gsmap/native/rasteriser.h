@@ -127,6 +127,8 @@ struct Kernels {
     int (*peaks)(const float *const *rows, float bar, int from, int to, int32_t *found);
     void (*polar)(const float *dx, const float *dy, int count, float *length, float *angle);
     int64_t (*near)(uint64_t mine, const uint64_t *theirs, int64_t count, int most, int32_t *which, uint8_t *differ);
+    int64_t (*within)(const int16_t *mine, const int8_t *theirs, int64_t stride, int64_t count, int32_t most,
+                      int32_t *which, int32_t *squared);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

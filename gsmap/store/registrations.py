@@ -241,10 +241,20 @@ class Registrations:
             made = [Standing(*_stands(choice)) for choice in _living(connection, rows)]
         return sorted((one for one in made if one.usable or not usable), key=_ends_of)
 
-    def tried(self) -> list[Tried]:
+    def noted(self, text: str) -> list[StoredRegistration]:
+        """The current registrations of which a note begins with a text, by the pair's first registration."""
+        notes = type_coerce(registrations.c.notes, Text).contains(text, autoescape=True)
+        with self._catalog.read() as connection:
+            found = _current(connection, silent_if=notes)
+        return [one for one in found if any(note.startswith(text) for note in one.registration.notes)]
+
+    def tried(self, *, disagreement: bool = True) -> list[Tried]:
         """The same of every pair, with what else was computed for it, in any order: what registering asks.
 
         It asks this twice an update, so what was taken from evidence is remembered.
+
+        Args:
+            disagreement: read it; else it is NaN.
         """
         repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
         again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
@@ -252,8 +262,9 @@ class Registrations:
             keys: dict[str, set[str]] = {}
             for pair, key in connection.execute(again):
                 keys.setdefault(pair, set()).add(key)
-            spoken = _spoken(connection, (*_TRIED, _PROPOSER), true())
-            made = [self._tried(*row, None, keys) for row in map(tuple, connection.execute(_silent(_TRIED)))]
+            columns = (*_TRIED, _EVIDENCE if disagreement else null())
+            spoken = _spoken(connection, (*columns, _PROPOSER), true())
+            made = [self._tried(*row, None, keys) for row in map(tuple, connection.execute(_silent(columns)))]
         return made + [self._tried(*tuple(one.row)[:-1], one.word, keys) for _, one in spoken]
 
     def _tried(
@@ -494,7 +505,7 @@ _FIRST = (
 ).label("first")
 _EVIDENCE = case((registrations.c.status == "accepted", type_coerce(registrations.c.evidence, Text))).label("evidence")
 _OF_TRIED = ("pair", "key", "status")
-_TRIED = (registrations.c.number, *(column for column in _LEAN if column.name in _OF_TRIED), _POSED, _EVIDENCE)
+_TRIED = (registrations.c.number, *(column for column in _LEAN if column.name in _OF_TRIED), _POSED)
 _PROPOSER = type_coerce(registrations.c.proposer, Text).label("proposer")
 
 

@@ -9,10 +9,9 @@ from retrieve_worlds import UP, layer, turned, walk
 from gsmap.errors import CorruptError
 from gsmap.retrieve import Params, look_up, new_segment, voters_of
 from gsmap.retrieve import codes as coding
-from gsmap.retrieve.index import unpacked
 from gsmap.types import SceneGraph
 from gsmap.types.retrieval import IndexArrays
-from gsmap.types.segments import InMemory, merged, to_merge
+from gsmap.types.segments import InMemory, merged, places_of, to_merge
 
 
 def _voters(graphs):
@@ -76,7 +75,7 @@ def test_merging_keeps_every_node_and_leaves_out_what_does_not_count():
     without = merged([replace(whole, members=[None, *whole.members[1:]])])
     again = new_segment(voters[1:])
     assert np.array_equal(without.arrays.nodes, again.arrays.nodes)
-    assert unpacked(without.arrays.nodes, 8).places.max() == 7
+    assert places_of(without.arrays.nodes, 8).max() == 7
 
 
 def test_segments_stay_few_and_are_seldom_written_again():

@@ -22,7 +22,7 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import StoredRegistration
+from gsmap.store.registrations import Tried
 from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
@@ -198,21 +198,22 @@ def _register_candidates(work: _Work) -> list[Registration]:
     return made
 
 
-def stale(current: Iterable[StoredRegistration], graphs: Mapping[str, RecipeKey], settings: Settings) -> list[Pair]:
-    """(target, source) of the edges that other settings or another version made; a person's own word is never stale.
+def num_stale(pairs: Iterable[Tried], graphs: Mapping[str, RecipeKey], settings: Settings) -> int:
+    """How many edges other settings or another version made; a person's own word is never stale.
 
     Args:
-        current: the current edges.
+        pairs: what counts of each pair.
         graphs: the key of each living scene's graph.
     """
-    recipe = recipe_key(settings.register)
-    computed = [stored for stored in current if not stored.manual and stored.review != "confirm"]
-    ends = [(stored.registration.target, stored.registration.source, stored.key) for stored in computed]
-    return [
-        (a, b)
-        for a, b, key in ends
-        if a in graphs and b in graphs and key != recipe.digest_of(graphs[a].digest, graphs[b].digest)
-    ]
+    digest_of = recipe_key(settings.register).digest_of
+    digests = {scene: key.digest for scene, key in graphs.items()}
+    count = 0
+    for one in pairs:
+        a, _, b = one.pair.partition(":")
+        first, second = digests.get(a), digests.get(b)
+        if first is not None and second is not None and not one.is_told:
+            count += one.key != digest_of(first, second) and one.key != digest_of(second, first)
+    return count
 
 
 def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np.ndarray, note: str) -> None:
