@@ -201,6 +201,14 @@ class Filled:
         return (store.folder / "map.sqlite").stat().st_size
 
     @contextmanager
+    def anew(self) -> Iterator[None]:
+        """The map opened once more, without what it remembers of what it has read."""
+        before = self.map
+        with gsmap.map.open(before.store.folder) as self.map:
+            yield
+        self.map = before
+
+    @contextmanager
     def standing_in(self, lookup: bool = False) -> Iterator[None]:
         """Describing and registering give what the street has.
 

@@ -44,7 +44,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
         f"gsmap update {at}",
         "graphs made by other settings or another version",
     )
-    pairs = store.registrations.tried(disagreement=False)
+    pairs = store.registrations.keys()
     registered = {scene for pair in pairs if living.issuperset(ends := pair.pair.split(":")) for scene in ends}
     add(
         "unregistered",
@@ -52,7 +52,12 @@ def status(store: Store, settings: Settings) -> MapStatus:
         f"gsmap update {at}",
         "scenes that were never tried with another",
     )
-    add("stale_edges", num_stale(pairs, keys, settings), f"gsmap update {at}", "edges made by other settings or versions")
+    add(
+        "stale_edges",
+        num_stale(pairs, keys, settings),
+        f"gsmap update {at}",
+        "edges made by other settings or versions",
+    )
     _add_unsolved(store, settings, add, f"gsmap optimize {at}")
     for target, (count, request) in dirty_tiles(store, settings).items():
         verb = " ".join(["gsmap export", at, shlex.quote(target), *request.options()])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,7 +112,7 @@ class Tried(NamedTuple):
         key: of what counts, as of `StoredRegistration`.
         is_told, usable: as of `Standing`.
         disagreement: of what both scenes saw, by what counts; NaN where that is not known, or it was not accepted.
-        keys: of all that was computed for the pair.
+        several: keys of all that was computed for the pair; None where it was registered once.
     """
 
     pair: str
@@ -120,7 +120,12 @@ class Tried(NamedTuple):
     is_told: bool
     usable: bool
     disagreement: float
-    keys: frozenset[str]
+    several: frozenset[str] | None
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """Of all that was computed for the pair."""
+        return frozenset((self.key,) if self.key else ()) if self.several is None else self.several
 
 
 @dataclass(frozen=True)
@@ -143,7 +148,8 @@ class Registrations:
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
-        self._disagreement: dict[tuple[int, str], float] = {}
+        self._silent: dict[str, Tried] = {}
+        self._read_upto: tuple[int, tuple[Any, ...]] = (0, ())
 
     def save(self, registration: Registration, key: RecipeKey | None = None) -> StoredRegistration:
         """Add a registration to its pair's history; it is the pair's current one from now on, unless a person spoke.
@@ -235,11 +241,15 @@ class Registrations:
         Args:
             usable: only those that are (`Standing.usable`).
         """
-        accepted = registrations.c.status == "accepted" if usable else None
+        wanted = registrations.c.status == "accepted" if usable else true()
         with self._catalog.read() as connection:
-            rows = _choose(connection, _LEAN, silent_if=accepted)
-            made = [Standing(*_stands(choice)) for choice in _living(connection, rows)]
-        return sorted((one for one in made if one.usable or not usable), key=_ends_of)
+            silent = connection.execute(_silent(_LEAN).where(wanted)).all()
+            spoken = [chosen for _, chosen in _spoken(connection, (*_LEAN, *_DECIDING), true())]
+            alive = living_ids(connection)
+        made = [_stands(*row, None) for row in map(tuple, silent)]
+        made += [_stands(*tuple(row)[: len(_LEAN)], None if word is None else word.review) for row, word in spoken]
+        found = (one for one in made if (one.usable or not usable) and one.target in alive and one.source in alive)
+        return sorted(found, key=_ends_of)
 
     def noted(self, text: str) -> list[StoredRegistration]:
         """The current registrations of which a note begins with a text, by the pair's first registration."""
@@ -248,45 +258,33 @@ class Registrations:
             found = _current(connection, silent_if=notes)
         return [one for one in found if any(note.startswith(text) for note in one.registration.notes)]
 
-    def tried(self, *, disagreement: bool = True) -> list[Tried]:
+    def tried(self) -> list[Tried]:
         """The same of every pair, with what else was computed for it, in any order: what registering asks.
 
-        It asks this twice an update, so what was taken from evidence is remembered.
-
-        Args:
-            disagreement: read it; else it is NaN.
+        It asks this twice an update, so what was read is remembered: of rows that stay as they are, only new ones are
+        read again.
         """
-        repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
-        again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
         with self._catalog.read() as connection:
-            keys: dict[str, set[str]] = {}
-            for pair, key in connection.execute(again):
-                keys.setdefault(pair, set()).add(key)
-            columns = (*_TRIED, _EVIDENCE if disagreement else null())
-            spoken = _spoken(connection, (*columns, _PROPOSER), true())
-            made = [self._tried(*row, None, keys) for row in map(tuple, connection.execute(_silent(columns)))]
-        return made + [self._tried(*tuple(one.row)[:-1], one.word, keys) for _, one in spoken]
+            upto, then = self._read_upto
+            pair_of_new = None
+            if upto and then == _mark(connection, upto):
+                pair_of_new = registrations.c.pair.in_(
+                    select(registrations.c.pair).where(registrations.c.number > upto)
+                )
+            else:
+                self._silent.clear()
+            for one in _tried(connection, _silent((*_TRIED, _EVIDENCE)), pair_of_new):
+                self._silent[one.pair] = one
+            upto = connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
+            self._read_upto = upto, _mark(connection, upto)
+            spoken = {one.pair: one for one in _tried_of_spoken(connection)}
+            said = set(connection.execute(_SPOKEN).scalars()) if spoken else set()
+        return [one for pair, one in self._silent.items() if pair not in said] + list(spoken.values())
 
-    def _tried(
-        self, number: int, pair: str, key: str, status: str, posed: bool, evidence: str | None,
-        word: Review | None, keys: Mapping[str, set[str]],
-    ) -> Tried:  # fmt: skip
-        disagreement = float("nan")
-        if evidence is not None:
-            known = self._disagreement.get((number, key))
-            if known is None:
-                said = registrations.c.evidence.type.process_result_value(evidence, None) or {}
-                known = self._disagreement[number, key] = float(said.get("disagreement", np.nan))
-            disagreement = known
-        review = None if word is None else word.review
-        return Tried(
-            pair,
-            key,
-            review == "confirm" or not key,
-            bool(posed) and _may_be_used(status, review),
-            disagreement,
-            frozenset(keys[pair] - {""}) if pair in keys else frozenset((key,) if key else ()),
-        )
+    def keys(self) -> list[Tried]:
+        """As `tried`, without what they say of disagreement; nothing is remembered."""
+        with self._catalog.read() as connection:
+            return _tried(connection, _silent((*_TRIED, null()))) + _tried_of_spoken(connection)
 
     def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
@@ -491,22 +489,23 @@ _FULL = tuple(
     for column in registrations.columns
 )
 _BRIEF = tuple(null().label(column.name) if column.name in ("evidence", "notes") else column for column in _FULL)
-_PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "status")
 _POSED = (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed")
-_LEAN = (  # as it lies: scenes that are none of the living ones are left out, and the rest is compared with
-    *(type_coerce(registrations.c[name], Text).label(name) for name in _PARTS[1:]),
-    registrations.c.number,
-    _POSED,
-)
+
+
+def _as_they_lie(*names: str) -> tuple[ColumnElement[Any], ...]:
+    """Scenes that are none of the living ones are left out, and the rest is compared with."""
+    return tuple(type_coerce(registrations.c[name], Text).label(name) for name in names)
+
+
+_LEAN = (registrations.c.number, *_as_they_lie("target", "source", "status", "key", "recipe"), _POSED)
+_TRIED = (*_as_they_lie("pair", "key", "status"), _POSED)
+_DECIDING = _as_they_lie("pair", "proposer")  # what `_decide` asks besides
 _SAME_PAIR = registrations.alias()
 _OUTDATED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
 _FIRST = (
     select(func.min(_SAME_PAIR.c.number)).where(_SAME_PAIR.c.pair == registrations.c.pair).scalar_subquery()
 ).label("first")
 _EVIDENCE = case((registrations.c.status == "accepted", type_coerce(registrations.c.evidence, Text))).label("evidence")
-_OF_TRIED = ("pair", "key", "status")
-_TRIED = (registrations.c.number, *(column for column in _LEAN if column.name in _OF_TRIED), _POSED)
-_PROPOSER = type_coerce(registrations.c.proposer, Text).label("proposer")
 
 
 def _current(
@@ -515,38 +514,20 @@ def _current(
     silent_if: ColumnElement[bool] | None = None,
     columns: Sequence[ColumnElement[Any]] = _FULL,
 ) -> list[StoredRegistration]:
-    return _stored_all(_living(connection, _choose(connection, columns, of, silent_if, in_order=True)))
-
-
-def _living(connection: Connection, chosen: Iterable[_Choice]) -> list[_Choice]:
-    alive = living_ids(connection)
-    return [one for one in chosen if one.row.target in alive and one.row.source in alive]
-
-
-def _choose(
-    connection: Connection,
-    columns: Sequence[ColumnElement[Any]],
-    of: ColumnElement[bool] | None = None,
-    silent_if: ColumnElement[bool] | None = None,
-    *,
-    in_order: bool = False,
-) -> list[_Choice]:
-    """The current row of every pair.
+    """What counts of every pair of living scenes, by the pair's first row.
 
     Of a pair on which nobody ever spoke it is the newest, which the index of pairs tells without reading the others.
 
     Args:
         of: only pairs all of whose rows meet this.
         silent_if: pairs on which nobody spoke only if their current row meets this.
-        in_order: by the pair's first row; else in any order.
     """
     wanted = true() if of is None else of
-    silent = _silent((*columns, _FIRST) if in_order else columns)
-    rows = connection.execute(silent.where(wanted, true() if silent_if is None else silent_if)).all()
-    if not in_order:
-        return [_Choice(row, None) for row in rows] + [chosen for _, chosen in _spoken(connection, columns, wanted)]
-    found = [(row.first, _Choice(row, None)) for row in rows]
-    return [chosen for _, chosen in sorted(found + _spoken(connection, columns, wanted), key=lambda item: item[0])]
+    silent = _silent((*columns, _FIRST)).where(wanted, true() if silent_if is None else silent_if)
+    found = [(row.first, _Choice(row, None)) for row in connection.execute(silent).all()]
+    found = sorted(found + _spoken(connection, columns, wanted), key=itemgetter(0))
+    alive = living_ids(connection)
+    return _stored_all([one for _, one in found if one.row.target in alive and one.row.source in alive])
 
 
 _SPOKEN = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
@@ -574,6 +555,48 @@ def _spoken(
     return found
 
 
+def _mark(connection: Connection, upto: int) -> tuple[Any, ...]:
+    """How many registrations there are up to a number, and what tells the last of them from one that took its number."""
+    count = connection.execute(select(func.count(registrations.c.number)).where(registrations.c.number <= upto))
+    last = select(registrations.c.key, registrations.c.created_at).where(registrations.c.number == upto)
+    return count.scalar_one(), *(connection.execute(last).first() or ())
+
+
+def _tried(connection: Connection, silent: Select[Any], of: ColumnElement[bool] | None = None) -> list[Tried]:
+    """What `_silent` says of all pairs, or of some."""
+    wanted = true() if of is None else of
+    keys, rows = _several(connection, wanted), connection.execute(silent.where(wanted)).all()
+    return [_tried_one(row, None, keys) for row in map(tuple, rows)]
+
+
+def _tried_of_spoken(connection: Connection) -> list[Tried]:
+    spoken = _spoken(connection, (*_TRIED, _EVIDENCE, registrations.c.number, _DECIDING[1]), true())
+    keys = _several(connection, registrations.c.pair.in_(_SPOKEN)) if spoken else {}
+    return [_tried_one(tuple(one.row)[:-2], one.word, keys) for _, one in spoken]
+
+
+def _several(connection: Connection, wanted: ColumnElement[bool]) -> dict[str, set[str]]:
+    """By pairs that were registered more than once, all keys of theirs."""
+    repeated = select(registrations.c.pair).where(wanted).group_by(registrations.c.pair).having(func.count() > 1)
+    again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
+    keys: dict[str, set[str]] = {}
+    for pair, key in connection.execute(again).all():
+        keys.setdefault(pair, set()).add(key)
+    return keys
+
+
+def _tried_one(row: tuple[Any, ...], word: Review | None, keys: Mapping[str, set[str]]) -> Tried:
+    pair, key, status, posed, evidence = row
+    disagreement = float("nan")
+    if evidence is not None:
+        said = registrations.c.evidence.type.process_result_value(evidence, None)
+        disagreement = float(said.get("disagreement", np.nan))
+    review = None if word is None else word.review
+    told, usable = review == "confirm" or not key, bool(posed) and _may_be_used(status, review)
+    every = frozenset(keys[pair] - {""}) if pair in keys else None
+    return Tried(pair, key, told, usable, disagreement, every)
+
+
 def _may_be_used(status: str, review: str | None) -> bool:
     return review == "confirm" or (status == "accepted" and review != "reject")
 
@@ -581,11 +604,11 @@ def _may_be_used(status: str, review: str | None) -> bool:
 _ends_of = attrgetter("target", "source")
 
 
-def _stands(chosen: _Choice) -> tuple[Any, ...]:
-    """The fields of `Standing`, in their order."""
-    row, review = chosen.row, None if chosen.word is None else chosen.word.review
-    usable = bool(row.posed) and _may_be_used(row.status, review)
-    return row.number, row.target, row.source, row.status, row.key, row.recipe, review, usable
+def _stands(
+    number: int, target: str, source: str, status: str, key: str, recipe: str | None, posed: bool, review: str | None
+) -> Standing:
+    usable = bool(posed) and _may_be_used(status, review)
+    return Standing(number, target, source, status, key, recipe, review, usable)
 
 
 def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:

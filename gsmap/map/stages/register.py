@@ -129,17 +129,17 @@ class _Known:
         self._registered: set[str] = set()
         self._replaced: list[tuple[Pair, frozenset[str]]] = []
         self.held: list[Pair] = []
-        for pair, key, is_told, usable, disagreement, keys in self._work.store.registrations.tried():
-            a, _, b = pair.partition(":")
+        for one in self._work.store.registrations.tried():
+            a, _, b = one.pair.partition(":")
             first, second = graphs.get(a), graphs.get(b)
             if first is None or second is None:
                 continue
-            current = key == digest_of(first, second) or key == digest_of(second, first)
-            if current or not keys.isdisjoint((digest_of(first, second), digest_of(second, first))):
-                self._registered.add(pair)
-            if not current and not is_told:
-                self._replaced.append(((a, b), keys))
-            elif usable and (is_told or not disagreement > bar.max_disagreement):
+            current = one.key == digest_of(first, second) or one.key == digest_of(second, first)
+            if current or not one.keys.isdisjoint((digest_of(first, second), digest_of(second, first))):
+                self._registered.add(one.pair)
+            if not current and not one.is_told:
+                self._replaced.append(((a, b), one.keys))
+            elif one.usable and (one.is_told or not one.disagreement > bar.max_disagreement):
                 self.held.append((a, b))
 
     def has(self, a: str, b: str) -> bool:
