@@ -45,7 +45,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
         "graphs made by other settings or another version",
     )
     pairs = store.registrations.keys()
-    registered = {scene for pair in pairs if living.issuperset(ends := pair.pair.split(":")) for scene in ends}
+    registered = {scene for pair, _ in pairs if living.issuperset(ends := pair.split(":")) for scene in ends}
     add(
         "unregistered",
         len(living - registered) if len(scenes) > 1 else 0,

@@ -31,7 +31,7 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.columns import not_ours
+from gsmap.store.columns import Json, an_object, not_ours
 from gsmap.store.matrices import matrices_of_bytes, poses_of_bytes
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import registrations, reviews, scenes
@@ -246,8 +246,8 @@ class Registrations:
             silent = connection.execute(_silent(_LEAN).where(wanted)).all()
             spoken = [chosen for _, chosen in _spoken(connection, (*_LEAN, *_DECIDING), true())]
             alive = living_ids(connection)
-        made = [_stands(*row, None) for row in map(tuple, silent)]
-        made += [_stands(*tuple(row)[: len(_LEAN)], None if word is None else word.review) for row, word in spoken]
+        made = [_stands(tuple(row), None) for row in silent]
+        made += [_stands(tuple(row), None if word is None else word.review) for row, word in spoken]
         found = (one for one in made if (one.usable or not usable) and one.target in alive and one.source in alive)
         return sorted(found, key=_ends_of)
 
@@ -281,10 +281,12 @@ class Registrations:
             said = set(connection.execute(_SPOKEN).scalars()) if spoken else set()
         return [one for pair, one in self._silent.items() if pair not in said] + list(spoken.values())
 
-    def keys(self) -> list[Tried]:
-        """As `tried`, without what they say of disagreement; nothing is remembered."""
+    def keys(self) -> list[tuple[str, str]]:
+        """Each pair (`Tried.pair`) with the key of what counts of it; empty where a person measured or confirmed it."""
         with self._catalog.read() as connection:
-            return _tried(connection, _silent((*_TRIED, null()))) + _tried_of_spoken(connection)
+            rows = connection.execute(_silent(_TRIED[:2])).all()
+            spoken = _tried_of_spoken(connection)
+        return [(pair, key) for pair, key in rows] + [(one.pair, "" if one.is_told else one.key) for one in spoken]
 
     def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
@@ -555,8 +557,11 @@ def _spoken(
     return found
 
 
+_OBJECT = Json(an_object).at("registrations.evidence")
+
+
 def _mark(connection: Connection, upto: int) -> tuple[Any, ...]:
-    """How many registrations there are up to a number, and what tells the last of them from one that took its number."""
+    """How many registrations there are up to a number, and what tells the last one from another of its number."""
     count = connection.execute(select(func.count(registrations.c.number)).where(registrations.c.number <= upto))
     last = select(registrations.c.key, registrations.c.created_at).where(registrations.c.number == upto)
     return count.scalar_one(), *(connection.execute(last).first() or ())
@@ -565,8 +570,8 @@ def _mark(connection: Connection, upto: int) -> tuple[Any, ...]:
 def _tried(connection: Connection, silent: Select[Any], of: ColumnElement[bool] | None = None) -> list[Tried]:
     """What `_silent` says of all pairs, or of some."""
     wanted = true() if of is None else of
-    keys, rows = _several(connection, wanted), connection.execute(silent.where(wanted)).all()
-    return [_tried_one(row, None, keys) for row in map(tuple, rows)]
+    keys = _several(connection, wanted)
+    return [_tried_one(tuple(row), None, keys) for row in connection.execute(silent.where(wanted)).all()]
 
 
 def _tried_of_spoken(connection: Connection) -> list[Tried]:
@@ -589,8 +594,7 @@ def _tried_one(row: tuple[Any, ...], word: Review | None, keys: Mapping[str, set
     pair, key, status, posed, evidence = row
     disagreement = float("nan")
     if evidence is not None:
-        said = registrations.c.evidence.type.process_result_value(evidence, None)
-        disagreement = float(said.get("disagreement", np.nan))
+        disagreement = float(_OBJECT.process_result_value(evidence, None).get("disagreement", np.nan))
     review = None if word is None else word.review
     told, usable = review == "confirm" or not key, bool(posed) and _may_be_used(status, review)
     every = frozenset(keys[pair] - {""}) if pair in keys else None
@@ -604,9 +608,8 @@ def _may_be_used(status: str, review: str | None) -> bool:
 _ends_of = attrgetter("target", "source")
 
 
-def _stands(
-    number: int, target: str, source: str, status: str, key: str, recipe: str | None, posed: bool, review: str | None
-) -> Standing:
+def _stands(row: tuple[Any, ...], review: str | None) -> Standing:
+    number, target, source, status, key, recipe, posed = row[: len(_LEAN)]
     usable = bool(posed) and _may_be_used(status, review)
     return Standing(number, target, source, status, key, recipe, review, usable)
 

@@ -22,7 +22,6 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import Tried
 from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
@@ -115,7 +114,8 @@ class _Known:
         self._work = work
         self._graphs = {scene: key.digest for scene, key in work.graphs.items()}
         self._read()
-        if any([self._adopt(pair, keys) for pair, keys in self._replaced]):
+        adopted = [self._adopt(pair, keys) for pair, keys in self._replaced]
+        if any(adopted):
             self._read()
         self.stale = sorted(
             pair
@@ -198,21 +198,21 @@ def _register_candidates(work: _Work) -> list[Registration]:
     return made
 
 
-def num_stale(pairs: Iterable[Tried], graphs: Mapping[str, RecipeKey], settings: Settings) -> int:
+def num_stale(pairs: Iterable[tuple[str, str]], graphs: Mapping[str, RecipeKey], settings: Settings) -> int:
     """How many edges other settings or another version made; a person's own word is never stale.
 
     Args:
-        pairs: what counts of each pair.
+        pairs: each with the key of what counts of it (`gsmap.store.registrations.Registrations.keys`).
         graphs: the key of each living scene's graph.
     """
     digest_of = recipe_key(settings.register).digest_of
     digests = {scene: key.digest for scene, key in graphs.items()}
     count = 0
-    for one in pairs:
-        a, _, b = one.pair.partition(":")
+    for pair, key in pairs:
+        a, _, b = pair.partition(":")
         first, second = digests.get(a), digests.get(b)
-        if first is not None and second is not None and not one.is_told:
-            count += one.key != digest_of(first, second) and one.key != digest_of(second, first)
+        if key and first is not None and second is not None:
+            count += key != digest_of(first, second) and key != digest_of(second, first)
     return count
 
 
