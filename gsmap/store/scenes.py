@@ -160,7 +160,10 @@ class Scenes:
         query = select(*columns).where(scenes.c.removed_at.is_(None)).order_by(scenes.c.number)
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
-        return [BriefScene(*told, thinning_of(thinned)) for *told, thinned in rows]
+        return [
+            BriefScene(scene, name, policy, captured_at, thinning_of(thinned))
+            for scene, name, policy, captured_at, thinned in rows
+        ]
 
     def bounds(self) -> dict[str, np.ndarray]:
         """(2, 3) of every living scene by its id, as of `Scene`."""
