@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter, itemgetter
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,21 +78,29 @@ class StoredRegistration:
         return posed and _may_be_used(self.registration.status, self.review)
 
 
+_UNKNOWN = float("nan")
+
+
 class Standing(NamedTuple):  # of every pair of a map, with every update: a tuple is made in a tenth of the time
     """What counts of a pair, without its figures: all that decides whether it is used; see `StoredRegistration`.
 
     Args:
+        pair: both ids with a colon between them, the lower first.
         usable: as `StoredRegistration.is_usable`.
+        disagreement: of what both scenes saw, by what counts; NaN where that is not known, it was not accepted, or not
+            asked for.
+        several: keys of all that was computed for the pair; None where it was registered once, or that was not asked.
     """
 
     number: int
     target: str
     source: str
-    status: str
+    pair: str
     key: str
-    recipe: str | None
     review: str | None
     usable: bool
+    disagreement: float = _UNKNOWN
+    several: frozenset[str] | None = None
 
     @property
     def manual(self) -> bool:
@@ -103,28 +112,9 @@ class Standing(NamedTuple):  # of every pair of a map, with every update: a tupl
         """Whether a person measured or confirmed it."""
         return self.manual or self.review == "confirm"
 
-
-class Tried(NamedTuple):
-    """What counts of a pair of scenes, living or not, and what was computed for it.
-
-    Args:
-        pair: both ids with a colon between them, the lower first.
-        key: of what counts, as of `StoredRegistration`.
-        is_told, usable: as of `Standing`.
-        disagreement: of what both scenes saw, by what counts; NaN where that is not known, or it was not accepted.
-        several: keys of all that was computed for the pair; None where it was registered once.
-    """
-
-    pair: str
-    key: str
-    is_told: bool
-    usable: bool
-    disagreement: float
-    several: frozenset[str] | None
-
     @property
     def keys(self) -> frozenset[str]:
-        """Of all that was computed for the pair."""
+        """Of all that was computed for the pair, where that was asked for."""
         return frozenset((self.key,) if self.key else ()) if self.several is None else self.several
 
 
@@ -148,7 +138,7 @@ class Registrations:
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
-        self._silent: dict[str, Tried] = {}
+        self._silent: dict[str, Standing] = {}
         self._read_upto: tuple[int, tuple[Any, ...]] = (0, ())
 
     def save(self, registration: Registration, key: RecipeKey | None = None) -> StoredRegistration:
@@ -238,16 +228,18 @@ class Registrations:
     def standing(self, *, usable: bool = False) -> list[Standing]:
         """What counts of each pair of living scenes, by (target, source); no matrix of any is read.
 
+        Where `tried` was asked before, what it remembers is not read again.
+
         Args:
             usable: only those that are (`Standing.usable`).
         """
-        wanted = registrations.c.status == "accepted" if usable else true()
         with self._catalog.read() as connection:
-            silent = connection.execute(_silent(_LEAN).where(wanted)).all()
-            spoken = [chosen for _, chosen in _spoken(connection, (*_LEAN, *_DECIDING), true())]
+            if self._silent:
+                made = self.tried()
+            else:
+                wanted = registrations.c.status == "accepted" if usable else true()
+                made = _of_silent(connection, null(), wanted) + _of_spoken(connection)
             alive = living_ids(connection)
-        made = [_stands(tuple(row), None) for row in silent]
-        made += [_stands(tuple(row), None if word is None else word.review) for row, word in spoken]
         found = (one for one in made if (one.usable or not usable) and one.target in alive and one.source in alive)
         return sorted(found, key=_ends_of)
 
@@ -258,34 +250,34 @@ class Registrations:
             found = _current(connection, silent_if=notes)
         return [one for one in found if any(note.startswith(text) for note in one.registration.notes)]
 
-    def tried(self) -> list[Tried]:
-        """The same of every pair, with what else was computed for it, in any order: what registering asks.
+    def tried(self) -> list[Standing]:
+        """The same of every pair, of scenes living or not, with what else was computed for it, in any order.
 
-        It asks this twice an update, so what was read is remembered: of rows that stay as they are, only new ones are
-        read again.
+        Registering asks this twice an update, so what was read is remembered: of rows that stay as they are, only new
+        ones are read again.
         """
         with self._catalog.read() as connection:
             upto, then = self._read_upto
-            pair_of_new = None
+            pair_of_new: ColumnElement[bool] = true()
             if upto and then == _mark(connection, upto):
                 pair_of_new = registrations.c.pair.in_(
                     select(registrations.c.pair).where(registrations.c.number > upto)
                 )
             else:
                 self._silent.clear()
-            for one in _tried(connection, _silent((*_TRIED, _EVIDENCE)), pair_of_new):
+            for one in _of_silent(connection, _EVIDENCE, pair_of_new, _several(connection, pair_of_new)):
                 self._silent[one.pair] = one
             upto = connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
             self._read_upto = upto, _mark(connection, upto)
-            spoken = {one.pair: one for one in _tried_of_spoken(connection)}
+            spoken = {one.pair: one for one in _of_spoken(connection)}
             said = set(connection.execute(_SPOKEN).scalars()) if spoken else set()
         return [one for pair, one in self._silent.items() if pair not in said] + list(spoken.values())
 
     def keys(self) -> list[tuple[str, str]]:
-        """Each pair (`Tried.pair`) with the key of what counts of it; empty where a person measured or confirmed it."""
+        """Each pair (`Standing.pair`) with the key of what counts of it; empty where that is a person's word."""
         with self._catalog.read() as connection:
-            rows = connection.execute(_silent(_TRIED[:2])).all()
-            spoken = _tried_of_spoken(connection)
+            rows = connection.execute(_silent(_as_they_lie("pair", "key"))).all()
+            spoken = _of_spoken(connection)
         return [(pair, key) for pair, key in rows] + [(one.pair, "" if one.is_told else one.key) for one in spoken]
 
     def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
@@ -499,9 +491,7 @@ def _as_they_lie(*names: str) -> tuple[ColumnElement[Any], ...]:
     return tuple(type_coerce(registrations.c[name], Text).label(name) for name in names)
 
 
-_LEAN = (registrations.c.number, *_as_they_lie("target", "source", "status", "key", "recipe"), _POSED)
-_TRIED = (*_as_they_lie("pair", "key", "status"), _POSED)
-_DECIDING = _as_they_lie("pair", "proposer")  # what `_decide` asks besides
+_LEAN = (registrations.c.number, *_as_they_lie("target", "source", "pair", "key", "status"), _POSED)
 _SAME_PAIR = registrations.alias()
 _OUTDATED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
 _FIRST = (
@@ -567,17 +557,22 @@ def _mark(connection: Connection, upto: int) -> tuple[Any, ...]:
     return count.scalar_one(), *(connection.execute(last).first() or ())
 
 
-def _tried(connection: Connection, silent: Select[Any], of: ColumnElement[bool] | None = None) -> list[Tried]:
-    """What `_silent` says of all pairs, or of some."""
-    wanted = true() if of is None else of
-    keys = _several(connection, wanted)
-    return [_tried_one(tuple(row), None, keys) for row in connection.execute(silent.where(wanted)).all()]
+def _of_silent(
+    connection: Connection,
+    evidence: ColumnElement[Any],
+    wanted: ColumnElement[bool],
+    several: Mapping[str, set[str]] = MappingProxyType({}),
+) -> list[Standing]:
+    """What counts of pairs on which nobody ever spoke."""
+    rows = connection.execute(_silent((*_LEAN, evidence)).where(wanted)).all()
+    return [_stands(tuple(row), None, several) for row in rows]
 
 
-def _tried_of_spoken(connection: Connection) -> list[Tried]:
-    spoken = _spoken(connection, (*_TRIED, _EVIDENCE, registrations.c.number, _DECIDING[1]), true())
-    keys = _several(connection, registrations.c.pair.in_(_SPOKEN)) if spoken else {}
-    return [_tried_one(tuple(one.row)[:-2], one.word, keys) for _, one in spoken]
+def _of_spoken(connection: Connection) -> list[Standing]:
+    """What counts of all others."""
+    found = _spoken(connection, (*_LEAN, _EVIDENCE, *_as_they_lie("proposer")), true())
+    several = _several(connection, registrations.c.pair.in_(_SPOKEN)) if found else {}
+    return [_stands(tuple(one.row)[:-1], one.word, several) for _, one in found]
 
 
 def _several(connection: Connection, wanted: ColumnElement[bool]) -> dict[str, set[str]]:
@@ -590,17 +585,6 @@ def _several(connection: Connection, wanted: ColumnElement[bool]) -> dict[str, s
     return keys
 
 
-def _tried_one(row: tuple[Any, ...], word: Review | None, keys: Mapping[str, set[str]]) -> Tried:
-    pair, key, status, posed, evidence = row
-    disagreement = float("nan")
-    if evidence is not None:
-        disagreement = float(_OBJECT.process_result_value(evidence, None).get("disagreement", np.nan))
-    review = None if word is None else word.review
-    told, usable = review == "confirm" or not key, bool(posed) and _may_be_used(status, review)
-    every = frozenset(keys[pair] - {""}) if pair in keys else None
-    return Tried(pair, key, told, usable, disagreement, every)
-
-
 def _may_be_used(status: str, review: str | None) -> bool:
     return review == "confirm" or (status == "accepted" and review != "reject")
 
@@ -608,10 +592,15 @@ def _may_be_used(status: str, review: str | None) -> bool:
 _ends_of = attrgetter("target", "source")
 
 
-def _stands(row: tuple[Any, ...], review: str | None) -> Standing:
-    number, target, source, status, key, recipe, posed = row[: len(_LEAN)]
+def _stands(row: tuple[Any, ...], word: Review | None, several: Mapping[str, set[str]]) -> Standing:
+    number, target, source, pair, key, status, posed, evidence = row
+    disagreement = _UNKNOWN
+    if evidence is not None:
+        disagreement = float(_OBJECT.process_result_value(evidence, None).get("disagreement", _UNKNOWN))
+    review = None if word is None else word.review
     usable = bool(posed) and _may_be_used(status, review)
-    return Standing(number, target, source, status, key, recipe, review, usable)
+    keys = frozenset(several[pair] - {""}) if pair in several else None
+    return Standing(number, target, source, pair, key, review, usable, disagreement, keys)
 
 
 def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:
