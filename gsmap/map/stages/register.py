@@ -134,8 +134,11 @@ class _Known:
             first, second = graphs.get(a), graphs.get(b)
             if first is None or second is None:
                 continue
-            current = one.key == digest_of(first, second) or one.key == digest_of(second, first)
-            if current or not one.keys.isdisjoint((digest_of(first, second), digest_of(second, first))):
+            mine = [digest_of(first, second)]
+            if one.key not in mine:
+                mine.append(digest_of(second, first))
+            current = one.key in mine
+            if current or not one.keys.isdisjoint(mine):
                 self._registered.add(one.pair)
             if not current and not one.is_told:
                 self._replaced.append(((a, b), one.keys))
