@@ -2,6 +2,7 @@
 
     python tools/bench_scale.py                               # maps of 10, 100 and 1,000 scenes
     python tools/bench_scale.py --scenes 10 100 1000 10000 --updates 100 --cache FOLDER
+    python tools/bench_scale.py --scenes 10 1000 10000 --updates 0 --lookup --maps FOLDER
 
 The maps are filled, not made: a street on which every capture sees what its neighbours see. All rows are real (scenes,
 graphs, ten registrations a scene of which two or three are accepted, a real solve), and so is all that reads them; what
@@ -32,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scale_maps import Filled, Pattern, filled, pattern
+from scale_maps import TRIED, Filled, Pattern, filled, kept, pattern
 from spent import Spent, spent
 
 from gsmap.cli import COLLECT_AFTER
@@ -50,6 +51,7 @@ def main() -> None:
     parser.add_argument("--tiles", nargs="+", type=int, default=[100, 1000, 10_000])
     parser.add_argument("--lookup", action="store_true", help="also let the map say which pairs to try")
     parser.add_argument("--cache", type=Path, help="keep the two real captures here")
+    parser.add_argument("--maps", type=Path, help="keep filled maps here: 10,000 scenes take minutes to fill")
     options = parser.parse_args()
     gc.set_threshold(COLLECT_AFTER)  # as the command line does
     with tempfile.TemporaryDirectory() as scratch:
@@ -57,7 +59,7 @@ def main() -> None:
         print(f"own share of one scene: describe {made.describe_s:.2f} CPU s, a pair {made.register_s:.2f} CPU s")
         rows = []
         for num in options.scenes:
-            with filled(Path(scratch) / f"{num}.gsmap", num, made) as one:
+            with opened(Path(scratch) / f"{num}.gsmap", num, made, options) as one:
                 rows.append(measured(one, made, options))
                 more = one.num_scenes - num
             if options.updates:
@@ -73,6 +75,15 @@ def main() -> None:
         print(
             f"  {name}: " + ", ".join(f"{num} scenes {planning(num, place):.2f}" for num in options.tiles), flush=True
         )
+
+
+def opened(path: Path, num: int, made: Pattern, options: argparse.Namespace) -> AbstractContextManager[Filled]:
+    """A filled map, or a copy of one that is kept."""
+    if options.maps is None:
+        return filled(path, num, made, asked=options.lookup)
+    options.maps.mkdir(parents=True, exist_ok=True)
+    name = f"{num}-asked" if options.lookup else f"{num}"
+    return kept(options.maps / name, num, made, path, asked=options.lookup)
 
 
 def measured(one: Filled, made: Pattern, options: argparse.Namespace) -> dict[str, float]:
@@ -107,13 +118,22 @@ def measured(one: Filled, made: Pattern, options: argparse.Namespace) -> dict[st
     row["bytes an update"] = (one.catalog_bytes() - size) / max(options.updates, 1)
     row["catalog MB"] = one.catalog_bytes() / 1e6
     if options.lookup:
-        with counted(one) as count, one.standing_in(lookup=True):
+        with one.standing_in(lookup=True):
+            m.update()  # what came above had its pairs given, and has not asked
             one.add()
-            m.update()
-        row |= {f"update, pairs looked up, {name}": value for name, value in count.items()}
-        with counted(one) as count, one.standing_in(lookup=True):
-            m.update()
-        row |= {f"no-op, pairs looked up, {name}": value for name, value in count.items()}
+            # As a process of its own has it: nothing that was read above is in memory.
+            with one.anew(), counted(one) as count:
+                report = one.map.update()
+            row |= {f"update, pairs looked up, {name}": value for name, value in count.items()}
+            row["  pairs tried"] = len(report.edges)
+            own = made.describe_s + TRIED * made.register_s
+            row["  CPU s with the own share of one with ten pairs"] = own + count["CPU s"]
+            with one.anew(), counted(one) as count:
+                one.map.update()
+            row |= {f"no-op, pairs looked up, {name}": value for name, value in count.items()}
+        with one.anew(), counted(one) as count:
+            one.map.status()
+        row |= {f"status, map just opened, {name}": value for name, value in count.items()}
     m.prune(keep_revisions=1)
     row["catalog MB, pruned"] = one.catalog_bytes() / 1e6
     row["files rows MB of scenes with arrays of their own"] = one.num_scenes * made.file_rows_bytes / 1e6

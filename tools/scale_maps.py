@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -26,15 +27,21 @@ import gsmap.map
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
 from gsmap.map import Map
+from gsmap.map.looking_up import keys_of_lookups
 from gsmap.map.stages import describe, register
 from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
+from gsmap.retrieve import Voters, index_recipe, new_segment, voters_of
+from gsmap.retrieve.codes import with_signs
 from gsmap.store import recipes
 from gsmap.store.boxes import get_boxes, put_boxes
 from gsmap.store.catalog import now
 from gsmap.store.graphs import Graphs
+from gsmap.store.indexes import Lookup
 from gsmap.store.schema import files, graphs, registrations, scene_facts, scenes
 from gsmap.types import Cameras, Gaussians, NodeLayer, Registration, SceneGraph, Sim3
+from gsmap.types.retrieval import Candidate
+from gsmap.types.segments import merged, to_merge
 
 NEAR, TRIED = 2, 10  # captures before it that a capture overlaps, and is tried with
 _REGISTER = register.register
@@ -194,6 +201,14 @@ class Filled:
         return (store.folder / "map.sqlite").stat().st_size
 
     @contextmanager
+    def anew(self) -> Iterator[None]:
+        """The map opened once more, without what it remembers of what it has read."""
+        before = self.map
+        with gsmap.map.open(before.store.folder) as self.map:
+            yield
+        self.map = before
+
+    @contextmanager
     def standing_in(self, lookup: bool = False) -> Iterator[None]:
         """Describing and registering give what the street has.
 
@@ -250,8 +265,12 @@ class Filled:
 
 
 @contextmanager
-def filled(path: Path, num: int, made: Pattern) -> Iterator[Filled]:
-    """A new map of so many scenes, solved."""
+def filled(path: Path, num: int, made: Pattern, *, asked: bool = False) -> Iterator[Filled]:
+    """A new map of so many scenes, solved.
+
+    Args:
+        asked: its scenes lie in the index and have asked it, each with nodes of its own (`_fill_index`).
+    """
     with gsmap.map.create(path) as m:
         one = Filled(m, made)
         with one.standing_in():
@@ -259,8 +278,69 @@ def filled(path: Path, num: int, made: Pattern) -> Iterator[Filled]:
             m.describe()
             _add_rows(one, num - 1)
             one.num_tried = num
+            if asked:
+                _fill_index(one)
             m.optimize()
             yield one
+
+
+@contextmanager
+def kept(path: Path, num: int, made: Pattern, scratch: Path, *, asked: bool = False) -> Iterator[Filled]:
+    """A copy of such a map, which is filled only where there is none at a path."""
+    if not path.exists():
+        partial = path.with_suffix(".partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        with filled(partial, num, made, asked=asked) as one:
+            order = one.order
+        (partial / "order.json").write_text(json.dumps(order))
+        partial.rename(path)
+    shutil.copytree(path, scratch)
+    order = json.loads((scratch / "order.json").read_text())
+    (scratch / "order.json").unlink()
+    with gsmap.map.open(scratch) as m:
+        one = Filled(m, made, order, len(order))
+        with one.standing_in():
+            yield one
+
+
+def _fill_index(one: Filled) -> None:
+    """Put all scenes into the index, each with nodes as far from each other's as those of one scene and type are, and
+    note that each has asked it and found those before it, all of which were tried."""
+    store, params = one.map.store, one.map.settings.retrieve
+    keys, rng = one.keys(one.order), np.random.default_rng(1)
+    voters = voters_of(one.made.graph, "", params.nodes_per_scene)
+    lists = np.unique(voters.kept.keys >> 8, return_inverse=True)[1]  # without signs: of one descriptor and type
+    for start in range(0, len(one.order), 512):
+        some = one.order[start : start + 512]
+        segment = new_segment([_alike(voters, lists, scene, keys[scene].digest, rng) for scene in some])
+        recipe = index_recipe(params)
+        old = store.indexes.segments(recipe)
+        old = [old[k] for k in to_merge([len(s.members) for s in old], len(some))]
+        whole = merged([*old, segment])
+        members = [member for member in whole.members if member is not None]
+        store.indexes.put(recipe, members, whole.arrays, [s.id for s in old])
+    named = keys_of_lookups(keys, params)
+    said = []
+    for k, scene in enumerate(one.order):
+        before = one.order[max(0, k - TRIED) : k][::-1]
+        candidates = tuple(Candidate(other, float(TRIED - i), 1.0) for i, other in enumerate(before))
+        said.append(Lookup(scene, named[scene], candidates, 0))
+    for start in range(0, len(said), 1000):
+        store.indexes.note(said[start : start + 1000])
+
+
+def _alike(voters: Voters, lists: np.ndarray, scene: str, graph: str, rng: np.random.Generator) -> Voters:
+    """Another scene's nodes: each of these, moved by half the way between two others of its type."""
+    kept = voters.kept
+    order = np.lexsort((rng.random(len(lists)), lists))  # within each list a random one
+    step = np.zeros(kept.codes.shape)
+    same = lists[order] == np.roll(lists[order], 1)
+    step[order] = np.where(same[:, None], kept.codes[order].astype(int) - kept.codes[np.roll(order, 1)], 0) / 2
+    codes = np.clip(np.rint(kept.codes + step), -127, 127).astype(np.int8)
+    keys = with_signs(kept.keys, codes)
+    member = replace(voters.member, scene=scene, graph=graph)
+    positions = (kept.positions + rng.normal(size=kept.positions.shape) * 0.3).astype(np.float16)
+    return replace(voters, member=member, kept=replace(kept, keys=keys, codes=codes, positions=positions))
 
 
 def _add_rows(one: Filled, count: int) -> None:

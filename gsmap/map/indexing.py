@@ -56,13 +56,13 @@ class SceneIndex:
         present = {member.scene for segment in segments for member in segment.members if member is not None}
         return sorted(set(self.keys) - present)
 
-    def bring_up_to_date(self, progress: Callable[[str], None]) -> None:
-        """Put the scenes into the index that are not in it."""
+    def brought_up_to_date(self, progress: Callable[[str], None]) -> list[StoredSegment]:
+        """`segments`, once the scenes are in the index that were not in it."""
         while True:
             segments = self.segments()
             missing = self.missing(segments)
             if not missing:
-                return
+                return segments
             if len(missing) > AT_ONCE:
                 progress(f"{len(missing)} scenes into the index")
             new = self.make(missing[:AT_ONCE])

@@ -36,11 +36,11 @@ def ask(
     index = _index(store, graphs, params, set(asking), mine)
     for left in reversed(range(PATIENCE)):
         try:
-            index.bring_up_to_date(lambda told: progress("register", 0.0, f"{told} of retrieval"))
+            segments = index.brought_up_to_date(lambda told: progress("register", 0.0, f"{told} of retrieval"))
             for start in range(0, len(asking), AT_ONCE):
                 scenes = asking[start : start + AT_ONCE]
                 voters = [mine[scene] if scene in mine else _voters(store, graphs[scene], params) for scene in scenes]
-                found = retrieve.look_up(voters, index.segments(), params)
+                found = retrieve.look_up(voters, segments, params)
                 store.indexes.note([_lookup(one, said, params) for one, said in zip(voters, found, strict=True)])
             return
         except CorruptError:

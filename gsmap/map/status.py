@@ -12,10 +12,11 @@ from gsmap.map.settings import Settings
 from gsmap.map.stages.describe import graph_keys, unthinned, without_graph
 from gsmap.map.stages.export import dirty_tiles
 from gsmap.map.stages.optimize import pose_basis
-from gsmap.map.stages.register import stale
+from gsmap.map.stages.register import num_stale
 from gsmap.register.duplicate import SAME_CAPTURE
 from gsmap.store import Store
 from gsmap.store.leases import Lease
+from gsmap.types import PoseGraph
 from gsmap.types.metre import Metre
 from gsmap.types.rows import AtWorkRow, MapStatus, MetreRow, TodoRow
 
@@ -24,8 +25,8 @@ from gsmap.types.rows import AtWorkRow, MapStatus, MetreRow, TodoRow
 def status(store: Store, settings: Settings) -> MapStatus:
     """``gsmap status MAP``, from the catalog alone: no array is read, nothing is computed."""
     at = shlex.quote(store.location)
-    scenes = store.scenes.list()
-    graph = store.revisions.get()
+    scenes = store.scenes.brief()
+    newest, graph = store.revisions.newest(), PoseGraph(store.revisions.poses(), world=store.revisions.world())
     todo: list[TodoRow] = []
 
     def add(what: str, count: int, verb: str, meaning: str) -> None:
@@ -34,9 +35,8 @@ def status(store: Store, settings: Settings) -> MapStatus:
 
     keys = graph_keys(store, unthinned(scenes), settings)
     living = {scene.id for scene in scenes}
-    current = store.registrations.current()
     lacking = without_graph(store, keys)
-    bare = set(lacking) - {stored.scene for stored in store.graphs.list()}
+    bare = set(lacking) - (set(store.graphs.node_counts()) if lacking else set())
     add("undescribed", len(bare), f"gsmap update {at}", "scenes without a graph")
     add(
         "stale_graphs",
@@ -44,35 +44,39 @@ def status(store: Store, settings: Settings) -> MapStatus:
         f"gsmap update {at}",
         "graphs made by other settings or another version",
     )
-    registered = {scene for stored in current for scene in (stored.registration.target, stored.registration.source)}
-    alone = [scene for scene in scenes if scene.id not in registered]
+    pairs = store.registrations.keys()
+    registered = {scene for pair, _ in pairs if living.issuperset(ends := pair.split(":")) for scene in ends}
     add(
         "unregistered",
-        len(alone) if len(scenes) > 1 else 0,
+        len(living - registered) if len(scenes) > 1 else 0,
         f"gsmap update {at}",
         "scenes that were never tried with another",
     )
-    aged = stale(current, keys, settings)
-    add("stale_edges", len(aged), f"gsmap update {at}", "edges made by other settings or versions")
+    add(
+        "stale_edges",
+        num_stale(pairs, keys, settings),
+        f"gsmap update {at}",
+        "edges made by other settings or versions",
+    )
     _add_unsolved(store, settings, add, f"gsmap optimize {at}")
     for target, (count, request) in dirty_tiles(store, settings).items():
         verb = " ".join(["gsmap export", at, shlex.quote(target), *request.options()])
         add("dirty_tiles", count, verb, f"tiles in {target} that are out of date")
-    poses = [pose for scene, pose in (graph.poses if graph else {}).items() if scene in living]
+    poses = [pose for scene, pose in graph.poses.items() if scene in living]
     tentative = [pose for pose in poses if pose.status == "tentative"]
     add("tentative", len(tentative), f"gsmap list {at} scenes --status tentative", "scenes on edges no cycle confirms")
-    undecided = [pair for pair in (graph.undecided if graph else ()) if set(pair) <= living]
+    judged = store.revisions.undecided(newest.number).get(newest.number, []) if newest else []
+    undecided = [pair for pair in judged if living.issuperset(pair)]
     add("undecided", len(undecided), f"gsmap list {at} edges", "edges that nothing could decide: confirm or reject")
     todo += set_aside_rows(store)
     add("changes", num_open(store, settings.change.min_confidence), f"gsmap changes {at}", "changes nobody looked at")
-    outweighed = [scene for scene in (graph.provenance.contradicted_priors if graph else ()) if scene in living]
+    outweighed = [scene for scene in (newest.provenance.contradicted_priors if newest else ()) if scene in living]
     add("contradicted_priors", len(outweighed), f"gsmap prior {at} SCENE", "priors that the edges outweigh")
-    ties = graph.world if graph else ()
-    contrary = sum(row.use == "outlier" for tie in ties for row in tie.residuals)
+    contrary = sum(row.use == "outlier" for tie in graph.world for row in tie.residuals)
     add("world_outliers", contrary, f"gsmap georeference {at}", "observations of the world that contradict the others")
-    untied = sum(bool(tie.problem) for tie in ties)
+    untied = sum(bool(tie.problem) for tie in graph.world)
     add("untied", untied, f"gsmap georeference {at}", "components whose place in the world is not determined yet")
-    twice = [stored for stored in current if any(n.startswith(SAME_CAPTURE) for n in stored.registration.notes)]
+    twice = store.registrations.noted(SAME_CAPTURE)
     add("duplicates", len(twice), f"gsmap list {at} edges", "pairs that are the same capture twice: remove one of each")
     isolated = [pose for pose in poses if pose.status == "isolated"]
     add("isolated", len(isolated), f"gsmap list {at} scenes --status isolated", "scenes that nothing ties to others")
@@ -84,7 +88,7 @@ def status(store: Store, settings: Settings) -> MapStatus:
         components=components,
         islands=components,
         tentative=len(tentative),
-        revision=store.revisions.current(),
+        revision=newest.number if newest else None,
         metres_per_unit=next((one.metres_per_unit for one in metres.values() if one.is_known), None),
         metres=tuple(metre_row(component, one) for component, one in metres.items()),
         at_work=at_work_rows(store.leases.others()),
@@ -93,9 +97,10 @@ def status(store: Store, settings: Settings) -> MapStatus:
 
 def set_aside_rows(store: Store) -> list[TodoRow]:
     """What was set aside, one row a job, with the command that tries it again."""
-    at, names = shlex.quote(store.location), {scene.id: scene.name for scene in store.scenes.list()}
+    aside = store.set_aside.list()
+    at, names = shlex.quote(store.location), store.scenes.names() if aside else {}
     rows = []
-    for one in store.set_aside.list():
+    for one in aside:
         kind = one.what.partition(" ")[0]
         if kind == "tile":
             verb, about = f"gsmap export {at} {shlex.quote(one.about)}", f"a tile in {one.about}"

@@ -8,6 +8,7 @@ namespace nb = nanobind;
 namespace gsmap {
 void bind_cells(nb::module_ &);
 void bind_clusters(nb::module_ &);
+void bind_codes(nb::module_ &);
 void bind_correspondences(nb::module_ &);
 void bind_filters(nb::module_ &);
 void bind_fit(nb::module_ &);
@@ -32,6 +33,7 @@ NB_MODULE(_native, m) {
     nb::set_leak_warnings(false);  // a view kept alive by an autograd graph at exit is no leak
     gsmap::bind_cells(m);
     gsmap::bind_clusters(m);
+    gsmap::bind_codes(m);
     gsmap::bind_correspondences(m);
     gsmap::bind_filters(m);
     gsmap::bind_fit(m);

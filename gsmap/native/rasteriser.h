@@ -133,6 +133,8 @@ struct Kernels {
     // The nearest of the points of a leaf: those of another one are looked at, and in the end only the k nearest left.
     float (*find_nearest)(const Leaf &of, const Leaf &among, int k, Search &);
     float (*settle_nearest)(const Leaf &of, int k, Search &);
+    int64_t (*within)(const int16_t *mine, const int8_t *theirs, int64_t stride, int64_t count, int32_t most,
+                      int32_t *which, int32_t *squared);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

@@ -1,4 +1,5 @@
 // Compiled once per instruction set: GSMAP_ISA is the namespace and name, the compiler's flags choose the vectors.
+#include "codes_kernel.h"
 #include "correspondences_kernel.h"
 #include "filters_kernel.h"
 #include "fit_kernel.h"
@@ -18,5 +19,6 @@ static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project
                                      GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::ssim, GSMAP_ISA::agree,
                                      GSMAP_ISA::vote, GSMAP_ISA::weigh, GSMAP_ISA::highest,
                                      GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::near,
-                                     GSMAP_ISA::pair_costs, GSMAP_ISA::find_nearest, GSMAP_ISA::settle_nearest};
+                                     GSMAP_ISA::pair_costs, GSMAP_ISA::find_nearest, GSMAP_ISA::settle_nearest,
+                                     GSMAP_ISA::within};
 const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;

@@ -56,8 +56,13 @@ def space(descriptor_id: str, *, second: bool) -> int:
 
 def keys_of(space_number: int, types: np.ndarray, codes: np.ndarray) -> np.ndarray:
     """(M,) int64 the list that each node lies in: of its descriptor, its type, and the signs of its first axes."""
+    return with_signs((np.int64(space_number) << 32) | ((types.astype(np.int64) & 0xFFFFFF) << 8), codes)
+
+
+def with_signs(keys: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """Keys (M,) with the signs of these codes for those that they hold."""
     signs = (codes[:, :NUM_SIGNS] >= 0) @ (1 << np.arange(NUM_SIGNS))
-    return (np.int64(space_number) << 32) | ((types.astype(np.int64) & 0xFFFFFF) << 8) | signs
+    return (keys & ~np.int64(0xFF)) | signs
 
 
 def probes(keys: np.ndarray, codes: np.ndarray, num_turned: int) -> np.ndarray:

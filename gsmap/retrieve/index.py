@@ -3,38 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.retrieve.codes import NUM_DIMS
 from gsmap.retrieve.voters import WIDTH, Nodes, Voters
-from gsmap.types.segments import InMemory, in_lists, places_of, write_places
+from gsmap.types.segments import InMemory, in_lists, write_places
 
 _POSITIONS = slice(NUM_DIMS, NUM_DIMS + 6)
 
 
-@dataclass(frozen=True, eq=False)
-class Unpacked:
-    """M nodes of many scenes.
-
-    Args:
-        places: (M,) int32 the scene of each among the members.
-    """
-
-    codes: np.ndarray
-    positions: np.ndarray
-    places: np.ndarray
-
-
-def unpacked(rows: np.ndarray, num_members: int) -> Unpacked:
-    """What lies in (M, WIDTH) uint8 rows of a segment of so many scenes."""
-    rows = np.ascontiguousarray(rows)
-    return Unpacked(
-        rows[:, :NUM_DIMS].view(np.int8),
-        np.ascontiguousarray(rows[:, _POSITIONS]).view("<f2"),
-        places_of(rows, num_members),
-    )
+def positions_of(rows: np.ndarray) -> np.ndarray:
+    """(M, 3) float16 where the nodes in (M, WIDTH) uint8 rows of a segment lie."""
+    return np.ascontiguousarray(rows[:, _POSITIONS]).view("<f2")
 
 
 def new_segment(voters: Sequence[Voters]) -> InMemory:

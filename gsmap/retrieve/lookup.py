@@ -7,17 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap._native import near_codes
+from gsmap.errors import CorruptError
 from gsmap.retrieve import codes
-from gsmap.retrieve.index import Unpacked, unpacked
+from gsmap.retrieve.index import positions_of
 from gsmap.retrieve.params import Params
 from gsmap.retrieve.voters import Voters
 from gsmap.types.retrieval import Candidate, Member
-from gsmap.types.segments import Segment, lists_of
+from gsmap.types.segments import Segment, lists_of, places_of
 
 VERSION = 3
 
-_BLOCK_ROWS = 100_000  # of an index that are in memory at a time: 6 MB
-_FAR = 1e12  # squared: farther than any code
+_BLOCK_ROWS = 250_000  # of an index that are in memory at a time: 15 MB
 _SAME_NODE_M = 0.05  # two nodes nearer than this may be one
 
 
@@ -34,11 +35,12 @@ def look_up(voters: Sequence[Voters], segments: Sequence[Segment], params: Param
         segments: all parts of the index.
     """
     members = _Members(segments)
-    found = [_Matches() for _ in voters]
-    for block in _blocks(voters, segments, members, params):
-        for asker, matches in zip(voters, found, strict=True):
-            _search(asker, block, members, matches, params)
-    return [_ranked(asker, matches, members, params) for asker, matches in zip(voters, found, strict=True)]
+    found = [_Matches(asker, members, params) for asker in voters]
+    for segment, place_of in zip(segments, members.places, strict=True):
+        for block in _blocks(found, segment):
+            for matches in found:
+                _search(matches, block, place_of)
+    return [_ranked(matches, members, params) for matches in found]
 
 
 class _Members:
@@ -61,133 +63,94 @@ class _Members:
         return len(self.members) - 1 <= params.top_k
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """What a segment has of some lists.
+class _Matches:
+    """What is found of one scene's nodes, block by block.
 
     Args:
-        at: (W, 2) where each of them begins and ends among the nodes.
-        nodes: their places are those of `_Members`, -1 where a scene does not count.
+        asker: the scene.
+        own: its place among the members; -1 where it is none.
+        probes: (M, 2 ** turned_signs) int64 lists in which each of its nodes looks.
+        nearest: (M, votes_per_node) int32 squared distances of the nearest that count, as a heap, the largest first.
+        seen: where all scenes are to be paired, places of those with nodes in the same lists, however unlike.
     """
 
-    at: np.ndarray
-    nodes: Unpacked
+    def __init__(self, asker: Voters, members: _Members, params: Params) -> None:
+        self.asker, self.own = asker, members.place_of.get(asker.member.scene, -1)
+        self.probes = codes.probes(asker.asking.keys, asker.asking.codes, params.turned_signs)
+        most = int(2 * codes.SCALE**2 * (1 - params.min_similarity) + 1e-6)
+        self.nearest = np.full((len(asker.asking), params.votes_per_node), most, np.int32)
+        self.seen: set[int] | None = set() if members.are_few(params) else None
+        self.parts: list[tuple[np.ndarray, ...]] = []
 
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Some lists of an index, of all segments; ``keys`` (W,) rises."""
+    """Some lists of a segment.
+
+    Args:
+        keys: (W,) int64 of the lists, rising.
+        starts: (W + 1,) int64 where each begins in the rows.
+        rows: (M, B) uint8.
+        num_members: of the segment.
+    """
 
     keys: np.ndarray
-    parts: list[_Part]
+    starts: np.ndarray
+    rows: np.ndarray
+    num_members: int
 
 
-def _blocks(
-    voters: Sequence[Voters], segments: Sequence[Segment], members: _Members, params: Params
-) -> Iterator[_Block]:
-    """The lists that any of the scenes looks into, some at a time."""
-    asked = [codes.probes(v.asking.keys, v.asking.codes, params.turned_signs).ravel() for v in voters]
-    wanted = np.unique(np.concatenate(asked)) if asked else np.zeros(0, np.int64)
-    lists = [lists_of(segment) for segment in segments]
-    total = np.zeros(len(wanted), dtype=np.int64)
-    for keys, starts in lists:
-        at = np.searchsorted(keys, wanted)
-        there = at < len(keys)
-        there[there] = keys[at[there]] == wanted[there]
-        total[there] += np.diff(starts)[at[there]]
-    wanted, total = wanted[total > 0], total[total > 0]
-    if not len(wanted):
-        return
-    block_of = (np.cumsum(total) - 1) // _BLOCK_ROWS
+def _blocks(found: Sequence[_Matches], segment: Segment) -> Iterator[_Block]:
+    """The lists of a segment that any of the scenes looks into, some at a time, with what lies between them."""
+    keys, starts = lists_of(segment)
+    asked = np.unique(np.concatenate([matches.probes.ravel() for matches in found] or [np.zeros(0, np.int64)]))
+    wanted = np.flatnonzero(np.isin(keys, asked, assume_unique=True))
+    block_of = (starts[wanted + 1] - 1) // _BLOCK_ROWS
     for number in np.unique(block_of):
         mine = wanted[block_of == number]
-        yield _read(mine, segments, lists, members)
+        low, high = int(mine[0]), int(mine[-1]) + 1
+        rows = np.ascontiguousarray(segment.rows(int(starts[low]), int(starts[high])))
+        yield _Block(keys[low:high], starts[low : high + 1] - starts[low], rows, len(segment.members))
 
 
-def _read(
-    wanted: np.ndarray,
-    segments: Sequence[Segment],
-    lists: Sequence[tuple[np.ndarray, np.ndarray]],
-    members: _Members,
-) -> _Block:
-    parts = []
-    for segment, (keys, starts), place_of in zip(segments, lists, members.places, strict=True):
-        low, high = np.searchsorted(keys, wanted[0]), np.searchsorted(keys, wanted[-1], side="right")
-        if low == high:
-            continue
-        found = unpacked(segment.rows(int(starts[low]), int(starts[high])), len(segment.members))
-        places = place_of[found.places]
-        first = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        at = np.stack([starts[first], starts[first + (keys[first] == wanted)]], 1) - starts[low]
-        at[keys[first] != wanted] = 0
-        parts.append(_Part(at, Unpacked(found.codes, found.positions, places)))
-    return _Block(wanted, parts)
+def _search(found: _Matches, block: _Block, place_of: np.ndarray) -> None:
+    """Compare a scene's nodes with those of the lists they look into.
 
+    Squared distances of codes are whole numbers, and of each node all are kept that are as near as the last of its
+    nearest: no order decides.
 
-class _Matches:
-    """Matches of one scene's nodes, collected over blocks."""
-
-    def __init__(self) -> None:
-        self.nodes: list[np.ndarray] = []
-        self.places: list[np.ndarray] = []
-        self.squared: list[np.ndarray] = []
-        self.positions: list[np.ndarray] = []
-        self.seen: set[int] = set()  # places of scenes with nodes in the same lists, however unlike
-
-
-def _search(asker: Voters, block: _Block, members: _Members, found: _Matches, params: Params) -> None:
-    """Compare a scene's nodes with those of the lists they look into."""
-    own, is_small = members.place_of.get(asker.member.scene, -1), members.are_few(params)
-    probes = codes.probes(asker.asking.keys, asker.asking.codes, params.turned_signs)
-    at = np.searchsorted(block.keys, probes)
-    there = (at < len(block.keys)) & (block.keys[np.minimum(at, len(block.keys) - 1)] == probes)
-    node, which = np.nonzero(there)[0], at[there]
+    Args:
+        place_of: of each scene of the segment that counts, its place among the members; else -1.
+    """
+    at = np.minimum(np.searchsorted(block.keys, found.probes), len(block.keys) - 1)
+    node, column = np.nonzero(block.keys[at] == found.probes)
+    which = at[node, column]
     order = np.argsort(which, kind="stable")
-    node, which = node[order], which[order]
-    firsts = np.flatnonzero(np.r_[True, which[1:] != which[:-1]]) if len(which) else np.zeros(0, np.int64)
-    vectors = np.ones((len(asker.asking), codes.NUM_DIMS + 2), np.float32)
-    vectors[:, :-2] = asker.asking.codes
-    vectors[:, -2] = (vectors[:, :-2] ** 2).sum(1)
-    vectors[:, :-2] *= -2
-    most = np.float32(2 * codes.SCALE**2 * (1 - params.min_similarity))
-    for first, last in zip(firsts, np.r_[firsts[1:], len(which)], strict=True):
-        nodes = _listed(block, int(which[first]))
-        mine, theirs = node[first:last], np.ones((len(nodes.codes), codes.NUM_DIMS + 2), np.float32)
-        theirs[:, :-2] = nodes.codes
-        theirs[:, -1] = (theirs[:, :-2] ** 2).sum(1)
-        theirs[(nodes.places == own) | (nodes.places < 0), -1] = _FAR
-        squared = vectors[mine] @ theirs.T  # |a|^2 + |b|^2 - 2 a b: whole numbers below 2 ** 22, so exact in any order
-        bar = np.full(len(mine), most)
-        if squared.shape[1] > params.votes_per_node:  # all that are as near as the last one: no order decides
-            kth = params.votes_per_node - 1
-            bar = np.minimum(bar, np.partition(squared, kth, axis=1)[:, kth])
-        if is_small:
-            found.seen.update(nodes.places[nodes.places >= 0].tolist())
-        q, e = np.nonzero(squared <= bar[:, None])
-        found.nodes.append(mine[q])
-        found.places.append(nodes.places[e])
-        found.squared.append(squared[q, e])
-        found.positions.append(nodes.positions[e])
+    node, begin, end = node[order], block.starts[which[order]], block.starts[which[order] + 1]
+    others = np.where(place_of == found.own, np.int32(-1), place_of)
+    try:
+        who, row, squared, place = near_codes(
+            found.asker.asking.codes, node, begin, end, block.rows, others, found.nearest
+        )
+    except ValueError as error:
+        raise CorruptError(f"an index has rows of scenes that it has not ({error})") from error
+    found.parts.append((who, squared, place, positions_of(block.rows[row])))
+    if found.seen is not None:
+        for first, last in zip(begin.tolist(), end.tolist(), strict=True):
+            there = others[places_of(block.rows[first:last], block.num_members)]
+            found.seen.update(there[there >= 0].tolist())
 
 
-def _listed(block: _Block, number: int) -> Unpacked:
-    """What one list holds, of all segments."""
-    slices = [(part.nodes, slice(*part.at[number])) for part in block.parts]
-    return Unpacked(
-        np.concatenate([nodes.codes[rows] for nodes, rows in slices]),
-        np.concatenate([nodes.positions[rows] for nodes, rows in slices]),
-        np.concatenate([nodes.places[rows] for nodes, rows in slices]),
-    )
-
-
-def _ranked(asker: Voters, found: _Matches, members: _Members, params: Params) -> list[Candidate]:
-    if not found.nodes:
+def _ranked(found: _Matches, members: _Members, params: Params) -> list[Candidate]:
+    if not found.parts:
         return []
-    node, place = np.concatenate(found.nodes), np.concatenate(found.places)
-    squared, theirs = np.concatenate(found.squared), np.concatenate(found.positions)
+    asker = found.asker
+    node, squared, place, theirs = (np.concatenate(part) for part in zip(*found.parts, strict=True))
+    near = squared <= found.nearest[node, 0]  # the others were near when they were found
+    node, squared, place, theirs = node[near], squared[near], place[near], theirs[near]
     # Of each node its nearest matches, and of these the best one in each scene. Squared distances are whole numbers
     # below 2 ** 23; equals come by scene, and within a scene as they lie in its lists: no order of arrival decides.
-    order = np.argsort((node << 44) | (squared.astype(np.int64) << 20) | place, kind="stable")
+    order = np.argsort((node << 44) | (squared << 20) | place, kind="stable")
     node, place, squared, theirs = node[order], place[order], squared[order], theirs[order]
     first = np.searchsorted(node, node)
     last = np.minimum(first + params.votes_per_node, np.searchsorted(node, node, side="right")) - 1
@@ -205,7 +168,7 @@ def _ranked(asker: Voters, found: _Matches, members: _Members, params: Params) -
         for k, score in zip(chosen, scores, strict=True)
     ]
     if members.are_few(params):  # a small map: whatever can be compared at all is worth a try
-        rest = found.seen.difference(chosen.tolist()) - {members.place_of.get(asker.member.scene, -1)}
+        rest = (found.seen or set()).difference(chosen.tolist())
         out += [Candidate(members.members[k].scene, 0.0, 0.0) for k in sorted(rest)]
     return sorted(out, key=lambda c: (-c.score, -c.votes, c.scene))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.retrieve.params import Params
-from gsmap.retrieve.rounds import Pair, directed
+from gsmap.retrieve.rounds import Pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,34 +39,37 @@ def neighbours(placed: Mapping[str, Placed], params: Params) -> list[Pair]:
     """
     from scipy.spatial import cKDTree
 
-    found: dict[Pair, float] = {}
-    components: dict[int, list[str]] = {}
-    for scene in sorted(placed):
-        components.setdefault(placed[scene].component, []).append(scene)
-    for scenes in components.values():
-        if len(scenes) < 2:
+    ids = sorted(placed)
+    component = np.array([placed[scene].component for scene in ids], dtype=np.int64)
+    found = [np.zeros((0, 3))]
+    for one in np.unique(component):
+        rows = np.flatnonzero(component == one)
+        if len(rows) < 2:
             continue
-        centres = np.array([placed[scene].centre for scene in scenes], dtype=np.float64)
-        sigmas = np.array([placed[scene].sigma for scene in scenes])
-        radii = np.array([placed[scene].radius for scene in scenes])
+        centres = np.array([placed[ids[row]].centre for row in rows], dtype=np.float64)
+        sigmas = np.array([placed[ids[row]].sigma for row in rows])
+        radii = np.array([placed[ids[row]].radius for row in rows])
         # hypot(a, b) <= a + b, so this reach leaves none out.
         reach = radii + params.reach_sigmas * sigmas
-        near: dict[int, dict[int, float]] = {}
         octave = np.floor(np.log2(np.maximum(reach, 1e-12))).astype(int)
+        near = [np.zeros((2, 0), dtype=np.int64)]
         for size in np.unique(octave):
             pool, askers = np.flatnonzero(octave == size), np.flatnonzero(octave <= size)
             tree = cKDTree(centres[pool])
-            found_rows = tree.query_ball_point(centres[askers], reach[askers] + reach[pool].max())
-            for asker, rows in zip(askers, found_rows, strict=True):
-                others = pool[rows]
-                distance = np.linalg.norm(centres[others] - centres[asker], axis=1)
-                gap = distance - radii[others] - radii[asker]
-                gap -= params.reach_sigmas * np.hypot(sigmas[others], sigmas[asker])
-                for beside, far in zip(others[gap <= 0].tolist(), distance[gap <= 0].tolist(), strict=True):
-                    if beside != asker:
-                        near.setdefault(int(asker), {})[beside] = far
-                        near.setdefault(beside, {})[int(asker)] = far
-        for row, distances in near.items():
-            for other in sorted(distances, key=lambda k: (distances[k], k))[: params.num_spatial]:
-                found[directed(scenes[row], scenes[other])] = distances[other]
-    return sorted(found, key=lambda pair: (found[pair], pair))
+            lists = tree.query_ball_point(centres[askers], reach[askers] + reach[pool].max(), return_sorted=False)
+            asker = np.repeat(askers, [len(others) for others in lists])
+            other = pool[np.concatenate(lists).astype(np.int64)]
+            near += [np.stack([asker, other]), np.stack([other, asker])]
+        row, other = np.divmod(np.unique(np.concatenate([a * len(rows) + b for a, b in near])), len(rows))
+        distance = np.linalg.norm(centres[other] - centres[row], axis=1)
+        gap = distance - radii[other] - radii[row] - params.reach_sigmas * np.hypot(sigmas[other], sigmas[row])
+        row, other, distance = (part[(gap <= 0) & (row != other)] for part in (row, other, distance))
+        order = np.lexsort((other, distance, row))
+        row, other, distance = row[order], other[order], distance[order]
+        nearest = np.arange(len(row)) - np.searchsorted(row, row) < params.num_spatial
+        ends = np.sort(np.stack([rows[row], rows[other]]), axis=0)[:, nearest]
+        found.append(np.column_stack([*ends, distance[nearest]]))
+    every = np.concatenate(found)
+    every = np.unique(every, axis=0)  # a pair that both of its scenes name
+    ordered = every[np.lexsort((every[:, 1], every[:, 0], every[:, 2]))]
+    return [(ids[a], ids[b]) for a, b in ordered[:, :2].astype(np.int64).tolist()]

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Row, Text, delete, func, insert, select, type_coerce
+from sqlalchemy import Connection, Row, Text, delete, func, insert, select, true, type_coerce
 
 from gsmap.errors import InputError
 from gsmap.methods import RecipeKey
@@ -184,11 +184,12 @@ class Graphs:
         with self._catalog.read() as connection:
             wanted = [(row.key, row.group_id) for row in connection.execute(query)]
             new = sorted(key for key, group_id in wanted if (key, group_id) not in self._said)
-            for start in range(0, len(new), recipes.ASKED_AT_ONCE):
-                some = graphs.c.key.in_(new[start : start + recipes.ASKED_AT_ONCE])
+            if new:
+                some = graphs.c.key.in_(new) if len(new) <= recipes.MOST_ASKED else true()
                 unread = select(graphs.c.key, graphs.c.scene, graphs.c.group_id, _TEXT).where(some)
-                for row in connection.execute(unread):
-                    self._said[row.key, row.group_id] = _says(row)
+                for row in connection.execute(unread).all():
+                    if (row.key, row.group_id) not in self._said:
+                        self._said[row.key, row.group_id] = _says(row)
         return [self._said[one] for one in wanted]
 
     def list(self) -> list[StoredGraph]:

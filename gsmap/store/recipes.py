@@ -14,6 +14,8 @@ from gsmap.store.schema import recipes
 from gsmap.types.plain import canonical, plain
 
 ASKED_AT_ONCE = 10_000  # values in one query; SQLite takes 32,766
+MOST_ASKED = 5_000
+"""Values that are named to a query; of more, all that there are are read instead, which is quicker."""
 PARTS = ("stage", "method", "version", "settings", "backend")
 
 
@@ -68,6 +70,9 @@ def kept(
 ) -> set[str]:
     """Those of the keys (as digests) that a column holds, in rows that meet a condition."""
     wanted, found = sorted({digest_of(key) for key in keys}), set()
+    if len(wanted) > MOST_ASKED:
+        query = select(column).where(true() if where is None else where)
+        return set(connection.execute(query).scalars()).intersection(wanted)
     for start in range(0, len(wanted), ASKED_AT_ONCE):
         some = column.in_(wanted[start : start + ASKED_AT_ONCE])
         query = select(column).where(some, true() if where is None else where)

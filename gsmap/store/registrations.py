@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from operator import attrgetter
+from operator import attrgetter, itemgetter
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from sqlalchemy import (
     Connection,
     LargeBinary,
     Row,
+    Select,
     Text,
     case,
     exists,
@@ -30,7 +32,7 @@ from gsmap.errors import ConfigError, InputError, NotFoundError
 from gsmap.methods import RecipeKey
 from gsmap.store import recipes
 from gsmap.store.catalog import Catalog, now
-from gsmap.store.columns import not_ours
+from gsmap.store.columns import Json, an_object, not_ours
 from gsmap.store.matrices import matrices_of_bytes, poses_of_bytes
 from gsmap.store.scene_refs import living_ids, resolve, scene_name
 from gsmap.store.schema import registrations, reviews, scenes
@@ -76,25 +78,29 @@ class StoredRegistration:
         return posed and _may_be_used(self.registration.status, self.review)
 
 
+_UNKNOWN = float("nan")
+
+
 class Standing(NamedTuple):  # of every pair of a map, with every update: a tuple is made in a tenth of the time
     """What counts of a pair, without its figures: all that decides whether it is used; see `StoredRegistration`.
 
     Args:
+        pair: both ids with a colon between them, the lower first.
         usable: as `StoredRegistration.is_usable`.
-        keys: of all that was computed for the pair; of `Registrations.tried` alone.
-        disagreement: of what both scenes saw, by what counts; NaN where that is not known. As ``keys``.
+        disagreement: of what both scenes saw, by what counts; NaN where that is not known, it was not accepted, or not
+            asked for.
+        several: keys of all that was computed for the pair; None where it was registered once, or that was not asked.
     """
 
     number: int
     target: str
     source: str
-    status: str
+    pair: str
     key: str
-    recipe: str | None
     review: str | None
     usable: bool
-    keys: frozenset[str] = frozenset()
-    disagreement: float = float("nan")
+    disagreement: float = _UNKNOWN
+    several: frozenset[str] | None = None
 
     @property
     def manual(self) -> bool:
@@ -105,6 +111,11 @@ class Standing(NamedTuple):  # of every pair of a map, with every update: a tupl
     def is_told(self) -> bool:
         """Whether a person measured or confirmed it."""
         return self.manual or self.review == "confirm"
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """Of all that was computed for the pair, where that was asked for."""
+        return frozenset((self.key,) if self.key else ()) if self.several is None else self.several
 
 
 @dataclass(frozen=True)
@@ -127,6 +138,8 @@ class Registrations:
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
+        self._silent: dict[str, Standing] = {}
+        self._read_upto: tuple[int, tuple[Any, ...]] = (0, ())
 
     def save(self, registration: Registration, key: RecipeKey | None = None) -> StoredRegistration:
         """Add a registration to its pair's history; it is the pair's current one from now on, unless a person spoke.
@@ -215,36 +228,57 @@ class Registrations:
     def standing(self, *, usable: bool = False) -> list[Standing]:
         """What counts of each pair of living scenes, by (target, source); no matrix of any is read.
 
+        Where `tried` was asked before, what it remembers is not read again.
+
         Args:
             usable: only those that are (`Standing.usable`).
         """
-        accepted = registrations.c.status == "accepted" if usable else None
         with self._catalog.read() as connection:
-            rows = _choose(connection, _LEAN, silent_if=accepted)
-            made = [Standing(*_stands(choice)) for choice in _living(connection, rows)]
-        return sorted((one for one in made if one.usable or not usable), key=_ends_of)
+            if self._silent:
+                made = self.tried()
+            else:
+                wanted = registrations.c.status == "accepted" if usable else true()
+                made = _of_silent(connection, null(), wanted) + _of_spoken(connection)
+            alive = living_ids(connection)
+        found = (one for one in made if (one.usable or not usable) and one.target in alive and one.source in alive)
+        return sorted(found, key=_ends_of)
+
+    def noted(self, text: str) -> list[StoredRegistration]:
+        """The current registrations of which a note begins with a text, by the pair's first registration."""
+        notes = type_coerce(registrations.c.notes, Text).contains(text, autoescape=True)
+        with self._catalog.read() as connection:
+            found = _current(connection, silent_if=notes)
+        return [one for one in found if any(note.startswith(text) for note in one.registration.notes)]
 
     def tried(self) -> list[Standing]:
-        """The same of every pair, with what else was computed for it: what registering asks."""
-        repeated = select(registrations.c.pair).group_by(registrations.c.pair).having(func.count() > 1)
-        again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
-        keys: dict[str, set[str]] = {}
+        """The same of every pair, of scenes living or not, with what else was computed for it, in any order.
+
+        Registering asks this twice an update, so what was read is remembered: of rows that stay as they are, only new
+        ones are read again.
+        """
         with self._catalog.read() as connection:
-            chosen = _living(connection, _choose(connection, (*_LEAN, _EVIDENCE)))
-            for row in connection.execute(again):
-                keys.setdefault(row.pair, set()).add(row.key)
-        nothing: dict[str, float] = {}
-        made = [
-            Standing._make(
-                (
-                    *_stands(choice),
-                    frozenset(keys.get(choice.row.pair, {choice.row.key})) - {""},
-                    float((choice.row.evidence or nothing).get("disagreement", np.nan)),
+            upto, then = self._read_upto
+            pair_of_new: ColumnElement[bool] = true()
+            if upto and then == _mark(connection, upto):
+                pair_of_new = registrations.c.pair.in_(
+                    select(registrations.c.pair).where(registrations.c.number > upto)
                 )
-            )
-            for choice in chosen
-        ]
-        return sorted(made, key=_ends_of)
+            else:
+                self._silent.clear()
+            for one in _of_silent(connection, _EVIDENCE, pair_of_new, _several(connection, pair_of_new)):
+                self._silent[one.pair] = one
+            upto = connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
+            self._read_upto = upto, _mark(connection, upto)
+            spoken = {one.pair: one for one in _of_spoken(connection)}
+            said = set(connection.execute(_SPOKEN).scalars()) if spoken else set()
+        return [one for pair, one in self._silent.items() if pair not in said] + list(spoken.values())
+
+    def keys(self) -> list[tuple[str, str]]:
+        """Each pair (`Standing.pair`) with the key of what counts of it; empty where that is a person's word."""
+        with self._catalog.read() as connection:
+            rows = connection.execute(_silent(_as_they_lie("pair", "key"))).all()
+            spoken = _of_spoken(connection)
+        return [(pair, key) for pair, key in rows] + [(one.pair, "" if one.is_told else one.key) for one in spoken]
 
     def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
@@ -449,18 +483,21 @@ _FULL = tuple(
     for column in registrations.columns
 )
 _BRIEF = tuple(null().label(column.name) if column.name in ("evidence", "notes") else column for column in _FULL)
-_PARTS = ("number", "target", "source", "pair", "key", "recipe", "proposer", "status")
-_LEAN = (  # as it lies: scenes that are none of the living ones are left out, and the rest is compared with
-    *(type_coerce(registrations.c[name], Text).label(name) for name in _PARTS[1:]),
-    registrations.c.number,
-    (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed"),
-)
+_POSED = (registrations.c.S_target_source.is_not(None) & registrations.c.information.is_not(None)).label("posed")
+
+
+def _as_they_lie(*names: str) -> tuple[ColumnElement[Any], ...]:
+    """Scenes that are none of the living ones are left out, and the rest is compared with."""
+    return tuple(type_coerce(registrations.c[name], Text).label(name) for name in names)
+
+
+_LEAN = (registrations.c.number, *_as_they_lie("target", "source", "pair", "key", "status"), _POSED)
 _SAME_PAIR = registrations.alias()
 _OUTDATED = exists().where(_SAME_PAIR.c.pair == registrations.c.pair, _SAME_PAIR.c.number > registrations.c.number)
 _FIRST = (
     select(func.min(_SAME_PAIR.c.number)).where(_SAME_PAIR.c.pair == registrations.c.pair).scalar_subquery()
 ).label("first")
-_EVIDENCE = case((registrations.c.status == "accepted", registrations.c.evidence)).label("evidence")
+_EVIDENCE = case((registrations.c.status == "accepted", type_coerce(registrations.c.evidence, Text))).label("evidence")
 
 
 def _current(
@@ -469,47 +506,83 @@ def _current(
     silent_if: ColumnElement[bool] | None = None,
     columns: Sequence[ColumnElement[Any]] = _FULL,
 ) -> list[StoredRegistration]:
-    return _stored_all(_living(connection, _choose(connection, columns, of, silent_if, in_order=True)))
-
-
-def _living(connection: Connection, chosen: Iterable[_Choice]) -> list[_Choice]:
-    alive = living_ids(connection)
-    return [one for one in chosen if one.row.target in alive and one.row.source in alive]
-
-
-def _choose(
-    connection: Connection,
-    columns: Sequence[ColumnElement[Any]],
-    of: ColumnElement[bool] | None = None,
-    silent_if: ColumnElement[bool] | None = None,
-    *,
-    in_order: bool = False,
-) -> list[_Choice]:
-    """The current row of every pair.
+    """What counts of every pair of living scenes, by the pair's first row.
 
     Of a pair on which nobody ever spoke it is the newest, which the index of pairs tells without reading the others.
 
     Args:
         of: only pairs all of whose rows meet this.
         silent_if: pairs on which nobody spoke only if their current row meets this.
-        in_order: by the pair's first row; else in any order.
     """
-    spoken = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
     wanted = true() if of is None else of
-    silent = select(*columns, *([_FIRST] if in_order else ())).where(registrations.c.pair.not_in(spoken), ~_OUTDATED)
-    rows = connection.execute(silent.where(wanted, true() if silent_if is None else silent_if)).all()
-    found = [(row.first if in_order else 0, _Choice(row, None)) for row in rows]
+    silent = _silent((*columns, _FIRST)).where(wanted, true() if silent_if is None else silent_if)
+    found = [(row.first, _Choice(row, None)) for row in connection.execute(silent).all()]
+    found = sorted(found + _spoken(connection, columns, wanted), key=itemgetter(0))
+    alive = living_ids(connection)
+    return _stored_all([one for _, one in found if one.row.target in alive and one.row.source in alive])
 
+
+_SPOKEN = select(reviews.c.pair).union(select(registrations.c.pair).where(registrations.c.key == ""))
+
+
+def _silent(columns: Sequence[ColumnElement[Any]]) -> Select[Any]:
+    """The newest row of every pair on which nobody ever spoke."""
+    return select(*columns).where(registrations.c.pair.not_in(_SPOKEN), ~_OUTDATED)
+
+
+def _spoken(
+    connection: Connection, columns: Sequence[ColumnElement[Any]], wanted: ColumnElement[bool]
+) -> list[tuple[int, _Choice]]:
+    """What counts of every other pair that has any, each behind the number of the pair's first row."""
     ordered = select(*columns).order_by(registrations.c.pair, registrations.c.number)
-    every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(spoken))).all()
+    every = connection.execute(ordered.where(wanted, registrations.c.pair.in_(_SPOKEN))).all()
     said = connection.execute(select(reviews).order_by(reviews.c.pair, reviews.c.number)).all() if every else ()
     words = {pair: [_review(row) for row in of_pair] for pair, of_pair in groupby(said, lambda row: str(row.pair))}
+    found = []
     for pair, of_pair in groupby(every, lambda row: str(row.pair)):
         history = list(of_pair)
         current, word = _decide(history, words.get(pair, []))
         if current is not None:
             found.append((history[0].number, _Choice(current, word)))
-    return [chosen for _, chosen in (sorted(found, key=lambda item: item[0]) if in_order else found)]
+    return found
+
+
+_OBJECT = Json(an_object).at("registrations.evidence")
+
+
+def _mark(connection: Connection, upto: int) -> tuple[Any, ...]:
+    """How many registrations there are up to a number, and what tells the last one from another of its number."""
+    count = connection.execute(select(func.count(registrations.c.number)).where(registrations.c.number <= upto))
+    last = select(registrations.c.key, registrations.c.created_at).where(registrations.c.number == upto)
+    return count.scalar_one(), *(connection.execute(last).first() or ())
+
+
+def _of_silent(
+    connection: Connection,
+    evidence: ColumnElement[Any],
+    wanted: ColumnElement[bool],
+    several: Mapping[str, set[str]] = MappingProxyType({}),
+) -> list[Standing]:
+    """What counts of pairs on which nobody ever spoke."""
+    rows = connection.execute(_silent((*_LEAN, evidence)).where(wanted)).all()
+    return [_stands(tuple(row), None, several) for row in rows]
+
+
+def _of_spoken(connection: Connection) -> list[Standing]:
+    """What counts of all others."""
+    found = _spoken(connection, (*_LEAN, _EVIDENCE, *_as_they_lie("proposer")), true())
+    several = _several(connection, registrations.c.pair.in_(_SPOKEN)) if found else {}
+    return [_stands(tuple(one.row)[:-1], one.word, several) for _, one in found]
+
+
+def _several(connection: Connection, wanted: ColumnElement[bool]) -> dict[str, set[str]]:
+    """By pairs that were registered more than once, all keys of theirs."""
+    repeated = select(registrations.c.pair).where(wanted).group_by(registrations.c.pair).having(func.count() > 1)
+    again = select(registrations.c.pair, registrations.c.key).where(registrations.c.pair.in_(repeated))
+    keys: dict[str, set[str]] = {}
+    for pair, key in connection.execute(again).all():
+        keys.setdefault(pair, set()).add(key)
+    return keys
 
 
 def _may_be_used(status: str, review: str | None) -> bool:
@@ -519,11 +592,15 @@ def _may_be_used(status: str, review: str | None) -> bool:
 _ends_of = attrgetter("target", "source")
 
 
-def _stands(chosen: _Choice) -> tuple[Any, ...]:
-    """The fields of `Standing`, in their order."""
-    row, review = chosen.row, None if chosen.word is None else chosen.word.review
-    usable = bool(row.posed) and _may_be_used(row.status, review)
-    return row.number, row.target, row.source, row.status, row.key, row.recipe, review, usable
+def _stands(row: tuple[Any, ...], word: Review | None, several: Mapping[str, set[str]]) -> Standing:
+    number, target, source, pair, key, status, posed, evidence = row
+    disagreement = _UNKNOWN
+    if evidence is not None:
+        disagreement = float(_OBJECT.process_result_value(evidence, None).get("disagreement", _UNKNOWN))
+    review = None if word is None else word.review
+    usable = bool(posed) and _may_be_used(status, review)
+    keys = frozenset(several[pair] - {""}) if pair in several else None
+    return Standing(number, target, source, pair, key, review, usable, disagreement, keys)
 
 
 def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import Connection, Row, insert, select, true, update
+from sqlalchemy import Connection, Row, Text, insert, select, true, type_coerce, update
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.store import compact, facts
@@ -41,8 +41,7 @@ KIND = "scenes"
 _SIGMAS = 3.0
 
 
-@dataclass(frozen=True)
-class BriefScene:
+class BriefScene(NamedTuple):  # made of all scenes several times an update: a tuple is made in a fifth of the time
     """What every update asks of all scenes; as in `Scene`, of which the rest takes ten times as long to read."""
 
     id: str
@@ -162,14 +161,24 @@ class Scenes:
         with self._catalog.read() as connection:
             rows = connection.execute(query).all()
         return [
-            BriefScene(row.id, row.name, row.scale_policy, row.captured_at, thinning_of(row.thinned)) for row in rows
+            BriefScene(scene, name, policy, captured_at, thinning_of(thinned))
+            for scene, name, policy, captured_at, thinned in rows
         ]
 
     def bounds(self) -> dict[str, np.ndarray]:
         """(2, 3) of every living scene by its id, as of `Scene`."""
-        query = select(scenes.c.id, scenes.c.bounds).where(scenes.c.removed_at.is_(None))
+        living = scenes.c.removed_at.is_(None)
+        query = select(scenes.c.id, type_coerce(scenes.c.bounds, Text).label("bounds")).where(living)
         with self._catalog.read() as connection:
-            return {row.id: np.array(row.bounds) for row in connection.execute(query)}
+            rows = connection.execute(query).all()
+            try:  # all at once: a tenth of the time
+                boxes = np.array(json.loads(f"[{','.join(row.bounds for row in rows)}]"))
+                if boxes.shape == (len(rows), 2, 3) and boxes.dtype == np.float64:
+                    return {row.id: box for row, box in zip(rows, boxes, strict=True)}
+            except (ValueError, TypeError, RecursionError):
+                pass  # one of them is no box: which one it is, its type tells
+            boxed = connection.execute(select(scenes.c.id, scenes.c.bounds).where(living))
+            return {row.id: np.array(row.bounds, dtype=np.float64) for row in boxed}
 
     def list(self, *, removed: bool = False, among: Collection[str] | None = None) -> list[Scene]:
         """The living scenes (or the removed ones) in the order they came.

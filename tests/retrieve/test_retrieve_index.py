@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from retrieve_worlds import UP, layer, turned, walk
 
+from gsmap._native import near_codes
 from gsmap.errors import CorruptError
 from gsmap.retrieve import Params, look_up, new_segment, voters_of
 from gsmap.retrieve import codes as coding
-from gsmap.retrieve.index import unpacked
 from gsmap.types import SceneGraph
 from gsmap.types.retrieval import IndexArrays
-from gsmap.types.segments import InMemory, merged, to_merge
+from gsmap.types.segments import InMemory, merged, places_of, to_merge, write_places
 
 
 def _voters(graphs):
@@ -76,7 +76,7 @@ def test_merging_keeps_every_node_and_leaves_out_what_does_not_count():
     without = merged([replace(whole, members=[None, *whole.members[1:]])])
     again = new_segment(voters[1:])
     assert np.array_equal(without.arrays.nodes, again.arrays.nodes)
-    assert unpacked(without.arrays.nodes, 8).places.max() == 7
+    assert places_of(without.arrays.nodes, 8).max() == 7
 
 
 def test_segments_stay_few_and_are_seldom_written_again():
@@ -161,6 +161,50 @@ def test_hostile_lists_and_nodes_are_refused():
     ):
         with pytest.raises(CorruptError):
             look_up(voters, [InMemory(members, arrays)], Params())
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_the_nearest_that_count_are_found_in_any_parts_with_all_that_are_as_near():
+    rng = np.random.default_rng(8)
+    votes, most = 5, 60_000
+    mine = rng.integers(-60, 61, (30, coding.NUM_DIMS)).astype(np.int8)
+    rows = np.zeros((900, coding.NUM_DIMS + 10), np.uint8)
+    theirs = np.clip(np.repeat(mine, 30, 0) + rng.integers(-30, 31, (900, 1)), -127, 127).astype(np.int8)
+    rows[:, : coding.NUM_DIMS] = theirs.view(np.uint8)
+    of = rng.integers(0, 40, 900)
+    write_places(rows, of)
+    place_of = np.where(np.arange(40) % 4 == 0, -1, np.arange(40)).astype(np.int32)
+    squared = ((mine[:, None].astype(int) - theirs) ** 2).sum(2)
+    ends = np.array([0, 250, 251, 700, 900])
+    asking = np.repeat(np.arange(30), 4)
+    begin, end = np.tile(ends[:-1], 30), np.tile(ends[1:], 30)
+    nearest = np.full((30, votes), most, np.int32)
+    who, which, told, places = near_codes(mine, asking, begin, end, rows, place_of, nearest)
+    assert (told == squared[who, which]).all()
+    assert (places == place_of[of[which]]).all()
+    ties = 0
+    for k in range(30):
+        counts = squared[k][place_of[of] >= 0]
+        bar = min(np.sort(counts)[votes - 1], most)
+        assert nearest[k, 0] == bar
+        want = np.flatnonzero((squared[k] <= bar) & (place_of[of] >= 0))
+        assert sorted(which[(who == k) & (told <= bar)]) == want.tolist()
+        ties += len(want) > votes
+    assert ties > 3
+
+
+def test_a_row_of_no_scene_is_refused():
+    voters = _voters(walk(3))
+    good = new_segment(voters)
+    strange = good.arrays.nodes.copy()
+    strange[:, -4:] = np.array([len(voters)], "<i4").view(np.uint8)  # the first that is not there
+    none = np.arange(len(voters), dtype=np.int32)
+    nearest = np.full((1, 4), 2**22, np.int32)
+    at = np.array([0]), np.array([0]), np.array([len(strange)])
+    with pytest.raises(ValueError, match="a scene that is not there"):
+        near_codes(voters[0].asking.codes[:1], *at, strange, none, nearest)
+    with pytest.raises(ValueError, match="outside of the rows"):
+        near_codes(voters[0].asking.codes[:1], *at[:2], at[2] + 1, good.arrays.nodes, none, nearest)
 
 
 def test_scenes_without_a_node_are_no_trouble():

@@ -5,13 +5,14 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from sqlalchemy import select
+from sqlalchemy import delete, select
 from store_samples import key, make_cameras, make_gaussians
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store, matrices
-from gsmap.store.schema import edges, graphs, poses
+from gsmap.store.registrations import Registrations
+from gsmap.store.schema import edges, graphs, poses, registrations, reviews
 from gsmap.types import EdgeOutcome, PoseGraph, Registration, SceneGraph, ScenePose, Sim3
 
 NUM = 12
@@ -190,13 +191,20 @@ def test_what_stands_of_every_pair_is_what_a_person_said_or_the_newest(store):
         )
         assert one.usable == stored.is_usable
     assert store.registrations.standing(usable=True) == [one for one in standing if one.usable]
-    tried = store.registrations.tried()
-    assert [(one.number, one.review, one.usable) for one in tried] == [
-        (one.number, one.review, one.usable) for one in standing
-    ]
-    for one in tried:
-        history = store.registrations.history(one.target, one.source)
-        assert one.keys == {stored.key for stored in history} - {""}
+    fresh = {name: store.registrations.standing(usable=name) for name in (False, True)}
+    living = {":".join(sorted(ends)) for ends in alone}
+    tried = {one.pair: one for one in store.registrations.tried() if one.pair in living}
+    assert set(tried) == living
+    for pair, stored in alone.items():
+        one = tried[":".join(pair)]
+        assert (one.key, one.usable) == (stored.key, stored.is_usable)
+        assert one.is_told == (stored.manual or stored.review == "confirm")
+        disagreement = stored.registration.evidence.get("disagreement", float("nan"))
+        accepted = stored.registration.status == "accepted"
+        assert np.array_equal(one.disagreement, disagreement if accepted else float("nan"), equal_nan=True)
+        assert one.keys == {stored.key for stored in store.registrations.history(*pair)} - {""}
+    for usable_only, told in fresh.items():  # the same of what is remembered now
+        assert [one[:7] for one in store.registrations.standing(usable=usable_only)] == [one[:7] for one in told]
     usable = store.registrations.usable()
     assert [one.number for one in usable] == [one.number for one in standing if one.usable]
     some = ids[1:4]
@@ -312,3 +320,31 @@ def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
         connection.execute(graphs.update().where(graphs.c.scene == some[0]).values(about={"up": [1, "x", 0]}))
     with Store.open(store.folder, "r") as other, pytest.raises(CorruptError, match=r"graphs\.about"):
         other.graphs.says()
+
+
+def test_what_is_remembered_of_pairs_is_what_is_read_anew(store):
+    """Whatever is registered, said and taken away between two times that it is asked for."""
+    rng = np.random.default_rng(6)
+    ids = sorted(scene.id for scene in store.scenes.list())[:4]
+    for k in range(80):
+        a, b = sorted(rng.choice(ids, 2, replace=False).tolist())
+        kind = rng.integers(4)
+        stored = store.registrations.get(a, b)
+        if kind < 2 or stored is None:
+            posed = {"S_target_source": some_pose(rng), "information": np.eye(7), "evidence": {"disagreement": k / 80}}
+            store.registrations.save(Registration(a, b, "accepted", **posed), key("register", a, b, turn=k))
+        elif kind == 2:
+            store.registrations.review(a, b, "confirm" if stored.review is None else "withdraw")
+        else:  # a purge takes the newest, and the next one its number
+            newest, said = store.registrations.newest(), select(reviews.c.registration)
+            with store.catalog.write() as connection:
+                mine = (registrations.c.number == newest) & registrations.c.number.not_in(said)
+                connection.execute(delete(registrations).where(mine))
+            if k % 2:
+                posed = {"S_target_source": some_pose(rng), "information": np.eye(7)}
+                store.registrations.save(Registration(a, b, "accepted", **posed), key("register", a, b, turn=k))
+        anew = Registrations(store.catalog)
+        assert sorted(map(str, store.registrations.tried())) == sorted(map(str, anew.tried()))
+        assert dict(store.registrations.keys()) == {
+            one.pair: "" if one.is_told else one.key for one in store.registrations.tried()
+        }

@@ -133,8 +133,9 @@ class Localizer:
         for left in reversed(range(PATIENCE)):
             try:
                 if self.store.catalog.writable and not self._held:
-                    index.bring_up_to_date(lambda told: progress("localize", 0.0, f"{told} of views"))
-                kept = index.segments()
+                    kept = index.brought_up_to_date(lambda told: progress("localize", 0.0, f"{told} of views"))
+                else:
+                    kept = index.segments()
                 missing = index.missing(kept)
                 parts = [missing[start : start + AT_ONCE] for start in range(0, len(missing), AT_ONCE)]
                 return view_index([*kept, *(self._segment(part) for part in parts)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from functools import partial
 from itertools import combinations
@@ -22,7 +22,6 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
-from gsmap.store.registrations import Standing, StoredRegistration
 from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
@@ -114,50 +113,53 @@ class _Known:
     def __init__(self, work: _Work) -> None:
         self._work = work
         self._graphs = {scene: key.digest for scene, key in work.graphs.items()}
-        self._standing = self._read()
-        if adopted := [pair for pair, (one, current) in self._standing.items() if not current and self._adopt(one)]:
-            changed = self._read()
-            self._standing |= {pair: changed[pair] for pair in adopted}
-        bar = work.settings.optimize.aliasing.max_disagreement
-        self.held = [
-            pair
-            for pair, (one, current) in self._standing.items()
-            if current and one.usable and (one.is_told or not one.disagreement > bar)
-        ]
+        self._read()
+        adopted = [self._adopt(pair, keys) for pair, keys in self._replaced]
+        if any(adopted):
+            self._read()
         self.stale = sorted(
             pair
-            for pair, (one, current) in self._standing.items()
-            if not current and all(scene in work.described for scene in pair) and not self._has(one)
+            for pair, keys in self._replaced
+            if all(scene in work.described for scene in pair) and keys.isdisjoint(self._keys(*pair))
         )
 
-    def _read(self) -> dict[Pair, tuple[Standing, bool]]:
-        """What stands of every pair, and whether it is what this recipe makes, or what a person told."""
-        return {
-            directed(one.target, one.source): (one, one.is_told or one.key in self._keys(one))
-            for one in self._work.store.registrations.tried()
-        }
+    def _read(self) -> None:
+        """What stands of every pair of living scenes, and whether it is what this recipe makes, or a person told."""
+        digest_of, graphs, bar = self._work.recipe.digest_of, self._graphs, self._work.settings.optimize.aliasing
+        self._registered: set[str] = set()
+        self._replaced: list[tuple[Pair, frozenset[str]]] = []
+        self.held: list[Pair] = []
+        for one in self._work.store.registrations.tried():
+            a, _, b = one.pair.partition(":")
+            first, second = graphs.get(a), graphs.get(b)
+            if first is None or second is None:
+                continue
+            mine = [digest_of(first, second)]
+            if one.key not in mine:
+                mine.append(digest_of(second, first))
+            current = one.key in mine
+            if current or not one.keys.isdisjoint(mine):
+                self._registered.add(one.pair)
+            if not current and not one.is_told:
+                self._replaced.append(((a, b), one.keys))
+            elif one.usable and (one.is_told or not one.disagreement > bar.max_disagreement):
+                self.held.append((a, b))
 
     def has(self, a: str, b: str) -> bool:
         """Whether it has registered a pair."""
-        known = self._standing.get(directed(a, b))
-        return known is not None and self._has(known[0])
+        return ":".join(directed(a, b)) in self._registered
 
-    def _has(self, one: Standing) -> bool:
-        return any(key in one.keys for key in self._keys(one))
+    def _keys(self, a: str, b: str) -> tuple[str, str]:
+        """What the pair's registration would be kept under, in either direction."""
+        first, second = self._graphs[a], self._graphs[b]
+        return self._work.recipe.digest_of(first, second), self._work.recipe.digest_of(second, first)
 
-    def _keys(self, one: Standing) -> Iterator[str]:
-        """What the pair's registration would be kept under, in its own direction and in the other."""
-        target, source = self._graphs.get(one.target), self._graphs.get(one.source)
-        if target is not None and source is not None:
-            yield self._work.recipe.digest_of(target, source)
-            yield self._work.recipe.digest_of(source, target)
-
-    def _adopt(self, one: Standing) -> bool:
-        if not self._has(one):
-            return False
-        known = [self._work.store.registrations.find(key) for key in self._keys(one)]
-        self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
-        return True
+    def _adopt(self, pair: Pair, keys: frozenset[str]) -> bool:
+        mine = [key for key in self._keys(*pair) if key in keys]
+        known = [self._work.store.registrations.find(key) for key in mine]
+        if known:
+            self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
+        return bool(known)
 
 
 def _register_candidates(work: _Work) -> list[Registration]:
@@ -182,7 +184,8 @@ def _register_candidates(work: _Work) -> list[Registration]:
     for pair in neighbours({s: at for s, at in placed_scenes(store).items() if s in work.described}, params):
         beside.setdefault(pair[0], []).append(pair)
     bar = work.settings.optimize.aliasing.max_disagreement
-    proposed = [*lists.values(), *beside.values()]
+    # Next to all neighbours have been tried; a list with one that has not keeps them all, and so its order.
+    proposed = [*lists.values(), *(pairs for pairs in beside.values() if not all(known.has(*pair) for pair in pairs))]
     tried = {pair for pairs in proposed for pair in pairs if known.has(*pair)}
     rounds = Rounds(proposed, tried.union(known.stale), known.held, params)
     pairs, made = known.stale + rounds.next(), list[Registration]()
@@ -198,21 +201,22 @@ def _register_candidates(work: _Work) -> list[Registration]:
     return made
 
 
-def stale(current: Iterable[StoredRegistration], graphs: Mapping[str, RecipeKey], settings: Settings) -> list[Pair]:
-    """(target, source) of the edges that other settings or another version made; a person's own word is never stale.
+def num_stale(pairs: Iterable[tuple[str, str]], graphs: Mapping[str, RecipeKey], settings: Settings) -> int:
+    """How many edges other settings or another version made; a person's own word is never stale.
 
     Args:
-        current: the current edges.
+        pairs: each with the key of what counts of it (`gsmap.store.registrations.Registrations.keys`).
         graphs: the key of each living scene's graph.
     """
-    recipe = recipe_key(settings.register)
-    computed = [stored for stored in current if not stored.manual and stored.review != "confirm"]
-    ends = [(stored.registration.target, stored.registration.source, stored.key) for stored in computed]
-    return [
-        (a, b)
-        for a, b, key in ends
-        if a in graphs and b in graphs and key != recipe.digest_of(graphs[a].digest, graphs[b].digest)
-    ]
+    digest_of = recipe_key(settings.register).digest_of
+    digests = {scene: key.digest for scene, key in graphs.items()}
+    count = 0
+    for pair, key in pairs:
+        a, _, b = pair.partition(":")
+        first, second = digests.get(a), digests.get(b)
+        if key and first is not None and second is not None:
+            count += key != digest_of(first, second) and key != digest_of(second, first)
+    return count
 
 
 def add_edge(store: Store, a: Scene, b: Scene, S_target_source: Sim3, sigmas: np.ndarray, note: str) -> None:
@@ -319,12 +323,21 @@ def _named(store: Store, pairs: str | Path | Sequence[Pair], work: _Work) -> lis
 
 def placed_scenes(store: Store) -> dict[str, Placed]:
     """Where scenes lie by the newest poses, for finding neighbours."""
-    bounds = store.scenes.bounds()
-    placed = {}
-    for scene, pose in store.revisions.poses().items():
-        if scene in bounds:
-            S = pose.S_map_scene
-            radius = S.scale * float(np.linalg.norm(np.diff(bounds[scene], axis=0))) / 2
-            sigma = 0.0 if pose.covariance is None else S.scale * float(np.sqrt(np.diag(pose.covariance)[3:6].max()))
-            placed[scene] = Placed(pose.component, S.apply(bounds[scene].mean(0)), radius, sigma)
-    return placed
+    bounds, poses = store.scenes.bounds(), store.revisions.poses()
+    scenes = [scene for scene in poses if scene in bounds]
+    if not scenes:
+        return {}
+    boxes = np.array([bounds[scene] for scene in scenes])
+    found = [poses[scene] for scene in scenes]
+    rotations = np.array([pose.S_map_scene.rotation for pose in found])
+    scales = np.array([pose.S_map_scene.scale for pose in found])
+    centres = np.einsum("nij,nj->ni", rotations, boxes.mean(1)) * scales[:, None]
+    centres += [pose.S_map_scene.translation for pose in found]
+    radii = scales * np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1) / 2
+    known = [pose.covariance is not None for pose in found]
+    sigmas = np.zeros(len(found))
+    if any(known):
+        variances = np.array([pose.covariance for pose in found if pose.covariance is not None])
+        sigmas[known] = scales[known] * np.sqrt(np.diagonal(variances, axis1=1, axis2=2)[:, 3:6].max(1))
+    parts = zip(scenes, found, centres, radii.tolist(), sigmas.tolist(), strict=True)
+    return {scene: Placed(pose.component, centre, radius, sigma) for scene, pose, centre, radius, sigma in parts}
