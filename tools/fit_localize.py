@@ -244,7 +244,8 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
     fewer, out = replace(params, max_candidates=2), []
     indexes = {place.seed: index_of(place.scenes, params) for place in found}
     for number, place in enumerate(found):
-        own, other = ({scene.scene: scene for scene in one.scenes} for one in (place, found[number ^ 1]))
+        stranger = found[(number + 1) % len(found)]
+        own, other = ({scene.scene: scene for scene in one.scenes} for one in (place, stranger))
         rng = np.random.default_rng([int(place.seed), 5])
         for count, told in enumerate(place.photos):
             photo, truth = place.photo(told), np.array(told["T_world_camera"])
@@ -256,8 +257,7 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
             judged, _ = localizing.judged_poses(picture, indexes[place.seed], own, extractor, params)
             out += [row(one, "found") for one in judged]
             if count % 2 == 0:
-                index = indexes[found[number ^ 1].seed]
-                judged, _ = localizing.judged_poses(picture, index, other, extractor, fewer)
+                judged, _ = localizing.judged_poses(picture, indexes[stranger.seed], other, extractor, fewer)
                 out += [row(one, "elsewhere") for one in judged]
             for size in (0.05, rng.uniform(0.1, 0.4), rng.uniform(0.2, 1.2)):
                 xi = np.r_[rng.normal(size=3) * size * 0.4, rng.normal(size=3) * size]
