@@ -38,7 +38,7 @@ from scipy.optimize import minimize
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
-from gsmap.localize import aligning, features, localizing, probability, settling, words
+from gsmap.localize import aligning, features, localizing, settling, words
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
@@ -191,11 +191,13 @@ def _chance(
 RIGHT_DEG, RIGHT_M = 3.0, 0.15
 WRONG_DEG, WRONG_M = 5.0, 0.3  # between the two a pose is neither
 FEWEST = 6  # inliers of a pose that nobody found, to be worth a judgement
-RISES = {"matches", "inliers", "found_again", "spread", "explained", "explained_coarsely", "compared", "colour", "seen"}
+RISES = {"matches", "inliers", "found_again", "laid", "spread", "explained", "explained_coarsely", "compared", "colour"}
+RISES |= {"seen"}
 KNOTS = {
     "matches": tuple(np.log10(np.array([6.0, 8, 11, 15, 21, 41, 81]))),
     "inliers": tuple(np.log10(np.array([1.0, 6, 11, 16, 26, 41, 81, 161]))),
     "found_again": (0.0, 0.03, 0.07, 0.12, 0.2, 0.35),
+    "laid": (0.1, 0.2, 0.3, 0.4, 0.55, 0.75),
     "spread": (0.05, 0.15, 0.25, 0.4, 0.6),
     "explained": (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8),
     "contradicted": (0.05, 0.1, 0.2, 0.3, 0.45, 0.6),
@@ -235,16 +237,17 @@ class Row:
 
 
 def judge_all(found: list[Place], params: Params) -> list[Row]:
-    """Poses of every photo in its own place and in two others, those that were found and some that were not."""
+    """Poses of every photo in its own place, and of every other one in another place, as they are looked into (more of
+    them than where photos are placed), and poses that settle from near the truth and from far of it."""
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
-    probability.model = lambda: Odds({name: Curve((0.0, 1.0), (0.0, 0.0), 0.0) for name in KNOTS}, 0.0, 1e-3)
     params = replace(params, max_candidates=4, sure=2.0)
-    rng, out = np.random.default_rng(5), []
+    fewer, out = replace(params, max_candidates=2), []
     indexes = {place.seed: index_of(place.scenes, params) for place in found}
     for number, place in enumerate(found):
-        own = {scene.scene: scene for scene in place.scenes}
-        others = [found[(number + k) % len(found)] for k in (1, 4)]
-        for told in place.photos:
+        stranger = found[(number + 1) % len(found)]
+        own, other = ({scene.scene: scene for scene in one.scenes} for one in (place, stranger))
+        rng = np.random.default_rng([int(place.seed), 5])
+        for count, told in enumerate(place.photos):
             photo, truth = place.photo(told), np.array(told["T_world_camera"])
             picture, _ = localizing.prepared(photo, params)
 
@@ -253,12 +256,10 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
 
             judged, _ = localizing.judged_poses(picture, indexes[place.seed], own, extractor, params)
             out += [row(one, "found") for one in judged]
-            for other in others:
-                scenes = {scene.scene: scene for scene in other.scenes}
-                fewer = replace(params, max_candidates=2)
-                judged, _ = localizing.judged_poses(picture, indexes[other.seed], scenes, extractor, fewer)
+            if count % 2 == 0:
+                judged, _ = localizing.judged_poses(picture, indexes[stranger.seed], other, extractor, fewer)
                 out += [row(one, "elsewhere") for one in judged]
-            for size in (0.05, rng.uniform(0.2, 1.2)):
+            for size in (0.05, rng.uniform(0.1, 0.4), rng.uniform(0.2, 1.2)):
                 xi = np.r_[rng.normal(size=3) * size * 0.4, rng.normal(size=3) * size]
                 start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
                 one = localizing.judged_pose(picture, start, own, params)
@@ -272,14 +273,17 @@ def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], f
     """Error in degrees and metres, and the normalised squared error by the covariance."""
     if kind == "elsewhere":
         return (180.0, np.inf), np.nan
-    T = judged.settled.T_metric_camera
-    turn = rotation_vectors(T[:3, :3].T @ truth[:3, :3])[0]
-    shift = T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])
-    error = float(np.degrees(np.linalg.norm(turn))), float(np.linalg.norm(shift))
+    xi = _error(judged.settled.T_metric_camera, truth)
+    error = float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]))
     if judged.covariance is None:
         return error, np.nan
-    xi = np.r_[turn, shift]
     return error, float(xi @ np.linalg.solve(judged.covariance, xi))
+
+
+def _error(T: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(6,) [rot_rad, trans] by which a pose is off, on the camera's side."""
+    turn, shift = rotation_vectors(T[:3, :3].T @ truth[:3, :3])[0], T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])
+    return np.r_[turn, shift]
 
 
 def index_of(scenes: list[PlacedFeatures], params: Params) -> ViewIndex:
@@ -387,9 +391,9 @@ def fit_sigma(found: list[Place], params: Params) -> None:
     Started near the truth, so that all poses are right; every sixth photo. Likelihoods are of Student's t of 8 degrees
     of freedom, since a few photos are placed on a part of a map that is bent.
     """
-    plain_sigma = replace(params.covariance, swell=1.0, swell_aligned=1.0, hidden_m=0.0, hidden_rad=0.0)
+    plain_sigma = replace(params.covariance, swell=1.0, swell_aligned=1.0, hidden_m=0.0, hidden_rad=0.0, differing=0.0)
     params = replace(params, covariance=plain_sigma)
-    told: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # error, what patches and what colours tell
+    told: list[tuple[np.ndarray, ...]] = []  # error, what patches and what colours tell, and by what these differ
     rng, between = np.random.default_rng(7), settling._between
 
     for place in found:
@@ -397,29 +401,35 @@ def fit_sigma(found: list[Place], params: Params) -> None:
         for photo_told in place.photos[::6]:
             photo, truth = place.photo(photo_told), np.array(photo_told["T_world_camera"])
             picture, _ = localizing.prepared(photo, params)
-            both: list[tuple[np.ndarray, np.ndarray]] = []
-            settling._between = lambda *args, both=both: (both.append((args[4], args[2])), between(*args))[1]
+            both: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+            def noted(pose, lens, by_colours, fit, by_patches, differing, both=both):
+                both.append((by_patches, by_colours, _error(pose, fit.T_map_camera)))
+                return between(pose, lens, by_colours, fit, by_patches, differing)
+
+            settling._between = noted
             xi = np.r_[rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.05]
             start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
             judged = localizing.judged_pose(picture, start, own, params)
             if both and judged.probability > 0.9:
-                T = judged.settled.T_metric_camera
-                error = np.r_[rotation_vectors(T[:3, :3].T @ truth[:3, :3])[0], T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])]
-                told.append((error, *both[0]))
+                told.append((_error(judged.settled.T_metric_camera, truth), *both[0]))
     settling._between = between
     tried = []
     for patches, aligned in product((1.5, 2.1, 2.6), (1.5, 2.6, 3.7, 4.7)):
-        for hidden_m, hidden_rad in product((0.002, 0.004, 0.007, 0.01), (0.0005, 0.001, 0.002)):
+        for hidden_m, hidden_rad, differing in product(
+            (0.002, 0.004, 0.007, 0.01), (0.0005, 0.001, 0.002), (0.0, 0.1, 0.25, 0.5)
+        ):
             nees, likely = [], []
-            for error, by_patches, by_colours in told:
+            for error, by_patches, by_colours, apart in told:
                 parts = by_patches * patches**2, by_colours * aligned**2
                 known = 2 * np.linalg.inv(sum(np.linalg.inv(part) for part in parts))
+                known += differing * np.outer(apart, apart)
                 known += np.diag(np.r_[np.full(3, hidden_rad), np.full(3, hidden_m)] ** 2)
                 nees.append(error @ np.linalg.solve(known, error))
                 likely.append(-0.5 * np.linalg.slogdet(known)[1] - 7 * np.log1p(nees[-1] / 8))
-            tried.append((np.mean(likely), patches, aligned, hidden_m, hidden_rad, *np.quantile(nees, (0.5, 0.9))))
-    for likely_, patches, aligned, hidden_m, hidden_rad, middle, most in sorted(tried, reverse=True)[:8]:
-        settings = f"swell {patches}, swell_aligned {aligned}, hidden_m {hidden_m}, hidden_rad {hidden_rad}"
+            settings = f"swell {patches}, swell_aligned {aligned}, hidden_m {hidden_m}, hidden_rad {hidden_rad}, "
+            tried.append((np.mean(likely), settings + f"differing {differing}", *np.quantile(nees, (0.5, 0.9))))
+    for likely_, settings, middle, most in sorted(tried, reverse=True)[:8]:
         print(f"likelihood {likely_:.2f}: {settings}; NEES {middle:.1f}, 90th {most:.1f}")
 
 

@@ -25,6 +25,8 @@ class Params:
         hidden_rad: the same of a rotation.
         swell: by how many times the standard deviations that residuals of patches tell are too small on made places.
         swell_aligned: the same of what differences of colours tell.
+        differing: by what poses by patches and by colours differ either may be wrong: so large a share of its square is
+            added.
     """
 
     blocks: tuple[int, int] = (6, 4)
@@ -33,6 +35,7 @@ class Params:
     hidden_rad: float = 0.001
     swell: float = 2.1
     swell_aligned: float = 3.7
+    differing: float = 0.25
 
 
 def pose_covariance(

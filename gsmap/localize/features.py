@@ -13,7 +13,7 @@ from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import Keypoints, SceneFeatures
 
-VERSION = 2
+VERSION = 3
 
 _STEP = 254.0  # of quantised descriptors: unit vectors of 64 and more dimensions hardly have a part above a half
 
@@ -24,7 +24,8 @@ class Params:
 
     Args:
         max_features: of a view; those that the extractor gives first.
-        indexed: of these, the first that photographs are looked for by.
+        indexed: of these, the largest that photographs are looked for by: small ones repeat themselves. Of an extractor
+            that says no sizes, the first.
         min_alpha: where the render is fainter, nothing is known of the surface.
         max_step: a feature whose surroundings differ in depth by more than this share lies on an edge, and its place
             is not known.
@@ -62,9 +63,10 @@ def scene_features(
             continue
         found = extractor.extract(picture(shown))
         rows, places = lifted(found, shown, camera, params)
-        rows = rows[: params.max_features]
+        first = _largest_first(found, rows[: params.max_features])
+        rows = rows[first]
         kept.append(row)
-        points.append(places[: len(rows)].astype(np.float32))
+        points.append(places[first].astype(np.float32))
         descriptors.append(quantised(found.descriptors[rows]))
         angles.append(turns(found)[rows])
     count = np.array([len(p) for p in points], dtype=np.int64)
@@ -77,6 +79,13 @@ def scene_features(
         np.concatenate([np.zeros((0, width), np.int8), *descriptors]),
         np.concatenate([np.zeros(0, np.uint8), *angles]),
     )
+
+
+def _largest_first(found: Keypoints, rows: np.ndarray) -> np.ndarray:
+    """(n,) order of some features by size; as they are where sizes are not known."""
+    if found.sizes_px is None:
+        return np.arange(len(rows))
+    return np.argsort(-found.sizes_px[rows], kind="stable")
 
 
 def picture(shown: Rendered, row: int = 0) -> np.ndarray:

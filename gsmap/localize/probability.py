@@ -48,6 +48,7 @@ def evidence_of(
         "matches": float(np.log10(num_matches + 1)),
         "inliers": float(np.log10(count + 1)),
         "found_again": count / settled.tried if settled.tried else 0.0,
+        "laid": settled.agreement,
         "spread": evidence.spread(settled.pixels[kept], picture.size_px, params.blocks),
         "explained": comparison.explained(params.agree),
         "contradicted": comparison.contradicted(params.contradict),

@@ -26,6 +26,8 @@ class Params:
         min_found: fewer patches say nothing of the pose.
         min_agreement: where a render that was laid over the photo once agrees with it less than this when it is laid
             over it again, the photo shows another place; made places say where (``tools/fit_localize.py``).
+        settle_again_under: a pose from which a render agrees less than this is settled once more from where it came to
+            lie; that is kept where the render agrees better then.
         again_px: scenes are rendered again once what they show has moved by more than this ...
         again_blurs: ... or, where renders are laid over the photo, by more than so many times their blur.
     """
@@ -35,6 +37,7 @@ class Params:
     max_scenes: int = 3
     min_found: int = 8
     min_agreement: float = 0.1
+    settle_again_under: float = 0.5
     again_px: float = 0.5
     again_blurs: float = 0.5
 
@@ -77,6 +80,8 @@ class Settled:
         points: (K, 3) their places, metres.
         scene: (K,) int, whose patches they are, among ``looks``.
         tried: how many patches were looked for in the last round.
+        agreement: how well a render agreed with the photo when it was laid over it for the last time, before it moved
+            (`gsmap.localize.aligning.Aligned`); 0 where none was.
         looks: renders from the pose, or from so near that it makes no difference; none where nothing was found from
             the first.
     """
@@ -89,6 +94,7 @@ class Settled:
     points: np.ndarray
     scene: np.ndarray
     tried: int
+    agreement: float
     looks: Sequence[Look]
 
 
@@ -107,13 +113,34 @@ def settle(
     """Find patches from far, lay renders over the photo, find patches again; what both tell is one pose.
 
     Patches are exact where renders are sharp and have corners; what is laid over whole holds where they are blurred, or
-    show little but edges.
+    show little but edges. From a rough pose that may not lead all the way: where the render agrees little, once more.
 
     Args:
         picture: of the photo.
         intrinsics_px: (4,) of the picture's size, as far as they are known.
         scenes: that may show the place, those that matter most first.
     """
+    rest = scenes, params, lifting, tracks, poses, laying, known
+    found = _settled(picture, T_metric_camera, intrinsics_px, *rest)
+    if found.fit is None or found.agreement >= params.settle_again_under:
+        return found
+    again = _settled(picture, found.T_metric_camera, found.intrinsics_px, *rest)
+    return again if again.agreement > found.agreement else found
+
+
+def _settled(
+    picture: Picture,
+    T_metric_camera: np.ndarray,
+    intrinsics_px: np.ndarray,
+    scenes: Sequence[PlacedFeatures],
+    params: Params,
+    lifting: features.Params,
+    tracks: tracking.Params,
+    poses: resection.Params,
+    laying: aligning.Params,
+    known: covariance.Params,
+) -> Settled:
+    """`settle`, once."""
     pose, lens = T_metric_camera, intrinsics_px
     scenes = scenes[: params.max_scenes]
     free = None if picture.focal_sigma <= 0.01 else (picture.intrinsics_px[0], picture.focal_sigma)
@@ -133,13 +160,14 @@ def settle(
         looks = look(scenes, pose, lens / 2, half.size_px, lifting)
         counts = aligning.agreements(half.rgb, looks, laying.blur_px[0] / 2, laying)
     best = int(np.argmax(counts))
-    aligned = None
+    aligned, agreement = None, 0.0
     for blur in laying.blur_px:
         looks = look([scenes[best]], pose, lens / 2, half.size_px, lifting, looks, params.again_blurs * blur / 2)
         (one,) = looks
         laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
+        agreement = float(np.nan_to_num(laid.agreement))
         if aligned is not None and laid.agreement < params.min_agreement:
-            return _nowhere(pose, lens)
+            return _nowhere(pose, lens, agreement)
         if len(laid.pixels):
             aligned, pose, lens = laid, laid.T_metric_camera, 2 * laid.intrinsics_px
 
@@ -153,11 +181,11 @@ def settle(
         if told is None:
             pose, lens, told = fit.T_map_camera, fit.intrinsics_px, by_patches
         else:
-            pose, lens, told = _between(pose, lens, told, fit, by_patches)
+            pose, lens, told = _between(pose, lens, told, fit, by_patches, known.differing)
         at, _ = project(patches.points, np.linalg.inv(pose), lens)
         fit = replace(fit, residuals_px=patches.pixels - at)
     if told is None:
-        return _nowhere(pose, lens)
+        return _nowhere(pose, lens, agreement)
     return Settled(
         pose,
         lens,
@@ -167,22 +195,28 @@ def settle(
         patches.points,
         patches.scene,
         patches.tried,
+        agreement,
         look(scenes, pose, lens, picture.size_px, lifting, looks, params.again_px),
     )
 
 
-def _nowhere(pose: np.ndarray, lens: np.ndarray) -> Settled:
+def _nowhere(pose: np.ndarray, lens: np.ndarray, agreement: float) -> Settled:
     """What is said of a pose from which the map shows something else than the photo."""
-    return Settled(pose, lens, None, None, np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, int), 0, [])
+    return Settled(pose, lens, None, None, np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, int), 0, agreement, [])
 
 
 def _between(
-    pose: np.ndarray, lens: np.ndarray, told: np.ndarray, fit: resection.Refined, by_patches: np.ndarray
+    pose: np.ndarray,
+    lens: np.ndarray,
+    told: np.ndarray,
+    fit: resection.Refined,
+    by_patches: np.ndarray,
+    differing: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A pose and that of patches as one, each by what is known of it.
 
     They saw the same pictures, so they err together in part: the covariance is as if each told half (covariance
-    intersection, Julier and Uhlmann 1997).
+    intersection, Julier and Uhlmann 1997). Residuals do not tell all: a share of what the two differ by is added.
     """
     dim = len(told)
     apart = np.linalg.inv(pose) @ fit.T_map_camera
@@ -193,7 +227,7 @@ def _between(
     moved_lens = lens.copy()
     if dim == 7:
         moved_lens[:2] *= np.exp(step[6])
-    return resection.moved(pose, step[:6]), moved_lens, 2 * both
+    return resection.moved(pose, step[:6]), moved_lens, 2 * both + differing * np.outer(xi, xi)
 
 
 @dataclass(frozen=True, eq=False)

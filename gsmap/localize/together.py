@@ -198,6 +198,7 @@ def _by_matches(
         points,
         np.zeros(len(pixels), int),
         len(pixels),
+        judged.settled.agreement,
         judged.settled.looks,
     )
     return Judged(start, settled, own, judged.evidence, min(judged.probability, 0.5))

@@ -60,6 +60,7 @@ def _weakest(evidence: Mapping[str, float]) -> str:
         "matches": f"{round(10 ** evidence['matches'] - 1)} features agree",
         "inliers": f"{round(10 ** evidence['inliers'] - 1)} patches are found again",
         "found_again": f"{evidence['found_again']:.0%} of the patches are found again",
+        "laid": f"a render that is laid over it agrees by {evidence['laid']:.2f}",
         "spread": f"what is found again covers {evidence['spread']:.0%} of the picture",
         "explained": f"the map explains {evidence['explained']:.0%} of what can be compared",
         "contradicted": f"{evidence['contradicted']:.0%} of what can be compared differs",

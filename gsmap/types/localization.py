@@ -53,11 +53,14 @@ class Keypoints:
         pixels: (N, 2) float32 ``column row``; the first pixel's centre is 0.5 0.5.
         descriptors: (N, D) float32 unit vectors.
         angles_rad: (N,) float32 by which each was turned before it was described; None of an extractor that turns none.
+        sizes_px: (N,) float32 how large each is (standard deviation of the blur that it was found in); None of an
+            extractor that does not say.
     """
 
     pixels: np.ndarray
     descriptors: np.ndarray
     angles_rad: np.ndarray | None = None
+    sizes_px: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.pixels)

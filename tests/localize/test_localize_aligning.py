@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from gsmap.geometry.rotations import angle_between, exp_so3
+from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import aligning, covariance, evidence, resection, settling
 from gsmap.localize.looks import GREY, Look
 
@@ -132,7 +133,7 @@ def test_two_poses_become_one_by_what_is_known_of_each(mine, theirs, share):
     none = np.zeros((0, 2))
     fit = resection.Refined(other, LENS, none, none[:, 0], np.zeros((0, 2, 6)))
     sigmas = np.diag([0.01**2] * 3 + [0.02**2] * 3)
-    pose, lens, told = settling._between(TRUE, LENS, mine * sigmas, fit, theirs * sigmas)
+    pose, lens, told = settling._between(TRUE, LENS, mine * sigmas, fit, theirs * sigmas, 0.0)
     between = TRUE[:3, 3] + share * (other[:3, 3] - TRUE[:3, 3])
     assert np.allclose(pose[:3, 3], between, atol=1e-9)
     whole = angle_between(TRUE[:3, :3], other[:3, :3])
@@ -140,6 +141,10 @@ def test_two_poses_become_one_by_what_is_known_of_each(mine, theirs, share):
     assert np.array_equal(lens, LENS)
     # Both saw the same pictures: two that are alike know no more together than each of them alone.
     assert np.allclose(told, 2 * mine * theirs / (mine + theirs) * sigmas)
+    # By how much they differ neither knows; half of it, if half of what they differ by is not known.
+    xi = np.r_[rotation_vectors(TRUE[:3, :3].T @ other[:3, :3])[0], TRUE[:3, :3].T @ (other[:3, 3] - TRUE[:3, 3])]
+    *_, doubted = settling._between(TRUE, LENS, mine * sigmas, fit, theirs * sigmas, 0.5)
+    assert np.allclose(doubted - told, 0.5 * np.outer(xi, xi))
 
 
 def test_a_blurred_render_explains_the_coarse_picture_and_little_else():

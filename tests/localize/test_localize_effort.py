@@ -9,7 +9,7 @@ import pytest
 
 from gsmap import _native
 from gsmap.geometry.projection import project
-from gsmap.localize import Params, localizing, looks
+from gsmap.localize import Params, localizing, looks, settling
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.features import Params as Features
 from gsmap.localize.resection import moved
@@ -79,6 +79,34 @@ def test_matches_of_a_place_that_was_found_are_not_looked_into_again(judged):
     assert not localizing._settles_at(other, found, picture, PARAMS)
     assert not localizing._settles_at(replace(same, component=1), found, picture, PARAMS)
     assert not localizing._settles_at(same, replace(found, probability=0.5), picture, PARAMS)
+
+
+@pytest.mark.parametrize(("first", "second", "kept"), [(0.6, 0.7, "first"), (0.3, 0.4, "second"), (0.3, 0.2, "first")])
+def test_where_a_render_agrees_little_its_pose_is_settled_once_more(judged, monkeypatch, first, second, kept):
+    picture, found = judged
+    told = iter([replace(found.settled, agreement=first), replace(found.settled, agreement=second)])
+    starts = []
+
+    def settled(picture, pose, *rest):
+        starts.append(pose)
+        return next(told)
+
+    monkeypatch.setattr(settling, "_settled", settled)
+    rough = moved(found.settled.T_metric_camera, np.full(6, 0.1))
+    answer = settling.settle(picture, rough, picture.intrinsics_px, (), PARAMS.settling, *[None] * 5)
+    assert answer.agreement == {"first": first, "second": second}[kept]
+    assert len(starts) == (1 if first > PARAMS.settling.settle_again_under else 2)
+    assert np.array_equal(starts[-1], rough if len(starts) == 1 else found.settled.T_metric_camera)
+
+
+def test_how_well_a_render_agrees_that_is_laid_over_is_evidence(world, judged):
+    """Of the last time, before it moved: high where the pose is right, low where it is not."""
+    picture, found = judged
+    assert found.evidence["laid"] == found.settled.agreement > 0.4
+    start = moved(found.settled.T_metric_camera, np.array([0.0, np.radians(25), 0, 0, 0, 0]))
+    wrong = Candidate(0, start, picture.intrinsics_px, 8, ("scene",))
+    other = localizing.judged_pose(picture, wrong, {"scene": world.placed}, PARAMS)
+    assert other.evidence["laid"] < 0.2
 
 
 @pytest.mark.usefixtures("instruction_set")

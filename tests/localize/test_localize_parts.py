@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,8 +14,10 @@ from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3
 from gsmap.localize import Lens, covariance, matching, read_photo, resection, tracking, views
 from gsmap.localize.extractors import sift
-from gsmap.localize.features import quantised
+from gsmap.localize.features import lifted, picture, quantised, scene_features
 from gsmap.localize.resection import moved
+from gsmap.render import render
+from gsmap.types.localization import Keypoints
 
 SIFT = sift.make({}, sift.Params())
 LENS = np.array([400.0, 390.0, 240.0, 180.0])
@@ -130,6 +134,36 @@ def test_features_lie_on_the_surface(world) -> None:
     solid = world.capture.gaussians.means[world.capture.gaussians.opacities > 0.5]
     distance, _ = cKDTree(solid).query(world.placed.features.points)
     assert np.quantile(distance, 0.95) < 0.1
+
+
+class Sized:
+    """The built-in features, with sizes of our own or with none."""
+
+    def __init__(self, sizes: np.ndarray | None) -> None:
+        self.sizes = sizes
+
+    def extract(self, rgb: np.ndarray) -> Keypoints:
+        found = SIFT.extract(rgb)
+        sizes = None if self.sizes is None else self.sizes[: len(found)]
+        return replace(found, sizes_px=sizes)
+
+
+def test_the_largest_features_of_a_view_come_first(world) -> None:
+    """Photographs are looked for by the first ones; where an extractor says no sizes its order stays."""
+    few = views.Params(own=1, made=0)
+    given = (world.capture.gaussians, world.capture.cameras)
+    sizes = np.random.default_rng(0).permutation(2000).astype(np.float32)
+    as_found = scene_features("scene", *given, Sized(None), few)
+    by_size = scene_features("scene", *given, Sized(sizes), few)
+    shown = render(given[0], as_found.cameras[[0]], dominant_id=False, backend="native")
+    found = SIFT.extract(picture(shown))
+    rows, places = lifted(found, shown, as_found.cameras[[0]])
+    order = np.argsort(-sizes[rows])
+    assert len(rows) > 50
+    assert np.array_equal(as_found.points, places.astype(np.float32))
+    assert np.array_equal(by_size.points, places[order].astype(np.float32))
+    assert np.array_equal(by_size.descriptors, as_found.descriptors[order])
+    assert np.array_equal(by_size.angles, as_found.angles[order])
 
 
 def exif_file(path, focal_mm: int, orientation: int = 1, size: tuple[int, int] = (400, 300)) -> None:

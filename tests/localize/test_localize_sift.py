@@ -50,5 +50,7 @@ def test_features_are_those_of_colmap(params):
     same = distance < 0.02
     assert same.mean() > 0.98
     assert (np.diff(row[same]) > 0).mean() > 0.98  # in the same order, on which the choice of features rests
+    assert found.sizes_px is not None
+    assert np.allclose(found.sizes_px[row[same]], want[same, 2], rtol=0.02)
     apart = np.abs(found.descriptors[row[same]] - descriptors[same]).max(1)
     assert np.quantile(apart, 0.95) < 4 / 512

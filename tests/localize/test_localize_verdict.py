@@ -18,6 +18,7 @@ GOOD = {
     "matches": 2.0,
     "inliers": 2.2,
     "found_again": 0.4,
+    "laid": 0.8,
     "spread": 0.7,
     "explained": 0.9,
     "explained_coarsely": 0.95,
@@ -29,7 +30,7 @@ GOOD = {
     "blocked": 0.0,
     "sigma_m": -2.3,
 }
-BAD = GOOD | {"matches": 0.9, "inliers": 0.9, "found_again": 0.03, "spread": 0.1, "explained": 0.15}
+BAD = GOOD | {"matches": 0.9, "inliers": 0.9, "found_again": 0.03, "laid": 0.15, "spread": 0.1, "explained": 0.15}
 BAD |= {"explained_coarsely": 0.2, "contradicted": 0.6, "contradicted_coarsely": 0.5, "colour": 0.0, "sigma_m": -1.0}
 SURE = (0.003, 0.005)
 

@@ -50,9 +50,11 @@ class SiftExtractor:
     def extract(self, rgb: np.ndarray) -> Keypoints:
         """Features of a picture; see `gsmap.methods.extractor`."""
         if min(rgb.shape[:2]) < 16:  # less than the smallest octave
-            return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
+            none = np.zeros(0, np.float32)
+            return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), none, none)
         # Rec. 601, as every SIFT has been computed of colour pictures since libjpeg gave grey ones.
         grey = np.ascontiguousarray((rgb @ np.array([0.299, 0.587, 0.114])).round().astype(np.uint8))
         kept = self._params
         found, descriptors = sift(grey, kept.max_features, kept.peak_threshold, kept.edge_threshold, kept.doubled)
-        return Keypoints(np.ascontiguousarray(found[:, :2]), descriptors, np.ascontiguousarray(found[:, 3]))
+        pixels, sizes, angles = (np.ascontiguousarray(found[:, part]) for part in (slice(0, 2), 2, 3))
+        return Keypoints(pixels, descriptors, angles, sizes)
