@@ -3,6 +3,7 @@
     python tools/bench_scale.py                               # maps of 10, 100 and 1,000 scenes
     python tools/bench_scale.py --scenes 10 100 1000 10000 --updates 100 --cache FOLDER
     python tools/bench_scale.py --scenes 10 1000 10000 --updates 0 --lookup --maps FOLDER
+    python tools/bench_scale.py --diagonal 4000               # only exports a street of 16 km along the diagonal
 
 The maps are filled, not made: a street on which every capture sees what its neighbours see. All rows are real (scenes,
 graphs, ten registrations a scene of which two or three are accepted, a real solve), and so is all that reads them; what
@@ -36,10 +37,11 @@ import numpy as np
 from scale_maps import TRIED, Filled, Pattern, filled, kept, pattern
 from spent import Spent, spent
 
+import gsmap.map
 from gsmap.cli import COLLECT_AFTER
 from gsmap.export import plan_tiles
 from gsmap.geometry.rotations import exp_so3
-from gsmap.types import Sim3
+from gsmap.types import Cameras, Gaussians, PoseGraph, ScenePose, Sim3
 
 
 def main() -> None:
@@ -50,10 +52,14 @@ def main() -> None:
     )
     parser.add_argument("--tiles", nargs="+", type=int, default=[100, 1000, 10_000])
     parser.add_argument("--lookup", action="store_true", help="also let the map say which pairs to try")
+    parser.add_argument("--diagonal", type=int, metavar="N", help="only export N small captures along the diagonal")
     parser.add_argument("--cache", type=Path, help="keep the two real captures here")
     parser.add_argument("--maps", type=Path, help="keep filled maps here: 10,000 scenes take minutes to fill")
     options = parser.parse_args()
     gc.set_threshold(COLLECT_AFTER)  # as the command line does
+    if options.diagonal:
+        exporting(options.diagonal)
+        return
     with tempfile.TemporaryDirectory() as scratch:
         made = pattern(options.cache or Path(scratch) / "pattern")
         print(f"own share of one scene: describe {made.describe_s:.2f} CPU s, a pair {made.register_s:.2f} CPU s")
@@ -197,6 +203,29 @@ def planning(num: int, place: Callable[[int], list[float]]) -> float:
     start = time.process_time()
     plan_tiles(poses, bounds, tile_size_m=10.0, reach_m=11.0)
     return time.process_time() - start
+
+
+def exporting(num: int) -> None:
+    """Captures of 200 Gaussians each, 4 m apart along the diagonal, exported in tiles of 10 m."""
+    rng, poses = np.random.default_rng(0), {}
+    unseen = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 4)), np.zeros((0, 2)))
+    with tempfile.TemporaryDirectory() as scratch, gsmap.map.create(Path(scratch) / "map.gsmap") as m:
+        for i in range(num):
+            means = rng.uniform([-4.0, -4, -1], [4, 4, 3], (200, 3))
+            own = Gaussians(means, np.tile([1.0, 0, 0, 0], (200, 1)), np.full((200, 3), -3.0), np.ones(200),
+                            np.zeros((200, 1, 3)))  # fmt: skip
+            scene, _ = m.store.scenes.add(own, unseen, name=f"s{i:05d}")
+            poses[scene.id] = ScenePose(scene.id, Sim3(exp_so3([0, 0, 0.1 * i]), _diagonal(i)), 0, "placed")
+        m.store.revisions.save(PoseGraph(poses))
+        for again in (False, True):
+            start = time.process_time()
+            report = m.export(Path(scratch) / "tiles", merge="union", tile_size_m=10.0)
+            spent_s = time.process_time() - start
+            held = sum(tile.num_gaussians for tile in report.tiles)
+            print(
+                f"{'again' if again else 'at once'}: {num} scenes over {4e-3 * num:.1f} km, {len(report.tiles)} tiles, "
+                f"{held} of {200 * num} Gaussians, {spent_s:.1f} CPU s"
+            )
 
 
 if __name__ == "__main__":
