@@ -28,7 +28,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 5
+VERSION = 6
 STEPS: str | None = "steps"
 RENDERS = True
 
