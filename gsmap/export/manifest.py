@@ -134,8 +134,20 @@ class Manifest:
         if self.doomed:
             content["doomed"] = sorted(self.doomed)
         began = time.process_time()
-        write_text_whole(folder / FILE_NAME, json.dumps(content, indent=1))
+        write_text_whole(folder / FILE_NAME, _as_json(content))
         self._saved_at, self._save_took_s = time.monotonic(), time.process_time() - began
+
+
+def _as_json(content: Mapping[str, object]) -> str:
+    """JSON with a line for each tile: with `json`'s own indents it takes eight times as long, again and again."""
+    lines = []
+    for name, value in content.items():
+        if isinstance(value, list):
+            text = "[\n" + ",\n".join(f"  {json.dumps(one)}" for one in value) + "\n ]"
+        else:
+            text = json.dumps(value)
+        lines.append(f" {json.dumps(name)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def _component(component: int, metre: Metre, world: dict[str, Any] | None) -> dict[str, object]:
