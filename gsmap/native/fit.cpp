@@ -85,7 +85,7 @@ void fit_step(const std::vector<View *> &views, const Floats &background, const 
     for (size_t i = 0; i < views.size(); i++) {
         Image one = image;
         one.colour += 3 * pixels * i, one.alpha += pixels * i;
-        views[i]->pixels_backward(one, {gradient + 3 * pixels * i, nullptr, nullptr});
+        views[i]->pixels_backward(one, {gradient + 3 * pixels * i, nullptr, nullptr, still});
     }
     uint32_t most = 0;
     for (int64_t i = 0; i < scene.n; i++) most = count[i] > most ? count[i] : most;

@@ -6,22 +6,37 @@
 namespace GSMAP_ISA {
 using namespace gsmap;
 
-// Kingma & Ba 2015; every Gaussian counts its own updates, so one that no camera saw stays as it is.
-void adam(const AdamArrays &a, const AdamStep &step, int64_t begin, int n, const uint8_t *touched, float *gradient) {
+// Kingma & Ba 2015; every Gaussian counts its own updates, so one that no camera saw stays as it is. The number of
+// columns is known where it is compiled, so that a row is a few vectors.
+template <int kCols>
+void adam_rows(const AdamArrays &a, const AdamStep &step, int64_t begin, int n, const uint8_t *touched, float *gradient) {
     const float b1 = step.beta1, b2 = step.beta2;
+    float rates[kCols];
+    for (int j = 0; j < kCols; j++) rates[j] = j < 3 ? a.rate : a.rate_rest;
     for (int i = 0; i < n; i++) {
         if (!touched[i]) continue;
-        const int64_t at = (begin + i) * a.cols;
-        float *p = a.value + at, *m = a.m + at, *v = a.v + at, *g = gradient + int64_t(i) * a.cols;
-        const float *c = step.corrections + 2 * int64_t(step.updates[begin + i]);
-        for (int j = 0; j < a.cols; j++) {
+        const int64_t at = (begin + i) * kCols;
+        float *__restrict p = a.value + at, *__restrict m = a.m + at, *__restrict v = a.v + at;
+        float *__restrict g = gradient + int64_t(i) * kCols;
+        const float *c = step.corrections + 2 * int64_t(step.updates[begin + i]), first = c[0], second = c[1];
+        for (int j = 0; j < kCols; j++) {
             const float gj = g[j];
             m[j] = b1 * m[j] + (1.f - b1) * gj;
             v[j] = b2 * v[j] + (1.f - b2) * gj * gj;
-            const float rate = j < 3 ? a.rate : a.rate_rest;
-            p[j] -= rate * c[0] * m[j] / (__builtin_sqrtf(v[j]) * c[1] + step.epsilon);
+            p[j] -= rates[j] * first * m[j] / (__builtin_sqrtf(v[j]) * second + step.epsilon);
             g[j] = 0.f;
         }
+    }
+}
+
+void adam(const AdamArrays &a, const AdamStep &step, int64_t begin, int n, const uint8_t *touched, float *gradient) {
+    switch (a.cols) {
+        case 1: return adam_rows<1>(a, step, begin, n, touched, gradient);
+        case 3: return adam_rows<3>(a, step, begin, n, touched, gradient);
+        case 4: return adam_rows<4>(a, step, begin, n, touched, gradient);
+        case 12: return adam_rows<12>(a, step, begin, n, touched, gradient);
+        case 27: return adam_rows<27>(a, step, begin, n, touched, gradient);
+        default: return adam_rows<48>(a, step, begin, n, touched, gradient);
     }
 }
 

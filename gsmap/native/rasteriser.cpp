@@ -41,7 +41,7 @@ void forward(View &view, const Floats &means, const Floats &quats, const Floats 
              const Floats &sh, const Doubles &pose, const Doubles &intrinsics, int width, int height,
              const std::optional<Ranges> &ranges, const Floats &background, const FloatsOut &colour,
              const std::optional<FloatsOut> &depth, const FloatsOut &alpha, const std::optional<Ints> &dominant_id,
-             const std::optional<FloatsOut> &max_weight) {
+             const std::optional<FloatsOut> &max_weight, const std::optional<Floats> &looked_at) {
     Camera camera{};
     for (int r = 0; r < 3; r++) {
         for (int c = 0; c < 3; c++) camera.R[3 * r + c] = pose.data()[4 * r + c];
@@ -54,6 +54,7 @@ void forward(View &view, const Floats &means, const Floats &quats, const Floats 
     Image image = image_of(background, colour, depth, alpha);
     image.dominant_id = dominant_id ? dominant_id->data() : nullptr;
     image.max_weight = max_weight ? max_weight->data() : nullptr;
+    image.looked_at = looked_at ? looked_at->data() : nullptr;
     nb::gil_scoped_release release;
     view.forward(scene, camera, ranges ? ranges->data() : nullptr, ranges ? int64_t(ranges->shape(0)) : 0, image);
 }
@@ -74,7 +75,7 @@ void backward(View &view, const Floats &means, const Floats &quats, const Floats
     }
     const Image image = image_of(background, colour, depth, alpha);
     const ImageGradient g{g_colour ? g_colour->data() : nullptr, g_depth ? g_depth->data() : nullptr,
-                          g_alpha ? g_alpha->data() : nullptr};
+                          g_alpha ? g_alpha->data() : nullptr, nullptr};
     double *pose = g_pose ? g_pose->data() : nullptr;
     nb::gil_scoped_release release;
     view.backward(scene, image, g, gradient, pose);
@@ -110,7 +111,7 @@ void bind_rasteriser(nb::module_ &m) {
         .def("forward", &forward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("logit_opacities"),
              nb::arg("sh"), nb::arg("pose"), nb::arg("intrinsics"), nb::arg("width"), nb::arg("height"), none("ranges"),
              nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"), none("dominant_id"),
-             none("max_weight"))
+             none("max_weight"), none("looked_at"))
         .def("backward", &backward, nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("logit_opacities"),
              nb::arg("sh"), nb::arg("background"), nb::arg("colour"), none("depth"), nb::arg("alpha"), none("g_colour"),
              none("g_depth"), none("g_alpha"), none("gradients"), none("g_pose"))

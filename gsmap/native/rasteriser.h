@@ -57,10 +57,12 @@ struct Image {  // any of them may be null, except alpha
     int32_t *dominant_id;
     float *max_weight;  // (n,) per Gaussian of the scene: largest blending weight, raised only
     float background[3];
+    const float *looked_at;  // not 0 where a loss looks: blocks out of its reach (`kSsimReach`) stay empty; null: all
 };
 
 struct ImageGradient {
     const float *colour, *depth, *alpha;  // gradients, null for zero
+    const uint8_t *frozen;  // (n,) not 0 for Gaussians whose own gradient nobody asks for; may be null
 };
 
 struct TileWork {

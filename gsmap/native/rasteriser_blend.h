@@ -99,7 +99,7 @@ template <bool kDepth, bool kId, bool kWeight> int64_t blend_tile(const TileWork
     }
 
     int64_t pairs = 0;
-    uint32_t blocks = blocks_in_image(work);
+    uint32_t blocks = blocks_in_image(work, image.looked_at);
     for (int64_t first = 0; first < work.count && blocks; first += kRound) {
         const int n = int(work.count - first < kRound ? work.count - first : kRound);
         round.gather(work, first, n);

@@ -103,11 +103,25 @@ template <class Body> INLINE void for_pixels(const TileWork &work, Body body) {
     }
 }
 
-INLINE uint32_t blocks_in_image(const TileWork &work) {
+// Whether a window of SSIM around some pixel of [x0, x1) x [y0, y1) holds one that is looked at.
+INLINE bool any_looked_at(const float *looked_at, int width, int height, int x0, int y0, int x1, int y1) {
+    const auto within = [](int at, int most) { return at < 0 ? 0 : at < most ? at : most; };
+    const int left = within(x0 - kSsimReach, width), right = within(x1 + kSsimReach, width);
+    for (int y = within(y0 - kSsimReach, height); y < within(y1 + kSsimReach, height); y++)
+        for (int x = left; x < right; x++)
+            if (looked_at[int64_t(y) * width + x] != 0.f) return true;
+    return false;
+}
+
+// The blocks that are to be drawn: those in the image, or of them those that are looked at.
+INLINE uint32_t blocks_in_image(const TileWork &work, const float *looked_at) {
     uint32_t blocks = 0;
-    for (int b = 0; b < kBlocks; b++)
-        if (work.tx * kTile + b % kAcross * kBlockX < work.width && work.ty * kTile + b / kAcross * kBlockY < work.height)
+    for (int b = 0; b < kBlocks; b++) {
+        const int x = work.tx * kTile + b % kAcross * kBlockX, y = work.ty * kTile + b / kAcross * kBlockY;
+        if (x >= work.width || y >= work.height) continue;
+        if (!looked_at || any_looked_at(looked_at, work.width, work.height, x, y, x + kBlockX, y + kBlockY))
             blocks |= 1u << b;
+    }
     return blocks;
 }
 

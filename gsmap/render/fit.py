@@ -126,8 +126,9 @@ class Fitter:
         loss = 0.0
         for i in range(count):
             pose, intrinsics = cameras.T_camera_frame[i], cameras.intrinsics_px[i]
-            native.forward(self._views[i], arrays, pose, intrinsics, self._background, out, i, None)
             mask = None if masks is None else masks[i]
+            looked_at = None if self.statistics else mask  # statistics are of whole pictures
+            native.forward(self._views[i], arrays, pose, intrinsics, self._background, out, i, None, looked_at)
             loss += image_loss(out["colour"][i], images[i], mask, self.ssim_weight, gradient[i]) / count
         if count > 1:
             gradient /= count

@@ -57,8 +57,12 @@ def forward(
     images: dict[str, Any],
     i: int,
     index: ChunkIndex | None,
+    looked_at: np.ndarray | None = None,
 ) -> None:
-    """Render view ``i`` into ``images``; ``view`` keeps what its backward pass needs."""
+    """Render view ``i`` into ``images``; ``view`` keeps what its backward pass needs.
+
+    Where no pixel of ``looked_at`` (H, W) in reach of SSIM's windows differs from 0, nothing need be drawn.
+    """
     height, width = images["alpha"].shape[1:]
     pose = np.ascontiguousarray(T_camera_frame[:3], dtype=np.float64)
     ranges = None
@@ -81,6 +85,7 @@ def forward(
         alpha=images["alpha"][i],
         dominant_id=None if images["dominant_id"] is None else images["dominant_id"][i],
         max_weight=images["max_weight"],
+        looked_at=looked_at,
     )
 
 

@@ -124,6 +124,36 @@ def test_masked_pixels_do_not_matter():
     assert np.array_equal(a.means, before.means)
 
 
+@pytest.mark.usefixtures("instruction_set")
+def test_what_no_window_of_the_loss_reaches_is_not_drawn_and_nothing_else_differs():
+    gaussians, cameras = random_scene(4, n=300)
+    target = np.random.default_rng(0).uniform(size=(1, 70, 100, 3)).astype(np.float32)
+    mask = np.zeros((1, 70, 100), np.float32)
+    mask[0, 21:24, 50:53] = 1.0  # their windows reach over the borders of blocks of 8 pixels, on all sides
+    mask[0, 69, 99] = 0.5
+    some, all_drawn = (Fitter(gaussians, ssim_weight=0.5, statistics=whole) for whole in (False, True))
+    for _ in range(3):
+        assert some.step(cameras, target, mask) == all_drawn.step(cameras, target, mask)
+    for ours, theirs in zip(some._values, all_drawn._values, strict=True):
+        assert np.array_equal(ours, theirs)
+    assert some._updates.any()
+    assert 0 < some._views[0].pairs < 0.4 * all_drawn._views[0].pairs
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_what_is_frozen_changes_no_step_of_the_others():
+    gaussians, cameras = random_scene(4, n=400)
+    target = np.random.default_rng(0).uniform(size=(1, 70, 100, 3)).astype(np.float32)
+    frozen = np.arange(400) % 3 == 0
+    held, free = Fitter(gaussians, frozen=frozen), Fitter(gaussians)
+    assert held.step(cameras, target) == free.step(cameras, target)
+    moved = (free.means != gaussians.means).any(1)
+    assert (moved & frozen).sum() > 50
+    assert (moved & ~frozen).sum() > 100
+    for ours, theirs in zip(held._values, free._values, strict=True):
+        assert np.array_equal(ours[~frozen], theirs[~frozen])
+
+
 def test_several_views_and_statistics():
     gaussians, cameras = random_scene(4, n=300)
     two = cameras[[0, 0]]
