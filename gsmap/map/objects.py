@@ -106,6 +106,7 @@ class Known:
                         id=name,
                         component=component,
                         position=level.T @ room.middle / unit,
+                        outline=room.outline @ level / unit,
                         size_m=room.box[1] - room.box[0],
                         area_m2=round(room.area_m2, 2),
                         doors=tuple(self._room_id(component, other) for other in room.doors),

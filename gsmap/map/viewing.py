@@ -177,10 +177,21 @@ class MapDoors:
                     "last_seen": row.last_seen,
                     "present": row.there,
                     "num_sightings": row.seen,
+                    "room": row.room,
                 }
                 for row in report.objects
             ],
             "relations": [{"a": one.subject, "b": one.other, "kind": one.relation} for one in report.relations],
+            "rooms": [
+                {
+                    "id": row.id,
+                    "component": row.component,
+                    "outline": row.outline.tolist(),
+                    "area_m2": row.area_m2,
+                    "doors": row.doors,
+                }
+                for row in report.rooms
+            ],
         }
 
     def history(self, at: str, component: int) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -43,6 +44,23 @@ class Room:
         """(3,) the middle of its floor."""
         at = np.argwhere(self.cells).mean(0) + 0.5
         return np.array([*(self.low + at * self.cell_m), self.floor_m])
+
+    @property
+    def outline(self) -> np.ndarray:
+        """(K, 2, 3) the ends of the straight pieces of line around its floor, in no order."""
+        cells = np.pad(self.cells, 1).astype(np.int8)
+        pieces = []
+        for axis in (0, 1):
+            # Which way one steps over each border between two cells: out of the room, into it, or neither.
+            step = np.diff(cells if axis == 0 else cells.T, axis=0)[:, 1:-1]
+            for line, along in enumerate(step):
+                ends = np.flatnonzero(np.diff(np.concatenate([[0], along, [0]])))
+                for first, last in pairwise(ends):
+                    if along[first]:
+                        both = np.array([[line, first], [line, last]])
+                        pieces.append(both if axis == 0 else both[:, ::-1])
+        at = self.low + np.array(pieces).reshape(-1, 2, 2) * self.cell_m
+        return np.concatenate([at, np.full((*at.shape[:2], 1), self.floor_m)], axis=2)
 
     def holds(self, point: np.ndarray) -> bool:
         """Whether a point (3,) lies in it, or in its floor or ceiling."""

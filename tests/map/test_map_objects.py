@@ -24,6 +24,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.map import Map
 from gsmap.map.persisting import has_passed
 from gsmap.map.small_map import SmallLocalizer
+from gsmap.map.viewing import MapDoors
 from gsmap.methods import RecipeKey
 from gsmap.store import Store, schema
 from gsmap.store.graphs import Graphs
@@ -124,6 +125,13 @@ def test_the_graph_is_written_and_is_what_networkx_gets(site: Map, tmp_path: Pat
     assert {row.room for row in report.objects} == {room.id} == {"r1"}
     assert set(room.objects) == {row.id for row in report.objects}
     np.testing.assert_allclose(room.position, [2, 1.5, 0], atol=0.2)
+    low, high = room.outline.min((0, 1)), room.outline.max((0, 1))
+    np.testing.assert_allclose([low, high], [[0, 0, 0], [4, 3, 0]], atol=0.2)
+    shown = MapDoors(site.store, site.settings).graph()
+    assert [row["room"] for row in shown["objects"]] == [room.id] * len(report.objects)
+    (drawn,) = shown["rooms"]
+    assert drawn["outline"] == room.outline.tolist()
+    assert (drawn["area_m2"], drawn["doors"]) == (room.area_m2, ())
     assert set(graph.nodes) == {row.id for row in report.objects} | {room.id}
     assert graph.number_of_edges() == len(report.relations) + len(room.objects)
     site.write_graph(tmp_path / "o.graphml", "graphml")

@@ -6,6 +6,7 @@ import pytest
 from gsmap.geometry.rotations import matrices_to_quats
 from gsmap.objects import find_rooms
 from gsmap.types import Gaussians
+from gsmap.types.room import Room
 
 HEIGHT, DOOR = 2.5, 2.05
 
@@ -97,3 +98,28 @@ def test_captures_that_show_little_have_no_rooms():
 
 def test_rooms_are_told_without_cameras():
     assert len(find_rooms([flat()], np.zeros((0, 3)))) == 2
+
+
+def test_the_outline_of_a_floor_parts_what_is_inside_from_what_is_not():
+    rng = np.random.default_rng(5)
+    cells = rng.random((9, 7)) < 0.6  # pieces that touch at corners, and holes
+    room = Room(np.array([1.0, -2.0]), cells, 0.5, 0.1, 2.5)
+    outline = room.outline
+    assert outline.shape[1:] == (2, 3)
+    assert (outline[..., 2] == 0.1).all()
+    across = outline[:, 0, 1] == outline[:, 1, 1]  # pieces along x
+    for x, column in enumerate(cells):
+        for y, inside in enumerate(column):
+            at = room.low + (np.array([x, y]) + 0.5) * 0.5
+            below = outline[across & (outline[:, 0, 1] < at[1])]
+            crossed = (below[..., 0].min(1) < at[0]) & (at[0] < below[..., 0].max(1))
+            assert crossed.sum() % 2 == inside
+    padded = np.pad(cells, 1).astype(int)
+    borders = np.abs(np.diff(padded, axis=0)).sum() + np.abs(np.diff(padded, axis=1)).sum()
+    assert np.linalg.norm(outline[:, 1] - outline[:, 0], axis=1).sum() == pytest.approx(0.5 * borders)
+
+
+def test_a_straight_wall_is_one_piece_of_the_outline():
+    cells = np.ones((6, 4), bool)
+    cells[3:, 2:] = False
+    assert len(Room(np.zeros(2), cells, 0.1, 0.0, 2.5).outline) == 6

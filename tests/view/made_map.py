@@ -309,10 +309,17 @@ class MadeServer:
                 "last_seen": f"2025-0{k + 1}-11",
                 "present": k != 2,
                 "num_sightings": 3 + k,
+                "room": f"r{1 + k // 2}",
             }
             for k, name in enumerate(names)
         ]
-        return {"objects": objects, "relations": [{"a": "o1", "b": "o2", "kind": "stands beside"}]}
+        relations = [{"a": "o1", "b": "o2", "kind": "stands beside"}]
+        rooms = []
+        for k, other in ((0, "r2"), (1, "r1")):
+            corners = [[4.0 * k + x, y, 0] for x, y in ((-1, -1), (3, -1), (3, 2), (-1, 2))]
+            outline = [[corners[i - 1], corners[i]] for i in range(4)]
+            rooms.append({"id": f"r{k + 1}", "component": 0, "outline": outline, "area_m2": 12.0, "doors": [other]})
+        return {"objects": objects, "relations": relations, "rooms": rooms}
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):

@@ -440,7 +440,10 @@ def test_objects_and_photos(hands):
     hands.wait("findAll('[role=row]').length === 1")
     hands.click("button.choose", "red cabinet")
     hands.says("chair stands beside red cabinet", "gs-thing")
-    assert told(hands, "setObjects") is not None
+    hands.says("r1, 12.0 m²", "gs-thing")
+    fill(hands, "find('#filter', null)", "r2", "input")
+    hands.wait("findAll('[role=row]').length === 2")
+    assert told(hands, "setGraph") is not None
     fill(hands, "find('#filter', null)", "", "input")
     hands.click("button", "Photos")
     hands.click("button.choose", "IMG_0001.jpg")

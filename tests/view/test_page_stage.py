@@ -140,7 +140,7 @@ def as_it_was(request) -> Iterator[None]:
         seen.page.value(
             "(() => { const s = gsmap.stage; s.setSplit(null); s.setClip(null); s.setCeiling(true); s.drag(null);"
             " s.setPoses(null); s.setVisible(new Set([0, 1, 2])); gsmap.picks.length = 0;"
-            " for (const n of ['cameras', 'nodes', 'boxes', 'edges', 'ellipsoids', 'objects', 'photos'])"
+            " for (const n of ['cameras', 'nodes', 'boxes', 'edges', 'ellipsoids', 'objects', 'rooms', 'photos'])"
             "   s.setOverlay(n, false); s.setChanges([]); s.setCorrespondences(null); s.setTheme(true); })()"
         )
 
@@ -300,21 +300,28 @@ def test_changes_objects_photos_and_correspondences_are_drawn_and_picked(seen):
     change = {"id": "c1", "kind": "moved", "component": 0, "box": box, "before": 0, "after": 1, "at": None,
               "confidence": 1, "status": "open", "pictures": None}  # fmt: skip
     thing = {"id": "a", "name": "chair", "component": 0, "position": [0, -1.2, 0.7], "box": box, "first_seen": None,
-             "last_seen": None, "present": True, "num_sightings": 1}  # fmt: skip
+             "last_seen": None, "present": True, "num_sightings": 1, "room": "r1"}  # fmt: skip
+    room = {"id": "r1", "component": 0, "outline": [box], "area_m2": 1, "doors": []}
     photo = {"file": "p.jpg", "component": 0, "T_map_camera": pose(0.0).tolist(), "intrinsics": [1, 1, 0.5, 0.5],
              "size": [1, 1], "captured_at": None}  # fmt: skip
     photo["T_map_camera"][1][3], photo["T_map_camera"][2][3] = -1.2, 0.4
     for call in (
         f"setChanges([{json.dumps(change)}])",
-        f"setObjects([{json.dumps(thing)}], [])",
+        f"setGraph({{ objects: [{json.dumps(thing)}], relations: [], rooms: [] }})",
+        f"setGraph({{ objects: [], relations: [], rooms: [{json.dumps(room)}] }})",
         f"setCorrespondences({{ correspondences: [[{box[0]}, {box[1]}]] }})",
     ):
-        if "Objects" in call:
+        if "Graph" in call:
             seen.do("setOverlay('objects', true)")
+            seen.do("setOverlay('rooms', true)")
         seen.do(call)
         assert np.abs(seen.page.picture() - plain).max() > 0.1
-        seen.page.value("(gsmap.stage.setChanges([]), gsmap.stage.setCorrespondences(null))")
+        nothing = "{ objects: [], relations: [], rooms: [] }"
+        seen.page.value(
+            f"(gsmap.stage.setChanges([]), gsmap.stage.setGraph({nothing}), gsmap.stage.setCorrespondences(null))"
+        )
     seen.do("setOverlay('objects', false)")
+    seen.do("setOverlay('rooms', false)")
     seen.show(f"map.photos = [{json.dumps(photo)}]")
     seen.stand(camera)
     seen.do("setOverlay('photos', true)")

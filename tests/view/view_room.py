@@ -108,7 +108,7 @@ class MadeDoors:
         raise NotFoundError(f"no change {change}")
 
     def graph(self) -> dict[str, Any]:
-        return {"objects": [], "relations": []}
+        return {"objects": [], "relations": [], "rooms": []}
 
     def history(self, at: str, component: int) -> dict[str, Any]:
         if at.count(",") != 2:

@@ -92,6 +92,7 @@ class RoomRow(Row):
         id: ``r1`` is the largest of the first component; another capture may change it.
         component: of the map.
         position: the middle of its floor, map frame and unit.
+        outline: (K, 2, 3) the ends of the straight pieces of line around its floor, map frame and unit, in no order.
         size_m: of the box around it, metres; the last number is its height.
         area_m2: of its floor.
         doors: ids of the rooms that one can walk to from it.
@@ -110,6 +111,7 @@ class RoomRow(Row):
     id: str
     component: int
     position: np.ndarray
+    outline: np.ndarray
     size_m: np.ndarray
     area_m2: float
     doors: tuple[str, ...]

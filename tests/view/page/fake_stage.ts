@@ -58,7 +58,7 @@ export async function createStage(options: StageOptions): Promise<Stage> {
     },
     setCeiling: note("setCeiling"),
     setOverlay: note("setOverlay"),
-    setObjects: note("setObjects"),
+    setGraph: note("setGraph"),
     setChanges: (changes) => calls.push(["setChanges", changes.map((one) => one.id)]),
     setCorrespondences: (detail) => calls.push(["setCorrespondences", detail?.correspondences.length ?? null]),
     setPoses: (revision) => calls.push(["setPoses", revision?.id ?? null]),

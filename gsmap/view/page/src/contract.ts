@@ -177,11 +177,20 @@ export interface ObjectEntry {
   last_seen: string | null;
   present: boolean;
   num_sightings: number;
+  room: string | null; // id of the one it stands in
 }
-/** GET of MapSummary.graph: objects of the map, and how they stand to each other. It may take a while to make. */
+export interface RoomEntry {
+  id: string; // "r1"
+  component: number;
+  outline: [Vector, Vector][]; // straight pieces of line around its floor, map frame
+  area_m2: number;
+  doors: string[]; // ids of the rooms that one can walk to from it
+}
+/** GET of MapSummary.graph: objects of the map, how they stand to each other, its rooms. It may take a while to make. */
 export interface GraphEntry {
   objects: ObjectEntry[];
   relations: { a: string; b: string; kind: string }[]; // ids; kind: "on", "in", "next to"
+  rooms: RoomEntry[];
 }
 
 /** GET of MapSummary.history */

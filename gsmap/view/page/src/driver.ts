@@ -101,11 +101,11 @@ export function drive(stage: Stage): () => void {
     clip.now(state.clip);
     ceiling.now(state.ceiling);
     for (const [name, told] of overlays) told.now(state.overlays.has(name) || OF_TAB[name] === state.tab);
-    if (state.overlays.has("objects") || state.tab === "things") {
+    if (state.overlays.has("objects") || state.overlays.has("rooms") || state.tab === "things") {
       const known = actions.graphOf(state);
       if (known?.status === "ready" && known.value !== things) {
         things = known.value;
-        stage.setObjects(known.value.objects, known.value.relations);
+        stage.setGraph(known.value);
       }
     }
     changes.now(state.tab === "time" || state.selection?.kind === "change" ? derive.listedChanges(state) : []);

@@ -6,7 +6,7 @@ import type { Pick, Source, Stage, Standpoint } from "./stage/stage";
 export const TABS = ["look", "review", "time", "things"] as const;
 export type Tab = (typeof TABS)[number];
 
-export const OVERLAYS = ["cameras", "nodes", "boxes", "edges", "ellipsoids", "objects", "photos"] as const;
+export const OVERLAYS = ["cameras", "nodes", "boxes", "edges", "ellipsoids", "objects", "rooms", "photos"] as const;
 export type Overlay = (typeof OVERLAYS)[number];
 
 export const EDGE_FILTERS = ["doubtful", "tentative", "undecided", "rejected", "reviewed", "all"] as const;

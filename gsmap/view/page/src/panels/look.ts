@@ -20,6 +20,7 @@ const OVERLAY_NAMES: Record<Overlay, string> = {
   ellipsoids: "Uncertainty",
   nodes: "Nodes",
   objects: "Objects",
+  rooms: "Rooms",
   photos: "Photos",
 };
 

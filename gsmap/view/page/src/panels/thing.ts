@@ -44,6 +44,7 @@ export class Thing extends Panel {
   private object(one: ObjectEntry, graph: GraphEntry) {
     const unit = this.unit(one.component);
     const nameOf = (id: string) => graph.objects.find((other) => other.id === id)?.name ?? id;
+    const room = graph.rooms.find(({ id }) => id === one.room);
     const relations = graph.relations.filter(({ a, b }) => a === one.id || b === one.id);
     const sides = one.box[1].map((v, i) => metres((v - (one.box[0][i] ?? v)) * unit));
     return html`
@@ -58,6 +59,14 @@ export class Thing extends Panel {
             <dd>${point(one.position, unit)}</dd>
             <dt>Size</dt>
             <dd>${sides.join(" × ")}</dd>
+            ${
+              room
+                ? html`<dt>Room</dt>
+                    <dd>${room.id}, ${room.area_m2.toFixed(1)} m²</dd>
+                    <dt>Doors to</dt>
+                    <dd>${room.doors.join(", ") || "none seen"}</dd>`
+                : nothing
+            }
             <dt>Seen</dt>
             <dd>${plural(one.num_sightings, "time")}</dd>
             <dt>First seen</dt>

@@ -53,7 +53,7 @@ export class Things extends Panel {
         id="filter"
         type="search"
         aria-label="Find by name"
-        placeholder=${this.kind === "objects" ? "Find an object by name" : "Find a photo by file or date"}
+        placeholder=${this.kind === "objects" ? "Find an object by name or room" : "Find a photo by file or date"}
         .value=${this.query}
         @input=${(event: Event) => (this.query = (event.target as HTMLInputElement).value)}
       />
@@ -82,7 +82,7 @@ export class Things extends Panel {
       () => actions.graphs.forget(),
       ({ objects }) => {
         const listed = objects.filter(
-          (one) => one.component === this.state.component && this.fits(one.name, one.id, one.last_seen),
+          (one) => one.component === this.state.component && this.fits(one.name, one.id, one.room, one.last_seen),
         );
         return listed.length
           ? this.list("Objects", listed, (one) => one.id, this.object, "object")
@@ -127,7 +127,7 @@ export class Things extends Panel {
         <span class="name">${one.name}</span>
         <span class="detail"
           ><span>${one.present ? `seen ${plural(one.num_sightings, "time")}` : "gone"}</span
-          ><span>${day(one.last_seen)}</span></span
+          >${one.room ? html`<span>${one.room}</span>` : nothing}<span>${day(one.last_seen)}</span></span
         >
       </button></span
     >`;

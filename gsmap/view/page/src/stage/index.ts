@@ -5,9 +5,9 @@ import { Object3D } from "three";
 import type {
   Box,
   EdgeDetail,
+  GraphEntry,
   MapSummary,
   Matrix,
-  ObjectEntry,
   PhotoEntry,
   RevisionPoses,
   SceneEntry,
@@ -21,12 +21,11 @@ import type { Budget, Placed, Sixteen } from "./loader";
 import { boxLines, CHANGE_COLOURS, COLOURS, crossLines, ellipsoidLines, frustumLines, Overlays } from "./overlays";
 import type { Lines } from "./overlays";
 import { Painter } from "./splats";
-import type { Pick, Source, Stage, StageOptions, StageState, Standpoint } from "./stage";
+import type { Overlay, Pick, Source, Stage, StageOptions, StageState, Standpoint } from "./stage";
 import { View } from "./view";
 
 export type { Pick, Source, Stage, StageOptions, StageState, Standpoint } from "./stage";
 
-type OverlayName = Parameters<Stage["setOverlay"]>[0];
 const BACKGROUND = { dark: 0x0d1014, light: 0xf4f4f1 };
 const MAX_PIXEL_RATIO = 2;
 const CLICK_PX = 4;
@@ -82,9 +81,8 @@ class View3D implements Stage {
   private split: Split | null = null;
   private isCeilingShown = true;
   private gizmos: { handle: Object3D; controls: TransformControls[] } | null = null;
-  private readonly shownOverlays = new Set<OverlayName>();
-  private objects: ObjectEntry[] = [];
-  private relations: { a: string; b: string; kind: string }[] = [];
+  private readonly shownOverlays = new Set<Overlay>();
+  private graph: GraphEntry = { objects: [], relations: [], rooms: [] };
   private changes: ChangeEntry[] = [];
   private detail: EdgeDetail | null = null;
   private readonly extras = new Map<string, SceneExtras | null>(); // by address; null while it is on its way
@@ -176,15 +174,14 @@ class View3D implements Stage {
     this.draw();
   }
 
-  setOverlay(name: OverlayName, shown: boolean): void {
+  setOverlay(name: Overlay, shown: boolean): void {
     if (shown) this.shownOverlays.add(name);
     else this.shownOverlays.delete(name);
     this.drawOverlays();
   }
 
-  setObjects(objects: ObjectEntry[], relations: { a: string; b: string; kind: string }[]): void {
-    this.objects = objects;
-    this.relations = relations;
+  setGraph(graph: GraphEntry): void {
+    this.graph = graph;
     this.drawOverlays();
   }
 
@@ -569,18 +566,20 @@ class View3D implements Stage {
     );
     const things: Lines[] = [];
     if (on.has("objects")) {
-      const places = new Map(this.objects.map((one) => [one.id, one]));
-      this.objects.forEach((object, index) => {
+      const places = new Map(this.graph.objects.map((one) => [one.id, one]));
+      this.graph.objects.forEach((object, index) => {
         if (isHere(object.component))
           things.push({ points: boxLines(object.box), colour: COLOURS.object, thing: { kind: "object", index } });
       });
-      for (const { a, b } of this.relations) {
+      for (const { a, b } of this.graph.relations) {
         const [from, to] = [places.get(a), places.get(b)];
         if (from && to && isHere(from.component) && isHere(to.component))
           things.push({ points: [...from.position, ...to.position], colour: COLOURS.relation });
       }
     }
     overlays.set("objects", things);
+    const rooms = on.has("rooms") ? this.graph.rooms.filter((room) => isHere(room.component)) : [];
+    overlays.set("rooms", [{ points: rooms.flatMap((room) => room.outline.flat(2)), colour: COLOURS.room }], 2);
     overlays.set(
       "photos",
       on.has("photos")

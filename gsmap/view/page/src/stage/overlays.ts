@@ -31,6 +31,7 @@ export const COLOURS = {
   ellipsoid: 0xc792ea,
   object: 0x5ad1e6,
   relation: 0x3c8ea0,
+  room: 0xe7e3d4,
   correspondence: 0x9be564,
   clip: 0x4f9dff,
 };

@@ -1,7 +1,8 @@
 // What the panels ask of the 3D view. The stage knows nothing of panels.
-import type { Box, ChangeEntry, EdgeDetail, MapSummary, Matrix, ObjectEntry, RevisionPoses, Vector } from "../contract";
+import type { Box, ChangeEntry, EdgeDetail, GraphEntry, MapSummary, Matrix, RevisionPoses, Vector } from "../contract";
 
 export type Source = "scenes" | "merged";
+export type Overlay = "cameras" | "nodes" | "boxes" | "edges" | "ellipsoids" | "objects" | "rooms" | "photos";
 
 /** Where the viewer stands: part of the page's address. */
 export interface Standpoint {
@@ -48,8 +49,8 @@ export interface Stage {
   /** What lies outside is not drawn; drawn with handles, and `onChange` is told as they are dragged. */
   setClip(box: Box | null, onChange?: (box: Box) => void): void;
   setCeiling(shown: boolean): void; // doll's house
-  setOverlay(name: "cameras" | "nodes" | "boxes" | "edges" | "ellipsoids" | "objects" | "photos", shown: boolean): void;
-  setObjects(objects: ObjectEntry[], relations: { a: string; b: string; kind: string }[]): void;
+  setOverlay(name: Overlay, shown: boolean): void;
+  setGraph(graph: GraphEntry): void; // of the objects
   setChanges(changes: ChangeEntry[]): void; // boxes coloured by kind
   setCorrespondences(detail: EdgeDetail | null): void;
   /** Poses of an old revision in place of the newest ones; null goes back. */
