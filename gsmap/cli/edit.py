@@ -35,6 +35,7 @@ def command(
         str | None,
         typer.Option("--same-as", metavar="OBJECT", help="Of an object: it is one with this one; `none`: it is not."),
     ] = None,
+    author: Annotated[str, typer.Option("--author", metavar="NAME", help="Who says so; kept in its history.")] = "",
     json: AsJson = False,
 ) -> None:
     """Change what is said of a scene, or of an object (`gsmap graph`); what was said before stays in its history.
@@ -56,7 +57,7 @@ def command(
         if m.is_object(scene) or of_object:
             if of_scene:
                 raise ConfigError(f"{scene} is an object: dates, tags and metres are of scenes")
-            done = m.edit_object(scene, name=name, label=label, note=note, same_as=same_as)
+            done = m.edit_object(scene, name=name, label=label, note=note, same_as=same_as, author=author)
             print_rows("edit OBJECT", done, json, "object")
             return
         row = m.edit(
@@ -67,6 +68,7 @@ def command(
             tags=tag or (),
             untag=untag or (),
             metres_per_unit=metres,
+            author=author,
         )
     print_rows("edit", row, json, "scene")
 

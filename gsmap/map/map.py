@@ -1096,12 +1096,14 @@ class Map(AbstractContextManager["Map"]):
         tags: Sequence[str] = (),
         untag: Sequence[str] = (),
         metres_per_unit: float | None = None,
+        author: str = "",
     ) -> SceneRow:
         """``gsmap edit MAP SCENE``: a scene's name, date, notes and tags; what was said before stays in its history.
 
         Args:
             captured_at: ISO 8601, UTC where it has no zone; ``none`` takes the date back.
             metres_per_unit: of the scene's own frame; 0 takes it back.
+            author: who says so.
         """
         from gsmap.ingest import parse_date
 
@@ -1115,6 +1117,7 @@ class Map(AbstractContextManager["Map"]):
             tags_add=tuple(tags),
             tags_remove=tuple(untag),
             metres_per_unit=metres_per_unit,
+            author=author,
         )
         return reports.scene_row(self.store, scene, self.metres())
 

@@ -74,14 +74,15 @@ def test_a_wrong_sidecar_changes_nothing(site: Path, left: Path, cli: Run) -> No
 
 
 def test_a_date_can_be_taken_back(site: Path, left: Path, cli: Run) -> None:
-    cli("edit", site, "left", "--captured-at", "2026-06-01")
+    assert cli("edit", site, "left", "--captured-at", "2026-06-01", "--author", "ann").code == 0
     assert cli("edit", site, "left", "--captured-at", "none", "--json").json["captured_at"] is None
     (left / "left.json").write_text('{"captured_at": "2026-05-31T10:00:00Z"}')
     again = cli("ingest", site, left)
     assert "its date stays unknown" in again.stderr
     assert date(cli, site) is None
     history = cli("show", site, "left", "--json").json["history"]
-    assert [row["value"][:10] for row in history if row["fact"] == "captured_at"] == ["2026-06-01", ""]
+    said = [(row["value"][:10], row["author"]) for row in history if row["fact"] == "captured_at"]
+    assert said == [("2026-06-01", "ann"), ("", "")]
 
 
 def test_a_date_that_is_found_makes_tiles_again_where_dates_decide(
