@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gsmap.render import render
+from gsmap.render import ChunkIndex, render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.views import View
 
@@ -19,9 +19,10 @@ def render_views(gaussians: Gaussians, cameras: Cameras, longest_side_px: int, b
         backend: as for `gsmap.render.render`.
     """
     small = cameras.resized(longest_side_px)
+    index = ChunkIndex.build(gaussians)  # a camera sees a room or two of a large capture
     for i in range(len(small)):
         camera = small[i]
-        image = render(gaussians, camera, backend=backend)
+        image = render(gaussians, camera, backend=backend, index=index)
         rgb = (np.clip(np.nan_to_num(image.colour[0]), 0, 1) * 255 + 0.5).astype(np.uint8)
         yield View(rgb, image.depth[0], image.alpha[0], image.dominant_id[0], camera)
 
