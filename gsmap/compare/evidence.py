@@ -9,6 +9,7 @@ import numpy as np
 from gsmap.compare.colours import Balance, limits
 from gsmap.compare.params import Params
 from gsmap.geometry.morton import morton_order
+from gsmap.geometry.neighbours import neighbours_of
 
 UNSEEN, HIDDEN, SAME, REPAINTED, GONE = 0, 1, 2, 3, 4
 """States of a Gaussian. ``UNSEEN``: the other capture saw too little of the place to say anything. ``HIDDEN``: behind
@@ -144,18 +145,14 @@ class _Neighbours:
     """The nearest Gaussians that show, of each."""
 
     def __init__(self, points: np.ndarray, shows: np.ndarray, params: Params) -> None:
-        from scipy.spatial import cKDTree
-
         self.rows = np.flatnonzero(shows)
         self.index = np.zeros((len(points), 0), dtype=np.int64)
         if len(self.rows):
-            tree = cKDTree(points[self.rows])
             count = min(params.neighbours, len(self.rows))
             # Along a curve through them, as their neighbours are then in the cache.
             order = morton_order(points)
-            index = tree.query(points[order], count, distance_upper_bound=params.cell_m)[1]
             self.index = np.empty((len(points), count), dtype=np.int64)
-            self.index[order] = index.reshape(len(points), count)
+            self.index[order] = neighbours_of(points[self.rows], points[order], count, params.cell_m)[1]
 
     @property
     def count(self) -> np.ndarray:

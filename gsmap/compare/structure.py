@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap._native import PointTree
 from gsmap.compare.components import components
+from gsmap.geometry.neighbours import nearest_of
 
 _BIN_M = 0.03
 _THICK_M = 0.045  # skirting boards, picture frames and the noise of a plane belong to it
@@ -77,7 +77,7 @@ def _wall(points: np.ndarray, rows: np.ndarray, ceiling: float, cell_m: float) -
         return rows[:0]
     if np.isfinite(ceiling) and points[core, 2].max() < ceiling - _TO_CEILING_M:
         return rows[:0]
-    near = cKDTree(points[core]).query(points[rows], distance_upper_bound=_BESIDE_M)[0]
+    near = nearest_of(points[core], points[rows], _BESIDE_M)[0]
     return rows[np.isfinite(near)]
 
 

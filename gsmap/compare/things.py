@@ -17,6 +17,7 @@ from gsmap.compare.components import components
 from gsmap.compare.params import Params
 from gsmap.compare.structure import normals_of, planes
 from gsmap.geometry.cells import cell_labels, group_means
+from gsmap.geometry.neighbours import nearest_of, neighbours_of
 
 _CELL_M = 0.05  # of the surface in which planes are looked for
 _FEWEST = 5  # points that have a hull
@@ -37,7 +38,7 @@ def shells(captures: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
         last = first + int(shows.sum())
         found[shows] = plane[label[first:last]]
         if len(means) and not shows.all():
-            found[~shows] = plane[cKDTree(means).query(points[~shows])[1]]
+            found[~shows] = plane[nearest_of(means, points[~shows])[1]]
         out.append(found)
         first = last
     return out
@@ -99,7 +100,7 @@ def rooted(doubts: Doubts, params: Params) -> np.ndarray:
     alone = (doubts.changed & doubts.sure) | (doubts.differs >= params.alone_colour)
     beyond, found = np.flatnonzero(alone & ~out), np.flatnonzero(out)
     while len(beyond) and len(found):
-        near = cKDTree(doubts.points[found]).query(doubts.points[beyond], distance_upper_bound=params.about_m)[0]
+        near = nearest_of(doubts.points[found], doubts.points[beyond], params.about_m)[0]
         found, beyond = beyond[np.isfinite(near)], beyond[np.isinf(near)]
         out[found] = True
     return out
@@ -179,7 +180,7 @@ def remnants(sides: tuple[Side, Side], params: Params) -> list[np.ndarray]:
         left = np.flatnonzero((thing >= 0) & ~one.changed & (share >= params.most_share))
         if not len(left) or not len(other.points):
             continue
-        nearest = cKDTree(other.points).query(one.points[left])[1]
+        nearest = nearest_of(other.points, one.points[left])[1]
         stays = np.zeros(len(left), dtype=bool)
         for k in np.unique(thing[left[one.framed[left]]]):
             # What was pushed along shows itself between what changed in both captures.
@@ -212,7 +213,7 @@ def clear(points: np.ndarray, others: np.ndarray, reach_m: float) -> np.ndarray:
     """(N,) bool, which points (N, 3) have none of the others (M, 3) within reach."""
     if not len(points) or not len(others):
         return np.ones(len(points), dtype=bool)
-    return np.isinf(cKDTree(others).query(points, distance_upper_bound=reach_m)[0])
+    return np.isinf(nearest_of(others, points, reach_m)[0])
 
 
 def _with_most(
@@ -224,6 +225,6 @@ def _with_most(
     if not len(asked) or not len(rows):
         return rows[:0]
     count = min(_ASKED, len(asked))
-    near = cKDTree(doubts.points[asked]).query(doubts.points[rows], count, distance_upper_bound=reach_m)[1]
+    near = neighbours_of(doubts.points[asked], doubts.points[rows], count, reach_m)[1]
     known = np.append(np.where(changed[asked], 1, -1), 0)
-    return rows[known[near.reshape(len(rows), count)].sum(1) > 0]
+    return rows[known[near].sum(1) > 0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsmap._native import PointTree
 from gsmap.geometry.cells import cell_labels
@@ -28,6 +27,8 @@ def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarra
 
     Points are looked at in the order of a grid's cells, those near each other together: that is twice as fast.
     """
+    from scipy.spatial import cKDTree  # naming a recipe does without
+
     order = spatial_order(points, _ACROSS)
     ordered, row_of = points[order], np.append(order, len(points))
     tree = cKDTree(ordered, balanced_tree=False)
@@ -39,6 +40,16 @@ def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarra
 def nearest_neighbours(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances and rows (N, k) of the nearest of the points (N, 3) to each; see `chunks_of_neighbours`."""
     found: tuple[np.ndarray, np.ndarray] = PointTree(np.ascontiguousarray(points, np.float64)).neighbours(k)
+    return found
+
+
+def neighbours_of(points: np.ndarray, at: np.ndarray, k: int, radius: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and rows (M, k) of those points (N, 3) nearest to each place (M, 3) that are nearer than a radius.
+
+    inf and N where there are fewer. Places in the order of a curve through them are looked at in half the time.
+    """
+    tree = PointTree(np.ascontiguousarray(points, np.float64))
+    found: tuple[np.ndarray, np.ndarray] = tree.neighbours(k, np.ascontiguousarray(at, np.float64), radius)
     return found
 
 

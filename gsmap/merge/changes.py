@@ -11,6 +11,7 @@ import numpy as np
 
 from gsmap import compare
 from gsmap.compare import GONE, HIDDEN, OTHER_BEFORE, REPAINTED, SAME, UNSEEN, Comparison, Looks
+from gsmap.geometry.neighbours import nearest_of
 from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.merge.exposure import apply_balance
 from gsmap.merge.placed import overlapping, share_in_view
@@ -206,12 +207,10 @@ def _revealed(newer: Looks, found: Comparison) -> np.ndarray:
 
 def _beside(older: np.ndarray, newer: Looks, verdict: _Verdict) -> np.ndarray:
     """(N,) which of the older's Gaussians (N, 3) lie beside what left or what is new."""
-    from scipy.spatial import cKDTree
-
     disputed = np.concatenate([older[verdict.lost], newer.gaussians.means[verdict.changed]])
     if not len(disputed):
         return np.zeros(len(older), dtype=bool)
-    out: np.ndarray = np.isfinite(cKDTree(disputed).query(older, distance_upper_bound=_NEAR_M)[0])
+    out: np.ndarray = np.isfinite(nearest_of(disputed, older, _NEAR_M)[0])
     return out
 
 

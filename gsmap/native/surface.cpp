@@ -340,18 +340,19 @@ void bind_surface(nb::module_ &m) {
             "Points whose face (unit, zero where unknown) is opposed to the `own` of what seeks them are passed over.")
         .def(
             "neighbours",
-            [](const PointTree &tree, int k) {
+            [](const PointTree &tree, int k, std::optional<Points> places, double radius) {
                 if (k < 1 || k > kMostNeighbours) throw std::invalid_argument("a point has 1 to 64 neighbours");
-                const std::size_t n = std::size_t(tree.size());
+                const std::size_t n = places ? places->shape(0) : std::size_t(tree.size());
                 std::vector<double> distance(n * k, __builtin_inf());
-                std::vector<int64_t> row(n * k, int64_t(n));
+                std::vector<int64_t> row(n * k, int64_t(tree.size()));
                 {
                     nb::gil_scoped_release release;
-                    over_blocks(tree.size(), [&](int64_t, int64_t begin, int64_t end) {
+                    over_blocks(int64_t(n), [&](int64_t, int64_t begin, int64_t end) {
                         Neighbour near[kMostNeighbours];
                         for (int64_t i = begin; i < end; ++i) {
-                            const int64_t at = tree.order()[i];
-                            for (int j = 0, found = tree.nearest(tree.point(int32_t(at)), k, near); j < found; ++j) {
+                            const int64_t at = places ? i : tree.order()[i];
+                            const double *place = places ? places->data() + 3 * i : tree.point(int32_t(at));
+                            for (int j = 0, found = tree.nearest(place, k, near, radius * radius); j < found; ++j) {
                                 distance[at * k + j] = std::sqrt(near[j].squared);
                                 row[at * k + j] = near[j].row;
                             }
@@ -360,8 +361,9 @@ void bind_surface(nb::module_ &m) {
                 }
                 return std::make_tuple(numpy_of(std::move(distance), {n, std::size_t(k)}), numpy_of(std::move(row), {n, std::size_t(k)}));
             },
-            nb::arg("k"),
-            "Distances and rows (n, k) of the points nearest to each, itself among them; inf and n where there are fewer.")
+            nb::arg("k"), nb::arg("at") = nb::none(), nb::arg("radius") = __builtin_inf(),
+            "Distances and rows (m, k) of the points nearest to each place, or to each of the points, itself among them;\n"
+            "inf and n where there are fewer nearer than the radius.")
         .def(
             "unlike",
             [](const PointTree &tree, Points values, int k) {

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gsmap.geometry import neighbours
-from gsmap.geometry.neighbours import chunks_of_neighbours, nearest_neighbours, nearest_of, spatial_order
+from gsmap.geometry.neighbours import chunks_of_neighbours, nearest_neighbours, nearest_of, neighbours_of, spatial_order
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 3000])
@@ -38,3 +38,14 @@ def test_the_nearest_of_other_points_is_that_of_a_search_tree():
     distances, rows = nearest_of(points, at, 0.2)
     np.testing.assert_array_equal(np.isfinite(distances), far < 0.2)
     np.testing.assert_array_equal(rows[far < 0.2], row[far < 0.2])
+
+
+@pytest.mark.parametrize("radius", [np.inf, 0.3])
+def test_several_nearest_of_other_points_are_those_of_a_search_tree(radius):
+    rng = np.random.default_rng(5)
+    points, at = rng.normal(size=(500, 3)), rng.normal(size=(300, 3))
+    far, row = cKDTree(points).query(at, 7, distance_upper_bound=radius)
+    distances, rows = neighbours_of(points, at, 7, radius)
+    np.testing.assert_allclose(distances, far)
+    np.testing.assert_array_equal(rows, row)
+    assert np.isinf(radius) == np.isfinite(distances).all()
