@@ -137,7 +137,7 @@ def test_what_lies_within_bounds_is_read_and_of_chunks_without_any_only_means(st
     g = make_gaussians(5 * CHUNK_ROWS)
     store.scenes.add(g, make_cameras(), name="a")
     whole = store.scenes.gaussians("a")
-    box = np.array([[-1.0, 0, 2], [0.5, 1, 3]])
+    box = np.array([[2.0, 2, 2], [4.0, 4, 4]])
     within = ((whole.means >= box[0]) & (whole.means < box[1])).all(1)
     assert 100 < within.sum() < len(g)
     np.testing.assert_array_equal(rows(store.scenes.gaussians_within("a", box)), rows(whole[within]))

@@ -29,7 +29,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 6
+VERSION = 7
 STEPS: str | None = "steps"
 RENDERS = True
 
