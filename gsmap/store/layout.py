@@ -170,12 +170,16 @@ class Body:
         if files > len(self.keys):
             raise ValueError(f"its shape is {shape}, but most of its chunks are missing")
         others = "/0" * len(rows)
-        for i in range(files):
-            span = self.keys.get(f"{name}/c/{i}{others}")
-            if span is None:
-                raise ValueError(f"its chunk {i} is missing")
+        spans = [span for i in range(files) if (span := self.keys.get(f"{name}/c/{i}{others}"))]
+        if len(spans) < files:
+            missing = next(i for i in range(files) if f"{name}/c/{i}{others}" not in self.keys)
+            raise ValueError(f"its chunk {missing} is missing")
+        if not sharded:
+            out.frames.extend(spans)
+            return out
+        for i, span in enumerate(spans):
             used = -(-min(outer[0], shape[0] - i * outer[0]) // inner[0])
-            out.frames.extend(self._in_shard(span, used, outer[0] // inner[0]) if sharded else [span])
+            out.frames.extend(self._in_shard(span, used, outer[0] // inner[0]))
         return out
 
     def _in_shard(self, span: Span, used: int, count: int) -> list[Span]:
