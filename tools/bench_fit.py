@@ -21,10 +21,11 @@ import numpy as np
 
 from gsmap.evaluate.images import psnr
 from gsmap.export import plan_tiles
+from gsmap.geometry.boxes import inside
 from gsmap.geometry.transforms import transform_cameras
 from gsmap.merge import reach_m
 from gsmap.merge.mergers import tto
-from gsmap.merge.placed import inside, pulled_inside
+from gsmap.merge.placed import pulled_inside
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.render import render
 from gsmap.types import Gaussians, Sim3

@@ -21,7 +21,7 @@ from gsmap.render import render
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Cameras, Gaussians
 
-VERSION = 3
+VERSION = 4
 """Raised whenever levels of the same tiles and cameras come out otherwise: they are then made again."""
 
 _SCREEN_PX = 16.0  # viewers of 3D Tiles refine what is off by more pixels than this, if not told otherwise

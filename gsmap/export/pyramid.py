@@ -91,8 +91,11 @@ class Layout(Protocol):
         """What decides how a level's file is written."""
         ...
 
-    def tile(self, folder: Path, tile: Tile, known: Mapping[str, Known]) -> tuple[str, int, np.ndarray]:
-        """The uri of a tile's file in a tree, how many Gaussians it holds, and the box (2, 3) of what they draw.
+    def tile(
+        self, folder: Path, tile: Tile, known: Mapping[str, Known]
+    ) -> tuple[str, int, np.ndarray, Gaussians | None]:
+        """The uri of a tile's file in a tree, how many Gaussians it holds, the box (2, 3) of what they draw, and
+        themselves where it had to be read.
 
         Args:
             known: what the folder's present tree says, by uri, which may be of an earlier content of the file.
@@ -154,12 +157,11 @@ def pyramids(
         folder = (out / members[0].path).parent
         refuse_links(out, folder.name, LEVELS_FOLDER)
         maker = _Maker(folder, layout, layout.known(folder), _once(cameras, component), levels)
-        cells = {_cell(tile, edge): maker.tile(tile) for tile in members}
-        height = 0
-        while len(cells) > 1:
-            height += 1
-            cells = _one_level_up(cells, maker, height)
-        (root,) = cells.values()
+        cells = np.array([_cell(tile, edge) for tile in members])
+        cells -= cells.min(0)  # counted from the lowest one, so that each component ends in one root
+        root, _ = maker.place(
+            dict(zip(map(tuple, cells.tolist()), members, strict=True)), int(cells.max()).bit_length()
+        )
         yield component, folder, root
 
 
@@ -205,12 +207,21 @@ class _Maker:
     cameras: Callable[[], Cameras | None]
     levels: Params
 
-    def tile(self, tile: Tile) -> Drawn:
-        uri, count, box = self.layout.tile(self.folder, tile, self.known)
-        return Drawn(uri, tile.sha256, np.asarray(tile.bounds, np.float64), (count,), box[None])
+    def place(self, tiles: Mapping[_Cell, Tile], height: int) -> tuple[Drawn, Gaussians | None]:
+        """What a block of 2^height cells along each axis draws, and its Gaussians if it is a tile that was read."""
+        if not height:
+            (tile,) = tiles.values()
+            uri, count, box, read = self.layout.tile(self.folder, tile, self.known)
+            return Drawn(uri, tile.sha256, np.asarray(tile.bounds, np.float64), (count,), box[None]), read
+        blocks: dict[_Cell, dict[_Cell, Tile]] = defaultdict(dict)
+        for (x, y, z), tile in tiles.items():
+            blocks[x >> height - 1, y >> height - 1, z >> height - 1][x, y, z] = tile
+        below = [self.place(blocks[block], height - 1) for block in sorted(blocks)]
+        return (below[0][0] if len(below) == 1 else self.parent(below, height)), None
 
-    def parent(self, children: list[Drawn], height: int) -> Drawn:
+    def parent(self, below: Sequence[tuple[Drawn, Gaussians | None]], height: int) -> Drawn:
         """What is drawn in place of its children; the one of earlier where it was made of the same."""
+        children = [child for child, _ in below]
         made_of = [f"levels {VERSION} {self.levels} {self.layout.key}", *(child.digest for child in children)]
         digest = hashlib.sha256("\n".join(made_of).encode()).hexdigest()
         uri = self.layout.level_uri(digest[:24])
@@ -223,7 +234,9 @@ class _Maker:
             parts, error_m, said = known.parts, known.error_m, dict(known.extras)
             children = _better(children, error_m)
         else:
-            finer = Gaussians.concatenate([self.layout.read(self.folder / child.uri) for child in children])
+            finer = Gaussians.concatenate(
+                [self.layout.read(self.folder / child.uri) if read is None else read for child, read in below]
+            )
             most = min(_MAX_PER_LEVEL, max(1, len(finer) // _COARSENING))
             level = make_level(finer, most, self.cameras(), self.levels)
             make_folder(path.parent)
@@ -252,15 +265,3 @@ def boxes_of(gaussians: Gaussians, parts: Sequence[int]) -> np.ndarray:
     ends = np.cumsum([0, *parts])
     none = np.full((2, 3), np.nan)
     return np.stack([box_of(gaussians[a:b]) if b > a else none for a, b in pairwise(ends)])
-
-
-def _one_level_up(cells: dict[_Cell, Drawn], maker: _Maker, height: int) -> dict[_Cell, Drawn]:
-    """Join every two by two by two cells, counted from the lowest one, so that each component ends in one root."""
-    low = np.min(list(cells), axis=0)
-    groups: dict[_Cell, list[Drawn]] = defaultdict(list)
-    for cell in sorted(cells):
-        x, y, z = ((np.array(cell) - low) // 2).tolist()
-        groups[x, y, z].append(cells[cell])
-    return {
-        cell: children[0] if len(children) == 1 else maker.parent(children, height) for cell, children in groups.items()
-    }

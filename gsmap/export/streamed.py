@@ -62,7 +62,9 @@ class StreamedSog:
     file_name: str = FILE_NAME
     key: str = f"sog {sog.VERSION}"
 
-    def tile(self, folder: Path, tile: Tile, known: Mapping[str, Known]) -> tuple[str, int, np.ndarray]:
+    def tile(
+        self, folder: Path, tile: Tile, known: Mapping[str, Known]
+    ) -> tuple[str, int, np.ndarray, Gaussians | None]:
         bundle = folder / Path(tile.path).name
         uri = self.level_uri(tile.sha256[:24])
         if not is_file(folder / uri):
@@ -70,7 +72,7 @@ class StreamedSog:
             sog.unbundled(bundle, (folder / uri).parent)
             _sync(folder / uri)
         found = sog.read(bundle)
-        return uri, len(found), boxes_of(found, [len(found)])[0]
+        return uri, len(found), boxes_of(found, [len(found)])[0], found
 
     def level_uri(self, name: str) -> str:
         return f"{LEVELS_FOLDER}/{name}/meta.json"

@@ -79,7 +79,9 @@ class Tiles3D:
     def key(self) -> str:
         return str(self.compressed)
 
-    def tile(self, folder: Path, tile: Tile, known: Mapping[str, Known]) -> tuple[str, int, np.ndarray]:
+    def tile(
+        self, folder: Path, tile: Tile, known: Mapping[str, Known]
+    ) -> tuple[str, int, np.ndarray, Gaussians | None]:
         uri = Path(tile.path).name
         there = known.get(uri)
         # What was written before the tree is what the tree was written of.
@@ -88,9 +90,9 @@ class Tiles3D:
             and there.boxes is not None
             and _written_ns(folder / uri) < _written_ns(folder / FILE_NAME)
         ):
-            return uri, tile.num_gaussians, there.boxes[0]
+            return uri, tile.num_gaussians, there.boxes[0], None
         found = self.read(folder / uri)
-        return uri, len(found), tiles3d.box_of(found)
+        return uri, len(found), tiles3d.box_of(found), found
 
     def level_uri(self, name: str) -> str:
         return f"{LEVELS_FOLDER}/{name}.glb"

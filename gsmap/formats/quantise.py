@@ -6,14 +6,14 @@ import os
 
 import numpy as np
 
+from gsmap._native import from_smallest_three as unit_quats
+from gsmap._native import smallest_three as three_and_largest
 from gsmap.errors import InputError
 from gsmap.types import Gaussians
 
 # Real splats compress 2 to 10 times; what claims far more than that is a bomb.
 _FREE_BYTES = 8 << 20
 _MAX_RATIO = 32
-
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def check_size(path: str | os.PathLike[str], expanded: int, compressed: int) -> None:
@@ -38,7 +38,8 @@ def require_writable(path: str | os.PathLike[str], gaussians: Gaussians) -> None
         raise InputError(f"{path}: there are no Gaussians to write")
     for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
         values = getattr(gaussians, name)
-        total = values.sum(dtype=np.float64)
+        with np.errstate(all="ignore"):
+            total = values.sum()  # of what is finite it may still overflow, and of nothing else does it not
         if not np.isfinite(total):
             bad = ~np.isfinite(values) if name in ("means", "quats", "sh") else np.isnan(values)
             if bad.any():
@@ -63,17 +64,11 @@ def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     The sign is chosen so that the largest is positive; a zero quaternion is the one with only component 0.
     """
-    q = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
-    largest = np.abs(q).argmax(1)
-    rows = np.arange(len(q))
-    q *= np.where(q[rows, largest] < 0, -1, 1).astype(q.dtype)[:, None]
-    return largest, np.take_along_axis(q, _OTHERS[largest], axis=1)
+    largest, three = three_and_largest(np.ascontiguousarray(quats, np.float32))
+    return largest, three
 
 
 def from_smallest_three(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
     """Unit quaternions (N, 4) float32 from the index of the largest component and the other three."""
-    squared = (three * three).sum(1)
-    q = np.empty((len(three), 4), np.float32)
-    np.put_along_axis(q, _OTHERS[largest], three.astype(np.float32), axis=1)
-    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(0.0, 1.0 - squared))
-    return q / np.linalg.norm(q, axis=1, keepdims=True)
+    out: np.ndarray = unit_quats(largest.astype(np.uint8), np.ascontiguousarray(three))
+    return out

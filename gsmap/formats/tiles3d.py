@@ -27,7 +27,7 @@ from gsmap.formats.inside import file_inside
 from gsmap.formats.quantise import require_writable
 from gsmap.geometry.boxes import cube_around, octants
 from gsmap.geometry.decimate import decimate
-from gsmap.geometry.voxels import axis_deviations
+from gsmap.geometry.voxels import reached_box
 from gsmap.types import Gaussians
 
 VERSION = 1
@@ -164,8 +164,7 @@ def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
 
 def box_of(gaussians: Gaussians) -> np.ndarray:
     """(2, 3) float64 box of the Gaussians, each widened by three standard deviations along the axes."""
-    reach = _SIGMAS * axis_deviations(gaussians)
-    return np.stack([(gaussians.means - reach).min(0), (gaussians.means + reach).max(0)])
+    return reached_box(gaussians, _SIGMAS)
 
 
 def _octree(

@@ -24,7 +24,7 @@ _BLUR = 0.05  # of the median Gaussian's largest deviation: what is thinner is n
 _COVER = 0.1  # how much hiding what is behind counts beside the light of a colour: black is seen, too
 _ABOUT = 16  # Gaussians over which the pixels that each shows in are averaged
 _MOST = 10.0  # times more, or less, than the median that a Gaussian's cost may count
-_PASSES = 6  # over the pairs of a round, each taking those that are cheapest for both
+_PASSES = 5  # over the pairs of a round, each taking those that are cheapest for both
 
 
 def decimate(gaussians: Gaussians, max_count: int, pixels: np.ndarray | None = None) -> tuple[Gaussians, np.ndarray]:

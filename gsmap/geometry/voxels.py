@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmap._native import group_moments
+from gsmap._native import reached_box as native_box
 from gsmap.errors import ConfigError, InputError
 from gsmap.geometry.cells import cell_labels
 from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
@@ -58,6 +59,12 @@ def axis_deviations(gaussians: Gaussians) -> np.ndarray:
         (xz - wy) ** 2 * a + (yz + wx) ** 2 * b + (1 - xx - yy) ** 2 * c,
     )
     out: np.ndarray = np.sqrt(np.stack(variances, axis=1))
+    return out
+
+
+def reached_box(gaussians: Gaussians, sigmas: float) -> np.ndarray:
+    """(2, 3) float64 box around Gaussians, each widened by so many of its `axis_deviations`; inverted around none."""
+    out: np.ndarray = native_box(gaussians.means, gaussians.quats, gaussians.log_scales, sigmas)
     return out
 
 

@@ -103,9 +103,17 @@ def _placed(path: str, scene_id: str, S_map_scene: Sim3, captured_at: str) -> Pl
 
 
 def _read(path: str, scene_id: str, passing: Passing | None, bounds: np.ndarray | None) -> Gaussians:
-    """Those Gaussians of a scene that lie in a box of its frame, without those that do not persist."""
-    without = None if passing is None or not passing.digest else _without(path, scene_id, passing)
-    return _store(path).scenes.gaussians(scene_id, bounds, without)
+    """Those Gaussians of a scene that reach into a box of its frame, without those that do not persist."""
+    return _store(path).scenes.gaussians(scene_id, bounds, _left_out(path, scene_id, passing))
+
+
+def _read_within(path: str, scene_id: str, passing: Passing | None, bounds: np.ndarray) -> Gaussians:
+    """As `_read`, those whose means lie in it."""
+    return _store(path).scenes.gaussians_within(scene_id, bounds, _left_out(path, scene_id, passing))
+
+
+def _left_out(path: str, scene_id: str, passing: Passing | None) -> np.ndarray | None:
+    return None if passing is None or not passing.digest else _without(path, scene_id, passing)
 
 
 @lru_cache(maxsize=8)
@@ -151,6 +159,7 @@ class TileMaker:
                 self.captured_at[scene],
                 self.store,
                 "" if (left := self.passing.get(scene)) is None else left.digest,
+                partial(_read_within, self.location, scene, self.passing.get(scene)),
             )
             for scene, pose in self.tile.poses.items()
         ]

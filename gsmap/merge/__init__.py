@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmap import compare, render
 from gsmap.errors import ConfigError, InputError
-from gsmap.merge.placed import inside
+from gsmap.geometry.boxes import inside
 from gsmap.methods import MethodParams, RecipeKey, family
 from gsmap.methods.merger import Merger
 from gsmap.types import MergeResult, PlacedScene

@@ -10,16 +10,6 @@ from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
 
-def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -> np.ndarray:
-    """(N,) which points (N, 3) lie in bounds (2, 3) grown by a margin (``low <= x < high``); all if None."""
-    if bounds is None:
-        return np.ones(len(points), dtype=bool)
-    low, high = bounds[0] - margin, bounds[1] + margin
-    x, y, z = ((points[:, k] >= low[k]) & (points[:, k] < high[k]) for k in range(3))  # `all` along rows is far slower
-    result: np.ndarray = x & y & z
-    return result
-
-
 def pulled_inside(points: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
     """Float32 points (N, 3) moved to the nearest place that `inside` calls inside."""
     if bounds is None:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.errors import ConfigError
+from gsmap.geometry.boxes import inside
 from gsmap.geometry.projection import in_image, project
 from gsmap.merge.changes import Settled, newest_first
-from gsmap.merge.placed import inside, share_in_view
+from gsmap.merge.placed import share_in_view
 from gsmap.merge.sights import surface_axes
 from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians, PlacedScene

@@ -18,8 +18,7 @@ from tempfile import NamedTemporaryFile
 
 import numpy as np
 
-from gsmap.geometry.boxes import moved_box
-from gsmap.merge.placed import inside
+from gsmap.geometry.boxes import inside, moved_box
 from gsmap.methods import text_digest
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, Sim3

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from gsmap.errors import InputError
-from gsmap.geometry.boxes import moved_box
+from gsmap.geometry.boxes import inside, moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import checked_params, merge, merger
-from gsmap.merge.placed import inside, overlapping
+from gsmap.merge.placed import overlapping
 from gsmap.merge.sights import PlacedSights, Sights, SightStore, keys_of
 from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
 from gsmap.types.progress import Progress
@@ -31,6 +31,7 @@ class LazyScene:
         captured_at: ISO 8601 time with zone, or None.
         store: where what its views show is kept for other tiles.
         without: names what ``load`` leaves out of it; empty where that is nothing.
+        load_within: as ``load`` of a box, but no more than asked for, where that is cheaper.
     """
 
     scene_id: str
@@ -40,6 +41,7 @@ class LazyScene:
     captured_at: str | None = None
     store: SightStore = field(default_factory=SightStore)
     without: str = ""
+    load_within: Callable[[np.ndarray], Gaussians] | None = None
 
     def centroid(self) -> np.ndarray | None:
         """(3,) mean of all of its means, map frame; None where it holds nothing."""
@@ -113,15 +115,15 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
             rows = found
         if rows is None or reading.reading_m > reading.reach_m:  # the Gaussians themselves tell what cameras see
             box = np.array([np.minimum(box[0], around[0]), np.maximum(box[1], around[1])])
-    read = scene.load(_box_in(S.inverse(), box))
-    gaussians = transform_gaussians(read, S)
-    inner = inside(gaussians.means, box)
+    read = (scene.load_within or scene.load)(_box_in(S.inverse(), box))
+    inner = inside(S.apply(read.means).astype(np.float32), box)
+    read = read if inner.all() else read[inner]
     sights = None
     if rows is not None:
         around_m = reading.looking_m + reading.reach_m + float((bounds[1] - bounds[0]).max())
-        sights = partial(_sights, scene, around_m, rows, keys_of(read.means)[inner])
-    inner_gaussians = gaussians if inner.all() else gaussians[inner]
-    return PlacedScene(inner_gaussians, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
+        sights = partial(_sights, scene, around_m, rows, keys_of(read.means))
+    moved = transform_gaussians(read, S)
+    return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
 
 
 def _sights(

@@ -101,6 +101,30 @@ void bind_groups(nb::module_ &m) {
         nb::arg("labels"),
         "Of each group of Gaussians: how many (m,), the heaviest row; and, 0 where there is one only, mass, mean (m, 3),\n"
         "covariance (m, 3, 3) and SH (m, k) of the mixture.");
+    m.def(
+        "reached_box",
+        [](Rows3 means, Rows4 quats, Rows3 log_scales, double sigmas) {
+            const std::size_t n = means.shape(0);
+            if (quats.shape(0) != n || log_scales.shape(0) != n) throw std::invalid_argument("arrays of one length");
+            const Given given{means.data(), quats.data(), log_scales.data(), nullptr, int64_t(n)};
+            std::vector<double> box{__builtin_inf(), __builtin_inf(), __builtin_inf()};
+            box.insert(box.end(), 3, -__builtin_inf());
+            nb::gil_scoped_release release;
+            for (int64_t i = 0; i < given.n; ++i) {
+                double s[6];
+                given.covariance(i, s);
+                const double variances[3] = {s[0], s[3], s[5]};
+                for (int k = 0; k < 3; ++k) {
+                    const double at = given.means[3 * i + k], reach = sigmas * std::sqrt(variances[k]);
+                    box[k] = std::min(box[k], at - reach);
+                    box[3 + k] = std::max(box[3 + k], at + reach);
+                }
+            }
+            nb::gil_scoped_acquire acquire;
+            return numpy_of(std::move(box), {2, 3});
+        },
+        nb::arg("means"), nb::arg("quats"), nb::arg("log_scales"), nb::arg("sigmas"),
+        "The box (2, 3) around Gaussians, each widened by so many of its standard deviations along the axes.");
 }
 
 }  // namespace gsmap

@@ -24,6 +24,11 @@ class Leaves {
         if (count_) build(points, 0, int32_t(points.size()));
     }
     int64_t count() const { return count_; }
+    // Lets rows be the places of the points in the order of the leaves.
+    void number() {
+        for (int64_t leaf = 0; leaf < count_; ++leaf)
+            for (int i = 0; i < leaves_.get()[leaf].count; ++i) leaves_.get()[leaf].row[i] = int32_t(leaf * kLeaf + i);
+    }
 
     // The k nearest others of each point of a leaf, by row, in any order; fewer than there are points. out: k for each row.
     void nearest(int64_t at, int k, int32_t *out) const {

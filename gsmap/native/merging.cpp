@@ -62,6 +62,8 @@ void light(Blob &blob, double opacity, double blur) {
     blob.root = std::sqrt(std::sqrt(determinant(s)));
 }
 
+constexpr int32_t kBlock = 1 << 15;  // Gaussians that are merged together, if there are more: what a cache holds of them
+
 struct Rules {
     int neighbours, passes;
     double blur, cover;
@@ -75,24 +77,19 @@ struct Left {
     std::vector<int32_t> lowest;  // row of those it stands for
 };
 
-std::vector<Pair> neighbour_pairs(const std::vector<Blob> &blobs, const double *centre, int k) {
-    const auto n = int32_t(blobs.size());
-    std::vector<Point> points(n);
-    for (int32_t i = 0; i < n; ++i) {
-        for (int axis = 0; axis < 3; ++axis) points[i].at[axis] = float(blobs[i].mean[axis] - centre[axis]);
-        points[i].row = i;
-    }
-    const Leaves leaves(points);
+// Each Gaussian with a few nearest to it, each pair once. Rows of the leaves are those of the blobs.
+std::vector<Pair> neighbour_pairs(const Leaves &leaves, std::size_t n, int most) {
+    const int k = std::min<int>(most, int(n) - 1);
     constexpr int64_t kAtOnce = 64;
-    std::vector<int32_t> near(std::size_t(n) * k);
+    std::vector<int32_t> near(n * std::size_t(k));
     const int64_t tasks = (leaves.count() + kAtOnce - 1) / kAtOnce;
     parallel_for(tasks, [&](int64_t task) {
         for (int64_t leaf = task * kAtOnce; leaf < std::min(leaves.count(), (task + 1) * kAtOnce); ++leaf)
             leaves.nearest(leaf, k, near.data());
     });
     std::vector<Pair> pairs;
-    pairs.reserve(std::size_t(n) * std::size_t(k) * 3 / 4);
-    for (int32_t i = 0; i < n; ++i)
+    pairs.reserve(n * std::size_t(k) * 3 / 4);
+    for (int32_t i = 0; i < int32_t(n); ++i)
         for (int j = 0; j < k; ++j) {
             const int32_t other = near[std::size_t(i) * k + j];
             const int32_t *theirs = &near[std::size_t(other) * k];
@@ -101,6 +98,28 @@ std::vector<Pair> neighbour_pairs(const std::vector<Blob> &blobs, const double *
             pairs.push_back({std::min(i, other), std::max(i, other), 0.f});
         }
     return pairs;
+}
+
+// The pairs of what they went into, each once, without those that became one.
+std::vector<Pair> inherited(const std::vector<Pair> &pairs, const std::vector<int32_t> &into, std::size_t n) {
+    std::vector<int32_t> begin(n + 2), others(pairs.size()), last(n, -1);
+    const auto joined = [&](const Pair &pair) { return std::minmax(into[pair.a], into[pair.b]); };
+    for (const Pair &pair : pairs) ++begin[std::size_t(joined(pair).first) + 2];
+    for (std::size_t i = 2; i < begin.size(); ++i) begin[i] += begin[i - 1];
+    for (const Pair &pair : pairs) {
+        const auto [a, b] = joined(pair);
+        others[begin[std::size_t(a) + 1]++] = b;
+    }
+    std::vector<Pair> out;
+    out.reserve(pairs.size());
+    for (int32_t i = 0; i < int32_t(n); ++i)
+        for (int32_t at = begin[i]; at < begin[i + 1]; ++at) {
+            const int32_t other = others[at];
+            if (other == i || last[other] == i) continue;
+            last[other] = i;
+            out.push_back({i, other, 0.f});
+        }
+    return out;
 }
 
 // Pairs that have nothing in common, those that are cheapest for both, again and again; at most so many, the cheapest.
@@ -150,14 +169,13 @@ void merge(Blob &into, const Blob &other) {
     into.weight = std::max(into.weight, other.weight);
 }
 
-// One round: as many pairs become one as are cheapest for both. Tells of each that was left which it went into.
-std::vector<int32_t> one_round(Left &left, const double *centre, const Rules &rules, std::size_t most) {
+// One round: as many of the pairs become one as are cheapest for both. Tells of each that was left which it went into.
+std::vector<int32_t> one_round(Left &left, std::vector<Pair> &pairs, const Rules &rules, std::size_t most) {
     const std::size_t n = left.blobs.size();
     std::vector<float> sizes = left.sizes;
     std::nth_element(sizes.begin(), sizes.begin() + n / 2, sizes.end());
     const double blur = rules.blur * rules.blur * double(sizes[n / 2]);
     for (std::size_t i = 0; i < n; ++i) light(left.blobs[i], left.opacities[i], blur);
-    std::vector<Pair> pairs = neighbour_pairs(left.blobs, centre, std::min<int>(rules.neighbours, int(n) - 1));
     constexpr int64_t kAtOnce = 4096;
     const auto count = int64_t(pairs.size());
     parallel_for((count + kAtOnce - 1) / kAtOnce, [&](int64_t task) {
@@ -192,6 +210,71 @@ std::vector<int32_t> one_round(Left &left, const double *centre, const Rules &ru
     return into;
 }
 
+// Cuts points into blocks that lie together, of so many at most: in halves, across the longest side.
+void cut(Point *points, int32_t begin, int32_t end, int32_t most, std::vector<int32_t> &ends) {
+    if (end - begin <= most) {
+        ends.push_back(end);
+        return;
+    }
+    float low[3], high[3];
+    std::fill_n(low, 3, __builtin_inff()), std::fill_n(high, 3, -__builtin_inff());
+    for (int32_t i = begin; i < end; ++i)
+        for (int k = 0; k < 3; ++k) {
+            low[k] = std::min(low[k], points[i].at[k]);
+            high[k] = std::max(high[k], points[i].at[k]);
+        }
+    int axis = 0;
+    for (int k = 1; k < 3; ++k)
+        if (high[k] - low[k] > high[axis] - low[axis]) axis = k;
+    const int32_t middle = begin + (end - begin) / 2;
+    std::nth_element(points + begin, points + middle, points + end, [axis](const Point &a, const Point &b) {
+        return a.at[axis] < b.at[axis] || (a.at[axis] == b.at[axis] && a.row < b.row);
+    });
+    cut(points, begin, middle, most, ends);
+    cut(points, middle, end, most, ends);
+}
+
+// Merges the Gaussians that some points are, down to a number of them. first: of each row the lowest one of its group.
+void merge_block(const Given &given, const float *base, const double *weights, std::vector<Point> points,
+                 std::size_t max_count, const Rules &rules, int32_t *first) {
+    const std::size_t count = points.size();
+    std::vector<int32_t> rows(count), at(count);
+    Left left;
+    left.blobs.resize(count), left.opacities.resize(count), left.sizes.resize(count), left.lowest.resize(count);
+    Leaves leaves(points);  // in whose order neighbours lie near each other in memory, too
+    leaves.number();
+    for (std::size_t i = 0; i < count; ++i) {
+        const int32_t row = rows[i] = points[i].row;
+        Blob &blob = left.blobs[i];
+        left.sizes[i] = float(given.covariance(row, blob.covariance));
+        left.opacities[i] = given.opacity(row);
+        left.lowest[i] = row;
+        for (int k = 0; k < 3; ++k) {
+            blob.mean[k] = given.means[3 * int64_t(row) + k];
+            blob.colour[k] = 0.5 + kColourOfBase * base[3 * int64_t(row) + k];
+        }
+        blob.mass = optical_depth(left.opacities[i]) * given.shadow(row) + 1e-30;
+        blob.weight = weights ? weights[row] : 1.0;
+        at[i] = int32_t(i);
+    }
+    std::vector<Pair> pairs = neighbour_pairs(leaves, count, rules.neighbours);
+    while (left.blobs.size() > max_count) {
+        const std::vector<int32_t> into = one_round(left, pairs, rules, left.blobs.size() - max_count);
+        for (int32_t &place : at) place = into[place];
+        const std::size_t n = left.blobs.size();
+        pairs = inherited(pairs, into, n);
+        if (pairs.size() >= 2 * n || n <= max_count) continue;
+        // What was near each other is one by now: look further.
+        points.resize(n);
+        for (std::size_t i = 0; i < n; ++i) {
+            for (int k = 0; k < 3; ++k) points[i].at[k] = float(left.blobs[i].mean[k] - left.blobs[0].mean[k]);
+            points[i].row = int32_t(i);
+        }
+        pairs = neighbour_pairs(Leaves(points), n, rules.neighbours);
+    }
+    for (std::size_t i = 0; i < count; ++i) first[rows[i]] = left.lowest[at[i]];
+}
+
 std::vector<int64_t> labels_of(const Given &given, const float *base, const double *weights, std::size_t max_count,
                                const Rules &rules) {
     double centre[3];
@@ -203,43 +286,26 @@ std::vector<int64_t> labels_of(const Given &given, const float *base, const doub
         }
         centre[k] = (double(low) + high) / 2;
     }
-    // In the order of leaves, as neighbours are then in the cache.
     std::vector<Point> points(given.n);
     for (int64_t i = 0; i < given.n; ++i) {
         for (int k = 0; k < 3; ++k) points[i].at[k] = float(given.means[3 * i + k] - centre[k]);
         points[i].row = int32_t(i);
     }
-    const Leaves leaves(points);
-    Left left;
-    left.blobs.resize(given.n), left.opacities.resize(given.n), left.sizes.resize(given.n), left.lowest.resize(given.n);
-    std::vector<int32_t> at(given.n);
-    for (int64_t i = 0; i < given.n; ++i) {
-        const int32_t row = points[i].row;
-        Blob &blob = left.blobs[i];
-        left.sizes[i] = float(given.covariance(row, blob.covariance));
-        left.opacities[i] = given.opacity(row);
-        left.lowest[i] = row;
-        for (int k = 0; k < 3; ++k) {
-            blob.mean[k] = given.means[3 * int64_t(row) + k];
-            blob.colour[k] = 0.5 + kColourOfBase * base[3 * int64_t(row) + k];
-        }
-        blob.mass = optical_depth(left.opacities[i]) * given.shadow(row) + 1e-30;
-        blob.weight = weights ? weights[row] : 1.0;
-        at[row] = int32_t(i);
-    }
-    while (left.blobs.size() > max_count) {
-        const std::vector<int32_t> into = one_round(left, centre, rules, left.blobs.size() - max_count);
-        for (int32_t &place : at) place = into[place];
-    }
-    // In the order of the lowest rows.
-    std::vector<int32_t> rank(given.n, -1);
-    for (std::size_t i = 0; i < left.lowest.size(); ++i) rank[left.lowest[i]] = int32_t(i);
-    std::vector<int64_t> number(left.lowest.size());
-    int64_t next = 0;
-    for (const int32_t place : rank)
-        if (place >= 0) number[place] = next++;
+    // Each block by itself, as it then stays in the cache; a level has room for at least one Gaussian of each.
+    std::vector<int32_t> ends{0}, first(given.n);
+    cut(points.data(), 0, int32_t(given.n), std::max<int32_t>(kBlock, 2 * (int32_t(given.n / int64_t(max_count)) + 1)), ends);
+    const auto merge_one = [&](int64_t block) {
+        const int64_t begin = ends[block], end = ends[block + 1];
+        // Shares that add up to what may be left.
+        const std::size_t most = end * max_count / given.n - begin * max_count / given.n;
+        merge_block(given, base, weights, {points.begin() + begin, points.begin() + end}, most, rules, first.data());
+    };
+    if (ends.size() == 2) merge_one(0);  // which then has all threads for itself
+    else parallel_for(int64_t(ends.size()) - 1, merge_one);
+    // Numbered in the order of the lowest rows.
     std::vector<int64_t> out(given.n);
-    for (int32_t i = 0; i < given.n; ++i) out[i] = number[at[i]];
+    int64_t next = 0;
+    for (int32_t i = 0; i < given.n; ++i) out[i] = first[i] == i ? next++ : out[first[i]];
     return out;
 }
 

@@ -19,6 +19,7 @@ void bind_merging(nb::module_ &);
 void bind_moves(nb::module_ &);
 void bind_parts(nb::module_ &);
 void bind_pictures(nb::module_ &);
+void bind_quaternions(nb::module_ &);
 void bind_rasteriser(nb::module_ &);
 void bind_sift(nb::module_ &);
 void bind_signatures(nb::module_ &);
@@ -44,6 +45,7 @@ NB_MODULE(_native, m) {
     gsmap::bind_moves(m);
     gsmap::bind_parts(m);
     gsmap::bind_pictures(m);
+    gsmap::bind_quaternions(m);
     gsmap::bind_rasteriser(m);
     gsmap::bind_sift(m);
     gsmap::bind_signatures(m);

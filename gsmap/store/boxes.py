@@ -6,7 +6,7 @@ import numpy as np
 from sqlalchemy import Connection, text
 
 from gsmap.errors import InputError, StoreError
-from gsmap.geometry.voxels import axis_deviations
+from gsmap.geometry.voxels import reached_box
 from gsmap.store.layout import CHUNK_ROWS
 from gsmap.store.schema import CHUNK_BOXES
 from gsmap.types import Gaussians
@@ -14,12 +14,8 @@ from gsmap.types import Gaussians
 
 def chunk_boxes(gaussians: Gaussians, rows: int, *, sigmas: float = 3.0) -> np.ndarray:
     """(C, 2, 3) float64 box of every ``rows`` Gaussians in a row, widened by ``sigmas`` standard deviations of each."""
-    out = []
-    for start in range(0, len(gaussians), rows):
-        part = gaussians[start : start + rows]
-        reach = sigmas * axis_deviations(part)
-        out.append(np.stack([(part.means - reach).min(0), (part.means + reach).max(0)]))
-    return np.array(out).reshape(-1, 2, 3)
+    parts = (gaussians[start : start + rows] for start in range(0, len(gaussians), rows))
+    return np.array([reached_box(part, sigmas) for part in parts]).reshape(-1, 2, 3)
 
 
 def put_boxes(connection: Connection, number: int, boxes: np.ndarray) -> None:

@@ -24,6 +24,7 @@ import numpy as np
 
 from gsmap.errors import CorruptError
 from gsmap.store import packed
+from gsmap.store.packed import Span
 
 CHUNK_ROWS = 16_384
 _SHARD_ROWS = 16 * CHUNK_ROWS  # in groups that are folders
@@ -42,15 +43,6 @@ _MAX_PACKED = 1_000
 _ALWAYS_ALLOWED_BYTES = 256 << 20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _MAX_FRAME_HEADER = 18
-
-
-@dataclass(frozen=True)
-class Span:
-    """A range of bytes of one file of a group."""
-
-    file: str
-    start: int
-    size: int
 
 
 class Reader(Protocol):
@@ -80,15 +72,14 @@ class Body:
         self.kind = kind
         self.num_bytes = sum(sizes.values())
         self._reader = reader
-        self._crc32: dict[str, int] = {}
-        self.keys = {path: Span(path, 0, size) for path, size in sizes.items()}
+        self.keys: Mapping[str, Span] = {path: Span(path, 0, size) for path, size in sizes.items()}
         if set(sizes) == {packed.FILE}:
             size = sizes[packed.FILE]
             reader.expect(packed.FILE, [(max(0, size - packed.TAIL_BYTES), size)])
             with self._explained(at):
-                found = packed.members(size, lambda start, stop: self._bytes(Span(packed.FILE, start, stop - start)))
-            self._crc32 = {name: member.crc32 for name, member in found.items()}
-            self.keys = {name: Span(packed.FILE, member.start, member.size) for name, member in found.items()}
+                self.keys = packed.members(
+                    size, lambda start, stop: self._bytes(Span(packed.FILE, start, stop - start))
+                )
 
     def _bytes(self, span: Span) -> bytes:
         found = self._reader.read(span.file, span.start, span.start + span.size)
@@ -101,7 +92,7 @@ class Body:
         if span is None or span.size > _MAX_METADATA_BYTES:
             raise ValueError("it has no zarr metadata")
         text = self._bytes(span)
-        if zlib.crc32(text) != self._crc32.get(key, zlib.crc32(text)):
+        if span.crc32 not in (None, zlib.crc32(text)):
             raise ValueError("its zarr metadata differs from what was written")
         found = json.loads(text)
         if not isinstance(found, dict):
@@ -178,12 +169,17 @@ class Body:
         files = -(-shape[0] // outer[0])
         if files > len(self.keys):
             raise ValueError(f"its shape is {shape}, but most of its chunks are missing")
-        for i in range(files):
-            span = self.keys.get("/".join([name, "c", str(i), *("0" for _ in rows)]))
-            if span is None:
-                raise ValueError(f"its chunk {i} is missing")
+        others = "/0" * len(rows)
+        spans = [span for i in range(files) if (span := self.keys.get(f"{name}/c/{i}{others}"))]
+        if len(spans) < files:
+            missing = next(i for i in range(files) if f"{name}/c/{i}{others}" not in self.keys)
+            raise ValueError(f"its chunk {missing} is missing")
+        if not sharded:
+            out.frames.extend(spans)
+            return out
+        for i, span in enumerate(spans):
             used = -(-min(outer[0], shape[0] - i * outer[0]) // inner[0])
-            out.frames.extend(self._in_shard(span, used, outer[0] // inner[0]) if sharded else [span])
+            out.frames.extend(self._in_shard(span, used, outer[0] // inner[0]))
         return out
 
     def _in_shard(self, span: Span, used: int, count: int) -> list[Span]:

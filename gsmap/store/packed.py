@@ -15,7 +15,9 @@ import struct
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,13 +36,14 @@ _UTF8 = 0x800
 Read = Callable[[int, int], bytes]
 
 
-@dataclass(frozen=True)
-class Member:
-    """A member of an archive: its bytes are ``[start, start + size)`` of the file, with this CRC-32."""
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A range of bytes of one file of a group; a whole member of an archive has a CRC-32."""
 
+    file: str
     start: int
     size: int
-    crc32: int
+    crc32: int | None = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ def _chunk(array: np.ndarray | Column, i: int, rows: int) -> np.ndarray:
     return part.reshape(-1).view(np.uint8)
 
 
-def members(size: int, read: Read) -> dict[str, Member]:
+def members(size: int, read: Read) -> Mapping[str, Span]:
     """The members of an archive by name.
 
     Args:
@@ -137,9 +140,10 @@ def members(size: int, read: Read) -> dict[str, Member]:
     return _entries(read(table, end), count, table)
 
 
-def _entries(table: bytes, count: int, end: int) -> dict[str, Member]:
+@lru_cache(maxsize=4)  # every tile asks the same scenes, and the table grows with the scene
+def _entries(table: bytes, count: int, end: int) -> Mapping[str, Span]:
     """The members that a table of contents lists; they end where it begins."""
-    out: dict[str, Member] = {}
+    out: dict[str, Span] = {}
     at = lies = 0
     for _ in range(count):
         if at + _ENTRY.size > len(table):
@@ -159,8 +163,8 @@ def _entries(table: bytes, count: int, end: int) -> dict[str, Member]:
         if start != lies:
             raise ValueError("its members do not lie one after the other")
         body = start + _LOCAL.size + named
-        out[name] = Member(body, size, crc)
+        out[name] = Span(FILE, body, size, crc)
         lies = body + size
     if at != len(table) or lies != end:
         raise ValueError("its table of contents does not tell all that is in it")
-    return out
+    return MappingProxyType(out)

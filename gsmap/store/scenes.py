@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Collection, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from sqlalchemy import Connection, Row, Text, insert, select, true, type_coerce, update
 
 from gsmap.errors import CorruptError, InputError, NotFoundError
+from gsmap.geometry.boxes import inside
 from gsmap.store import compact, facts
 from gsmap.store.arrays import Arrays, StoredFile, digest
 from gsmap.store.boxes import chunk_boxes, put_boxes, row_ranges, touching
@@ -302,7 +304,7 @@ class Scenes:
             out = self._read(row, files, rows)
         if without is not None:
             spans = [(0, row.num_gaussians)] if rows is None else rows
-            out = out[~np.concatenate([np.zeros(0, bool), *(without[start:stop] for start, stop in spans)])]
+            out = out[~_rows_of(without, spans)]
         if bounds is None:
             return out
         low, high = np.asarray(bounds, np.float64)
@@ -311,6 +313,39 @@ class Scenes:
         x, y, z = ((p >= low[k] - reach) & (p <= high[k] + reach) for k, p in enumerate(out.means.T))
         near = x & y & z
         return out if near.all() else out[near]
+
+    def gaussians_within(self, ref: str, bounds: np.ndarray, without: np.ndarray | None = None) -> Gaussians:
+        """Read the Gaussians of a scene whose means lie in a box: of chunks without any, only means are read.
+
+        Args:
+            bounds: (2, 3) lowest and highest corner in the scene's frame.
+            without: (N,) bool, those that are left out.
+
+        Raises:
+            CorruptError, NotFoundError: as `gaussians`.
+        """
+        bounds = np.asarray(bounds, np.float64)
+        with self._catalog.read() as connection:
+            row = find(connection, ref)
+            files = _manifest(connection, row)
+            chunks = touching(connection, row.number, bounds)
+        if row.thinned is not None:
+            out = self.gaussians(row.id, bounds, without)
+            return out[inside(out.means, bounds)]
+        spans = row_ranges(chunks, row.num_gaussians)
+        read = partial(self._arrays.read, KIND, row.group_id, files, shapes=shapes_of(row))
+        with unless_pruned(self._catalog, row.group_id, f"scene {row.name!r} was removed or thinned"):
+            means = read(only=("means",), rows=spans)["means"]
+            within = inside(means, bounds)
+            if without is not None:
+                within &= ~_rows_of(without, spans)
+            begins = np.cumsum([0, *(min(CHUNK_ROWS, row.num_gaussians - chunk * CHUNK_ROWS) for chunk in chunks)])
+            holds = np.logical_or.reduceat(within, begins[:-1]) if chunks else np.zeros(0, bool)
+            held = np.repeat(holds, np.diff(begins))
+            spans = row_ranges([chunk for chunk, some in zip(chunks, holds, strict=True) if some], row.num_gaussians)
+            others = read(only=[name for name in FIELDS if name != "means"], rows=spans)
+        out = Gaussians(means if held.all() else means[held], **others)
+        return out if within.all() else out[within[held]]
 
     def source(self, ref: str) -> GaussianSource:
         """A scene's Gaussians (Morton order), read a few chunks at a time.
@@ -483,6 +518,11 @@ class Scenes:
         if fields["captured_at"] or (before is not None and before.captured_at):
             facts.say(connection, new_id, [("captured_at", fields["captured_at"] or "")], dated_by)
         return _with_tags(connection, find(connection, new_id))
+
+
+def _rows_of(column: np.ndarray, spans: Sequence[tuple[int, int]]) -> np.ndarray:
+    """The rows of a column that lie in ranges, in order."""
+    return np.concatenate([column[:0], *(column[start:stop] for start, stop in spans)])
 
 
 def _manifest(connection: Connection, row: Row[Any]) -> tuple[StoredFile, ...]:

@@ -201,6 +201,7 @@ def test_a_tile_that_did_not_change_is_not_read_again_to_tell_its_box(tmp_path, 
 
     first = boxes()
     assert set(first) == {f"{i}.glb" for i in range(8)} <= set(read)
+    assert len(read) == len(set(read))
     moved = replace(g[7::8], means=g[7::8].means + np.float32(2))
     tiles3d.write_content(tmp_path / tiles[7].path, moved)
     tiles[7] = replace(tiles[7], sha256="another")

@@ -72,11 +72,13 @@ def plainly_merged(g: Gaussians, count: int) -> np.ndarray:
     colours = np.c_[rgb_of_sh0(g.sh[:, 0]).astype(np.float64), np.full(len(g), rules._COVER)]
     masses = optical_depths(g) * projected_areas(g.scales)
     members = [[i] for i in range(len(g))]
+    pairs = np.zeros((0, 2), int)
     while len(means) > count:
-        apart = ((means[:, None] - means) ** 2).sum(2)
-        np.fill_diagonal(apart, np.inf)
-        near = np.argsort(apart, axis=1)[:, : rules._NEIGHBOURS]
-        pairs = np.array(sorted({(min(i, j), max(i, j)) for i in range(len(means)) for j in near[i].tolist()}))
+        if len(pairs) < 2 * len(means):
+            apart = ((means[:, None] - means) ** 2).sum(2)
+            np.fill_diagonal(apart, np.inf)
+            near = np.argsort(apart, axis=1)[:, : rules._NEIGHBOURS]
+            pairs = np.array(sorted({(min(i, j), max(i, j)) for i in range(len(means)) for j in near[i].tolist()}))
         i, j = pairs.T
         largest = np.sort(np.linalg.eigvalsh(S)[:, 2])
         blur = rules._BLUR * np.sqrt(largest[len(means) // 2])
@@ -122,6 +124,10 @@ def plainly_merged(g: Gaussians, count: int) -> np.ndarray:
             S[a], masses[a], opacities[a], colours[a] = M[p], total[p], drawn[p], cz[p]
             members[a] += members[b]
         kept = np.setdiff1d(np.arange(len(means)), pairs[chosen, 1])
+        into = np.arange(len(means))
+        into[pairs[chosen, 1]] = pairs[chosen, 0]
+        pairs = np.unique(np.sort(np.searchsorted(kept, into[pairs]), axis=1), axis=0)
+        pairs = pairs[pairs[:, 0] < pairs[:, 1]]
         means, S, masses, opacities, colours = (v[kept] for v in (means, S, masses, opacities, colours))
         members = [members[k] for k in kept.tolist()]
     label = np.empty(len(g), int)
@@ -136,6 +142,26 @@ def test_what_is_merged_is_what_a_plain_computation_merges(instruction_set):
     expected = plainly_merged(g, 75)
     assert (label == expected).mean() > 0.95  # costs are float32: what costs nearly the same may change places
     np.testing.assert_array_equal(decimate(g, 280)[1], plainly_merged(g, 280))
+
+
+def test_what_lies_in_lumps_far_apart_becomes_one_in_the_end():
+    """Lumps of more than have neighbours know nothing of each other before each of them is one."""
+    lump = uneven(20)
+    lumps = [replace(lump, means=lump.means + np.float32([100 * i, 0, 0])) for i in range(6)]
+    g = Gaussians.concatenate(lumps)
+    for count in (6, 2, 1):
+        assert len(decimate(g, count)[0]) == count
+
+
+def test_more_than_are_merged_together_are_cut_into_blocks_that_keep_their_share():
+    g = uneven(70_000)
+    fewer, into = decimate(g, 7001)
+    assert len(fewer) == 7001
+    np.testing.assert_array_equal(np.unique(into), np.arange(7001))
+    middle = np.median(g.means, axis=0)
+    for part in (g.means < middle).T:
+        assert abs(len(np.unique(into[part])) / len(np.unique(into[~part])) - 1) < 0.2
+    assert len(decimate(g, 1)[0]) == 1
 
 
 def test_the_same_is_merged_by_any_machine_and_in_any_number_of_threads(instruction_set):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gsmap.errors import ConfigError, InputError
+from gsmap.geometry.boxes import inside
 from gsmap.merge import PlacedScene, default_params, merge, methods
-from gsmap.merge.placed import inside
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.types import Cameras, Gaussians, Sim3
 

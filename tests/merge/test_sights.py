@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from synthetic_walls import cameras_facing, two_scenes, wall
 
+from gsmap.geometry.boxes import inside
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import MergeResult, default_params, sights, with_steps
-from gsmap.merge.placed import inside
 from gsmap.merge.references import render_references
 from gsmap.merge.sights import Sight, Sights, SightStore, keys_of
 from gsmap.merge.tile import LazyScene, _read, _Reading, merge_tile

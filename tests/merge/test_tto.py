@@ -7,11 +7,11 @@ from synthetic_walls import cameras_facing, two_scenes, wall
 
 from gsmap.errors import ConfigError
 from gsmap.evaluate.images import ssim
+from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import voxel_labels
 from gsmap.merge import PlacedScene, default_params, merge
 from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
-from gsmap.merge.placed import inside
 from gsmap.merge.selection import one_owner_per_cell
 from gsmap.render import render
 from gsmap.types import Gaussians

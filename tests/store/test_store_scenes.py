@@ -133,6 +133,33 @@ def test_bounds_read_exactly_what_reaches_in(store):
         store.scenes.gaussians("a", np.zeros((3, 2)))
 
 
+def test_what_lies_within_bounds_is_read_and_of_chunks_without_any_only_means(store, monkeypatch):
+    g = make_gaussians(5 * CHUNK_ROWS)
+    store.scenes.add(g, make_cameras(), name="a")
+    whole = store.scenes.gaussians("a")
+    box = np.array([[2.0, 2, 2], [4.0, 4, 4]])
+    within = ((whole.means >= box[0]) & (whole.means < box[1])).all(1)
+    assert 100 < within.sum() < len(g)
+    np.testing.assert_array_equal(rows(store.scenes.gaussians_within("a", box)), rows(whole[within]))
+    without = np.arange(len(g)) % 3 == 0
+    found = store.scenes.gaussians_within("a", box, without)
+    np.testing.assert_array_equal(rows(found), rows(whole[within & ~without]))
+    everything = np.array([[-99.0] * 3, [99.0] * 3])
+    np.testing.assert_array_equal(store.scenes.gaussians_within("a", everything).sh, whole.sh)
+    asked = []
+    real = store.arrays.read
+    monkeypatch.setattr(store.arrays, "read", lambda *a, **k: asked.append(k) or real(*a, **k))
+    beside = np.array([[-99.0, -99, -99], [whole.means[:, 0].min() - 1e-6, 99, 99]])
+    assert len(store.scenes.gaussians_within("a", beside)) == 0 < len(store.scenes.gaussians("a", beside))
+    assert asked[0]["only"] == ("means",)
+    assert asked[0]["rows"]
+    assert asked[1]["rows"] == []
+    store.scenes.thin("a", np.ones(len(g), bool))
+    compact = store.scenes.gaussians("a")
+    within = ((compact.means >= box[0]) & (compact.means < box[1])).all(1)
+    np.testing.assert_array_equal(rows(store.scenes.gaussians_within("a", box)), rows(compact[within]))
+
+
 def test_bounds_read_few_chunks(store, monkeypatch):
     store.scenes.add(make_gaussians(8 * CHUNK_ROWS), make_cameras(), name="a")
     asked = []

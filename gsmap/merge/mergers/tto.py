@@ -17,18 +17,19 @@ import numpy as np
 
 from gsmap import compare
 from gsmap.errors import ConfigError
+from gsmap.geometry.boxes import inside
 from gsmap.geometry.voxels import merge_groups, voxel_labels
 from gsmap.merge import exposure, references
 from gsmap.merge.changes import Prefer, Settled, settle
 from gsmap.merge.exposure import balance_exposure
-from gsmap.merge.placed import inside, pulled_inside, united
+from gsmap.merge.placed import pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
 from gsmap.merge.selection import beside, one_owner_per_cell
 from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 6
+VERSION = 7
 STEPS: str | None = "steps"
 RENDERS = True
 
