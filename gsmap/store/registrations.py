@@ -274,10 +274,13 @@ class Registrations:
 
     def keys(self) -> list[tuple[str, str]]:
         """Each pair (`Standing.pair`) with the key of what counts of it; empty where that is a person's word."""
+        every = select(*_as_they_lie("pair", "key")).order_by(registrations.c.number)
         with self._catalog.read() as connection:
-            rows = connection.execute(_silent(_as_they_lie("pair", "key"))).all()
+            keys = {row[0]: row[1] for row in connection.execute(every).all()}  # the newest stays
             spoken = _of_spoken(connection)
-        return [(pair, key) for pair, key in rows] + [(one.pair, "" if one.is_told else one.key) for one in spoken]
+            for pair in connection.execute(_SPOKEN).scalars() if spoken else ():
+                keys.pop(pair, None)
+        return [*keys.items(), *((one.pair, "" if one.is_told else one.key) for one in spoken)]
 
     def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
