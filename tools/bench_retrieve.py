@@ -3,11 +3,14 @@
 
     tools/bench_retrieve.py --cache /tmp/rooms --scenes 30 60 120 300
     tools/bench_retrieve.py --cache /tmp/rooms --scenes 30 --cost 10 100 300 1000
+    tools/bench_retrieve.py --cache /tmp/small --size 120 90 --gaussians 6000 --scenes 100 300 1000
 
-The floors of a building: 31 rooms in a row each, of five decorations that repeat exactly, with the furniture standing
-elsewhere in every room. Capture k of a floor walks rooms k and k + 1 (20 frames, 15,000 Gaussians laid on their depth,
-not trained, in a frame of its own), and is described under the default settings; made once, and kept under --cache
-(4 CPU s each). Of N captures, N - N / 30 pairs share a room: these are to be found.
+The floors of a building: 31 rooms in a row each, of five decorations (--decorations) that repeat exactly, with the
+furniture standing elsewhere in every room. Capture k of a floor walks rooms k and k + 1 (20 frames, 15,000 Gaussians
+laid on their depth, not trained, in a frame of its own), and is described under the default settings; made once, and
+kept under --cache, which holds captures of one kind (3 to 4 CPU s each; --size and --gaussians make smaller ones,
+1.8 CPU s each, of which the rooms take 1). Of N captures, N - N / 30 pairs share a room: these are to be found. --seed
+draws another building.
 
 For each N it prints, of up to 60 of the captures, each asking an index of all N as a newcomer does: the share of its
 true neighbours among the first 5, 10, top_k and 15 of its list, and by votes alone; pairs a scene and the share of
@@ -50,7 +53,7 @@ from gsmap.store import Store
 from gsmap.types import SceneGraph
 from gsmap.types.segments import merged, to_merge
 
-SEED, ROOMS, DECORATIONS = 31, 31, 5
+ROOMS = 31
 A_FLOOR = ROOMS - 1
 
 
@@ -60,10 +63,14 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, nargs="*", default=[30, 60, 120, 300])
     parser.add_argument("--cost", type=int, nargs="*", default=[])
     parser.add_argument("--older", action="store_true", help="votes of all for all as well")
+    parser.add_argument("--seed", type=int, default=31, help="of the building")
+    parser.add_argument("--decorations", type=int, default=5, help="of its rooms; the fewer, the more look alike")
+    parser.add_argument("--gaussians", type=int, default=15_000, help="of a capture")
+    parser.add_argument("--size", type=int, nargs=2, default=(200, 150), help="of a frame, pixels")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
     params = Params()
-    graphs = [described(args.cache, k) for k in range(max([*args.scenes, *(n for n in args.cost if n <= 300), 0]))]
+    graphs = [described(args, k) for k in range(max([*args.scenes, *(n for n in args.cost if n <= 300), 0]))]
     voters = [voters_of(graph, f"{k:032x}", params.nodes_per_scene) for k, graph in enumerate(graphs)]
     for count in args.scenes:
         report(graphs[:count], voters[:count], params, older=args.older)
@@ -71,29 +78,29 @@ def main() -> None:
         cost(voters, count, params)
 
 
-def described(cache: Path, number: int) -> SceneGraph:
+def described(args: argparse.Namespace, number: int) -> SceneGraph:
     """The graph of a capture, made with the rest of its floor where it is not there yet."""
     floor, k = divmod(number, A_FLOOR)
-    path = cache / f"{floor:02d}_{k:02d}.pickle"
+    path = args.cache / f"{floor:02d}_{k:02d}.pickle"
     if not path.exists():
-        make_floor(cache, floor)
+        make_floor(args, floor)
     graph: SceneGraph = pickle.loads(path.read_bytes())[0]
     return graph
 
 
-def make_floor(cache: Path, floor: int) -> None:
+def make_floor(args: argparse.Namespace, floor: int) -> None:
     from gsmap.describe import describe
     from gsmap_synthetic.capture import film, unused_doors, walk
     from gsmap_synthetic.make import fit_frames, put_in_own_frame
     from gsmap_synthetic.streets import make_street
 
-    place = make_street(SEED, rooms=ROOMS, decorations=DECORATIONS, floor=floor, texel_m=0.03)
+    place = make_street(args.seed, rooms=ROOMS, decorations=args.decorations, floor=floor, texel_m=0.03)
     for k in range(A_FLOOR):
-        path, seed = cache / f"{floor:02d}_{k:02d}.pickle", 1000 * floor + k
+        path, seed = args.cache / f"{floor:02d}_{k:02d}.pickle", 1000 * floor + k
         poses = walk(place, (k, k + 1), 20, seed=seed)
-        frames = film(place, poses, size_px=(200, 150), shut=unused_doors(place, (k, k + 1)), name="f")
-        gaussians = fit_frames(frames, steps=0, num_gaussians=15_000, seed=seed)
-        capture = put_in_own_frame(gaussians, frames, path.stem, np.random.default_rng([SEED, floor, k, 8]))
+        frames = film(place, poses, size_px=tuple(args.size), shut=unused_doors(place, (k, k + 1)), name="f")
+        gaussians = fit_frames(frames, steps=0, num_gaussians=args.gaussians, seed=seed)
+        capture = put_in_own_frame(gaussians, frames, path.stem, np.random.default_rng([args.seed, floor, k, 8]))
         graph = describe(path.stem, capture.gaussians, capture.cameras, scale_policy="auto")
         partial = path.with_suffix(f".{os.getpid()}")
         partial.write_bytes(pickle.dumps((graph, capture.gaussians, capture.cameras, capture.T_scene_world)))

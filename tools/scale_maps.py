@@ -242,7 +242,7 @@ class Filled:
         for i, (_, target, source, *_rest) in enumerate(arguments):
             yield i, self.edge(place[target[0]], place[source[0]])
 
-    def _register_new(self, store: Any, pairs: Any, settings: Any, progress: Any) -> list[Registration]:
+    def _register_new(self, store: Any, pairs: Any, settings: Any, *_: Any) -> list[Registration]:
         """Captures that were never tried, with those before them."""
         assert pairs == "auto"
         new = [k for k in range(self.num_tried, len(self.order)) if k]

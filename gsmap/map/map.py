@@ -340,7 +340,7 @@ class Map(AbstractContextManager["Map"]):
         """
         from gsmap.map.stages.describe import describe, unthinned
         from gsmap.map.stages.optimize import solve
-        from gsmap.map.stages.register import register
+        from gsmap.map.stages.register import Known, register
 
         if captured_at is not None and not captures:
             raise ConfigError("captured-at is of captures: name their files, or correct a scene with gsmap edit")
@@ -348,10 +348,11 @@ class Map(AbstractContextManager["Map"]):
         with at_work(self.store, "update"):
             ingested = self.ingest(*captures, captured_at=captured_at) if captures else []
             describe(self.store, unthinned(self.store.scenes.brief()), self.settings, self._progress)
-            register(self.store, "auto", self.settings, self._progress)
+            known = Known()
+            register(self.store, "auto", self.settings, self._progress, known)
             # Poses may tell of new neighbours, and their edges of new poses.
             while solve(self.store, self.settings, self._progress):
-                if not register(self.store, "auto", self.settings, self._progress):
+                if not register(self.store, "auto", self.settings, self._progress, known):
                     break
         return reports.update_report(self.store, ingested, before, self.metres)
 

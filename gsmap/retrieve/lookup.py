@@ -16,7 +16,7 @@ from gsmap.retrieve.voters import Voters
 from gsmap.types.retrieval import Candidate, Member
 from gsmap.types.segments import Segment, lists_of, places_of
 
-VERSION = 3
+VERSION = 4
 
 _BLOCK_ROWS = 250_000  # of an index that are in memory at a time: 15 MB
 _SAME_NODE_M = 0.05  # two nodes nearer than this may be one
@@ -28,7 +28,8 @@ def look_up(voters: Sequence[Voters], segments: Sequence[Segment], params: Param
     A node's match is worth the more the fewer scenes have one like it (the logarithm of their share, squared: once for
     either scene, as in tf-idf). The score of a scene is the largest worth of matches that bear out one pair of them:
     distances between nodes, and differences in height, are the same in both scenes, which two points and the vertical
-    fix but for a mirror.
+    fix but for a mirror. Rooms that are decorated alike bear each other out by what is decoration; so a node counts the
+    less, likewise, the more scenes it bears out, and scenes are scored by that once more.
 
     Args:
         voters: the scenes that ask; a scene does not find itself.
@@ -197,11 +198,11 @@ def _scores(
     members: _Members,
     params: Params,
 ) -> np.ndarray:
-    """(C,) how much of what the matches of each scene say is borne out by where they lie."""
+    """(C,) how much of what the matches of each scene say is borne out by where they lie, and not in every scene."""
     if not len(chosen):
         return np.zeros(0)
     count = params.matches
-    weights = np.zeros((len(chosen), count))
+    weights, nodes = np.zeros((len(chosen), count)), np.zeros((len(chosen), count), dtype=np.int64)
     a, b = np.zeros((len(chosen), count, 3), np.float32), np.zeros((len(chosen), count, 3), np.float32)
     order = np.lexsort((node, -np.round(worth, 9), place))
     firsts = np.searchsorted(place[order], chosen, side="left")
@@ -209,7 +210,7 @@ def _scores(
     mine = asker.asking.positions.astype(np.float32)
     for row, (first, last) in enumerate(zip(firsts, lasts, strict=True)):
         rows = order[first : min(last, first + count)]
-        weights[row, : len(rows)] = worth[rows]
+        weights[row, : len(rows)], nodes[row, : len(rows)] = worth[rows], node[rows]
         a[row, : len(rows)], b[row, : len(rows)] = mine[node[rows]], theirs[rows]
     others = [members.members[k] for k in chosen]
     coarse = np.array([max(o.coarseness, asker.member.coarseness) for o in others], np.float32)[:, None, None]
@@ -221,11 +222,32 @@ def _scores(
     rise = a[:, :, None, 2] - a[:, None, :, 2] - b[:, :, None, 2] + b[:, None, :, 2]
     agree &= ~upright | (np.abs(rise) <= slack)
     agree &= (np.minimum(da, db) > _SAME_NODE_M * coarse) & (weights[:, :, None] > 0) & (weights[:, None] > 0)
+    apart = agree & (np.minimum(da, db) > params.apart_m * coarse)
+    which, best = _best_pairs(agree, apart, weights)
+    each = np.arange(len(chosen))
+    borne_out = agree[each, which[0]] & agree[each, which[1]]
+    borne_out[each, which[0]] = borne_out[each, which[1]] = True
+    borne_out[best == 0] = False
+    times = np.bincount(nodes[borne_out], minlength=len(mine))
+    rarity = np.log((len(members.members) + 1) / np.maximum(times, 1))
+    return _best_pairs(agree, apart, weights * rarity[nodes] ** 2)[1]
+
+
+def _best_pairs(agree: np.ndarray, apart: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each scene the two matches (2, C) that most of the weight agrees with, and (C,) how much that is.
+
+    Args:
+        agree: (C, M, M) whether two matches lie alike in both scenes.
+        apart: the same, of two that are far enough from each other.
+        weights: (C, M) of the matches; 0 where there is none.
+    """
     plain = agree.astype(np.float64)
     both = (plain * weights[:, None]) @ plain + weights[:, :, None] + weights[:, None]
-    both[~(agree & (np.minimum(da, db) > params.apart_m * coarse))] = 0.0
-    out: np.ndarray = both.max(axis=(1, 2))
-    return out
+    both[~apart] = 0.0
+    # Sums differ in their last digits from machine to machine: of what is as good, the first.
+    best = np.round(both, 6).reshape(len(both), -1).argmax(1)
+    i, j = np.divmod(best, weights.shape[1])
+    return np.stack([i, j]), both[np.arange(len(both)), i, j]
 
 
 def _distances(points: np.ndarray) -> np.ndarray:

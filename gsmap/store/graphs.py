@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -179,10 +180,11 @@ class Graphs:
 
         An update asks this several times, so what was read once is remembered.
         """
-        alive = select(graphs.c.key, graphs.c.group_id).join(scenes, scenes.c.id == graphs.c.scene)
+        names = (type_coerce(graphs.c.key, Text), type_coerce(graphs.c.group_id, Text))  # to be compared with
+        alive = select(*names).join(scenes, scenes.c.id == graphs.c.scene)
         query = alive.where(scenes.c.removed_at.is_(None)).order_by(graphs.c.created_at)
         with self._catalog.read() as connection:
-            wanted = [(row.key, row.group_id) for row in connection.execute(query)]
+            wanted = [(key, group_id) for key, group_id in connection.execute(query).all()]
             new = sorted(key for key, group_id in wanted if (key, group_id) not in self._said)
             if new:
                 some = graphs.c.key.in_(new) if len(new) <= recipes.MOST_ASKED else true()
@@ -200,12 +202,14 @@ class Graphs:
 
 
 _TEXT = type_coerce(graphs.c.about, Text).label("about")
+_BEGINS = re.compile(r'(\{"up":(?:null|\[[^][{}"]*\]),"unit_m":[^][{}",]+),')
 
 
 def _says(row: Row[Any]) -> GraphSays:
-    """From its text: what a graph is beside its arrays is a hundred numbers, of which these four are asked for."""
+    """From its text: what a graph is beside its arrays is a hundred numbers, of which the first four are asked for."""
     try:
-        about = json.loads(row.about)
+        begins = _BEGINS.match(row.about)
+        about = json.loads(row.about if begins is None else f"{begins[1]}}}")
         up, unit_m = about["up"], about["unit_m"]
         if isinstance(unit_m, (int, float)) and (up is None or a_direction(up)):
             return GraphSays(row.key, row.scene, float(unit_m), None if up is None else tuple(up))

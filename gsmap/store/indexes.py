@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, Text, delete, insert, select, type_coerce, update
 
 from gsmap.errors import CorruptError
 from gsmap.store.arrays import Arrays, StoredFile, digest
@@ -135,9 +135,9 @@ class Indexes:
 
     def asked(self) -> dict[str, tuple[str, int | None]]:
         """By scene, the key of its lookup and how many of its candidates were not tried (`Lookup.num_left`)."""
-        query = select(lookups.c.scene, lookups.c.key, lookups.c.num_left)
-        with self._catalog.read() as connection:
-            return {row.scene: (row.key, row.num_left) for row in connection.execute(query)}
+        columns = (type_coerce(lookups.c.scene, Text), type_coerce(lookups.c.key, Text), lookups.c.num_left)
+        with self._catalog.read() as connection:  # scenes and keys are only compared with
+            return {scene: (key, left) for scene, key, left in connection.execute(select(*columns)).all()}
 
     def lookups(self, scenes: Collection[str]) -> list[Lookup]:
         """What the index said of these scenes (ids), of those that have asked."""
@@ -159,7 +159,7 @@ class Indexes:
         ]
         with self._catalog.write() as connection:
             alive = living_ids(connection)
-            known = set(connection.execute(select(lookups.c.scene)).scalars())
+            known = set(connection.execute(select(type_coerce(lookups.c.scene, Text))).scalars().all())
             gone = sorted((known - set(alive)) | {one.scene for one in found} & known)
             if gone:
                 connection.execute(delete(lookups).where(lookups.c.scene.in_(gone)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, insert, select, true
+from sqlalchemy import ColumnElement, Connection, Row, Text, insert, select, true, type_coerce
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.methods import RecipeKey, text_digest
@@ -69,10 +69,11 @@ def kept(
     where: ColumnElement[bool] | None = None,
 ) -> set[str]:
     """Those of the keys (as digests) that a column holds, in rows that meet a condition."""
-    wanted, found = sorted({digest_of(key) for key in keys}), set()
-    if len(wanted) > MOST_ASKED:
-        query = select(column).where(true() if where is None else where)
-        return set(connection.execute(query).scalars()).intersection(wanted)
+    some_of, found = {digest_of(key) for key in keys}, set()
+    if len(some_of) > MOST_ASKED:  # what is only compared with needs no check (`gsmap.store.columns`)
+        query = select(type_coerce(column, Text)).where(true() if where is None else where)
+        return some_of.intersection(connection.execute(query).scalars().all())
+    wanted = sorted(some_of)
     for start in range(0, len(wanted), ASKED_AT_ONCE):
         some = column.in_(wanted[start : start + ASKED_AT_ONCE])
         query = select(column).where(some, true() if where is None else where)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter, itemgetter
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -238,7 +238,7 @@ class Registrations:
                 made = self.tried()
             else:
                 wanted = registrations.c.status == "accepted" if usable else true()
-                made = _of_silent(connection, null(), wanted) + _of_spoken(connection)
+                made = _of_silent(connection, wanted) + _of_spoken(connection)
             alive = living_ids(connection)
         found = (one for one in made if (one.usable or not usable) and one.target in alive and one.source in alive)
         return sorted(found, key=_ends_of)
@@ -257,28 +257,30 @@ class Registrations:
         ones are read again.
         """
         with self._catalog.read() as connection:
+            count = connection.execute(select(func.count()).select_from(registrations)).scalar_one()
             upto, then = self._read_upto
-            pair_of_new: ColumnElement[bool] = true()
-            if upto and then == _mark(connection, upto):
-                pair_of_new = registrations.c.pair.in_(
-                    select(registrations.c.pair).where(registrations.c.number > upto)
-                )
-            else:
+            new = connection.execute(_EVERY.where(registrations.c.number > upto)).all()
+            if upto and then != (count - len(new), _last(connection, upto)):
                 self._silent.clear()
-            for one in _of_silent(connection, _EVIDENCE, pair_of_new, _several(connection, pair_of_new)):
-                self._silent[one.pair] = one
-            upto = connection.execute(select(func.max(registrations.c.number))).scalar_one() or 0
-            self._read_upto = upto, _mark(connection, upto)
-            spoken = {one.pair: one for one in _of_spoken(connection)}
+                upto, new = 0, connection.execute(_EVERY).all()
+            _add(self._silent, new)
+            upto = new[-1].number if new else upto
+            self._read_upto = upto, (count, _last(connection, upto))
+            spoken = _of_spoken(connection)
             said = set(connection.execute(_SPOKEN).scalars()) if spoken else set()
-        return [one for pair, one in self._silent.items() if pair not in said] + list(spoken.values())
+        if not said:
+            return list(self._silent.values())
+        return [one for pair, one in self._silent.items() if pair not in said] + spoken
 
     def keys(self) -> list[tuple[str, str]]:
         """Each pair (`Standing.pair`) with the key of what counts of it; empty where that is a person's word."""
+        every = select(*_as_they_lie("pair", "key")).order_by(registrations.c.number)
         with self._catalog.read() as connection:
-            rows = connection.execute(_silent(_as_they_lie("pair", "key"))).all()
+            keys = {row[0]: row[1] for row in connection.execute(every).all()}  # the newest stays
             spoken = _of_spoken(connection)
-        return [(pair, key) for pair, key in rows] + [(one.pair, "" if one.is_told else one.key) for one in spoken]
+            for pair in connection.execute(_SPOKEN).scalars() if spoken else ():
+                keys.pop(pair, None)
+        return [*keys.items(), *((one.pair, "" if one.is_told else one.key) for one in spoken)]
 
     def usable(self, among: Collection[str] | None = None) -> list[StoredRegistration]:
         """The current registrations that may be used (`Standing.usable`) and have a pose, by (target, source).
@@ -548,24 +550,30 @@ def _spoken(
 
 
 _OBJECT = Json(an_object).at("registrations.evidence")
+_EVERY = select(*_LEAN, _EVIDENCE).order_by(registrations.c.number)
 
 
-def _mark(connection: Connection, upto: int) -> tuple[Any, ...]:
-    """How many registrations there are up to a number, and what tells the last one from another of its number."""
-    count = connection.execute(select(func.count(registrations.c.number)).where(registrations.c.number <= upto))
-    last = select(registrations.c.key, registrations.c.created_at).where(registrations.c.number == upto)
-    return count.scalar_one(), *(connection.execute(last).first() or ())
+def _last(connection: Connection, upto: int) -> tuple[str, str] | None:
+    """What tells a registration from another one of its number; None where there is none."""
+    query = select(registrations.c.key, registrations.c.created_at).where(registrations.c.number == upto)
+    row = connection.execute(query).first()
+    return None if row is None else (row.key, row.created_at)
 
 
-def _of_silent(
-    connection: Connection,
-    evidence: ColumnElement[Any],
-    wanted: ColumnElement[bool],
-    several: Mapping[str, set[str]] = MappingProxyType({}),
-) -> list[Standing]:
-    """What counts of pairs on which nobody ever spoke."""
-    rows = connection.execute(_silent((*_LEAN, evidence)).where(wanted)).all()
-    return [_stands(tuple(row), None, several) for row in rows]
+def _add(standing: dict[str, Standing], rows: Iterable[Sequence[Any]]) -> None:
+    """Let registrations, oldest first, stand in place of those before them: what counts where nobody ever spoke."""
+    for number, target, source, pair, key, status, posed, evidence in rows:
+        before = standing.get(pair)
+        keys = None if before is None else before.keys | {key} - {""}
+        disagreement = _UNKNOWN if evidence is None else _disagreement(evidence)
+        usable = bool(posed) and _may_be_used(status, None)
+        standing[pair] = Standing(number, target, source, pair, key, None, usable, disagreement, keys)
+
+
+def _of_silent(connection: Connection, wanted: ColumnElement[bool]) -> list[Standing]:
+    """What counts of pairs on which nobody ever spoke, without what disagrees and what else was computed."""
+    rows = connection.execute(_silent((*_LEAN, null())).where(wanted)).all()
+    return [_stands(tuple(row), None, {}) for row in rows]
 
 
 def _of_spoken(connection: Connection) -> list[Standing]:
@@ -594,13 +602,20 @@ _ends_of = attrgetter("target", "source")
 
 def _stands(row: tuple[Any, ...], word: Review | None, several: Mapping[str, set[str]]) -> Standing:
     number, target, source, pair, key, status, posed, evidence = row
-    disagreement = _UNKNOWN
-    if evidence is not None:
-        disagreement = float(_OBJECT.process_result_value(evidence, None).get("disagreement", _UNKNOWN))
+    disagreement = _UNKNOWN if evidence is None else _disagreement(evidence)
     review = None if word is None else word.review
     usable = bool(posed) and _may_be_used(status, review)
     keys = frozenset(several[pair] - {""}) if pair in several else None
     return Standing(number, target, source, pair, key, review, usable, disagreement, keys)
+
+
+def _disagreement(evidence: str) -> float:
+    """One number of a dozen; where they are a flat object and it is there once, the others are not made."""
+    _, named, after = evidence.partition('"disagreement":')
+    if named and evidence.count("{") == 1 and '"disagreement"' not in after:
+        with suppress(ValueError):
+            return float(after[: after.find("," if "," in after else "}")])
+    return float(_OBJECT.process_result_value(evidence, None).get("disagreement", _UNKNOWN))
 
 
 def _stored_all(chosen: Sequence[_Choice]) -> list[StoredRegistration]:

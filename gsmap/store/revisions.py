@@ -452,22 +452,22 @@ def _poses(connection: Connection, where: ColumnElement[bool]) -> dict[str, Scen
         covariances = iter(covariances_of_bytes([bytes(row.covariance) for row in rows if row.covariance is not None]))
     none: Any = None
     return {
-        row.scene: ScenePose(
-            row.scene,
-            none if row.S_map_scene is None else next(S_map_scene),
-            row.component,
-            row.status,
-            None if row.covariance is None else next(covariances),
+        scene: ScenePose(
+            scene,
+            none if pose is None else next(S_map_scene),
+            component,
+            status,
+            None if covariance is None else next(covariances),
         )
-        for row in rows
+        for scene, _, _, pose, component, status, covariance in rows
     }
 
 
 def _outcomes(connection: Connection, where: ColumnElement[bool]) -> dict[tuple[str, str], EdgeOutcome]:
     query = select(edges).where(where).order_by(edges.c.target, edges.c.source)
     return {
-        (row.target, row.source): EdgeOutcome(row.use, row.residual_chi2, row.reason, bool(row.undecided))
-        for row in connection.execute(query)
+        (target, source): EdgeOutcome(use, residual_chi2, reason, bool(undecided))
+        for target, source, _, _, use, residual_chi2, reason, undecided in connection.execute(query).all()
     }
 
 

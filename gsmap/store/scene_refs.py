@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import Connection, Row, Text, select, type_coerce
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.store.schema import scenes
@@ -14,7 +14,8 @@ from gsmap.store.schema import scenes
 
 def living_ids(connection: Connection) -> set[str]:
     """Of the scenes that were not removed."""
-    return set(connection.execute(select(scenes.c.id).where(scenes.c.removed_at.is_(None))).scalars())
+    ids = select(type_coerce(scenes.c.id, Text)).where(scenes.c.removed_at.is_(None))  # to be compared with
+    return set(connection.execute(ids).scalars().all())
 
 
 def resolve(connection: Connection, ref: str) -> str:

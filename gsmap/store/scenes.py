@@ -198,7 +198,7 @@ class Scenes:
     def names(self) -> dict[str, str]:
         """The name of every scene by its id, removed ones included."""
         with self._catalog.read() as connection:
-            return {row.id: row.name for row in connection.execute(select(scenes.c.id, scenes.c.name))}
+            return {row[0]: row[1] for row in connection.execute(select(scenes.c.id, scenes.c.name)).all()}
 
     def get(self, ref: str) -> Scene:
         """One scene by name, id or the beginning of its id; a removed one by its id only.

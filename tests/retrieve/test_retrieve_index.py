@@ -144,6 +144,31 @@ def test_what_is_everywhere_says_little():
     assert sum(first == f"s{k ^ 1:02}" for k, first in enumerate(firsts)) >= 48
 
 
+def test_decoration_that_repeats_says_less_than_how_the_same_things_stand():
+    """Scenes of two rooms each, in a row: all have the same walls, and the same things, elsewhere in each."""
+    rng = np.random.default_rng(7)
+    walls, things = rng.normal(size=(2, 24, 24)), rng.normal(size=(20, 24))
+    at_wall = rng.uniform(0, 1, (2, 24, 3)) * [5, 5, 2.5]
+    at_thing = rng.uniform(0, 1, (61, 20, 3)) * [5, 5, 1]
+    graphs = []
+    for k in range(60):
+        e, p = [], []
+        for room in (k, k + 1):
+            east = [5.0 * (room - k), 0, 0]
+            e += [walls[room % 2], things]
+            p += [at_wall[room % 2] + east, at_thing[room] + east]
+        seen, places = np.concatenate(e), np.concatenate(p)
+        seen = seen + rng.normal(size=seen.shape) * 0.1
+        places = turned(places + rng.normal(size=places.shape) * 0.02, rng)
+        nodes = layer(rng, len(seen), embeddings=seen, type_ids=np.zeros(len(seen)), positions=places)
+        graphs.append(SceneGraph(f"s{k:02}", {"landmarks": nodes}, UP))
+    voters = _voters(graphs)
+    found = look_up(voters, [new_segment(voters)], Params())
+    firsts = [{one.scene for one in said[:5]} for said in found]
+    beside = [f"s{k + step:02}" in firsts[k] for k in range(60) for step in (-1, 1) if 0 <= k + step < 60]
+    assert np.mean(beside) > 0.8  # by what nodes say alone, none
+
+
 def test_hostile_lists_and_nodes_are_refused():
     voters = _voters(walk(3))
     good = new_segment(voters).arrays

@@ -1,5 +1,6 @@
 """A revision adds what differs from the one before; prune gives its room back; what is read of one is exact."""
 
+import json
 from dataclasses import replace
 from itertools import combinations, pairwise
 
@@ -11,7 +12,8 @@ from store_samples import key, make_cameras, make_gaussians
 from gsmap.errors import CorruptError, InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
 from gsmap.store import Store, matrices
-from gsmap.store.registrations import Registrations
+from gsmap.store import registrations as module
+from gsmap.store.registrations import Registrations, _disagreement
 from gsmap.store.schema import edges, graphs, poses, registrations, reviews
 from gsmap.types import EdgeOutcome, PoseGraph, Registration, SceneGraph, ScenePose, Sim3
 
@@ -320,6 +322,57 @@ def test_brief_scenes_and_what_graphs_say_are_what_lists_have(store):
         connection.execute(graphs.update().where(graphs.c.scene == some[0]).values(about={"up": [1, "x", 0]}))
     with Store.open(store.folder, "r") as other, pytest.raises(CorruptError, match=r"graphs\.about"):
         other.graphs.says()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"log_nfa":-3.5,"disagreement":0.01051047480010089,"seen_m2":1e2}', 0.01051047480010089),
+        ('{"disagreement":-2e-3}', -2e-3),
+        ('{"disagreement":Infinity,"x":1}', np.inf),
+        ('{"x":1,"disagreement":NaN}', np.nan),
+        ('{"x":{"disagreement":1.0},"y":2}', np.nan),  # of something else
+        ('{"x":{"disagreement":1.0,"z":3},"y":2}', np.nan),
+        ('{"x":{"y":2},"disagreement":1.0}', 1.0),
+        ('{"disagreement":1.0,"disagreement":2.0}', 2.0),
+        ('{ "disagreement" : 0.5 }', 0.5),
+        ('{"x":"\\"disagreement\\":3.0","disagreement":4.0}', 4.0),
+        ('{"x":"\\"disagreement\\":3.0"}', np.nan),
+        ('{"x":"{","disagreement":6.0}', 6.0),
+        ("{}", np.nan),
+    ],
+)
+def test_what_disagrees_is_read_as_json_says_it(text, said):
+    assert np.array_equal(json.loads(text).get("disagreement", np.nan), said, equal_nan=True)
+    assert np.array_equal(_disagreement(text), said, equal_nan=True)
+
+
+def test_of_pairs_and_graphs_what_is_new_is_read(store, monkeypatch):
+    """And of that what is asked for: neither evidence nor what graphs say beside their frames is made of its text."""
+    ids, read, parsed = sorted(scene.id for scene in store.scenes.list()), [], []
+    for k, pair in enumerate(combinations(ids, 2)):
+        evidence = {f"figure_{i}": i * 0.1 for i in range(12)} | {"disagreement": k * 0.01}
+        edge = Registration(
+            *pair, "accepted", S_target_source=Sim3.identity(), evidence=evidence, information=np.eye(7)
+        )
+        store.registrations.save(edge, key("register", *pair))
+    for scene in ids:
+        notes = ("a remark that is longer than all else that a graph says of its frame, and as JSON quite long",)
+        store.graphs.save(SceneGraph(scene, {}, np.array([0.0, 0.6, 0.8]), 0.5, notes=notes), key("describe", scene))
+    add, loads = module._add, json.loads
+    monkeypatch.setattr(module, "_add", lambda known, rows: read.append(len(rows)) or add(known, rows))
+    monkeypatch.setattr(json, "loads", lambda text: parsed.append(len(text)) or loads(text))
+    store.registrations.tried()
+    said = store.graphs.says()
+    assert read == [len(ids) * (len(ids) - 1) // 2]
+    assert max(parsed, default=0) < 60
+    assert {(one.unit_m, one.up) for one in said} == {(0.5, (0.0, 0.6, 0.8))}
+    store.registrations.save(Registration(*ids[:2], "no_match"), key("register", *ids[:2], turn=1))
+    parsed.clear()
+    for _ in range(2):
+        store.registrations.standing()
+        store.graphs.says()
+    assert (read[1:], parsed) == ([1, 0], [])
 
 
 def test_what_is_remembered_of_pairs_is_what_is_read_anew(store):

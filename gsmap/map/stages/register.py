@@ -22,6 +22,7 @@ from gsmap.methods import RecipeKey
 from gsmap.register import recipe_key
 from gsmap.retrieve import Placed, Rounds, directed, neighbours
 from gsmap.store import MANUAL, Store
+from gsmap.store.registrations import Standing
 from gsmap.store.scenes import BriefScene
 from gsmap.types import Registration, Scene, Sim3
 from gsmap.types.progress import StageProgress
@@ -31,20 +32,26 @@ Pairs = str | Path | Sequence[Pair]
 """``auto``, ``all``, ``A:B``, a file of pairs, or the pairs themselves."""
 
 
-def register(store: Store, pairs: Pairs, settings: Settings, progress: StageProgress) -> list[Registration]:
+def register(
+    store: Store, pairs: Pairs, settings: Settings, progress: StageProgress, known: Known | None = None
+) -> list[Registration]:
     """Register the pairs asked for; those of ``auto`` and ``all`` only where this recipe has not done so yet.
 
     A result that this recipe made before, under settings that were changed meanwhile, becomes the pair's current one
     again without being computed. The target of a pair is the scene of lower id, however the pair was named: an edge is
     the same whichever scene came first.
+
+    Args:
+        known: what was found of pairs before, in the same update; only what has changed since is looked at.
     """
     scenes = store.scenes.brief()
     work = _Work(store, scenes, graph_keys(store, scenes, settings), settings, progress)
+    known = Known() if known is None else known
     if pairs == "auto":
-        return _register_candidates(work)
+        return _register_candidates(work, known)
     if pairs == "all":
         everything = list(combinations(sorted(work.described), 2))
-        known = _Known(work)
+        known.look(work)
         return work.register([pair for pair in everything if not known.has(*pair)], after=0)
     # What is named is registered again: only what comes later counts.
     return work.register(_named(store, pairs, work), after=store.registrations.newest(), again=True)
@@ -100,37 +107,73 @@ class _Work:
         return store.registrations.found(edges)
 
 
-class _Known:
+class Known:
     """What the present recipe knows of pairs, in either direction: older maps hold both.
 
-    What it made before, under settings that were changed meanwhile, is made current again.
+    What it made before, under settings that were changed meanwhile, is made current again. Looked at once more, only
+    those pairs are judged of which something else stands by now.
 
     Args:
-        held: pairs whose edge stands and is not in doubt.
+        held: pairs whose edge stands and is not in doubt, by `Standing.pair`.
         stale: pairs of described scenes that other settings, or another version, registered.
     """
 
-    def __init__(self, work: _Work) -> None:
-        self._work = work
-        self._graphs = {scene: key.digest for scene, key in work.graphs.items()}
-        self._read()
-        adopted = [self._adopt(pair, keys) for pair, keys in self._replaced]
+    def __init__(self) -> None:
+        self.held: dict[str, Pair] = {}
+        self.stale: list[Pair] = []
+        self._by: tuple[str, float, dict[str, str]] = ("", 0.0, {})
+        self._forget()
+
+    def look(self, work: _Work) -> None:
+        """See what stands by now."""
+        self._read(work)
+        adopted = [self._adopt(work, pair, keys) for pair, keys in self._replaced.values()]
         if any(adopted):
-            self._read()
+            self._read(work)
         self.stale = sorted(
             pair
-            for pair, keys in self._replaced
-            if all(scene in work.described for scene in pair) and keys.isdisjoint(self._keys(*pair))
+            for pair, keys in self._replaced.values()
+            if all(scene in work.described for scene in pair) and keys.isdisjoint(_keys(work, pair))
         )
 
-    def _read(self) -> None:
-        """What stands of every pair of living scenes, and whether it is what this recipe makes, or a person told."""
-        digest_of, graphs, bar = self._work.recipe.digest_of, self._graphs, self._work.settings.optimize.aliasing
+    def has(self, a: str, b: str) -> bool:
+        """Whether it has registered a pair."""
+        return ":".join(directed(a, b)) in self._registered
+
+    def _forget(self) -> None:
+        self.held.clear()
+        self._judged: dict[str, Standing] = {}
         self._registered: set[str] = set()
-        self._replaced: list[tuple[Pair, frozenset[str]]] = []
-        self.held: list[Pair] = []
-        for one in self._work.store.registrations.tried():
-            a, _, b = one.pair.partition(":")
+        self._replaced: dict[str, tuple[Pair, frozenset[str]]] = {}
+
+    def _read(self, work: _Work) -> None:
+        """What stands of every pair, and whether it is what this recipe makes, or a person told."""
+        by = (
+            work.recipe.recipe,
+            work.settings.optimize.aliasing.max_disagreement,
+            {scene: key.digest for scene, key in work.graphs.items()},
+        )
+        tried = work.store.registrations.tried()
+        if by != self._by:
+            self._forget()
+            self._by = by
+        self._judge_all(work, tried)
+        if len(self._judged) != len(tried):  # some have gone
+            self._forget()
+            self._judge_all(work, tried)
+
+    def _judge_all(self, work: _Work, tried: Sequence[Standing]) -> None:
+        judged, digest_of, (_, max_disagreement, graphs) = self._judged, work.recipe.digest_of, self._by
+        for one in tried:
+            pair = one.pair
+            if judged.get(pair) is one:
+                continue
+            if pair in judged:
+                self._registered.discard(pair)
+                self._replaced.pop(pair, None)
+                self.held.pop(pair, None)
+            judged[pair] = one
+            a, _, b = pair.partition(":")
             first, second = graphs.get(a), graphs.get(b)
             if first is None or second is None:
                 continue
@@ -139,40 +182,38 @@ class _Known:
                 mine.append(digest_of(second, first))
             current = one.key in mine
             if current or not one.keys.isdisjoint(mine):
-                self._registered.add(one.pair)
+                self._registered.add(pair)
             if not current and not one.is_told:
-                self._replaced.append(((a, b), one.keys))
-            elif one.usable and (one.is_told or not one.disagreement > bar.max_disagreement):
-                self.held.append((a, b))
+                self._replaced[pair] = (a, b), one.keys
+            elif one.usable and (one.is_told or not one.disagreement > max_disagreement):
+                self.held[pair] = (a, b)
 
-    def has(self, a: str, b: str) -> bool:
-        """Whether it has registered a pair."""
-        return ":".join(directed(a, b)) in self._registered
-
-    def _keys(self, a: str, b: str) -> tuple[str, str]:
-        """What the pair's registration would be kept under, in either direction."""
-        first, second = self._graphs[a], self._graphs[b]
-        return self._work.recipe.digest_of(first, second), self._work.recipe.digest_of(second, first)
-
-    def _adopt(self, pair: Pair, keys: frozenset[str]) -> bool:
-        mine = [key for key in self._keys(*pair) if key in keys]
-        known = [self._work.store.registrations.find(key) for key in mine]
+    def _adopt(self, work: _Work, pair: Pair, keys: frozenset[str]) -> bool:
+        mine = [key for key in _keys(work, pair) if key in keys]
+        known = [work.store.registrations.find(key) for key in mine]
         if known:
-            self._work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
+            work.store.registrations.adopt(max(stored.number for stored in known if stored is not None))
         return bool(known)
 
 
-def _register_candidates(work: _Work) -> list[Registration]:
+def _keys(work: _Work, pair: Pair) -> tuple[str, str]:
+    """What the pair's registration would be kept under, in either direction."""
+    a, b = pair
+    return work.key(a, b).digest, work.key(b, a).digest
+
+
+def _register_candidates(work: _Work, known: Known) -> list[Registration]:
     """Register what retrieval proposes, round by round, and what other settings had registered.
 
     Only scenes that have not been looked up by this recipe are, and nothing is read of the others.
     """
     store, params = work.store, work.settings.retrieve
-    known, asked, keys = _Known(work), store.indexes.asked(), keys_of_lookups(work.described, params)
+    known.look(work)
+    asked, keys = store.indexes.asked(), keys_of_lookups(work.described, params)
     new = sorted(scene for scene in work.described if asked.get(scene, ("", None))[0] != keys[scene])
     if new:
         ask(store, work.described, new, params, work.progress)
-    ties = Counter(scene for pair in known.held for scene in pair)
+    ties = Counter(scene for pair in known.held.values() for scene in pair)
     # Whose list was not gone down to its end, and who has lost edges since.
     short = {s for s, (_, left) in asked.items() if s in keys and (left is None or (left and ties[s] < params.enough))}
     lookups = store.indexes.lookups(short.union(new))
@@ -187,7 +228,7 @@ def _register_candidates(work: _Work) -> list[Registration]:
     # Next to all neighbours have been tried; a list with one that has not keeps them all, and so its order.
     proposed = [*lists.values(), *(pairs for pairs in beside.values() if not all(known.has(*pair) for pair in pairs))]
     tried = {pair for pairs in proposed for pair in pairs if known.has(*pair)}
-    rounds = Rounds(proposed, tried.union(known.stale), known.held, params)
+    rounds = Rounds(proposed, tried.union(known.stale), known.held.values(), params)
     pairs, made = known.stale + rounds.next(), list[Registration]()
     while pairs:
         found = work.register(pairs, after=0)
