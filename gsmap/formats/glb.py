@@ -21,6 +21,7 @@ from gsmap.errors import MALFORMED, InputError
 from gsmap.formats import spz
 from gsmap.formats.axes import GLTF, PLY, change_axes
 from gsmap.formats.quantise import check_size, opacity_bytes, require_writable
+from gsmap.geometry.boxes import box_around
 from gsmap.geometry.sh import rgb_of_sh0
 from gsmap.geometry.transforms import transform_gaussians
 from gsmap.types import Gaussians, Sim3
@@ -119,7 +120,7 @@ def write_packed(path: str | os.PathLike[str], gaussians: Gaussians, matrix: np.
 
     They are counted from the middle, which the node's transform gives back: SPZ has 24 bits for a position.
     """
-    low, high = gaussians.means.min(0).astype(np.float64), gaussians.means.max(0).astype(np.float64)
+    low, high = box_around(gaussians.means).astype(np.float64)
     middle = np.eye(4)
     middle[:3, 3] = (low + high) / 2
     g = replace(gaussians, means=(gaussians.means - middle[:3, 3]).astype(np.float32))
@@ -170,7 +171,7 @@ def _accessor_of(name: str, values: np.ndarray) -> dict[str, Any]:
     if values.dtype == np.uint8:
         accessor["normalized"] = True
     if name == "POSITION":  # the one attribute whose bounds glTF asks for
-        accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        accessor |= dict(zip(("min", "max"), box_around(values).tolist(), strict=True))
     return accessor
 
 

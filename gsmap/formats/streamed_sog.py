@@ -28,7 +28,7 @@ from gsmap.formats import sog
 from gsmap.formats.inside import file_inside
 from gsmap.formats.quantise import require_writable
 from gsmap.formats.tiles3d import box_of, coarser
-from gsmap.geometry.boxes import cube_around, octants
+from gsmap.geometry.boxes import box_around, cube_around, octants
 from gsmap.geometry.morton import morton_codes
 from gsmap.types import FileInfo, Gaussians
 
@@ -153,7 +153,7 @@ def parted(gaussians: Gaussians, cells: np.ndarray) -> tuple[Gaussians, tuple[in
         means = gaussians.means[start : start + _BLOCK, None].astype(np.float64)
         away = np.maximum(0, np.maximum(cells[:, 0] - means, means - cells[:, 1]))
         nearest[start : start + _BLOCK] = (away**2).sum(2).argmin(1)
-    codes = morton_codes(gaussians.means, np.stack([gaussians.means.min(0), gaussians.means.max(0)]))
+    codes = morton_codes(gaussians.means, box_around(gaussians.means))
     order = np.lexsort((codes, nearest))
     return gaussians[order], tuple(np.bincount(nearest, minlength=len(cells)).tolist())
 

@@ -158,8 +158,8 @@ def coarser(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
     level, into = decimate(gaussians, max_count)
     if len(level) == len(gaussians):
         return level, 0.0
-    apart = np.linalg.norm(gaussians.means.astype(np.float64) - level.means[into], axis=1)
-    return level, float(np.quantile(apart, 0.95))
+    apart = gaussians.means.astype(np.float64) - level.means.take(into, axis=0)
+    return level, float(np.quantile(np.sqrt(np.einsum("nk,nk->n", apart, apart)), 0.95))
 
 
 def box_of(gaussians: Gaussians) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsmap._native import cell_means as native_cell_means
 from gsmap._native import ranks
+from gsmap.geometry.boxes import box_around
 
 
 def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -18,8 +19,8 @@ def cell_labels(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cells = np.asarray(cells).astype(np.int64)
     if not len(cells):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    cells = cells - cells.min(0)
-    sides = cells.max(0) + 1
+    low, high = box_around(cells)
+    cells, sides = cells - low, high - low + 1
     if np.prod(sides, dtype=np.float64) >= 2.0**62:  # strays very far out: one number a cell would not hold them
         _, label, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         return label.reshape(-1), counts

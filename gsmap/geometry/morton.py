@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmap.geometry.boxes import box_around
+
 BITS = 21
 """Of each axis: three fill 63 bits."""
 
@@ -12,7 +14,7 @@ def morton_order(points: np.ndarray) -> np.ndarray:
     """(N,) permutation that sorts finite points (N, 3) along a Z-order curve of cubic cells; ties keep their order."""
     if not len(points):
         return np.zeros(0, np.int64)
-    return np.argsort(morton_codes(points, np.stack([points.min(0), points.max(0)])), kind="stable")
+    return np.argsort(morton_codes(points, box_around(points)), kind="stable")
 
 
 def morton_codes(points: np.ndarray, box: np.ndarray) -> np.ndarray:

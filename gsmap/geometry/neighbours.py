@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gsmap._native import PointTree
+from gsmap.geometry.boxes import box_around
 from gsmap.geometry.cells import cell_labels
 
 _ACROSS = 64  # cells of the grid by whose order points are visited
@@ -15,10 +16,11 @@ _CHUNK = 100_000  # points that are looked at together: memory stays bounded
 
 def spatial_order(points: np.ndarray, across: int) -> np.ndarray:
     """Rows of the points (N, 3), those in one cell of a grid together; so many cells along the longest side."""
-    span = float(np.ptp(points, axis=0).max(initial=0)) if len(points) else 0.0
+    low, high = box_around(points) if len(points) else np.zeros((2, 3))
+    span = float((high - low).max())
     if span <= 0:
         return np.arange(len(points))
-    return np.argsort(cell_labels(np.floor((points - points.min(0)) * (across / span)))[0], kind="stable")
+    return np.argsort(cell_labels(np.floor((points - low) * (across / span)))[0], kind="stable")
 
 
 def chunks_of_neighbours(points: np.ndarray, k: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

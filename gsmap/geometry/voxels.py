@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap._native import group_moments
+from gsmap._native import group_moments, principal_axes
 from gsmap._native import reached_box as native_box
 from gsmap.errors import ConfigError, InputError
+from gsmap.geometry.boxes import box_around
 from gsmap.geometry.cells import cell_labels
-from gsmap.geometry.rotations import matrices_to_quats, quats_to_matrices
+from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.types import Gaussians
 
 _MAX_OPACITY = 0.9999  # an optical depth of 9.2: finite, and beyond what any renderer tells from 1
@@ -30,8 +31,9 @@ def voxel_labels(points: np.ndarray, voxel_size: float) -> np.ndarray:
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
     cells = np.floor(points / voxel_size)
-    cells -= cells.min(0)
-    extent = cells.max(0) + 1
+    low, high = box_around(cells)
+    cells -= low
+    extent = high - low + 1
     if not np.isfinite(extent).all() or np.prod(extent) >= 2**63:
         raise InputError(f"points span {extent.max():.3g} voxels of {voxel_size}: remove outliers or use larger voxels")
     return cell_labels(cells)[0]
@@ -104,7 +106,8 @@ def merge_groups(gaussians: Gaussians, labels: np.ndarray) -> tuple[Gaussians, n
     crowded = np.flatnonzero(counts > 1)
     if len(crowded) == 0:
         return merged, heaviest
-    quats, scales = _principal_axes(covariance[crowded])
+    quats, variances = principal_axes(covariance[crowded])
+    scales = np.sqrt(np.maximum(variances, 1e-20))
     opacity = -np.expm1(-total[crowded] / projected_areas(scales))
     opacity = np.clip(opacity, 1e-6, _MAX_OPACITY)
     merged.means[crowded] = means[crowded]
@@ -113,10 +116,3 @@ def merge_groups(gaussians: Gaussians, labels: np.ndarray) -> tuple[Gaussians, n
     merged.logit_opacities[crowded] = np.log(opacity) - np.log1p(-opacity)
     merged.sh[crowded] = averaged[crowded].reshape(len(crowded), -1, 3)
     return merged, heaviest
-
-
-def _principal_axes(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quaternions (N, 4) and standard deviations (N, 3) of covariance matrices (N, 3, 3)."""
-    variances, axes = np.linalg.eigh(covariance)
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    return matrices_to_quats(axes), np.sqrt(np.maximum(variances, 1e-20))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsmap.geometry.boxes import box_around
 from gsmap.geometry.projection import in_image, project
 from gsmap.types import Cameras, Gaussians, PlacedScene
 
@@ -30,8 +31,8 @@ def overlapping(a: PlacedScene, b: PlacedScene) -> bool:
     """Whether the boxes around two scenes' means meet: cheap, and spares comparing captures of different places."""
     if len(a.gaussians) == 0 or len(b.gaussians) == 0:
         return False
-    low = np.maximum(a.gaussians.means.min(0), b.gaussians.means.min(0))
-    return bool((low <= np.minimum(a.gaussians.means.max(0), b.gaussians.means.max(0))).all())
+    (a_low, a_high), (b_low, b_high) = (box_around(scene.gaussians.means) for scene in (a, b))
+    return bool((np.maximum(a_low, b_low) <= np.minimum(a_high, b_high)).all())
 
 
 def share_in_view(cameras: Cameras, points: np.ndarray, sample: int = 2000) -> np.ndarray:

@@ -9,6 +9,7 @@
 
 #include "arrays.h"
 #include "point_tree.h"
+#include "symmetric.h"
 #include "threads.h"
 
 namespace gsmap {
@@ -39,33 +40,10 @@ struct Facing {
     bool operator()(int32_t row) const { return !own || dot(faces + 3 * std::size_t(row), own) > kOpposed; }
 };
 
-// The unit vector of least spread of a symmetric matrix (xx, xy, xz, yy, yz, zz), by cyclic Jacobi rotations.
+// The unit vector of least spread of a symmetric matrix (xx, xy, xz, yy, yz, zz).
 void least_axis(const double *m, double *out) {
-    double a[3][3] = {{m[0], m[1], m[2]}, {m[1], m[3], m[4]}, {m[2], m[4], m[5]}};
-    double v[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
-    for (int sweep = 0; sweep < 12; ++sweep) {
-        const double off = std::abs(a[0][1]) + std::abs(a[0][2]) + std::abs(a[1][2]);
-        if (!(off > 1e-18 * (std::abs(a[0][0]) + std::abs(a[1][1]) + std::abs(a[2][2])))) break;
-        for (int p = 0; p < 2; ++p)
-            for (int q = p + 1; q < 3; ++q) {
-                if (a[p][q] == 0) continue;
-                const double theta = (a[q][q] - a[p][p]) / (2 * a[p][q]);
-                const double t = (theta < 0 ? -1 : 1) / (std::abs(theta) + std::sqrt(theta * theta + 1));
-                const double c = 1 / std::sqrt(t * t + 1), s = t * c;
-                for (int k = 0; k < 3; ++k) {
-                    const double x = a[k][p], y = a[k][q];
-                    a[k][p] = c * x - s * y, a[k][q] = s * x + c * y;
-                }
-                for (int k = 0; k < 3; ++k) {
-                    const double x = a[p][k], y = a[q][k];
-                    a[p][k] = c * x - s * y, a[q][k] = s * x + c * y;
-                }
-                for (int k = 0; k < 3; ++k) {
-                    const double x = v[k][p], y = v[k][q];
-                    v[k][p] = c * x - s * y, v[k][q] = s * x + c * y;
-                }
-            }
-    }
+    double a[3][3] = {{m[0], m[1], m[2]}, {m[1], m[3], m[4]}, {m[2], m[4], m[5]}}, v[3][3];
+    diagonalise(a, v);
     int least = 0;
     for (int k = 1; k < 3; ++k)
         if (a[k][k] < a[least][least]) least = k;

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsmap.errors import CorruptError
 from gsmap.formats.quantise import from_smallest_three, logits_of_bytes, opacity_bytes, smallest_three
+from gsmap.geometry.boxes import box_around
 from gsmap.store.layout import CHUNK_ROWS, Shape
 from gsmap.types import Gaussians
 
@@ -35,9 +36,9 @@ def pack(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """
     n, k = gaussians.sh.shape[:2]
     starts = np.arange(0, n, CHUNK_ROWS)
-    low = np.stack([gaussians.means[s : s + CHUNK_ROWS].min(0) for s in starts]) if n else np.zeros((0, 3))
-    high = np.stack([gaussians.means[s : s + CHUNK_ROWS].max(0) for s in starts]) if n else np.zeros((0, 3))
-    boxes = np.stack([low, high], axis=1).astype(np.float64)
+    boxes = np.zeros((len(starts), 2, 3))
+    for box, start in zip(boxes, starts, strict=True):
+        box[:] = box_around(gaussians.means[start : start + CHUNK_ROWS])
     chunk = np.arange(n) // CHUNK_ROWS
     size = np.maximum(boxes[:, 1] - boxes[:, 0], 1e-30)
     means = np.round((gaussians.means - boxes[chunk, 0]) / size[chunk] * _LEVELS_16)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gsmap.geometry.boxes import box_around
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.gaussians import FIELDS
 
@@ -43,6 +44,5 @@ def blocks(source: GaussianSource, rows: int) -> Iterator[Gaussians]:
 
 def bounds(source: GaussianSource) -> np.ndarray:
     """(2, 3) float32 lowest and highest coordinates of the means of a source that is not empty."""
-    found = [(means.min(0), means.max(0)) for means in source.columns("means") if len(means)]
-    lows, highs = zip(*found, strict=True)
-    return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
+    corners = [box_around(means) for means in source.columns("means") if len(means)]
+    return box_around(np.concatenate(corners))

@@ -18,13 +18,13 @@ import numpy as np
 from gsmap.errors import ConfigError, InputError
 from gsmap.formats import tiles3d
 from gsmap.formats.tiles3d import CONTENT_FOLDER, TileNode
-from gsmap.geometry.boxes import robust_box
+from gsmap.geometry.boxes import box_around, robust_box
 from gsmap.geometry.morton import BITS, morton_codes
 from gsmap.geometry.voxels import axis_deviations, merge_groups, optical_depths, projected_areas
 from gsmap.types import Gaussians, GaussianSource
 from gsmap.types.progress import Progress
 
-VERSION = 3
+VERSION = 4
 """Of what is made: another one makes all trees and sketches anew."""
 
 FILE_NAME = "tileset.json"
@@ -268,7 +268,7 @@ def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
     twentieth of the Gaussians lie beyond from the one that stands for them."""
     if len(gaussians) <= max_count:
         return gaussians, 0.0
-    codes = morton_codes(gaussians.means, np.stack([gaussians.means.min(0), gaussians.means.max(0)]))
+    codes = morton_codes(gaussians.means, box_around(gaussians.means))
     ordered = np.sort(codes)
     low, high = 0, 3 * BITS
     while low < high:  # the least shift that leaves few enough
@@ -286,9 +286,8 @@ def _merged(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
 def _codes(source: GaussianSource) -> np.ndarray:
     """(N,) uint64 places along the curve, in ascending order."""
     means = np.concatenate(list(source.columns("means")))
-    box = np.stack([means.min(0), means.max(0)])
     # A thinned scene's means are rounded, so that neighbours may have changed places.
-    return np.maximum.accumulate(morton_codes(means, box))
+    return np.maximum.accumulate(morton_codes(means, box_around(means)))
 
 
 def _octree(codes: np.ndarray, max_leaf: int) -> _Cell:

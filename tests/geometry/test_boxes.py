@@ -1,11 +1,18 @@
-"""The corners of a box, against those counted by hand."""
+"""Boxes, against those counted by hand."""
 
 import numpy as np
 
-from gsmap.geometry.boxes import box_corners
+from gsmap.geometry.boxes import box_around, box_corners
 
 
 def test_corners_come_in_the_order_of_their_bits():
     corners = box_corners(np.array([[0, 1, 2], [5, 6, 7]]))
     expected = [[0, 1, 2], [5, 1, 2], [0, 6, 2], [5, 6, 2], [0, 1, 7], [5, 1, 7], [0, 6, 7], [5, 6, 7]]
     assert corners.tolist() == expected
+
+
+def test_a_box_around_points_keeps_what_they_are_counted_in():
+    for kind in (np.float32, np.float64, np.int64):
+        box = box_around(np.array([[3, -1, 2], [0, 7, 2], [1, 1, -5]], kind))
+        assert box.dtype == kind
+        assert box.tolist() == [[0, -1, -5], [3, 7, 2]]

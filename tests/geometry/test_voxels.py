@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from gsmap._native import principal_axes
 from gsmap.errors import ConfigError, InputError
+from gsmap.geometry.rotations import quats_to_matrices
 from gsmap.geometry.voxels import (
     axis_deviations,
     covariances,
@@ -100,3 +102,26 @@ def test_deviations_along_the_axes_are_those_of_the_covariances():
     g = Gaussians(np.zeros((n, 3)), quats, rng.normal(-3, 1, (n, 3)), np.zeros(n), np.zeros((n, 1, 3)))
     expected = np.sqrt(np.diagonal(covariances(g), axis1=1, axis2=2))
     np.testing.assert_allclose(axis_deviations(g), expected, rtol=1e-12)
+
+
+def test_principal_axes_are_those_of_numpy_and_turn_without_a_mirror():
+    rng = np.random.default_rng(5)
+    axes = quats_to_matrices(rng.normal(size=(400, 4)))
+    axes[:30] = np.eye(3)[rng.permuted(np.tile([0, 1, 2], (30, 1)), axis=1)]  # already diagonal
+    deviations = np.exp(rng.uniform(-9, 1, (400, 3)))
+    deviations[100:200, 1] = deviations[100:200, 0]  # two axes alike, then three, then a disc without thickness
+    deviations[200:250] = deviations[200:250, :1]
+    deviations[250:300, 2] = 0.0
+    covariance = (axes * deviations[:, None] ** 2) @ axes.transpose(0, 2, 1)
+    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
+
+    quats, variances = principal_axes(covariance)
+
+    size = covariance.max((1, 2))
+    turned = quats_to_matrices(quats)
+    assert (
+        np.abs((turned * variances[:, None]) @ turned.transpose(0, 2, 1) - covariance).max((1, 2)) < 1e-13 * size
+    ).all()
+    assert (np.abs(np.sort(variances, axis=1) - np.linalg.eigh(covariance)[0]).max(1) < 1e-13 * size).all()
+    assert (quats[:, 0] >= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1.0, rtol=0, atol=1e-14)

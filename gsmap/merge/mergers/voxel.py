@@ -13,7 +13,7 @@ from gsmap.merge.placed import united
 from gsmap.types import MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 1
+VERSION = 2
 STEPS: str | None = None
 RENDERS = False
 
