@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -29,9 +30,20 @@ def command(
     verb = "would drop" if dry_run else "dropped"
     for name in report.scene_names:
         say(f"{verb} the arrays of {name}")
-    for number in report.revisions:
-        say(f"{verb} revision {number}")
+    for first, last in _runs(report.revisions):
+        say(f"{verb} revision {first}" if first == last else f"{verb} revisions {first} to {last}")
     if json:
         print_rows("prune", report, json)
     else:
         print(f"{'would free' if dry_run else 'freed'} {report.num_bytes / 1e6:.1f} MB")
+
+
+def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of numbers that follow one another."""
+    out: list[tuple[int, int]] = []
+    for number in sorted(numbers):
+        if out and number == out[-1][1] + 1:
+            out[-1] = (out[-1][0], number)
+        else:
+            out.append((number, number))
+    return out

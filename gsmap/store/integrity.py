@@ -82,7 +82,8 @@ class Pruned:
         scenes: names of removed scenes whose arrays were dropped.
         revisions: numbers that can no longer be exported in full.
         num_graphs, num_orphans, num_models: graphs, folders without a row, and copies of models that were forgotten.
-        num_bytes: on disk, of all of these, of replaced graphs, and of what dead writers left.
+        num_bytes: on disk, of all of these, of replaced graphs, and of what dead writers left; and by how much the
+            catalog's file shrank, which no dry run knows.
         dry_run: nothing was changed.
     """
 
@@ -191,7 +192,7 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
                 _drop_rows(catalog, waste)
             # The rows are gone for good: a crash from here on leaves orphans for the next prune of any branch.
             num_bytes += reclaim(catalog, arrays).num_bytes
-            _give_back(catalog)
+            num_bytes += _give_back(catalog)
     return Pruned(
         scenes=tuple(name for name, _ in waste.scenes),
         revisions=tuple(waste.revisions),
@@ -203,17 +204,24 @@ def _prune(catalog: Catalog, arrays: Arrays, keep_revisions: int | None, dry_run
     )
 
 
-def _give_back(catalog: Catalog) -> None:
-    """Give the room of rows that are gone back to the disk, where it is worth it. (A server does so by itself.)"""
+def _give_back(catalog: Catalog) -> int:
+    """Give the room of rows that are gone back to the disk, where it is worth it. (A server does so by itself.)
+
+    Returns:
+        By how many bytes the catalog's file is smaller.
+    """
     if not catalog.is_sqlite:
-        return
+        return 0
     file = catalog.folder / sqlite.FILE
     try:
         with explained(catalog.folder):
-            if sqlite.num_free_bytes(catalog.engine) > max(_WORTH_BYTES, _WORTH_SHARE * file.stat().st_size):
+            before = file.stat().st_size
+            if sqlite.num_free_bytes(catalog.engine) > max(_WORTH_BYTES, _WORTH_SHARE * before):
                 sqlite.vacuum(catalog.engine, file)
+            return max(0, before - file.stat().st_size)
     except StoreError as error:  # a full disk, or a reader: what is gone is gone, and its room is used again
         _log.warning("%s keeps the room of what was dropped: %s", sqlite.FILE, error)
+        return 0
 
 
 @dataclass(frozen=True)

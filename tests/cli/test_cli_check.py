@@ -1,4 +1,4 @@
-"""``gsmap check``: what it says of a catalog that differs, that cannot be verified, that a person accepts."""
+"""``gsmap check`` and ``prune``: what they say of a catalog that differs, that a person accepts, that shrinks."""
 
 import sqlite3
 
@@ -6,6 +6,7 @@ import pytest
 
 import gsmap.map
 from gsmap.cli.app import run
+from gsmap.types import PoseGraph
 
 
 @pytest.fixture
@@ -47,3 +48,13 @@ def test_a_catalog_that_cannot_be_verified_is_not_called_whole(path, capfd):
     assert code == 0
     assert out.startswith("cannot verify the catalog: ")
     assert "is whole" not in err
+
+
+def test_revisions_that_follow_one_another_are_dropped_in_one_line(path, capfd):
+    with gsmap.map.open(path) as m:
+        for _ in range(5):
+            m.store.revisions.save(PoseGraph({}))
+    _, _, err = said(capfd, "prune", str(path), "--keep-revisions", "3")
+    assert err.splitlines() == ["dropped revisions 1 to 2"]
+    _, _, err = said(capfd, "prune", str(path), "--keep-revisions", "2")
+    assert err.splitlines() == ["dropped revision 3"]

@@ -191,7 +191,7 @@ class PruneReport(Row):
         revisions: numbers of revisions that can no longer be exported.
         num_graphs: graphs that go.
         num_orphans: folders left by interrupted work that go.
-        num_bytes: bytes on disk that this frees.
+        num_bytes: bytes on disk that this frees; a dry run does not know by how much the catalog would shrink.
     """
 
     columns: ClassVar[Mapping[str, str]] = {
