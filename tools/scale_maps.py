@@ -23,7 +23,11 @@ import numpy as np
 from spent import spent, statements
 from sqlalchemy import insert, select
 
+import gsmap.describe
 import gsmap.map
+import gsmap.optimize
+import gsmap.register
+import gsmap.retrieve
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.similarities import exp
 from gsmap.map import Map
@@ -286,7 +290,15 @@ def filled(path: Path, num: int, made: Pattern, *, asked: bool = False) -> Itera
 
 @contextmanager
 def kept(path: Path, num: int, made: Pattern, scratch: Path, *, asked: bool = False) -> Iterator[Filled]:
-    """A copy of such a map, which is filled only where there is none at a path."""
+    """A copy of such a map, which is filled only where there is none at a path that today's recipes would leave so."""
+    keys = (
+        gsmap.describe.recipe_key(),
+        gsmap.register.recipe_key(),
+        gsmap.retrieve.recipe_key(gsmap.retrieve.Params()),
+        gsmap.optimize.recipe_key(gsmap.optimize.Params()),
+    )
+    made_by = "".join(key.recipe for key in keys)
+    path = path.with_name(f"{path.name}-{hashlib.sha256(made_by.encode()).hexdigest()[:12]}")
     if not path.exists():
         partial = path.with_suffix(".partial")
         shutil.rmtree(partial, ignore_errors=True)
