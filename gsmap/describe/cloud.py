@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.geometry.boxes import are_finite, box_around
 from gsmap.geometry.cells import cell_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.floaters import find_floaters
@@ -45,20 +46,22 @@ def surface_cloud(gaussians: Gaussians, params: Params | None = None) -> Cloud:
         Points in the Gaussians' frame and unit.
     """
     params = params or Params()
-    scale = gaussians.scales.max(1, initial=0)
-    finite = np.isfinite(gaussians.means).all(1) & np.isfinite(scale) & np.isfinite(gaussians.sh[:, 0]).all(1)
+    x, y, z = gaussians.scales.T
+    scale = np.maximum(np.maximum(x, y), z)
+    finite = are_finite(gaussians.means) & np.isfinite(scale) & are_finite(gaussians.sh[:, 0])
     keep = np.flatnonzero((gaussians.opacities > params.min_opacity) & finite)
     if len(keep):
         keep = keep[scale[keep] <= params.max_relative_scale * np.median(scale[keep])]
-    points = gaussians.means[keep].astype(np.float64)
-    lab = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[keep, 0]), 0.0, 1.0))
+    points = gaussians.means.take(keep, axis=0).astype(np.float64)
+    lab = srgb_to_lab(np.clip(rgb_of_sh0(gaussians.sh[:, 0].take(keep, axis=0)), 0.0, 1.0))
     stray, spacing = find_floaters(points, lab, params.floater_lab)
-    return Cloud(points[~stray], lab[~stray], np.pi / 8 * spacing[~stray] ** 2, keep[~stray])
+    rows = np.flatnonzero(~stray)
+    return Cloud(points.take(rows, axis=0), lab.take(rows, axis=0), np.pi / 8 * spacing[rows] ** 2, keep[rows])
 
 
 def downsample(points: np.ndarray, values: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean position and mean value of the points of each occupied cell of a grid; ``values`` is (N, 3)."""
-    return cell_means(points, values, cell, origin=points.min(0) if len(points) else None)[:2]
+    return cell_means(points, values, cell, origin=box_around(points)[0] if len(points) else None)[:2]
 
 
 def local_planes(points: np.ndarray, num_neighbours: int = 16) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,13 @@ def box_around(points: np.ndarray) -> np.ndarray:
     return np.array([[column.min() for column in columns], [column.max() for column in columns]])
 
 
+def are_finite(points: np.ndarray) -> np.ndarray:
+    """(N,) which points (N, 3) have no NaN nor infinity."""
+    x, y, z = (np.isfinite(column) for column in points.T)
+    result: np.ndarray = x & y & z
+    return result
+
+
 def inside(points: np.ndarray, bounds: np.ndarray | None, margin: float = 0.0) -> np.ndarray:
     """(N,) which points (N, 3) lie in bounds (2, 3) grown by a margin (``low <= x < high``); all if None."""
     if bounds is None:

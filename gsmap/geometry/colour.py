@@ -10,9 +10,19 @@ _XYZ_RGB = np.array(
 _WHITE_D65 = np.array([0.95047, 1.0, 1.08883])
 
 
+_BLOCK = 32_768  # colours at a time: what lies between stays in the processor's cache
+
+
 def srgb_to_lab(rgb: np.ndarray) -> np.ndarray:
     """CIE L*a*b* (..., 3) float32 of sRGB (..., 3) in [0, 1] (IEC 61966-2-1, white D65)."""
-    rgb = np.clip(np.asarray(rgb, dtype=np.float64), 0.0, 1.0)
+    rgb = np.asarray(rgb)
+    if rgb.ndim == 2 and len(rgb) > _BLOCK:
+        return np.concatenate([_lab(rgb[i : i + _BLOCK]) for i in range(0, len(rgb), _BLOCK)])
+    return _lab(rgb)
+
+
+def _lab(rgb: np.ndarray) -> np.ndarray:
+    rgb = np.clip(rgb.astype(np.float64), 0.0, 1.0)
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     xyz = linear @ _XYZ_RGB.T / _WHITE_D65
     f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)

@@ -17,12 +17,25 @@ def project(points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.nd
         (N, 2) pixel coordinates ``column row`` (the first pixel's centre is 0.5 0.5), which mean nothing where the
         depth is not positive; and (N,) depth along the camera's axis.
     """
+    column, row, z = project_all(points, T_camera_frame, intrinsics_px)
+    return np.stack([column, row], axis=1), z
+
+
+def project_all(
+    points: np.ndarray, T_camera_frame: np.ndarray, intrinsics_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns, rows and depths (..., N) of points (N, 3), as `project` gives them, in one image or in many at once.
+
+    Args:
+        T_camera_frame: (..., 4, 4).
+        intrinsics_px: (..., 4).
+    """
     view = np.asarray(T_camera_frame).astype(points.dtype, copy=False)
-    fx, fy, cx, cy = (points.dtype.type(value) for value in intrinsics_px)
-    local = points @ view[:3, :3].T + view[:3, 3]
-    z = local[:, 2]
+    fx, fy, cx, cy = np.moveaxis(np.asarray(intrinsics_px).astype(points.dtype)[..., None], -2, 0)
+    local = points @ view[..., :3, :3].swapaxes(-1, -2) + view[..., None, :3, 3]
+    z = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return np.stack([fx * local[:, 0] / z + cx, fy * local[:, 1] / z + cy], axis=1), z
+        return fx * local[..., 0] / z + cx, fy * local[..., 1] / z + cy, z
 
 
 def in_image(pixels: np.ndarray, depth: np.ndarray, size_px: np.ndarray, near: float = 0.0) -> np.ndarray:
@@ -47,9 +60,11 @@ def on_surface(
     Returns:
         (n,) rows of the points, and the pixels (n, 2) int64 ``column row`` they fall on.
     """
-    at, z = project(points, T_camera_frame, intrinsics_px)
-    rows = np.flatnonzero(in_image(at, z, np.array(depth.shape[::-1]), 1e-9))
-    pixel = at[rows].astype(np.int64)
+    column, row, z = project_all(points, T_camera_frame, intrinsics_px)
+    height, width = depth.shape
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero((z > 1e-9) & (column >= 0) & (column < width) & (row >= 0) & (row < height))
+    pixel = np.stack([column[rows], row[rows]], axis=1).astype(np.int64)
     surface = depth[pixel[:, 1], pixel[:, 0]]
     rows, pixel, surface = rows[surface > 0], pixel[surface > 0], surface[surface > 0]
     on = np.abs(z[rows] - surface) < tolerance * surface

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "arrays.h"
+#include "memory.h"
 
 namespace gsmap {
 namespace {
@@ -25,12 +26,12 @@ struct Keyed {
 };
 
 // Sorts by the key, equal ones as they come: digit by digit from the lowest, digits that all have in common left out.
-void sort(std::vector<Keyed> &values) {
+void sort(Many<Keyed> &values) {
     constexpr int kBits = 11;
     constexpr uint64_t kDigits = 1 << kBits;
     uint64_t most = 0;
     for (const Keyed &v : values) most = std::max(most, v.key);
-    std::vector<Keyed> other(values.size());
+    Many<Keyed> other(values.size());
     for (int shift = 0; shift < 64 && most >> shift; shift += kBits) {
         std::array<std::size_t, kDigits + 1> begin{};
         for (const Keyed &v : values) ++begin[(v.key >> shift) % kDigits + 1];
@@ -42,8 +43,8 @@ void sort(std::vector<Keyed> &values) {
 }
 
 // The rank of each key among those that occur, and how often each of these does.
-void rank(const int64_t *keys, std::size_t count, std::vector<int64_t> &label, std::vector<int64_t> &times) {
-    std::vector<Keyed> sorted(count);
+void rank(const int64_t *keys, std::size_t count, Many<int64_t> &label, std::vector<int64_t> &times) {
+    Many<Keyed> sorted(count);
     for (std::size_t i = 0; i < count; ++i) sorted[i] = {uint64_t(keys[i]), int64_t(i)};
     sort(sorted);
     label.resize(count);
@@ -54,18 +55,26 @@ void rank(const int64_t *keys, std::size_t count, std::vector<int64_t> &label, s
     }
 }
 
+// std::floor, without the call that older processors need for it.
+inline double floor_of(double v) {
+    if (!(std::abs(v) < 0x1p52)) return v;  // has no fraction
+    const double whole = double(int64_t(v));
+    return whole - (v < whole);
+}
+
 // Weighted means of the points in each cell of a grid, and of three values of each, in the order of the cells.
 struct Means {
-    std::vector<double> points, values, weights;
+    Many<double> points, values, weights;
 
     Means(const Points &all, const Points &of, const double *weight, const double *origin, double cell) {
         const std::size_t count = all.shape(0);
-        std::vector<Keyed> sorted(count);
+        Many<Keyed> sorted(count);
         double low[3] = {__builtin_inf(), __builtin_inf(), __builtin_inf()}, high[3] = {-low[0], -low[0], -low[0]};
-        for (std::size_t i = 0; i < 3 * count; ++i) {
-            low[i % 3] = std::min(low[i % 3], all.data()[i]);
-            high[i % 3] = std::max(high[i % 3], all.data()[i]);
-        }
+        for (std::size_t i = 0; i < count; ++i)
+            for (int k = 0; k < 3; ++k) {
+                low[k] = std::min(low[k], all.data()[3 * i + k]);
+                high[k] = std::max(high[k], all.data()[3 * i + k]);
+            }
         uint64_t side[3] = {};
         double cells = 1;
         for (int k = 0; count && k < 3; ++k) {
@@ -77,7 +86,7 @@ struct Means {
         for (std::size_t i = 0; i < count; ++i) {
             uint64_t key = 0;
             for (int k = 0; k < 3; ++k)
-                key = key * side[k] + uint64_t(std::floor((all.data()[3 * i + k] - origin[k]) / cell) - low[k]);
+                key = key * side[k] + uint64_t(floor_of((all.data()[3 * i + k] - origin[k]) / cell) - low[k]);
             sorted[i] = {key, int64_t(i)};
         }
         sort(sorted);
@@ -113,7 +122,8 @@ void bind_cells(nb::module_ &m) {
         [](Keys keys) {
             for (std::size_t i = 0; i < keys.shape(0); ++i)
                 if (keys.data()[i] < 0) throw std::invalid_argument("keys must not be negative");
-            std::vector<int64_t> label, times;
+            Many<int64_t> label;
+            std::vector<int64_t> times;
             {
                 nb::gil_scoped_release release;
                 rank(keys.data(), keys.shape(0), label, times);

@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "arrays.h"
+#include "memory.h"
 
 namespace gsmap {
 namespace {
@@ -47,13 +48,19 @@ struct Grid {
     static constexpr int WIDTH = SEGMENT * CHANNELS;  // values of a segment
 };
 
-// Values of one cell, and of half a segment; wherever they lie.
+// Values of one cell, and of a segment; wherever they lie.
 typedef float Cell __attribute__((vector_size(16), aligned(4), may_alias));
-typedef float Half __attribute__((vector_size(32), aligned(4), may_alias));
-static_assert(2 * sizeof(Half) == Grid::WIDTH * sizeof(float) && sizeof(Cell) == CHANNELS * sizeof(float));
+typedef float Segment __attribute__((vector_size(64), aligned(4), may_alias));
+static_assert(sizeof(Segment) == Grid::WIDTH * sizeof(float) && sizeof(Cell) == CHANNELS * sizeof(float));
 
-using Field = std::vector<float>;
+using Field = Many<float>;
 using Flags = std::vector<std::uint64_t>;  // a word for each row
+
+// std::floor of what an int holds, without the call that older processors need for it.
+inline int floor_of(double v) {
+    const int i = int(v);
+    return i - (v < i);
+}
 
 // Calls visit(segment) for each that is flagged.
 template <class Visit> void each(std::uint64_t flags, Visit visit) {
@@ -85,7 +92,7 @@ void both(Flags &flags, const Flags &others) {
 
 // Wider vectors where the processor has them; nothing is contracted, so all give the same bits.
 #if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
-#define WIDE __attribute__((target_clones("avx2", "default")))
+#define WIDE __attribute__((target_clones("avx512f", "avx2", "default")))
 #else
 #define WIDE
 #endif
@@ -102,15 +109,11 @@ WIDE void pass_across(const Grid &g, int x, int axis, const std::vector<float> &
         const std::size_t row = g.row(x, y);
         for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
             const int s = __builtin_ctzll(left);
-            Half first = {}, second = {};
-            for (int k = from; k <= to; ++k) {
-                if (!(filled[row + k * step] >> s & 1)) continue;
-                const Half *source = reinterpret_cast<const Half *>(&in[g.at(row + k * step - first_in, s)]);
-                first += taps[k + reach] * source[0];
-                second += taps[k + reach] * source[1];
-            }
-            Half *target = reinterpret_cast<Half *>(&out[g.at(y, s)]);
-            target[0] = first, target[1] = second;
+            Segment sum = {};
+            for (int k = from; k <= to; ++k)
+                if (filled[row + k * step] >> s & 1)
+                    sum += taps[k + reach] * *reinterpret_cast<const Segment *>(&in[g.at(row + k * step - first_in, s)]);
+            *reinterpret_cast<Segment *>(&out[g.at(y, s)]) = sum;
         }
     }
 }
@@ -120,7 +123,7 @@ WIDE void pass_along(const Grid &g, int x, const std::vector<float> &taps, const
                      Field &out, const Flags &wanted) {
     const int reach = int(taps.size()) / 2;
     const int margin = (reach + SEGMENT - 1) / SEGMENT;  // segments
-    Field line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH, 0.f);
+    Field line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH);
     for (int y = 0; y < g.ny; ++y) {
         const std::size_t row = g.row(x, y);
         if (!wanted[row]) continue;
@@ -131,14 +134,11 @@ WIDE void pass_along(const Grid &g, int x, const std::vector<float> &taps, const
         }
         for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
             const int s = __builtin_ctzll(left);
-            Half first = {}, second = {};
+            Segment sum = {};
             const float *source = &line[(s + margin) * Grid::WIDTH - reach * CHANNELS];
-            for (std::size_t k = 0; k < taps.size(); ++k, source += CHANNELS) {
-                first += taps[k] * reinterpret_cast<const Half *>(source)[0];
-                second += taps[k] * reinterpret_cast<const Half *>(source)[1];
-            }
-            Half *target = reinterpret_cast<Half *>(&out[g.at(row, s)]);
-            target[0] = first, target[1] = second;
+            for (std::size_t k = 0; k < taps.size(); ++k, source += CHANNELS)
+                sum += taps[k] * *reinterpret_cast<const Segment *>(source);
+            *reinterpret_cast<Segment *>(&out[g.at(row, s)]) = sum;
         }
     }
 }
@@ -184,12 +184,12 @@ struct Run {
     std::size_t begin, end;
 };
 
-// All points as runs, by their blocks.
-std::vector<Run> runs_of(const Points &points, double edge) {
+// All points as runs, by their blocks of cells of a size.
+std::vector<Run> runs_of(const Points &points, double size, double edge) {
     std::vector<Run> runs;
     for (std::size_t i = 0; i < points.shape(0); ++i) {
         BlockIndex block;
-        for (int k = 0; k < 3; ++k) block[k] = std::floor(points.data()[3 * i + k] / edge);
+        for (int k = 0; k < 3; ++k) block[k] = std::floor(points.data()[3 * i + k] / size / edge);
         if (runs.empty() || runs.back().block != block) runs.push_back({block, i, i});
         runs.back().end = i + 1;
     }
@@ -219,26 +219,28 @@ std::vector<Run> runs_near(const std::vector<Run> &runs, const BlockIndex &block
 
 // Points of one block and its halo, in cells, their colours and areas; and the block's least corner and shape.
 struct Block {
-    std::vector<double> points, lab, areas;
+    Many<double> points, lab, areas;
     double low[3] = {};
     int shape[3] = {};
 
-    Block(const Points &all, const Points &colours, const Numbers &sizes, const std::vector<Run> &near,
-          const double *core, double edge, double halo) {
+    // In place of what was in it, whose memory is used again.
+    void fill(const Points &all, const Points &colours, const Numbers &sizes, double size, double square,
+              const std::vector<Run> &near, const double *core, double edge, double halo) {
         double high[3] = {};
+        points.clear(), lab.clear(), areas.clear();
         for (const Run &run : near)
             for (std::size_t i = run.begin; i < run.end; ++i) {
-                const double *at = all.data() + 3 * i;
+                double at[3];
                 bool inside = true;
+                for (int k = 0; k < 3; ++k) at[k] = all.data()[3 * i + k] / size;
                 for (int k = 0; k < 3; ++k) inside &= at[k] >= core[k] - halo && at[k] < core[k] + edge + halo;
                 if (!inside) continue;
                 for (int k = 0; k < 3; ++k) {
                     low[k] = areas.empty() ? at[k] : std::min(low[k], at[k]);
                     high[k] = areas.empty() ? at[k] : std::max(high[k], at[k]);
                 }
-                points.insert(points.end(), at, at + 3);
-                lab.insert(lab.end(), colours.data() + 3 * i, colours.data() + 3 * i + 3);
-                areas.push_back(sizes.data()[i]);
+                for (int k = 0; k < 3; ++k) points.push_back(at[k]), lab.push_back(colours.data()[3 * i + k]);
+                areas.push_back(sizes.data()[i] / square);
             }
         for (int k = 0; k < 3; ++k) {  // room for extrema just off the surface
             low[k] = std::floor(low[k]) - 3;
@@ -248,24 +250,26 @@ struct Block {
 };
 
 // Trilinear splatting of the points' surface, and of it times their colours, into cells; flags the segments.
-void splat(const Grid &g, const Block &block, Field &out, Flags &filled) {
+WIDE void splat(const Grid &g, const Block &block, Field &out, Flags &filled) {
+    typedef double Values __attribute__((vector_size(32)));
     for (std::size_t i = 0; i < block.areas.size(); ++i) {
         const double *lab = &block.lab[3 * i], area = block.areas[i];
-        const double values[CHANNELS] = {area * (lab[0] - 50.0), area * lab[1], area * lab[2], area};
+        const Values values = {area * (lab[0] - 50.0), area * lab[1], area * lab[2], area};
         int base[3];
         double t[3];
         for (int k = 0; k < 3; ++k) {
             const double at = block.points[3 * i + k] - block.low[k] - 0.5;
-            base[k] = int(std::floor(at));
+            base[k] = floor_of(at);
             t[k] = at - base[k];
         }
-        for (int corner = 0; corner < 8; ++corner) {
-            const int dx = corner >> 2, dy = corner >> 1 & 1, dz = corner & 1;
-            const double share = (dx ? t[0] : 1 - t[0]) * (dy ? t[1] : 1 - t[1]) * (dz ? t[2] : 1 - t[2]);
-            const Cell part = {float(share * values[0]), float(share * values[1]), float(share * values[2]),
-                               float(share * values[3])};
-            *reinterpret_cast<Cell *>(&out[g.cell(base[0] + dx, base[1] + dy, base[2] + dz)]) += part;
-            filled[g.row(base[0] + dx, base[1] + dy)] |= std::uint64_t(1) << (base[2] + dz) / SEGMENT;
+        const int segment = base[2] / SEGMENT, next = (base[2] + 1) / SEGMENT;
+        for (int side = 0; side < 4; ++side) {
+            const int dx = side >> 1, dy = side & 1;
+            const double across = (dx ? t[0] : 1 - t[0]) * (dy ? t[1] : 1 - t[1]);
+            float *cell = &out[g.cell(base[0] + dx, base[1] + dy, base[2])];
+            *reinterpret_cast<Cell *>(cell) += __builtin_convertvector(across * (1 - t[2]) * values, Cell);
+            *reinterpret_cast<Cell *>(cell + CHANNELS) += __builtin_convertvector(across * t[2] * values, Cell);
+            filled[g.row(base[0] + dx, base[1] + dy)] |= std::uint64_t(1) << segment | std::uint64_t(1) << next;
         }
     }
 }
@@ -306,9 +310,9 @@ struct Work {
 
     void fit(const Grid &g) {
         for (Field *f : {&field, &smooth})
-            if (f->size() < g.values()) *f = Field(g.values(), 0.f);
+            if (f->size() < g.values()) f->resize(g.values());
         for (Field *f : {&a, &b})
-            if (f->size() < g.at(g.ny, 0)) *f = Field(g.at(g.ny, 0), 0.f);
+            if (f->size() < g.at(g.ny, 0)) f->resize(g.at(g.ny, 0));
     }
 };
 
@@ -350,21 +354,28 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
                 response[cell + 3] = mass * plane - 1;
             }
         });
-    float about[CHANNELS];  // no more than the thresholds: most cells are far below
+    Cell about;  // no more than the thresholds: most cells are far below
     for (int c = 0; c < CHANNELS; ++c) about[c] = std::nextafter(float(thresholds[c]), 0.f);
+    const auto is_far_below = [&](const Cell &cell) {
+        const auto high = (cell >= about) | (-cell >= about);  // of all channels at once
+        std::int64_t any[2];
+        std::memcpy(any, &high, sizeof any);
+        return !(any[0] | any[1]);
+    };
     std::vector<Extremum> found;
     for (int x = 0; x < g.nx; ++x)
         for (int y = 0; y < g.ny; ++y)
             each(surface[g.row(x, y)], [&](int s) {
-                for (int z = s * SEGMENT; z < std::min((s + 1) * SEGMENT, shape[2]); ++z)
+                for (int z = s * SEGMENT; z < std::min((s + 1) * SEGMENT, shape[2]); ++z) {
+                    if (is_far_below(of(response, g.cell(x, y, z)))) continue;
                     for (int c = 0; c < CHANNELS; ++c) {
                         const float value = response[g.cell(x, y, z) + c];
-                        if (std::abs(value) < about[c]) continue;
                         if (value > thresholds[c])
                             maximum(g, response, shape, x, y, z, c, 1.f, thresholds[c], found);
                         else if (c < 3 && -value > thresholds[c])
                             maximum(g, response, shape, x, y, z, c, -1.f, thresholds[c], found);
                     }
+                }
             });
     empty(g, response, surface);
     return found;
@@ -375,11 +386,12 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
 void bind_landmarks(nb::module_ &m) {
     m.def(
         "landmark_extrema",
-        [](Points points, Points lab, Numbers areas, Numbers thresholds, double edge, double halo, double sigma,
-           double surround) {
+        [](Points points, Points lab, Numbers areas, Numbers thresholds, double size, double square, double edge,
+           double halo, double sigma, double surround) {
             const std::size_t n = points.shape(0);
             if (lab.shape(0) != n || areas.shape(0) != n || thresholds.shape(0) != 4)
                 throw std::invalid_argument("extrema need as many colours and areas as points, and 4 thresholds");
+            if (!(size > 0 && square > 0)) throw std::invalid_argument("cells have a size");
             // Of a block's cells the first and the last hold parts of a cell, and there is room beside them.
             if (!(edge > 0 && halo >= 0 && edge + 2 * halo <= MOST - 8))
                 throw std::invalid_argument("a block has at most 248 cells a side, those around included");
@@ -389,13 +401,14 @@ void bind_landmarks(nb::module_ &m) {
             {
                 nb::gil_scoped_release release;
                 Work work;
-                const std::vector<Run> runs = runs_of(points, edge);
+                Block block;
+                const std::vector<Run> runs = runs_of(points, size, edge);
                 for (std::size_t r = 0; r < runs.size(); ++r) {
                     if (r && runs[r].block == runs[r - 1].block) continue;
                     double core[3];
                     for (int k = 0; k < 3; ++k) core[k] = runs[r].block[k] * edge;
                     const auto near = runs_near(runs, runs[r].block, int(std::ceil(halo / edge)));
-                    const Block block(points, lab, areas, near, core, edge, halo);
+                    block.fill(points, lab, areas, size, square, near, core, edge, halo);
                     if (block.areas.empty()) continue;
                     for (Extremum &e : extrema(block, work, thresholds.data(), sigma, surround)) {
                         bool own = true;
@@ -412,10 +425,12 @@ void bind_landmarks(nb::module_ &m) {
             const std::size_t count = rows.size() / 6;
             return numpy_of(std::move(rows), {count, 6});
         },
-        nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("edge"),
+        nb::arg("points"), nb::arg("lab"), nb::arg("areas"), nb::arg("thresholds"), nb::arg("size"),
+        nb::arg("square"), nb::arg("edge"),
         nb::arg("halo"), nb::arg("sigma"), nb::arg("surround"),
         "Rows (channel, negative, x, y, z, response over threshold) of the extrema within blocks of cells, each looked at "
-        "with its halo; all lengths in cells. Points that come in an order in space are faster.");
+        "with its halo: all in cells. Points and areas are in a unit of which a cell has a side of `size` and an area of\n"
+        "`square`. Points that come in an order in space are faster.");
 }
 
 }  // namespace gsmap

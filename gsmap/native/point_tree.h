@@ -3,7 +3,8 @@
 #include <algorithm>
 #include <cstdint>
 #include <numeric>
-#include <vector>
+
+#include "memory.h"
 
 namespace gsmap {
 
@@ -24,7 +25,7 @@ template <int kAxes> class Tree {
     }
     int32_t size() const { return int32_t(rows_.size()); }
     // Rows, those near each other together.
-    const std::vector<int32_t> &order() const { return rows_; }
+    const Many<int32_t> &order() const { return rows_; }
     const double *point(int32_t row) const { return &points_[kAxes * std::size_t(row)]; }
 
     static double squared(const double *a, const double *b) {
@@ -126,9 +127,9 @@ template <int kAxes> class Tree {
         }
     }
 
-    std::vector<double> points_, sorted_;
-    std::vector<int32_t> rows_;
-    std::vector<Node> nodes_;
+    Many<double> points_, sorted_;
+    Many<int32_t> rows_;
+    Many<Node> nodes_;
 };
 
 using PointTree = Tree<3>;

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "arrays.h"
+#include "memory.h"
 #include "point_tree.h"
 #include "symmetric.h"
 #include "threads.h"
@@ -298,8 +299,8 @@ void bind_surface(nb::module_ &m) {
                 if (bool(faces) != bool(own)) throw std::invalid_argument("faces of both sides, or of none");
                 if (faces && (int64_t(faces->shape(0)) != tree.size() || own->shape(0) != at.shape(0)))
                     throw std::invalid_argument("a tree's points and what is sought need a face each");
-                std::vector<double> distance(n);
-                std::vector<int64_t> row(n);
+                Many<double> distance(n);
+                Many<int64_t> row(n);
                 {
                     nb::gil_scoped_release release;
                     over_blocks(n, [&](int64_t, int64_t begin, int64_t end) {
@@ -321,8 +322,8 @@ void bind_surface(nb::module_ &m) {
             [](const PointTree &tree, int k, std::optional<Points> places, double radius) {
                 if (k < 1 || k > kMostNeighbours) throw std::invalid_argument("a point has 1 to 64 neighbours");
                 const std::size_t n = places ? places->shape(0) : std::size_t(tree.size());
-                std::vector<double> distance(n * k, __builtin_inf());
-                std::vector<int64_t> row(n * k, int64_t(tree.size()));
+                Many<double> distance(n * k, __builtin_inf());
+                Many<int64_t> row(n * k, int64_t(tree.size()));
                 {
                     nb::gil_scoped_release release;
                     over_blocks(int64_t(n), [&](int64_t, int64_t begin, int64_t end) {
@@ -348,7 +349,7 @@ void bind_surface(nb::module_ &m) {
                 if (k < 2 || k >= kMostNeighbours) throw std::invalid_argument("a point is held against 2 to 63 neighbours");
                 const std::size_t n = std::size_t(tree.size());
                 if (values.shape(0) != n) throw std::invalid_argument("a tree's points and values must be as many");
-                std::vector<double> far(n, __builtin_inf()), second(n, __builtin_inf());
+                Many<double> far(n, __builtin_inf()), second(n, __builtin_inf());
                 {
                     nb::gil_scoped_release release;
                     over_blocks(tree.size(), [&](int64_t, int64_t begin, int64_t end) {

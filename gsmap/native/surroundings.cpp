@@ -10,13 +10,19 @@
 namespace gsmap {
 namespace {
 
+// A point and its three values.
+struct Valued {
+    double at[3], values[3];
+};
+
 // Points sorted into square columns of a plane, so that those near a place are found in few runs.
 struct Columns {
     double low[2] = {}, size;
     int n[2] = {};
-    std::vector<std::int64_t> starts, order;
+    std::vector<std::int64_t> starts;
+    std::vector<Valued> sorted;
 
-    Columns(const Points &points, double cell) : size(cell) {
+    Columns(const Points &points, const Points &values, double cell) : size(cell) {
         const std::size_t count = points.shape(0);
         double high[2] = {};
         for (std::size_t i = 0; i < count; ++i)
@@ -39,8 +45,12 @@ struct Columns {
         }
         for (std::size_t i = 1; i < starts.size(); ++i) starts[i] += starts[i - 1];
         std::vector<std::int64_t> next(starts.begin(), starts.end() - 1);
-        order.resize(count);
-        for (std::size_t i = 0; i < count; ++i) order[next[column[i]]++] = std::int64_t(i);
+        sorted.resize(count);
+        for (std::size_t i = 0; i < count; ++i) {
+            Valued &to = sorted[next[column[i]]++];
+            std::copy_n(points.data() + 3 * i, 3, to.at);
+            std::copy_n(values.data() + 3 * i, 3, to.values);
+        }
     }
 
     int at(double v, int axis) const {
@@ -48,20 +58,33 @@ struct Columns {
     }
 };
 
-// Index of the first edge that is not below a value; as many as there are where all are.
-int first_not_below(const Numbers &edges, double value) {
-    int i = 0;
-    while (i < int(edges.shape(0)) && edges.data()[i] < value) ++i;
-    return i;
+// The largest number whose root is no larger than a length: what is held against it needs no root.
+double square_of(double length) {
+    if (length < 0) return -1;  // none is
+    double square = length * length, next = square;
+    while (std::sqrt(square) > length) square = std::nextafter(square, 0.0);
+    while ((next = std::nextafter(square, __builtin_inf())) > square && std::sqrt(next) <= length) square = next;
+    return square;
+}
+
+// How many of the edges, which rise, lie below a value.
+int below(const std::vector<double> &edges, double value) {
+    int count = 0;
+    for (double edge : edges) count += edge < value;
+    return count;
 }
 
 // See gsmap/describe/landmarks/context.py: sums of values (M, bins, 3) and counts (M, bins), in rings of an upright
 // cylinder where there are heights, else in shells.
 void surroundings(const Points &positions, const Points &points, const Points &values, const Numbers &radii,
-                  const Numbers &heights, double *sums, double *counts) {
-    const int rings = int(radii.shape(0)), levels = std::max(int(heights.shape(0)) - 1, 1);
-    const double reach = radii.data()[rings - 1];
-    const Columns columns(points, reach / 4);
+                  const Numbers &given_heights, double *sums, double *counts) {
+    const std::vector<double> heights(given_heights.data(), given_heights.data() + given_heights.shape(0));
+    std::vector<double> squares;
+    for (std::size_t i = 0; i < radii.shape(0); ++i) squares.push_back(square_of(radii.data()[i]));
+    const int rings = int(squares.size()), levels = std::max(int(heights.size()) - 1, 1);
+    const double reach = radii.data()[rings - 1], farthest = squares.back();
+    const bool upright = !heights.empty();
+    const Columns columns(points, values, reach / 4);
     for (std::size_t m = 0; m < positions.shape(0); ++m) {
         const double *p = positions.data() + 3 * m;
         double *sum = sums + m * rings * levels * 3, *count = counts + m * rings * levels;
@@ -69,19 +92,14 @@ void surroundings(const Points &positions, const Points &points, const Points &v
         for (int x = columns.at(p[0] - reach, 0); x <= x1; ++x) {
             const std::size_t row = std::size_t(x) * columns.n[1];
             for (std::int64_t i = columns.starts[row + y0]; i < columns.starts[row + y1 + 1]; ++i) {
-                const std::int64_t j = columns.order[i];
-                const double *q = points.data() + 3 * j, dx = q[0] - p[0], dy = q[1] - p[1], dz = q[2] - p[2];
-                int level = 0;
+                const Valued &q = columns.sorted[i];
+                const double dx = q.at[0] - p[0], dy = q.at[1] - p[1], dz = q.at[2] - p[2];
                 double distance = dx * dx + dy * dy;
-                if (heights.shape(0)) {
-                    level = first_not_below(heights, dz) - 1;
-                    if (level < 0 || level >= levels) continue;
-                } else distance += dz * dz;
-                const int ring = first_not_below(radii, std::sqrt(distance));
-                if (ring == rings) continue;
-                const int bin = ring * levels + level;
+                if (!upright) distance += dz * dz;
+                if (distance > farthest || (upright && (dz <= heights.front() || dz > heights.back()))) continue;
+                const int bin = below(squares, distance) * levels + (upright ? below(heights, dz) - 1 : 0);
                 count[bin] += 1;
-                for (int c = 0; c < 3; ++c) sum[3 * bin + c] += values.data()[3 * j + c];
+                for (int c = 0; c < 3; ++c) sum[3 * bin + c] += q.values[c];
             }
         }
     }

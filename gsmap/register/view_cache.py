@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.projection import in_image, project, project_all
 from gsmap.geometry.vantage import synthesise_cameras
 from gsmap.render import Rendered, render
 from gsmap.types import Cameras, Gaussians
@@ -150,10 +150,14 @@ def select_views(
 def _visible(cameras: Cameras, points: np.ndarray, nearest: list[np.ndarray] | None) -> np.ndarray:
     """(C, S) whether each camera sees each of an even sample of the points."""
     sample = points[np.linspace(0, len(points) - 1, min(len(points), 1000)).astype(int)].astype(np.float32)
-    inside = np.zeros((len(cameras), len(sample)), dtype=bool)
-    for c, view in enumerate(cameras.T_camera_frame):
-        pixel, z, at = _project(sample, view, cameras.intrinsics_px[c], cameras.sizes_px[c])
-        inside[c, at if nearest is None else at[z <= nearest[c][pixel]]] = True
+    column, row, z = project_all(sample, cameras.T_camera_frame, cameras.intrinsics_px)
+    width, height = cameras.sizes_px.T[..., None]
+    with np.errstate(invalid="ignore"):
+        inside: np.ndarray = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    for c, depth in enumerate(nearest or ()):
+        at = np.flatnonzero(inside[c])
+        pixel = row[c, at].astype(np.int64) * int(width[c, 0]) + column[c, at].astype(np.int64)
+        inside[c, at] = z[c, at] <= depth[pixel]
     return inside
 
 

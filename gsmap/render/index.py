@@ -39,7 +39,8 @@ class ChunkIndex:
             return cls(starts, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         first = starts[:-1]
         with np.errstate(over="ignore"):
-            radius = np.exp(np.fmax.reduceat(gaussians.log_scales.max(1).astype(np.float64), first))
+            x, y, z = gaussians.log_scales.T  # column by column: `max` along rows is far slower
+            radius = np.exp(np.fmax.reduceat(np.maximum(np.maximum(x, y), z).astype(np.float64), first))
         return cls(
             starts,
             np.fmin.reduceat(gaussians.means, first, axis=0).astype(np.float64),

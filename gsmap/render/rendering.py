@@ -68,10 +68,10 @@ def render(
 
             return gsplat.render_numpy(gaussians, cameras, colour, depth, dominant_id, max_weight)
         images = native.allocate(len(cameras), height, width, len(gaussians), depth, dominant_id, max_weight)
-        view = native.View()
-        arrays = native.arrays_of(gaussians)
-        for i in range(len(cameras)):
-            native.forward(view, arrays, cameras.T_camera_frame[i], cameras.intrinsics_px[i], colour, images, i, index)
+        arrays, poses = native.arrays_of(gaussians), cameras.T_camera_frame
+        with native.workspace() as view:
+            for i in range(len(cameras)):
+                native.forward(view, arrays, poses[i], cameras.intrinsics_px[i], colour, images, i, index)
         return Rendered(**images)
 
     from gsmap.render import autograd, gsplat

@@ -7,6 +7,7 @@ import pytest
 from describe_places import room
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+from gsmap._native import landmark_surroundings
 from gsmap.describe import Params, describe
 from gsmap.describe.cloud import downsample, surface_cloud
 from gsmap.describe.landmarks import detect
@@ -56,6 +57,18 @@ def test_extrema_are_those_of_the_plain_computation(cloud, channel):
     assert distance.min(1).max() < 2.5
     assert abs(len(at) - len(expected)) <= 0.2 * len(expected)
     np.testing.assert_allclose(ratio, strong[distance.argmin(1)], rtol=1e-3)
+
+
+def test_extrema_of_points_in_any_unit_are_those_of_points_in_cells(cloud):
+    size, thresholds = 0.1, np.array([2.6, 2.0, 2.0, 0.6])
+    lab = cloud.lab.astype(float)
+    given = list(detect._extrema(cloud.points, lab, cloud.areas, thresholds, size))
+    scaled = list(detect._extrema(cloud.points / size, lab, cloud.areas / size**2, thresholds))
+    assert sum(len(at) for _, _, at, _ in given) > 100
+    for (*kind, at, ratio), (*expected, where, strong) in zip(given, scaled, strict=True):
+        assert kind == expected
+        np.testing.assert_array_equal(at, where)
+        np.testing.assert_array_equal(ratio, strong)
 
 
 def test_blocks_find_what_one_grid_finds(cloud, monkeypatch):
@@ -123,3 +136,22 @@ def test_strays_a_hundred_thousand_kilometres_out_change_no_landmark_of_the_room
 def test_nothing_around_is_no_error():
     graph = describe("none", room(n=100)[0][:0], None, Params(objects=False))
     assert graph.num_nodes == 0
+
+
+def test_what_lies_on_the_edge_of_a_ring_is_of_the_inner_one():
+    radii, heights = np.array([0.2, 0.45, 0.75, 1.1]), np.array([-0.65, -0.12, 0.12, 0.65])
+    rng = np.random.default_rng(3)
+    # To the last digit before, on and behind the edges, where a root and a square round apart.
+    far = np.concatenate([np.nextafter(radii, 0), radii, np.nextafter(radii, 2)])
+    turn = rng.uniform(0, 2 * np.pi, (200, len(far)))
+    steps = np.stack([far * np.cos(turn), far * np.sin(turn), rng.choice(heights, turn.shape)], axis=-1).reshape(-1, 3)
+    values = rng.normal(size=steps.shape)
+    sums, counts = landmark_surroundings(
+        positions=np.zeros((1, 3)), points=steps, values=values, radii=radii, heights=heights
+    )
+    x, y, z = steps.T
+    ring, level = np.searchsorted(radii, np.sqrt(x * x + y * y)), np.searchsorted(heights, z) - 1
+    inside = (ring < len(radii)) & (level >= 0)
+    bins = (ring * (len(heights) - 1) + level)[inside]
+    np.testing.assert_array_equal(counts[0], np.bincount(bins, minlength=counts.shape[1]))
+    np.testing.assert_allclose(sums[0, :, 1], np.bincount(bins, values[inside, 1], counts.shape[1]), atol=1e-12)

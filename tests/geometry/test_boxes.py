@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsmap.geometry.boxes import box_around, box_corners
+from gsmap.geometry.boxes import are_finite, box_around, box_corners
 
 
 def test_corners_come_in_the_order_of_their_bits():
@@ -16,3 +16,9 @@ def test_a_box_around_points_keeps_what_they_are_counted_in():
         box = box_around(np.array([[3, -1, 2], [0, 7, 2], [1, 1, -5]], kind))
         assert box.dtype == kind
         assert box.tolist() == [[0, -1, -5], [3, 7, 2]]
+
+
+def test_points_are_finite_where_all_three_numbers_are():
+    points = np.zeros((5, 3))
+    points[1, 0], points[2, 1], points[3, 2] = np.nan, np.inf, -np.inf
+    assert are_finite(points).tolist() == [True, False, False, False, True]

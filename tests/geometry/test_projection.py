@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsmap.geometry.projection import in_image, project
+from gsmap.geometry.projection import in_image, project, project_all
 
 INTRINSICS = np.array([100.0, 200.0, 32.0, 24.0])
 
@@ -41,3 +41,17 @@ def test_inside_means_before_the_camera_beyond_near_and_within_half_open_borders
     inside = in_image(pixels, depth, np.array([64, 48]))
     assert inside.tolist() == [True, True, False, False, False, False, False, False, False]
     assert in_image(pixels[:2], np.array([0.5, 2.0]), np.array([64, 48]), near=0.5).tolist() == [False, True]
+
+
+def test_many_images_at_once_are_as_each_by_itself():
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, :3] = np.linalg.qr(rng.normal(size=(5, 3, 3)))[0]
+    poses[:, :3, 3] = rng.normal(size=(5, 3))
+    intrinsics = INTRINSICS + rng.uniform(0, 9, (5, 4))
+    column, row, depth = project_all(points, poses, intrinsics)
+    for c in range(5):
+        pixels, z = project(points, poses[c], intrinsics[c])
+        np.testing.assert_array_equal(np.stack([column[c], row[c]], axis=1), pixels)
+        np.testing.assert_array_equal(depth[c], z)

@@ -170,3 +170,17 @@ def test_the_environment_chooses_the_kernels():
     refused = run("sse9")
     assert refused.returncode != 0
     assert "GSMAP_INSTRUCTION_SET=sse9: this machine runs" in refused.stderr
+
+
+def test_memory_that_was_used_before_changes_no_picture():
+    few, many = (random_scene(1, n)[0] for n in (50, 3000))
+    camera = Cameras(np.eye(4)[None], np.array([[60.0, 60, 32, 24]]), np.array([[64, 48]]))
+    first = render(few, camera)
+    render(many, camera)
+    again = render(few, camera)
+    for name in ("colour", "alpha", "depth", "dominant_id"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    with native.workspace() as one, native.workspace() as other:
+        assert one is not other
+    with native.workspace() as again_one:
+        assert again_one in (one, other)

@@ -83,7 +83,8 @@ class Octaves:
         if self._levelled is None:
             points = cloud.points @ level.T
             order = spatial_order(points, _ORDER_ACROSS)
-            self._levelled = points[order], cloud.lab[order], cloud.areas[order]
+            lab = cloud.lab.take(order, axis=0).astype(np.float64)  # as kernels take it, once
+            self._levelled = points.take(order, axis=0), lab, cloud.areas[order]
         return self._levelled
 
     def extrema(
@@ -98,7 +99,7 @@ class Octaves:
         """As `_extrema` of a grid of ``size_m``; ``unit_m`` is that of the points."""
         key = size_m / unit_m, thresholds.tobytes()
         if key not in self._found:
-            self._found[key] = list(_extrema(points / size_m, lab, areas / size_m**2, thresholds))
+            self._found[key] = list(_extrema(points, lab, areas, thresholds, size_m))
         return self._found[key]
 
 
@@ -170,9 +171,9 @@ def _strongest(parts: list[Blobs], count: int | None = None) -> Blobs:
 
 
 def _extrema(
-    points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray
+    points: np.ndarray, lab: np.ndarray, areas: np.ndarray, thresholds: np.ndarray, size: float = 1.0
 ) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
-    """Yield (channel, negative, positions (n, 3), responses over threshold (n,)); lengths in cells."""
+    """Yield (channel, negative, positions (n, 3), responses over threshold (n,)), positions in cells of a size."""
     from gsmap import _native
 
     table = _native.landmark_extrema(
@@ -180,6 +181,8 @@ def _extrema(
         lab=np.ascontiguousarray(lab, np.float64),
         areas=np.ascontiguousarray(areas, np.float64),
         thresholds=thresholds,
+        size=size,
+        square=size**2,
         edge=_BLOCK_CELLS,
         halo=_HALO_CELLS,
         sigma=_SIGMA_CELLS,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.describe.objects.structure import Structure, components, find_structure
+from gsmap.geometry.boxes import are_finite, box_around
 from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.geometry.colour import srgb_to_lab
 from gsmap.geometry.directions import level_frame
@@ -115,7 +116,8 @@ def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: 
     level = level_frame(up)
     rows = _thinned(cloud, params.max_points)
     points = cloud.points[rows] @ level.T * unit_m
-    if np.ptp(points, axis=0).max() > _WIDEST_M:
+    low, high = box_around(points)
+    if (high - low).max() > _WIDEST_M:
         return out
     areas = cloud.areas[rows] * unit_m**2 * (len(cloud) / len(rows))
     distances, neighbours = nearest_neighbours(points, _NEIGHBOURS + 1)
@@ -126,10 +128,10 @@ def _members(gaussians: Gaussians, cloud: Cloud, up: np.ndarray | None, unit_m: 
     things = _numbered(surface.things(), params.min_points)
     out[cloud.index[rows]] = things
     # The others, opaque or not: the thing (or the building) whose surface is nearest.
-    others = np.isfinite(gaussians.means).all(1)
+    others = are_finite(gaussians.means)
     others[cloud.index[rows]] = False
     rest = np.flatnonzero(others)
-    at = gaussians.means[rest].astype(np.float64) @ level.T * unit_m
+    at = gaussians.means.take(rest, axis=0).astype(np.float64) @ level.T * unit_m
     distance, nearest = nearest_of(points, at, params.assign_m)
     near = np.isfinite(distance)
     out[rest[near]] = things[nearest[near]]
@@ -141,9 +143,10 @@ def _thinned(cloud: Cloud, max_points: int) -> np.ndarray:
     if len(cloud) <= max_points:
         return np.arange(len(cloud))
     cell = float(np.sqrt(cloud.areas.sum() / max_points))
-    cells = np.floor((cloud.points - cloud.points.min(0)) / cell).astype(np.int64)
-    sides = cells.max(0) + 1
-    return np.sort(np.unique((cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2], return_index=True)[1])
+    labels, counts = cell_labels(np.floor((cloud.points - box_around(cloud.points)[0]) / cell))
+    first = np.empty(len(counts), np.int64)
+    first[labels[::-1]] = np.arange(len(cloud))[::-1]
+    return np.sort(first)
 
 
 def _normals(
