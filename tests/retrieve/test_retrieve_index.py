@@ -170,7 +170,7 @@ def test_decoration_that_repeats_says_less_than_how_the_same_things_stand():
 
 
 def test_rooms_decorated_alike_are_told_apart_by_the_little_that_else_agrees():
-    """Each scene shows some 60 % of what is there; hundreds agree in as much of the walls as the two that share a room."""
+    """Each shows 60 % of what is there; many agree in as much of the walls as the two that share a room."""
     rng = np.random.default_rng(9)
     num, decorations = 150, 5
     walls, things = rng.normal(size=(decorations, 40, 24)), rng.normal(size=(12, 24))
