@@ -16,6 +16,7 @@ from gsmap.types.progress import StageProgress
 from gsmap.types.retrieval import Candidate
 from gsmap.types.segments import InMemory, Segment
 
+_AT_ONCE = 16  # scenes that ask together: what they find is in memory, some 7 MB of each
 _KEPT = 2  # times as many candidates are kept as are tried, to be shown
 
 
@@ -37,8 +38,8 @@ def ask(
     for left in reversed(range(PATIENCE)):
         try:
             segments = index.brought_up_to_date(lambda told: progress("register", 0.0, f"{told} of retrieval"))
-            for start in range(0, len(asking), AT_ONCE):
-                scenes = asking[start : start + AT_ONCE]
+            for start in range(0, len(asking), _AT_ONCE):
+                scenes = asking[start : start + _AT_ONCE]
                 voters = [mine[scene] if scene in mine else _voters(store, graphs[scene], params) for scene in scenes]
                 found = retrieve.look_up(voters, segments, params)
                 store.indexes.note([_lookup(one, said, params) for one, said in zip(voters, found, strict=True)])

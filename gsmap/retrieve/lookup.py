@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,20 +16,21 @@ from gsmap.retrieve.voters import Voters
 from gsmap.types.retrieval import Candidate, Member
 from gsmap.types.segments import Segment, lists_of, places_of
 
-VERSION = 4
+VERSION = 5
 
 _BLOCK_ROWS = 250_000  # of an index that are in memory at a time: 15 MB
 _SAME_NODE_M = 0.05  # two nodes nearer than this may be one
+_LEAST_SPREAD = 0.05  # of what is said of the best scene: differences below that are chance
 
 
 def look_up(voters: Sequence[Voters], segments: Sequence[Segment], params: Params) -> list[list[Candidate]]:
     """For each scene that asks the most promising others, best first, equals by id.
 
     A node's match is worth the more the fewer scenes have one like it (the logarithm of their share, squared: once for
-    either scene, as in tf-idf). The score of a scene is the largest worth of matches that bear out one pair of them:
-    distances between nodes, and differences in height, are the same in both scenes, which two points and the vertical
-    fix but for a mirror. Rooms that are decorated alike bear each other out by what is decoration; so a node counts the
-    less, likewise, the more scenes it bears out, and scenes are scored by that once more.
+    either scene, as in tf-idf). The most voted for scenes are laid onto the one that asks, where most of what they
+    match agrees, and what a scene says is the worth of the nodes that lie where those do that they match. Rooms that
+    are decorated alike come to lie at the same place and agree in all that is decoration; so the score is by how much
+    a scene says more than those that come to lie nearest to it, in deviations of what these say. 0: it does not.
 
     Args:
         voters: the scenes that ask; a scene does not find itself.
@@ -149,21 +150,18 @@ def _ranked(found: _Matches, members: _Members, params: Params) -> list[Candidat
     node, squared, place, theirs = (np.concatenate(part) for part in zip(*found.parts, strict=True))
     near = squared <= found.nearest[node, 0]  # the others were near when they were found
     node, squared, place, theirs = node[near], squared[near], place[near], theirs[near]
-    # Of each node its nearest matches, and of these the best one in each scene. Squared distances are whole numbers
-    # below 2 ** 23; equals come by scene, and within a scene as they lie in its lists: no order of arrival decides.
+    # Nearest first. Squared distances are whole numbers below 2 ** 23; equals come by scene, and within a scene as they
+    # lie in its lists: no order of arrival decides. With a vote goes the best match of a node in each scene.
     order = np.argsort((node << 44) | (squared << 20) | place, kind="stable")
     node, place, squared, theirs = node[order], place[order], squared[order], theirs[order]
-    first = np.searchsorted(node, node)
-    last = np.minimum(first + params.votes_per_node, np.searchsorted(node, node, side="right")) - 1
-    best = np.zeros(len(node), dtype=bool)
-    best[np.unique(node * len(members.members) + place, return_index=True)[1]] = True
-    best &= squared <= squared[last]
-    node, place, squared, theirs = node[best], place[best], squared[best], theirs[best]
-    worth = _worth(node, squared, len(members.members), params)
+    best = np.unique(node * len(members.members) + place, return_index=True)[1]
+    best.sort()
+    worth = np.zeros(len(node))
+    worth[best] = _worth(node[best], squared[best], len(members.members), params)
     votes = np.bincount(place, weights=worth, minlength=len(members.members))
     chosen = np.argsort(-np.round(votes, 6), kind="stable")[: params.checked_scenes]
     chosen = chosen[votes[chosen] > 0]
-    scores = _scores(asker, chosen, node, place, worth, theirs, members, params)
+    scores = _scores(_Checked.of(asker, chosen, node, place, worth, theirs, members), params)
     out = [
         Candidate(members.members[k].scene, round(float(score), 4), round(float(votes[k]), 4))
         for k, score in zip(chosen, scores, strict=True)
@@ -183,71 +181,174 @@ def _worth(node: np.ndarray, squared: np.ndarray, num_scenes: int, params: Param
     step = 4.0 * node
     alike = np.searchsorted(step - cosine, step - cosine + params.equal_similarity, side="right")
     first = np.searchsorted(node, node)
-    rarity = np.log((num_scenes + 1) / (alike - first))
+    rarity = np.log(1 + num_scenes / (alike - first))
     worth: np.ndarray = rarity**2 * np.maximum(cosine - params.min_similarity, 0.0)
     return worth
 
 
-def _scores(
-    asker: Voters,
-    chosen: np.ndarray,
-    node: np.ndarray,
-    place: np.ndarray,
-    worth: np.ndarray,
-    theirs: np.ndarray,
-    members: _Members,
-    params: Params,
-) -> np.ndarray:
-    """(C,) how much of what the matches of each scene say is borne out by where they lie, and not in every scene."""
-    if not len(chosen):
+@dataclass(frozen=True, eq=False)
+class _Checked:
+    """The matches of C scenes with the M nodes of the one that asks, and what is known of how these scenes lie.
+
+    Args:
+        row: (K,) of each match its scene, rising.
+        node: (K,) of each match the node that asked.
+        worth: (K,) what it says; 0 of all but a node's best in that scene.
+        mine, theirs: (K, 3) float64 where the nodes lie in either scene.
+        num_nodes: M.
+        coarse: (C,) metres that look like one in a room, of the coarser of the two.
+        metric, upright: (C,) bool whether both are.
+    """
+
+    row: np.ndarray
+    node: np.ndarray
+    worth: np.ndarray
+    mine: np.ndarray
+    theirs: np.ndarray
+    num_nodes: int
+    coarse: np.ndarray
+    metric: np.ndarray
+    upright: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        asker: Voters,
+        chosen: np.ndarray,
+        node: np.ndarray,
+        place: np.ndarray,
+        worth: np.ndarray,
+        theirs: np.ndarray,
+        members: _Members,
+    ) -> _Checked:
+        row_of = np.full(len(members.members), -1)
+        row_of[chosen] = np.arange(len(chosen))
+        mine = np.flatnonzero(row_of[place] >= 0)
+        mine = mine[np.argsort(row_of[place[mine]], kind="stable")]
+        others = [members.members[k] for k in chosen]
+        return cls(
+            row_of[place[mine]],
+            node[mine],
+            worth[mine],
+            asker.asking.positions[node[mine]].astype(np.float64),
+            theirs[mine].astype(np.float64),
+            len(asker.asking),
+            np.array([max(o.coarseness, asker.member.coarseness) for o in others]),
+            np.array([o.metric and asker.member.metric for o in others], bool),
+            np.array([o.upright and asker.member.upright for o in others], bool),
+        )
+
+
+def _scores(checked: _Checked, params: Params) -> np.ndarray:
+    """(C,) by how much the matches that lie alike in both scenes say more than is usual of scenes that lie there."""
+    count = len(checked.coarse)
+    if not count:
         return np.zeros(0)
-    count = params.matches
-    weights, nodes = np.zeros((len(chosen), count)), np.zeros((len(chosen), count), dtype=np.int64)
-    a, b = np.zeros((len(chosen), count, 3), np.float32), np.zeros((len(chosen), count, 3), np.float32)
-    order = np.lexsort((node, -np.round(worth, 9), place))
-    firsts = np.searchsorted(place[order], chosen, side="left")
-    lasts = np.searchsorted(place[order], chosen, side="right")
-    mine = asker.asking.positions.astype(np.float32)
-    for row, (first, last) in enumerate(zip(firsts, lasts, strict=True)):
-        rows = order[first : min(last, first + count)]
-        weights[row, : len(rows)], nodes[row, : len(rows)] = worth[rows], node[rows]
-        a[row, : len(rows)], b[row, : len(rows)] = mine[node[rows]], theirs[rows]
-    others = [members.members[k] for k in chosen]
-    coarse = np.array([max(o.coarseness, asker.member.coarseness) for o in others], np.float32)[:, None, None]
-    metric = np.array([o.metric and asker.member.metric for o in others])[:, None, None]
-    upright = np.array([o.upright and asker.member.upright for o in others])[:, None, None]
+    alike, centres = _laid(checked, params)
+    rarity = np.log((count + 1) / (alike.sum(0) + 0.5)) ** 2
+    said = np.round(alike @ rarity, 6)
+    # What lies alike in many scenes is decoration; where the same room may be laid in two ways, the rest decides.
+    other, others = _laid(replace(checked, worth=checked.worth * rarity[checked.node]), params)
+    then = np.round(other @ rarity, 6)
+    centres[then > said] = others[then > said]
+    said = np.maximum(said, then)
+    # Scenes that show the same decoration come to lie at the same place, and agree in as much of it.
+    gaps = np.round(((centres[:, None] - centres) ** 2).sum(2), 6)
+    np.fill_diagonal(gaps, np.inf)
+    beside = np.argsort(gaps, axis=1, kind="stable")[:, : min(params.peers, count // 3)]
+    mean = said[beside].sum(1) / max(params.peers, 1)
+    spread = np.sqrt(np.maximum((said[beside] ** 2).sum(1) / max(params.peers, 1) - mean**2, 0.0))
+    least = max(_LEAST_SPREAD * float(said.max()), 1e-9)
+    out: np.ndarray = np.maximum(said - mean, 0.0) / (spread + least)
+    return out
+
+
+def _laid(checked: _Checked, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """Lay each scene onto the one that asks, where most of its most telling matches agree.
+
+    Returns:
+        (C, M) bool the nodes that lie at the same place then as one that they match, and (C, 3) where the scenes'
+        middles come to lie.
+    """
+    rows, fits = _first_matches(checked, params)
+    for reach in (1.5, 1.0):
+        turns, shifts = _fitted(checked, rows, params)
+        laid = np.einsum("kij,kj->ki", turns[checked.row], checked.theirs) + shifts[checked.row]
+        off = np.linalg.norm(laid - checked.mine, axis=1)
+        borne_out = fits[checked.row] & (off <= reach * params.tolerance_m * checked.coarse[checked.row])
+        rows = np.flatnonzero(borne_out)
+    alike = np.zeros((len(fits), checked.num_nodes), bool)
+    alike[checked.row[rows], checked.node[rows]] = True
+    return alike, shifts
+
+
+def _first_matches(checked: _Checked, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """The matches that bear out the best pair of each scene, of its most telling ones; and (C,) where there is one."""
+    num, count = len(checked.coarse), params.matches
+    at = np.full((num, count), -1)
+    order = np.lexsort((checked.node, -np.round(checked.worth, 9), checked.row))
+    order = order[checked.worth[order] > 0]
+    rank = np.arange(len(order)) - np.searchsorted(checked.row[order], checked.row[order])
+    order, rank = order[rank < count], rank[rank < count]
+    at[checked.row[order], rank] = order
+    weights = np.where(at >= 0, checked.worth[at], 0.0)
+    a, b = (points[at].astype(np.float32) for points in (checked.mine, checked.theirs))
+    coarse = checked.coarse.astype(np.float32)[:, None, None]
     da, db = _distances(a), _distances(b)
-    slack = params.tolerance_m * coarse + np.where(metric, np.float32(0), params.scale_slack * np.maximum(da, db))
+    loose = np.where(checked.metric, 0, params.scale_slack).astype(np.float32)[:, None, None]
+    slack = params.tolerance_m * coarse + loose * np.maximum(da, db)
     agree = np.abs(da - db) <= slack
     rise = a[:, :, None, 2] - a[:, None, :, 2] - b[:, :, None, 2] + b[:, None, :, 2]
-    agree &= ~upright | (np.abs(rise) <= slack)
+    agree &= ~checked.upright[:, None, None] | (np.abs(rise) <= slack)
     agree &= (np.minimum(da, db) > _SAME_NODE_M * coarse) & (weights[:, :, None] > 0) & (weights[:, None] > 0)
     apart = agree & (np.minimum(da, db) > params.apart_m * coarse)
-    which, best = _best_pairs(agree, apart, weights)
-    each = np.arange(len(chosen))
-    borne_out = agree[each, which[0]] & agree[each, which[1]]
-    borne_out[each, which[0]] = borne_out[each, which[1]] = True
-    borne_out[best == 0] = False
-    times = np.bincount(nodes[borne_out], minlength=len(mine))
-    rarity = np.log((len(members.members) + 1) / np.maximum(times, 1))
-    return _best_pairs(agree, apart, weights * rarity[nodes] ** 2)[1]
+    borne_out, fits = _borne_out(agree, apart, weights)
+    return at[borne_out], fits
 
 
-def _best_pairs(agree: np.ndarray, apart: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each scene the two matches (2, C) that most of the weight agrees with, and (C,) how much that is.
+def _fitted(checked: _Checked, rows: np.ndarray, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """(C, 3, 3) and (C, 3) what lays each scene's nodes onto the asker's, by these of the matches: turned, about the
+    vertical where both know it, and moved; and to scale, as far as it may be off, where the metre is guessed."""
+    row, num = checked.row[rows], len(checked.coarse)
+    times = np.maximum(np.bincount(row, minlength=num), 1)[:, None]
+
+    def means(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(row, column, num) for column in values.T], 1) / times
+
+    here, there = means(checked.mine[rows]), means(checked.theirs[rows])
+    x, y = checked.mine[rows] - here[row], checked.theirs[rows] - there[row]
+    both = means((x[:, :, None] * y[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+    both[checked.upright, 2, :2] = both[checked.upright, :2, 2] = 0.0
+    both[checked.upright, 2, 2] = 1.0 + np.abs(both[checked.upright]).sum((1, 2))
+    u, _, v = np.linalg.svd(both)
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
+    large, small = means(x**2).sum(1), means(y**2).sum(1)
+    least = max(1.0 - params.scale_slack, 1e-3)
+    scale = np.clip(np.sqrt(np.maximum(large, 1e-12) / np.maximum(small, 1e-12)), least, 1.0 / least)
+    turns = (u @ v) * np.where(checked.metric, 1.0, scale)[:, None, None]
+    return turns, here - np.einsum("kij,kj->ki", turns, there)
+
+
+def _borne_out(agree: np.ndarray, apart: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each scene the matches (C, M) bool that bear out the two that most of the weight agrees with, and these; and
+    (C,) whether there are two.
 
     Args:
         agree: (C, M, M) whether two matches lie alike in both scenes.
         apart: the same, of two that are far enough from each other.
         weights: (C, M) of the matches; 0 where there is none.
     """
-    plain = agree.astype(np.float64)
-    both = (plain * weights[:, None]) @ plain + weights[:, :, None] + weights[:, None]
+    plain = agree.astype(np.float32)
+    scaled = np.round(weights * (1 << 10) / max(float(weights.max()), 1e-9)).astype(np.float32)  # their sums are exact
+    both = (plain * scaled[:, None]) @ plain + scaled[:, :, None] + scaled[:, None]
     both[~apart] = 0.0
-    # Sums differ in their last digits from machine to machine: of what is as good, the first.
-    best = np.round(both, 6).reshape(len(both), -1).argmax(1)
+    best = both.reshape(len(both), -1).argmax(1)  # of what is as good, the first
     i, j = np.divmod(best, weights.shape[1])
-    return np.stack([i, j]), both[np.arange(len(both)), i, j]
+    each = np.arange(len(both))
+    fits = both[each, i, j] > 0
+    out = agree[each, i] & agree[each, j]
+    out[each, i] = out[each, j] = True
+    return out & fits[:, None], fits
 
 
 def _distances(points: np.ndarray) -> np.ndarray:

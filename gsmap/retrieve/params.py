@@ -20,10 +20,12 @@ class Params:
         min_similarity: nodes whose vectors have a smaller cosine are no match.
         equal_similarity: a match says little where other scenes have nodes whose cosine is at most this much smaller.
         turned_signs: of the axes that name a node's list, so many are looked at on both sides.
-        matches: most telling matches of two scenes whose places are compared.
-        checked_scenes: most voted for scenes whose matches are compared by place.
-        tolerance_m: by which the distance of two nodes, and their difference in height, may differ between two scenes;
-            working metres.
+        matches: most telling matches of two scenes, of which those that lie alike say how one is laid onto the other.
+        checked_scenes: most voted for scenes that are laid onto the one that asks.
+        peers: what a scene says is compared with what as many of them say that come to lie nearest to it; with at most
+            a third of them all, as if the others said nothing.
+        tolerance_m: by which the distance of two nodes, and their difference in height, may differ between two scenes,
+            and within which a node lies where the one it matches does; working metres.
         apart_m: nodes that are nearer to each other do not bear each other out; working metres.
         scale_slack: of a distance, what it may differ by where the metre of one of the scenes is guessed.
         num_spatial: nearest placed scenes of its component that each placed scene is paired with.
@@ -33,13 +35,14 @@ class Params:
     top_k: int = 12
     enough: int = 4
     nodes_per_scene: int = 400
-    votes_per_node: int = 32
+    votes_per_node: int = 200
     min_similarity: float = 0.6
     equal_similarity: float = 0.02
     turned_signs: int = 2
-    matches: int = 40
-    checked_scenes: int = 100
-    tolerance_m: float = 0.15
+    matches: int = 24
+    checked_scenes: int = 300
+    peers: int = 30
+    tolerance_m: float = 0.2
     apart_m: float = 0.5
     scale_slack: float = 0.25
     num_spatial: int = 12
