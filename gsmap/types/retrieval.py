@@ -47,7 +47,7 @@ class Candidate:
 
     Args:
         scene: its id.
-        score: what those of the matches say together that lie alike in both scenes.
+        score: by how much more lies alike in both scenes than is usual of scenes that lie there, in deviations.
         votes: what all matches say.
     """
 
