@@ -196,6 +196,28 @@ def test_rooms_decorated_alike_are_told_apart_by_the_little_that_else_agrees():
     assert np.mean(beside) > 0.75  # by how much agrees alone .61, by its rarity in pairs .07
 
 
+def test_a_place_visited_more_often_than_scenes_are_compared_with_is_found():
+    """Sixty visits of one room, which lie where each other lie, among sixty with its walls and its things elsewhere."""
+    rng = np.random.default_rng(12)
+    walls, things = rng.normal(size=(40, 24)), rng.normal(size=(20, 24))
+    at_wall = rng.uniform(0, 1, (40, 3)) * [5, 5, 2.5]
+    mine = rng.uniform(0, 1, (20, 3)) * [5, 5, 1]
+    graphs = []
+    for k in range(120):
+        at_thing = mine if k < 60 else rng.uniform(0, 1, (20, 3)) * [5, 5, 1]
+        again = rng.uniform(size=60) < 0.6
+        seen = (np.concatenate([walls, things]) + rng.normal(size=(60, 24)) * 0.1)[again]
+        places = turned((np.concatenate([at_wall, at_thing]) + rng.normal(size=(60, 3)) * 0.02)[again], rng)
+        nodes = layer(rng, len(seen), embeddings=seen, type_ids=np.zeros(len(seen)), positions=places)
+        graphs.append(SceneGraph(f"s{k:03}", {"landmarks": nodes}, UP))
+    params = Params()
+    assert params.peers < 59
+    voters = _voters(graphs)
+    found = look_up(voters[:8], [new_segment(voters)], params)
+    visits = {f"s{k:03}" for k in range(60)}
+    assert np.mean([one.scene in visits for said in found for one in said[: params.top_k]]) > 0.9
+
+
 @pytest.mark.parametrize("knows_up", [True, False])
 def test_scenes_are_laid_onto_each_other_however_they_are_turned_and_whatever_their_unit(knows_up):
     rng = np.random.default_rng(10)
