@@ -81,13 +81,13 @@ def score_changes(truth: Truth, before: str, after: str, claims: Sequence[Claim]
     claims = [c for c in claims if c.kind != "lighting" and len(c.voxels_m)]
     all_true = _stacked([v for _, v in true])
     all_claimed = _stacked([c.voxels_m for c in claims])
-    right = [bool((_distances(c.voxels_m, all_true) <= 0.15).mean() >= 0.5) for c in claims]
+    right = [bool((distances(c.voxels_m, all_true) <= 0.15).mean() >= 0.5) for c in claims]
     objects, moves = [], {"moved_true": 0, "moved_right": 0, "moved_symmetric": 0, "moved_symmetric_right": 0}
     moves["moved_symmetric_said"] = 0
     answered = set()
     for change, voxels in must:
-        near = [(_distances(voxels, c.voxels_m) <= VOXEL_M).mean() for c in claims]
-        covered = float((_distances(voxels, all_claimed) <= VOXEL_M).mean())
+        near = [(distances(voxels, c.voxels_m) <= VOXEL_M).mean() for c in claims]
+        covered = float((distances(voxels, all_claimed) <= VOXEL_M).mean())
         best = int(np.argmax(near)) if near and max(near) > 0 else -1
         found = covered >= 0.3
         named = claims[best].kind if found and best >= 0 else None
@@ -108,9 +108,9 @@ def score_changes(truth: Truth, before: str, after: str, claims: Sequence[Claim]
             row["move_errors"] = [(round(metres, 3), round(degrees, 1)) for _, metres, degrees in errors]
         objects.append(row)
     claimed = [k for k, c in enumerate(claims) if c.S_after_before is not None]
-    precision = float((_distances(all_claimed, all_true) <= VOXEL_M).mean()) if len(all_claimed) else 1.0
+    precision = float((distances(all_claimed, all_true) <= VOXEL_M).mean()) if len(all_claimed) else 1.0
     must_voxels = _stacked([v for _, v in must])
-    recall = float((_distances(must_voxels, all_claimed) <= VOXEL_M).mean()) if len(must_voxels) else 1.0
+    recall = float((distances(must_voxels, all_claimed) <= VOXEL_M).mean()) if len(must_voxels) else 1.0
     both = precision * recall
     return {
         "objects": len(must),
@@ -165,7 +165,7 @@ def _stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(parts) if len(parts) else np.zeros((0, 3))
 
 
-def _distances(points: np.ndarray, to: np.ndarray) -> np.ndarray:
+def distances(points: np.ndarray, to: np.ndarray) -> np.ndarray:
     if not len(to) or not len(points):
         return np.full(len(points), np.inf)
     return np.asarray(cKDTree(to).query(points, distance_upper_bound=1.0)[0])

@@ -99,9 +99,11 @@ class Truth:
 
 
 def observed(truth: Truth, time: str, points: np.ndarray) -> np.ndarray:
-    """(n,) whether a capture looked at points or through them."""
-    views, seen = truth.views(time), np.zeros(len(points), bool)
+    """(n,) whether a capture looked at points or through them, in the frames that it was trained on."""
+    views, seen, held = truth.views(time), np.zeros(len(points), bool), truth.held_out(time)
     for row, pixels, depth in projected(truth.cameras(time), points):
+        if held[row]:
+            continue
         at = views.depths_m[row][pixels[:, 1], pixels[:, 0]]
         seen |= (depth > 0.05) & (depth < at + _SEEN_M) & (pixels >= 0).all(1)
     return seen

@@ -62,7 +62,8 @@ SETS: dict[str, dict[int, tuple[Visit, ...]]] = {
         313: (_T0, replace(_T1, exposure=True)),
         323: (_T0, replace(_T1, exposure=True)),
     },
-    "dev-false": {111: _FALSE},
+    "dev-small": {seed: (_T0, Visit("t1", "small:5,replaced:3,moved:2")) for seed in range(6001, 6007)},
+    "dev-false": {111: _FALSE, 121: _FALSE, 131: _FALSE},
     # ... and on these since their scores were looked at one by one ...
     "seen": {
         404: (_T0, _T1, Visit("t2", "moved:3,removed:1,added:1,small:1", route=1)),
@@ -78,6 +79,7 @@ SETS: dict[str, dict[int, tuple[Visit, ...]]] = {
         3131: (_T0, _T1),
         3232: (_T0, _T1),
         3333: (_T0, replace(_T1, exposure=True)),
+        **dict.fromkeys((4141, 4242, 4343, 4444, 4545, 4646), (_T0, _T1)),
     },
     "false": {707: _FALSE, 808: _FALSE, 909: _FALSE, 1010: (_T0, replace(_FALSE[1], name="e1"))},
 }

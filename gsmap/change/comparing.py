@@ -10,7 +10,7 @@ from gsmap import compare as comparison
 from gsmap import render
 from gsmap.change.finding import find_changes
 from gsmap.change.params import Params
-from gsmap.change.reporting import change_of, lighting
+from gsmap.change.reporting import change_of, lighting, with_pieces
 from gsmap.change.sides import sides
 from gsmap.change.things import judge, light
 from gsmap.errors import InputError
@@ -22,7 +22,7 @@ from gsmap.types.change import Change, ChangeReport
 from gsmap.types.plain import plain
 from gsmap.types.progress import Progress, silent
 
-VERSION = 1
+VERSION = 2
 """Raised whenever a report comes out otherwise for the same two captures."""
 
 
@@ -73,7 +73,7 @@ def compare(
     unlike = light(both)
     ones = find_changes(both, cells, unlike, (looks_older, looks_newer), params)
     changes = [change_of(one, both, cells, params) for one in ones]
-    changes = [c for c in changes if c.confidence >= params.min_confidence]
+    changes = with_pieces([c for c in changes if c.confidence >= params.min_confidence], params)
     other_light = lighting(both, found.balance, unlike)
     changes += [other_light] if other_light is not None else []
     changes.sort(key=lambda c: (-c.confidence, c.box.tolist()))

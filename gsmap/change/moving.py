@@ -27,6 +27,7 @@ _COARSE, _FINE, _JUDGED = 80, 300, 250  # cells that are laid on others, and tha
 _TRIED, _KEPT = 10, 3  # poses that are looked at, and that are followed to the end
 _AS_GOOD = 0.92  # a pose that scores this share of the best is not told from it
 _LEAST_M = 0.08  # a thing that was moved by less, and not turned, was not moved
+_LEAST_LEFT = 0.14  # nor one of which so small a share was looked through, before and after together
 _APART_M = 0.15  # the middle of a symmetric thing stays this near
 _BESIDE_M = 0.5  # how far beyond a moved thing more of it is looked for
 _TAKES_M = 0.1  # what lies so close to where a thing moved is a part of it
@@ -99,7 +100,7 @@ def find_moves(
         for move in sorted(found, key=lambda m: -m.score):
             if not any(_overlap(move, other, a, b) for other in moves + news):
                 whole = _completed(move, a, b, params)
-                if _is_panel(a.points(whole.older)) or _is_panel(b.points(whole.newer)):
+                if _is_panel(a.points(whole.older)) or _is_panel(b.points(whole.newer)) or _stays(whole):
                     continue
                 news.append(whole)
                 a.things, b.things = _without(a.things, news[-1].older), _without(b.things, news[-1].newer)
@@ -119,6 +120,13 @@ def _moves_from(here: _Capture, there: _Capture, back: bool, asked: set[bytes], 
             move = _moved(seed, here, there, back, params)
             found += [move] if move is not None else []
     return found
+
+
+def _stays(move: Move) -> bool:
+    """Whether too little of a thing was looked through for it to have gone from one place to another: things of one
+    shape and colour that take each other's place look as if they had been turned."""
+    moved = len(move.older.moved) + len(move.newer.moved)
+    return moved < _LEAST_LEFT * (len(move.older.cells) + len(move.newer.cells))
 
 
 def _overlap(move: Move, other: Move, a: _Capture, b: _Capture) -> bool:

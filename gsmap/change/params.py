@@ -45,7 +45,7 @@ class Params:
     moved_within_m: float = 0.05
     min_moved: float = 0.68
     most_ambiguous: float = 0.875
-    min_confidence: float = 0.6
+    min_confidence: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("cell_m", "voxel_m", "reach_m", "moved_within_m", "yaw_starts"):

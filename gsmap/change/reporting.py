@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.change.confidence import confidence
 from gsmap.change.kinds import Found
 from gsmap.change.params import Params
 from gsmap.change.sides import Side
@@ -13,6 +18,7 @@ from gsmap.geometry.cells import cell_labels, group_means
 from gsmap.types.change import Change
 
 _GAIN = 0.08  # logarithm of a gain from which the light is said to differ
+_BY_M = 0.15  # what lies so close to a larger change of its kind is a piece of it, if half of it does
 _SLIVER_M = 0.07  # what is thinner than this in two directions is an edge that two trainings put elsewhere
 
 
@@ -30,11 +36,13 @@ def change_of(one: Found, both: tuple[Side, Side], cells: tuple[Cells, Cells], p
     voxels = (group_means(grid, *cell_labels(grid)) + 0.5) * params.voxel_m
     moved = [t.moved if t is not None else np.zeros(0, np.int64) for t in one.things]
     through = sum(float(side.through[m].sum()) for side, m in zip(both, moved, strict=True))
+    on = sum(float(side.on[m].sum()) for side, m in zip(both, moved, strict=True))
     count = sum(len(m) for m in moved)
     evidence = {
         "cells": float(len(points)),
         "looked_through": float(count),
         "views_through": through / max(count, 1),
+        "views_on": on / max(count, 1),
         "strength": float(np.mean(np.concatenate([c.strength[r] for c, r in zip(cells, rows, strict=True)]))),
         "offset_m": float(np.median(np.r_[cells[0].offset_m[rows[0]], -cells[1].offset_m[rows[1]]])),
     } | one.evidence
@@ -54,13 +62,39 @@ def change_of(one: Found, both: tuple[Side, Side], cells: tuple[Cells, Cells], p
     )
 
 
+def with_pieces(changes: Sequence[Change], params: Params) -> list[Change]:
+    """Changes, those of one kind that lie by a larger one joined to it; what moved has found its pieces already."""
+    out: list[Change] = []
+    for change in sorted(changes, key=lambda c: (-len(c.voxels), c.box.tolist())):
+        if change.kind != "moved" and len(change.voxels):
+            for k, other in enumerate(out):
+                near = cKDTree(other.voxels).query(change.voxels, distance_upper_bound=_BY_M)[0]
+                if other.kind == change.kind and np.isfinite(near).mean() >= 0.5:
+                    out[k] = _joined(other, change, params)
+                    break
+            else:
+                out.append(change)
+        else:
+            out.append(change)
+    return out
+
+
+def _joined(whole: Change, piece: Change, params: Params) -> Change:
+    """A change with a piece more; as sure as it was."""
+    every = np.concatenate([whole.voxels, piece.voxels])
+    _, first = np.unique(np.floor(every / params.voxel_m), axis=0, return_index=True)
+    return replace(
+        whole,
+        box=np.stack([np.minimum(whole.box[0], piece.box[0]), np.maximum(whole.box[1], piece.box[1])]),
+        voxels=every[np.sort(first)],
+        before=np.union1d(whole.before, piece.before),
+        after=np.union1d(whole.after, piece.after),
+    )
+
+
 def _confidence(one: Found, evidence: dict[str, float]) -> float:
-    """In [0, 1]: how much was looked through, how clear a change of colour is, and how well a moved thing fits."""
-    through = evidence["looked_through"] * min(evidence["views_through"], 6) / 6
-    paint = max(evidence["cells"] - evidence["looked_through"], 0) * np.clip(evidence["strength"] / 2 - 0.4, 0, 2)
-    sure = 1 - float(np.exp(-through / 10 - paint / 50))
-    if evidence["slender"]:
-        sure *= 0.5
+    """In [0, 1]; of what moved also by how well it fits where it stands."""
+    sure = confidence(evidence)
     return sure * float(np.clip(evidence["fit"] / 0.8, 0, 1)) if one.kind == "moved" else sure
 
 

@@ -138,7 +138,9 @@ def things_of(side: Side, cells: Cells, painted: np.ndarray, params: Params) -> 
     share = np.bincount(cells.thing[changed], minlength=count) / np.maximum(total, 1)
     whole = (share >= _WHOLE)[cells.thing] & (cells.thing >= 0)
     # What is changed only in part is cut out; what is changed as a whole is kept together, within its own box.
-    kind = np.where(whole, cells.thing, -1)
+    # A few cells of a thing so smooth that it has no more, or so little seen, are a thing together with those near.
+    size = np.bincount(cells.thing[cells.thing >= 0], minlength=count)
+    kind = np.where(whole & (size >= fewest)[cells.thing], cells.thing, -1)
     for thing in np.unique(kind[kind >= 0]):
         rows = np.flatnonzero(kind == thing)
         box = side.points[rows[changed[rows]]]
