@@ -137,6 +137,10 @@ struct Kernels {
     float (*settle_nearest)(const Leaf &of, int k, Search &);
     int64_t (*within)(const int16_t *mine, const int8_t *theirs, int64_t stride, int64_t count, int32_t most,
                       int32_t *which, int32_t *squared);
+    // Rows of a grid of landmarks, of whose segments flags tell which are filled or wanted.
+    void (*blur_across)(const float *const *rows, const uint64_t *filled, const float *taps, int n, uint64_t wanted,
+                        float *out);
+    void (*blur_along)(const float *line, int step, const float *taps, int n, uint64_t wanted, float *out);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;
