@@ -54,7 +54,7 @@ typedef float Cell __attribute__((vector_size(16), aligned(4), may_alias));
 static_assert(Grid::WIDTH == 16, "as the kernels take segments");
 static_assert(sizeof(Cell) == CHANNELS * sizeof(float));
 
-using Field = Many<float>;
+using Field = Zeros<float>;
 using Flags = std::vector<std::uint64_t>;  // a word for each row
 
 // std::floor of what an int holds, without the call that older processors need for it.
@@ -221,6 +221,9 @@ struct Block {
               const std::vector<Run> &near, const double *core, double edge, double halo) {
         double high[3] = {};
         points.clear(), lab.clear(), areas.clear();
+        std::size_t most = 0;
+        for (const Run &run : near) most += run.end - run.begin;
+        points.reserve(3 * most), lab.reserve(3 * most), areas.reserve(most);  // takes no memory until it is used
         for (const Run &run : near)
             for (std::size_t i = run.begin; i < run.end; ++i) {
                 double at[3];
@@ -301,12 +304,23 @@ struct Work {
     Field smooth;  // anything
     Field plane;   // anything
 
-    void fit(const Grid &g) {
-        for (Field *f : {&field, &smooth})
-            if (f->size() < g.values()) f->resize(g.values());
-        if (plane.size() < g.at(g.ny, 0)) plane.resize(g.at(g.ny, 0));
-    }
+    explicit Work(const Grid &largest) : field(largest.values()), smooth(largest.values()), plane(largest.at(largest.ny, 0)) {}
 };
+
+// As large a block as any of these points, so many cells a side.
+Grid largest(const Points &points, double size, double cells) {
+    int shape[3] = {};
+    for (int k = 0; k < 3; ++k) {
+        double low = 0, high = 0;
+        for (std::size_t i = 0; i < points.shape(0); ++i) {
+            const double at = points.data()[3 * i + k];
+            low = i ? std::min(low, at) : at;
+            high = i ? std::max(high, at) : at;
+        }
+        shape[k] = int(std::min(cells, (high - low) / size)) + 9;  // see Block
+    }
+    return Grid(shape[0], shape[1], shape[2]);
+}
 
 void empty(const Grid &g, Field &field, const Flags &flags) {
     for (std::size_t row = 0; row < flags.size(); ++row)
@@ -317,7 +331,6 @@ void empty(const Grid &g, Field &field, const Flags &flags) {
 std::vector<Extremum> extrema(const Block &block, Work &work, const double *thresholds, double sigma, double surround) {
     const int *shape = block.shape;
     const Grid g(shape[0], shape[1], shape[2]);
-    work.fit(g);
     auto &[field, smooth, plane] = work;
     Flags filled(g.rows(), 0), surface(g.rows(), 0);
     splat(g, block, field, filled);
@@ -392,7 +405,7 @@ void bind_landmarks(nb::module_ &m) {
             std::vector<double> rows;
             {
                 nb::gil_scoped_release release;
-                Work work;
+                Work work(largest(points, size, edge + 2 * halo));
                 Block block;
                 const std::vector<Run> runs = runs_of(points, size, edge);
                 for (std::size_t r = 0; r < runs.size(); ++r) {
