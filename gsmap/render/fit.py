@@ -131,7 +131,9 @@ class Fitter:
             mask = None if masks is None else masks[i]
             looked_at = None if self.statistics else mask  # statistics are of whole pictures
             native.forward(self._views[i], arrays, pose, intrinsics, self._background, out, i, None, looked_at)
-            loss += image_loss(out["colour"][i], images[i], mask, self.ssim_weight, self.huber_delta, gradient[i]) / count
+            loss += (
+                image_loss(out["colour"][i], images[i], mask, self.ssim_weight, self.huber_delta, gradient[i]) / count
+            )
         if count > 1:
             gradient /= count
         rates = self.learning_rates
