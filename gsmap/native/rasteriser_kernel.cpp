@@ -17,7 +17,7 @@
 
 static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend, GSMAP_ISA::blend_limit,
                                      GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
-                                     GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::ssim, GSMAP_ISA::agree,
+                                     GSMAP_ISA::adam, GSMAP_ISA::huber, GSMAP_ISA::ssim, GSMAP_ISA::agree,
                                      GSMAP_ISA::vote, GSMAP_ISA::weigh, GSMAP_ISA::highest,
                                      GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::near,
                                      GSMAP_ISA::pair_costs, GSMAP_ISA::find_nearest, GSMAP_ISA::settle_nearest,
