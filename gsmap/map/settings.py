@@ -57,6 +57,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "merge.mergers.tto.voxel_m": 0.01,
         "merge.mergers.tto.owner_cells": False,
         "merge.mergers.tto.ssim_weight": 0.0,
+        "merge.mergers.tto.huber_delta": 0.0,
+        "merge.mergers.tto.rates.momentum": 0.9,
         "merge.mergers.tto.min_weight": 0.0,
         "merge.mergers.tto.keep": 1.0,
         "merge.mergers.tto.prefer": "both",

@@ -26,12 +26,12 @@ struct Keyed {
 };
 
 // Sorts by the key, equal ones as they come: digit by digit from the lowest, digits that all have in common left out.
-void sort(Many<Keyed> &values) {
+void sort(Zeros<Keyed> &values) {
     constexpr int kBits = 11;
     constexpr uint64_t kDigits = 1 << kBits;
     uint64_t most = 0;
     for (const Keyed &v : values) most = std::max(most, v.key);
-    Many<Keyed> other(values.size());
+    Zeros<Keyed> other(values.size());
     for (int shift = 0; shift < 64 && most >> shift; shift += kBits) {
         std::array<std::size_t, kDigits + 1> begin{};
         for (const Keyed &v : values) ++begin[(v.key >> shift) % kDigits + 1];
@@ -44,7 +44,7 @@ void sort(Many<Keyed> &values) {
 
 // The rank of each key among those that occur, and how often each of these does.
 void rank(const int64_t *keys, std::size_t count, Many<int64_t> &label, std::vector<int64_t> &times) {
-    Many<Keyed> sorted(count);
+    Zeros<Keyed> sorted(count);
     for (std::size_t i = 0; i < count; ++i) sorted[i] = {uint64_t(keys[i]), int64_t(i)};
     sort(sorted);
     label.resize(count);
@@ -68,7 +68,7 @@ struct Means {
 
     Means(const Points &all, const Points &of, const double *weight, const double *origin, double cell) {
         const std::size_t count = all.shape(0);
-        Many<Keyed> sorted(count);
+        Zeros<Keyed> sorted(count);
         double low[3] = {__builtin_inf(), __builtin_inf(), __builtin_inf()}, high[3] = {-low[0], -low[0], -low[0]};
         for (std::size_t i = 0; i < count; ++i)
             for (int k = 0; k < 3; ++k) {

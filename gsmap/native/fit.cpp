@@ -15,9 +15,9 @@
 namespace gsmap {
 namespace {
 
-// (1 - s) * L1 + s * (1 - SSIM), means over pixels weighed by mask (H, W); writes the gradient (H, W, 3).
+// (1 - s) * Huber + s * (1 - SSIM), means over pixels weighed by mask (H, W); writes the gradient (H, W, 3).
 double image_loss(const Floats &image, const Floats &target, const std::optional<Floats> &mask, float ssim_weight,
-                  const FloatsOut &gradient) {
+                  float huber_delta, const FloatsOut &gradient) {
     const int height = int(image.shape(0)), width = int(image.shape(1));
     const float *a = image.data(), *b = target.data(), *m = mask ? mask->data() : nullptr;
     float *g = gradient.data();
@@ -34,12 +34,12 @@ double image_loss(const Floats &image, const Floats &target, const std::optional
     std::vector<double> sums(height);
     parallel_for(height, [&](int64_t r) {
         const int64_t o = r * width;
-        sums[r] = kernels->l1(a + 3 * o, b + 3 * o, m ? m + o : nullptr, width, float((1 - ssim_weight) * per_value),
-                              g + 3 * o);
+        sums[r] = kernels->huber(a + 3 * o, b + 3 * o, m ? m + o : nullptr, width, huber_delta,
+                                 float((1 - ssim_weight) * per_value), g + 3 * o);
     });
-    double l1 = 0;
-    for (double s : sums) l1 += s;
-    double loss = (1 - ssim_weight) * l1 * per_value;
+    double differences = 0;
+    for (double s : sums) differences += s;
+    double loss = (1 - ssim_weight) * differences * per_value;
     if (ssim_weight > 0) {
         const int64_t bands = height / 64 < num_threads() ? std::max(height / 64, 1) : num_threads();
         parallel_for(bands, [&](int64_t band) {
@@ -134,7 +134,7 @@ void fit_step(const std::vector<View *> &views, const Floats &background, const 
 
 void bind_fit(nb::module_ &m) {
     m.def("image_loss", &image_loss, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(), nb::arg("ssim_weight"),
-          nb::arg("gradient"));
+          nb::arg("huber_delta"), nb::arg("gradient"));
     m.def("fit_step", &fit_step, nb::arg("views"), nb::arg("background"), nb::arg("colour"), nb::arg("alpha"),
           nb::arg("g_colour"), nb::arg("values"), nb::arg("m"), nb::arg("v"), nb::arg("updates"), nb::arg("frozen").none(),
           nb::arg("rates"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("gradient_norm").none(),

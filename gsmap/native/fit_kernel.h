@@ -40,14 +40,18 @@ void adam(const AdamArrays &a, const AdamStep &step, int64_t begin, int n, const
     }
 }
 
-float l1(const float *a, const float *b, const float *mask, int pixels, float weight, float *g) {
+// |d| - delta / 2, and d^2 / (2 delta) where |d| < delta; of a delta of 0 the slope at 0 is 0: L1.
+float huber(const float *a, const float *b, const float *mask, int pixels, float delta, float weight, float *g) {
+    const float inverse = delta > 0.f ? 1.f / delta : 0.f;
     float sum = 0.f;
     for (int i = 0; i < pixels; i++) {
         const float w = mask ? mask[i] : 1.f;
         for (int c = 0; c < 3; c++) {
-            const float d = a[3 * i + c] - b[3 * i + c];
-            sum += w * __builtin_fabsf(d);
-            g[3 * i + c] += d == 0.f ? 0.f : __builtin_copysignf(w * weight, d);
+            const float d = a[3 * i + c] - b[3 * i + c], size = __builtin_fabsf(d);
+            const bool near = size < delta;
+            sum += w * (near ? 0.5f * inverse * d * d : size - 0.5f * delta);
+            const float slope = near ? inverse * size : d == 0.f ? 0.f : 1.f;
+            g[3 * i + c] += __builtin_copysignf(w * weight * slope, d);
         }
     }
     return sum;

@@ -10,6 +10,7 @@
 
 #include "arrays.h"
 #include "memory.h"
+#include "rasteriser_view.h"
 
 namespace gsmap {
 namespace {
@@ -48,12 +49,12 @@ struct Grid {
     static constexpr int WIDTH = SEGMENT * CHANNELS;  // values of a segment
 };
 
-// Values of one cell, and of a segment; wherever they lie.
+// Values of one cell, wherever they lie.
 typedef float Cell __attribute__((vector_size(16), aligned(4), may_alias));
-typedef float Segment __attribute__((vector_size(64), aligned(4), may_alias));
-static_assert(sizeof(Segment) == Grid::WIDTH * sizeof(float) && sizeof(Cell) == CHANNELS * sizeof(float));
+static_assert(Grid::WIDTH == 16, "as the kernels take segments");
+static_assert(sizeof(Cell) == CHANNELS * sizeof(float));
 
-using Field = Many<float>;
+using Field = Zeros<float>;
 using Flags = std::vector<std::uint64_t>;  // a word for each row
 
 // std::floor of what an int holds, without the call that older processors need for it.
@@ -97,50 +98,29 @@ void both(Flags &flags, const Flags &others) {
 #define WIDE
 #endif
 
-// One pass along the first or second axis into the wanted segments of the rows of one plane (x), of which `out` holds no
-// more; `in` holds the whole block, or that plane.
-WIDE void pass_across(const Grid &g, int x, int axis, const std::vector<float> &taps, const Field &in,
-                      const Flags &filled, Field &out, const Flags &wanted) {
-    const int reach = int(taps.size()) / 2;
-    const std::ptrdiff_t step = axis == 0 ? g.ny : 1, first_in = axis == 0 ? 0 : g.row(x, 0);
-    for (int y = 0; y < g.ny; ++y) {
-        const int at = axis == 0 ? x : y, length = axis == 0 ? g.nx : g.ny;
-        const int from = std::max(-reach, -at), to = std::min(reach, length - 1 - at);
-        const std::size_t row = g.row(x, y);
-        for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
-            const int s = __builtin_ctzll(left);
-            Segment sum = {};
-            for (int k = from; k <= to; ++k)
-                if (filled[row + k * step] >> s & 1)
-                    sum += taps[k + reach] * *reinterpret_cast<const Segment *>(&in[g.at(row + k * step - first_in, s)]);
-            *reinterpret_cast<Segment *>(&out[g.at(y, s)]) = sum;
-        }
-    }
-}
+// The rows that are blurred into one, which of their segments hold anything, and what each counts for.
+struct Rows {
+    std::vector<const float *> at;
+    Flags filled;
+    std::vector<float> taps;
 
-// One pass along the last axis, from what holds one plane into the whole block.
-WIDE void pass_along(const Grid &g, int x, const std::vector<float> &taps, const Field &in, const Flags &filled,
-                     Field &out, const Flags &wanted) {
-    const int reach = int(taps.size()) / 2;
-    const int margin = (reach + SEGMENT - 1) / SEGMENT;  // segments
-    Field line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH);
-    for (int y = 0; y < g.ny; ++y) {
-        const std::size_t row = g.row(x, y);
-        if (!wanted[row]) continue;
-        for (int s = 0; s < g.segments; ++s) {
-            float *to = &line[(s + margin) * Grid::WIDTH];
-            if (filled[row] >> s & 1) std::memcpy(to, &in[g.at(y, s)], Grid::WIDTH * sizeof(float));
-            else std::memset(to, 0, Grid::WIDTH * sizeof(float));
-        }
-        for (std::uint64_t left = wanted[row]; left; left &= left - 1) {
-            const int s = __builtin_ctzll(left);
-            Segment sum = {};
-            const float *source = &line[(s + margin) * Grid::WIDTH - reach * CHANNELS];
-            for (std::size_t k = 0; k < taps.size(); ++k, source += CHANNELS)
-                sum += taps[k] * *reinterpret_cast<const Segment *>(source);
-            *reinterpret_cast<Segment *>(&out[g.at(row, s)]) = sum;
-        }
+    void clear() { at.clear(), filled.clear(), taps.clear(); }
+    void add(const float *row, std::uint64_t holds, float tap) {
+        at.push_back(row), filled.push_back(holds), taps.push_back(tap);
     }
+};
+
+// One pass along the first or second axis into the wanted segments of the row (x, y); `in` holds the rows from `first` on.
+void pass_across(const Grid &g, int x, int y, int axis, const std::vector<float> &taps, const Field &in, std::size_t first,
+                 const Flags &filled, std::uint64_t wanted, Rows &rows, float *out) {
+    const int reach = int(taps.size()) / 2, at = axis == 0 ? x : y, length = axis == 0 ? g.nx : g.ny;
+    const std::ptrdiff_t step = axis == 0 ? g.ny : 1;
+    rows.clear();
+    for (int k = std::max(-reach, -at); k <= std::min(reach, length - 1 - at); ++k) {
+        const std::size_t row = g.row(x, y) + k * step;
+        if (filled[row] & wanted) rows.add(&in[g.at(row - first, 0)], filled[row], taps[k + reach]);
+    }
+    kernels->blur_across(rows.at.data(), rows.filled.data(), rows.taps.data(), int(rows.at.size()), wanted, out);
 }
 
 // A Gaussian convolution, zero beyond the block, of what is filled into what is wanted.
@@ -161,11 +141,24 @@ struct Blur {
         }
     }
 
-    void operator()(const Grid &g, const Field &in, const Flags &filled, Field &a, Field &b, Field &out) const {
+    // Plane by plane: `plane` holds one after the first pass, a line one of its rows after the second.
+    void operator()(const Grid &g, const Field &in, const Flags &filled, Field &plane, Field &out) const {
+        const int reach = int(taps.size()) / 2, margin = (reach + SEGMENT - 1) / SEGMENT;  // cells, segments
+        Field line(std::size_t(g.segments + 2 * margin) * Grid::WIDTH);  // zero but for what the row holds
+        float *own = &line[margin * Grid::WIDTH];
+        Rows rows;
         for (int x = 0; x < g.nx; ++x) {
-            pass_across(g, x, 0, taps, in, filled, a, after_x);
-            pass_across(g, x, 1, taps, a, after_x, b, after_y);
-            pass_along(g, x, taps, b, after_y, out, after_z);
+            for (int y = 0; y < g.ny; ++y)
+                if (const std::uint64_t wanted = after_x[g.row(x, y)])
+                    pass_across(g, x, y, 0, taps, in, 0, filled, wanted, rows, &plane[g.at(y, 0)]);
+            for (int y = 0; y < g.ny; ++y) {
+                const std::size_t row = g.row(x, y);
+                if (!after_z[row]) continue;
+                pass_across(g, x, y, 1, taps, plane, g.row(x, 0), after_x, after_y[row], rows, own);
+                kernels->blur_along(own - reach * CHANNELS, CHANNELS, taps.data(), int(taps.size()), after_z[row],
+                                    &out[g.at(row, 0)]);
+                each(after_y[row], [&](int s) { std::fill_n(own + s * Grid::WIDTH, Grid::WIDTH, 0.f); });
+            }
         }
     }
 };
@@ -228,6 +221,9 @@ struct Block {
               const std::vector<Run> &near, const double *core, double edge, double halo) {
         double high[3] = {};
         points.clear(), lab.clear(), areas.clear();
+        std::size_t most = 0;
+        for (const Run &run : near) most += run.end - run.begin;
+        points.reserve(3 * most), lab.reserve(3 * most), areas.reserve(most);  // takes no memory until it is used
         for (const Run &run : near)
             for (std::size_t i = run.begin; i < run.end; ++i) {
                 double at[3];
@@ -306,15 +302,25 @@ void maximum(const Grid &g, const Field &response, const int *shape, int x, int 
 struct Work {
     Field field;   // zero between blocks
     Field smooth;  // anything
-    Field a, b;    // anything, of one plane
+    Field plane;   // anything
 
-    void fit(const Grid &g) {
-        for (Field *f : {&field, &smooth})
-            if (f->size() < g.values()) f->resize(g.values());
-        for (Field *f : {&a, &b})
-            if (f->size() < g.at(g.ny, 0)) f->resize(g.at(g.ny, 0));
-    }
+    explicit Work(const Grid &largest) : field(largest.values()), smooth(largest.values()), plane(largest.at(largest.ny, 0)) {}
 };
+
+// As large a block as any of these points, so many cells a side.
+Grid largest(const Points &points, double size, double cells) {
+    int shape[3] = {};
+    for (int k = 0; k < 3; ++k) {
+        double low = 0, high = 0;
+        for (std::size_t i = 0; i < points.shape(0); ++i) {
+            const double at = points.data()[3 * i + k];
+            low = i ? std::min(low, at) : at;
+            high = i ? std::max(high, at) : at;
+        }
+        shape[k] = int(std::min(cells, (high - low) / size)) + 9;  // see Block
+    }
+    return Grid(shape[0], shape[1], shape[2]);
+}
 
 void empty(const Grid &g, Field &field, const Flags &flags) {
     for (std::size_t row = 0; row < flags.size(); ++row)
@@ -325,15 +331,14 @@ void empty(const Grid &g, Field &field, const Flags &flags) {
 std::vector<Extremum> extrema(const Block &block, Work &work, const double *thresholds, double sigma, double surround) {
     const int *shape = block.shape;
     const Grid g(shape[0], shape[1], shape[2]);
-    work.fit(g);
-    auto &[field, smooth, a, b] = work;
+    auto &[field, smooth, plane] = work;
     Flags filled(g.rows(), 0), surface(g.rows(), 0);
     splat(g, block, field, filled);
     const Blur near(g, sigma, filled, nullptr);
-    near(g, field, filled, a, b, smooth);
+    near(g, field, filled, plane, smooth);
     empty(g, field, filled);
-    const float plane = float(std::sqrt(2 * 3.14159265358979323846) * sigma);
-    const auto is_surface = [&](float mass) { return mass * plane > 0.3f; };
+    const float of_plane = float(std::sqrt(2 * 3.14159265358979323846) * sigma);
+    const auto is_surface = [&](float mass) { return mass * of_plane > 0.3f; };
     for (std::size_t row = 0; row < g.rows(); ++row)
         each(near.after_z[row], [&](int s) {
             bool any = false;
@@ -341,7 +346,7 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
             surface[row] |= std::uint64_t(any) << s;
         });
     const Blur far(g, sigma * std::sqrt(surround * surround - 1), near.after_z, &surface);
-    far(g, smooth, near.after_z, a, b, field);
+    far(g, smooth, near.after_z, plane, field);
     Field &response = field;  // takes the place of what is around
     const auto of = [](Field &values, std::size_t cell) -> Cell & { return *reinterpret_cast<Cell *>(&values[cell]); };
     for (std::size_t row = 0; row < g.rows(); ++row)
@@ -351,7 +356,7 @@ std::vector<Extremum> extrema(const Block &block, Work &work, const double *thre
                 of(response, cell) = is_surface(mass) ? of(smooth, cell) / std::max(mass, 1e-9f) -
                                                             of(field, cell) / std::max(around, 1e-9f)
                                                       : Cell{};
-                response[cell + 3] = mass * plane - 1;
+                response[cell + 3] = mass * of_plane - 1;
             }
         });
     Cell about;  // no more than the thresholds: most cells are far below
@@ -400,7 +405,7 @@ void bind_landmarks(nb::module_ &m) {
             std::vector<double> rows;
             {
                 nb::gil_scoped_release release;
-                Work work;
+                Work work(largest(points, size, edge + 2 * halo));
                 Block block;
                 const std::vector<Run> runs = runs_of(points, size, edge);
                 for (std::size_t r = 0; r < runs.size(); ++r) {

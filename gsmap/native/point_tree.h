@@ -70,7 +70,8 @@ template <int kAxes> class Tree {
     }
 
   private:
-    static constexpr int32_t kLeaf = 8;
+    static constexpr int32_t kLeaf = 12;
+    static constexpr int kDeepest = 32;  // halves of what an int32_t counts
     struct Node {
         double split;
         int32_t begin, end, right;  // of a leaf right is 0; the left child is the next node
@@ -104,26 +105,37 @@ template <int kAxes> class Tree {
         return at;
     }
 
+    // A half that was passed by on the way down: how far its box lies from `at`, along the axis of the split and in all.
+    struct Passed {
+        int32_t node, axis;
+        double offset, distance;
+    };
+
     // Calls take(best, found) for every point that may come before `best`, whose distance bounds the search; `away` is how
     // far the node's box lies from `at` along each axis, `distance` the sum of its squares.
     template <class Best, class Take>
     void search(int32_t node, const double *at, double *away, double distance, Best &best, const Take &take) const {
-        const Node &n = nodes_[node];
-        if (!n.right) {
-            for (int32_t i = n.begin; i < n.end; ++i) {
-                const Neighbour found{squared(at, &sorted_[kAxes * std::size_t(i)]), rows_[i]};
-                if (found.squared <= best.squared) take(best, found);
-            }
-            return;
+        Passed passed[kDeepest];
+        int deep = 0;
+        const Node *n = &nodes_[node];
+        for (; n->right; n = &nodes_[node]) {
+            const double offset = at[n->axis] - n->split, before = away[n->axis];
+            const bool left = offset < 0;
+            passed[deep++] = {left ? n->right : node + 1, n->axis, offset, distance - before * before + offset * offset};
+            node = left ? node + 1 : n->right;
         }
-        const double offset = at[n.axis] - n.split;
-        search(offset < 0 ? node + 1 : n.right, at, away, distance, best, take);
-        const double before = away[n.axis], across = distance - before * before + offset * offset;
-        // Rounding must not hide an equally near point, of which the first counts.
-        if (across <= best.squared * (1 + 1e-9)) {
-            away[n.axis] = offset;
-            search(offset < 0 ? n.right : node + 1, at, away, across, best, take);
-            away[n.axis] = before;
+        for (int32_t i = n->begin; i < n->end; ++i) {
+            const Neighbour found{squared(at, &sorted_[kAxes * std::size_t(i)]), rows_[i]};
+            if (found.squared <= best.squared) take(best, found);
+        }
+        while (deep) {
+            const Passed &p = passed[--deep];
+            // Rounding must not hide an equally near point, of which the first counts.
+            if (!(p.distance <= best.squared * (1 + 1e-9))) continue;
+            const double before = away[p.axis];
+            away[p.axis] = p.offset;
+            search(p.node, at, away, p.distance, best, take);
+            away[p.axis] = before;
         }
     }
 

@@ -117,7 +117,7 @@ struct Kernels {
     // One Adam update of rows [begin, begin + n) that are touched; clears their gradients, not `touched`.
     void (*adam)(const AdamArrays &, const AdamStep &, int64_t begin, int n, const uint8_t *touched, float *gradient);
     // One row of pixels of weight * sum mask |a - b|: adds its gradient to g, returns the sum. mask may be null.
-    float (*l1)(const float *a, const float *b, const float *mask, int pixels, float weight, float *g);
+    float (*huber)(const float *a, const float *b, const float *mask, int pixels, float delta, float weight, float *g);
     // Structural similarity of some rows of two images, and its gradient. Scratch: ssim_scratch(width) floats.
     void (*ssim)(const SsimTask &, float *scratch);
     // One correspondence against those after it: which agree, and which bin of log scales each pair votes for (or -1).
@@ -137,6 +137,10 @@ struct Kernels {
     float (*settle_nearest)(const Leaf &of, int k, Search &);
     int64_t (*within)(const int16_t *mine, const int8_t *theirs, int64_t stride, int64_t count, int32_t most,
                       int32_t *which, int32_t *squared);
+    // Rows of a grid of landmarks, of whose segments flags tell which are filled or wanted.
+    void (*blur_across)(const float *const *rows, const uint64_t *filled, const float *taps, int n, uint64_t wanted,
+                        float *out);
+    void (*blur_along)(const float *line, int step, const float *taps, int n, uint64_t wanted, float *out);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

@@ -3,6 +3,7 @@
 #include "correspondences_kernel.h"
 #include "filters_kernel.h"
 #include "fit_kernel.h"
+#include "landmarks_kernel.h"
 #include "merging_kernel.h"
 #include "rasteriser_blend.h"
 #include "rasteriser_blend_backward.h"
@@ -16,9 +17,9 @@
 
 static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project, GSMAP_ISA::blend, GSMAP_ISA::blend_limit,
                                      GSMAP_ISA::blend_backward, GSMAP_ISA::project_backward,
-                                     GSMAP_ISA::adam, GSMAP_ISA::l1, GSMAP_ISA::ssim, GSMAP_ISA::agree,
+                                     GSMAP_ISA::adam, GSMAP_ISA::huber, GSMAP_ISA::ssim, GSMAP_ISA::agree,
                                      GSMAP_ISA::vote, GSMAP_ISA::weigh, GSMAP_ISA::highest,
                                      GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::near,
                                      GSMAP_ISA::pair_costs, GSMAP_ISA::find_nearest, GSMAP_ISA::settle_nearest,
-                                     GSMAP_ISA::within};
+                                     GSMAP_ISA::within, GSMAP_ISA::blur_across, GSMAP_ISA::blur_along};
 const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;

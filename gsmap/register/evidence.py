@@ -123,7 +123,7 @@ def measure(
         cells = np.floor(forward[hit] / params.cell_m).astype(int)
         cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
         camera_free = CrossViewStats.of(0)
-        camera_free.compare(target.coarse[1][row[hit]], source.coarse[1][rows_s[hit]], cell)
+        camera_free.compare(_opponent(target.coarse[1][row[hit]]), _opponent(source.coarse[1][rows_s[hit]]), cell)
         colours = [camera_free.colour()]
     areas = np.sum([stats.areas_m2(params.pattern_correlation) for stats in judges], axis=0) if judges else np.zeros(3)
     return PoseEvidence(
@@ -196,7 +196,7 @@ class CrossViewStats:
             )
 
     def compare(self, a: np.ndarray, b: np.ndarray, patch: np.ndarray) -> None:
-        """Take colours (N, 3) of the same places into account, which lie in the patches of index ``patch`` (N,)."""
+        """Take lightness and chromas (N, 3) of the same places into account, in the patches of index ``patch`` (N,)."""
         if not len(a):
             return
         a, b = _local(a, patch), _local(b, patch)
@@ -257,17 +257,18 @@ def _compare(
     stats.agrees[other.dominant_id[0][agrees]] = True
     rows, columns = np.nonzero(agrees)
     patch = rows // params.patch_px * -(-agrees.shape[1] // params.patch_px) + columns // params.patch_px
-    stats.compare(own.colour[0][agrees], other.colour[0][agrees], patch)
+    a, b = _opponent(own.colour[0][agrees]), _opponent(other.colour[0][agrees])
+    stats.compare(a, b, patch)
     pattern = np.full(agrees.shape, np.nan)
     patch = rows // params.pattern_px * -(-agrees.shape[1] // params.pattern_px) + columns // params.pattern_px
-    pattern[agrees] = _pattern_correlation(own.colour[0][agrees], other.colour[0][agrees], patch, params)
+    pattern[agrees] = _pattern_correlation(a, b, patch, params)
     judged = in_front | agrees
     area_m2 = (other_depth[judged] / focal_px) ** 2
     stats.see(other.dominant_id[0][judged], area_m2, pattern[judged])
 
 
 def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray, params: Params) -> np.ndarray:
-    """(N,) correlation of local colours within the patch of each pixel; NaN where not both show a pattern."""
+    """(N,) correlation of lightness and chromas within the patch of each pixel; NaN where not both show a pattern."""
     if not len(a):
         return np.zeros(0)
     count = np.bincount(patch)
@@ -278,10 +279,15 @@ def _pattern_correlation(a: np.ndarray, b: np.ndarray, patch: np.ndarray, params
     return out
 
 
-def _local(colours: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """(N, 3) lightness and two chromas, less their means over patches."""
+def _opponent(colours: np.ndarray) -> np.ndarray:
+    """(N, 3) lightness and two chromas of RGB."""
     opponent = np.array([[0.299, 0.587, 0.114], [1.0, -1.0, 0.0], [0.5, 0.5, -1.0]]).T
-    values = np.clip(colours, 0.0, 1.0) @ opponent
+    out: np.ndarray = np.clip(colours, 0.0, 1.0) @ opponent
+    return out
+
+
+def _local(values: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """Values (N, 3) less their means over patches."""
     means = _sums(values, patch) / np.maximum(np.bincount(patch), 1)[:, None]
     return values - means[patch]
 

@@ -46,7 +46,8 @@ class Fitter:
         gaussians: where to start; copied.
         learning_rates: may be replaced between steps (``fitter.learning_rates = ...``).
         frozen: (N,) bool, Gaussians that are rendered but never changed.
-        ssim_weight: share of ``1 - SSIM`` in the loss; the rest is L1.
+        ssim_weight: share of ``1 - SSIM`` in the loss; the rest is Huber's of the colours.
+        huber_delta: differences of colours below this count by their square (Huber's loss); 0 is L1.
         background: colour behind everything.
         statistics: also keep what a densifier or pruner needs (about a tenth slower):
             ``gradient_norm`` (N,) float32, sum over views of the norm of dL/d(projected centre), in halves of the
@@ -65,13 +66,14 @@ class Fitter:
         *,
         frozen: np.ndarray | None = None,
         ssim_weight: float = 0.0,
+        huber_delta: float = 0.0,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         statistics: bool = False,
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-15,
     ) -> None:
         self.learning_rates = learning_rates or LearningRates()
-        self.ssim_weight = float(ssim_weight)
+        self.ssim_weight, self.huber_delta = float(ssim_weight), float(huber_delta)
         self.statistics = statistics
         self._background = np.asarray(background, np.float32)
         self._betas, self._epsilon = betas, epsilon
@@ -129,7 +131,9 @@ class Fitter:
             mask = None if masks is None else masks[i]
             looked_at = None if self.statistics else mask  # statistics are of whole pictures
             native.forward(self._views[i], arrays, pose, intrinsics, self._background, out, i, None, looked_at)
-            loss += image_loss(out["colour"][i], images[i], mask, self.ssim_weight, gradient[i]) / count
+            loss += (
+                image_loss(out["colour"][i], images[i], mask, self.ssim_weight, self.huber_delta, gradient[i]) / count
+            )
         if count > 1:
             gradient /= count
         rates = self.learning_rates

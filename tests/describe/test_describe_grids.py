@@ -7,6 +7,7 @@ import pytest
 from describe_places import room
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+from gsmap import _native
 from gsmap._native import landmark_surroundings
 from gsmap.describe import Params, describe
 from gsmap.describe.cloud import downsample, surface_cloud
@@ -41,6 +42,7 @@ def plain_extrema(points, lab, areas, threshold, channel):
     return np.argwhere(peaks) + low + 0.5, response[peaks] / threshold
 
 
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_extrema_are_those_of_the_plain_computation(cloud, channel):
     size = 0.1
@@ -57,6 +59,18 @@ def test_extrema_are_those_of_the_plain_computation(cloud, channel):
     assert distance.min(1).max() < 2.5
     assert abs(len(at) - len(expected)) <= 0.2 * len(expected)
     np.testing.assert_allclose(ratio, strong[distance.argmin(1)], rtol=1e-3)
+
+
+def test_every_instruction_set_finds_the_same_extrema(cloud, instruction_set):
+    args = cloud.points, cloud.lab.astype(float), cloud.areas, np.array([2.6, 2.0, 2.0, 0.6]), 0.1
+    found = list(detect._extrema(*args))
+    _native.use_instruction_set("baseline")
+    plain = list(detect._extrema(*args))
+    assert sum(len(at) for _, _, at, _ in plain) > 100
+    for (*kind, at, ratio), (*expected, where, strong) in zip(found, plain, strict=True):
+        assert kind == expected, instruction_set
+        np.testing.assert_array_equal(at, where)
+        np.testing.assert_array_equal(ratio, strong)
 
 
 def test_extrema_of_points_in_any_unit_are_those_of_points_in_cells(cloud):

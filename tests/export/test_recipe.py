@@ -131,7 +131,7 @@ def test_every_setting_of_a_merger_is_in_its_recipe():
                 else 3
                 if value is None
                 else value * 2
-                if value <= 0.5
+                if value < 0.5
                 else value / 2
             )
         new = type(value)(new) if isinstance(value, int) and not isinstance(value, bool) else new

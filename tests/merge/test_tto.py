@@ -147,8 +147,8 @@ def test_of_too_many_the_most_alike_become_one(watched):
 class WatchedFitter(tto.Fitter):
     """A fitter that remembers what it was given and what its steps cost."""
 
-    def __init__(self, start, *, frozen, ssim_weight):
-        super().__init__(start, frozen=frozen, ssim_weight=ssim_weight)
+    def __init__(self, start, **settings):
+        super().__init__(start, **settings)
         self.start, self.asked, self.losses = start, [], []
         WatchedFitter.last = self
 
@@ -218,7 +218,32 @@ def test_ssim_is_part_of_what_is_fitted():
     assert structure(with_ssim) > structure(without) + 1e-4
 
 
-PLAIN = Params(owner_cells=False, ssim_weight=0.0, min_weight=0.0, keep=1.0, prefer="both", voxel_m=0.01)
+def test_few_passes_come_nearer_by_huber_s_loss_and_less_momentum(watched):
+    """The colours that a fit of few steps misses its references by; what a map loses is square errors."""
+
+    def missed(params):
+        merge(two_scenes(), "tto", params)
+        fitter = watched.last
+        errors = [
+            (render(fitter.gaussians(), cameras).colour - images / np.float32(255)) ** 2 * masks[..., None]
+            for cameras, images, masks in {id(asked[1].base): asked for asked in fitter.asked}.values()
+        ]
+        return np.mean([error.mean() for error in errors])
+
+    params = Params(passes=3.0, stopping=tto.Stopping(sure_share=1.0))
+    as_in_training = replace(params.rates, momentum=0.9)
+    assert missed(params) < 0.97 * missed(replace(params, rates=as_in_training))
+    assert missed(params) < 0.97 * missed(replace(params, huber_delta=0.0))
+
+
+def test_a_momentum_that_never_forgets_is_refused():
+    with pytest.raises(ConfigError, match="momentum"):
+        Params(rates=replace(Params().rates, momentum=1.0))
+
+
+PLAIN = Params(
+    owner_cells=False, ssim_weight=0.0, huber_delta=0.0, min_weight=0.0, keep=1.0, prefer="both", voxel_m=0.01
+)
 
 
 @pytest.mark.parametrize("bounds", [None, np.array([[-0.3, -2, -2], [0.6, 2, 2]])])
@@ -246,7 +271,15 @@ def test_where_both_are_preferred_dates_decide_nothing():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"keep": 1.2}, {"steps": -1}, {"voxel_m": 0.0}, {"halo_m": -1.0}, {"ssim_weight": 2.0}]
+    "wrong",
+    [
+        {"keep": 1.2},
+        {"steps": -1},
+        {"voxel_m": 0.0},
+        {"halo_m": -1.0},
+        {"ssim_weight": 2.0},
+        {"huber_delta": -0.1},
+    ],
 )
 def test_settings_that_make_no_sense_are_refused_by_name(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):

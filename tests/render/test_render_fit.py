@@ -23,12 +23,13 @@ def structural_similarity(a, b):
     return ((2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4))).mean()
 
 
-@pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
-def test_steps_equal_torch_adam(ssim_weight):
+@pytest.mark.parametrize(("ssim_weight", "delta", "momentum"), [(0.0, 0.0, 0.9), (0.2, 0.0, 0.9), (0.2, 0.2, 0.5)])
+def test_steps_equal_torch_adam(ssim_weight, delta, momentum):
     gaussians, cameras = random_scene(4, n=400)
     target = np.random.default_rng(0).uniform(size=(1, 70, 100, 3)).astype(np.float32)
     rates = LearningRates(means=1e-3)
-    fitter = Fitter(gaussians, rates, ssim_weight=ssim_weight, epsilon=1e-8)
+    betas = momentum, 0.999
+    fitter = Fitter(gaussians, rates, ssim_weight=ssim_weight, huber_delta=delta, betas=betas, epsilon=1e-8)
     tensors = GaussianTensors.of(gaussians, requires_grad=True)
     base = tensors.sh.detach()[:, :1].clone().requires_grad_()
     rest = tensors.sh.detach()[:, 1:].clone().requires_grad_()
@@ -40,14 +41,15 @@ def test_steps_equal_torch_adam(ssim_weight):
         (base, rates.sh_base),
         (rest, rates.sh_rest),
     ]
-    adam = torch.optim.Adam([{"params": [p], "lr": r} for p, r in pairs], eps=1e-8)
+    adam = torch.optim.Adam([{"params": [p], "lr": r} for p, r in pairs], betas=betas, eps=1e-8)
     for _ in range(5):
         loss = fitter.step(cameras, target)
         adam.zero_grad()
         leaves = GaussianTensors(*tensors.tensors()[:4], torch.cat([base, rest], 1))
         image = render(leaves, cameras, depth=False, dominant_id=False).colour[0]
         truth = torch.from_numpy(target[0])
-        theirs = (1 - ssim_weight) * (image - truth).abs().mean()
+        colours = F.huber_loss(image, truth, delta=delta) / delta if delta else (image - truth).abs().mean()
+        theirs = (1 - ssim_weight) * colours
         theirs = theirs + ssim_weight * (1 - structural_similarity(image, truth))
         theirs.backward()
         adam.step()
@@ -72,7 +74,7 @@ def test_the_loss_of_an_image_and_its_gradient_are_torch_s_whatever_cuts_it_into
         for threads in (1, 3):
             set_num_threads(threads)
             gradient = np.empty_like(ours)
-            found.append((image_loss(ours, wanted, None, 1.0, gradient), gradient))
+            found.append((image_loss(ours, wanted, None, 1.0, 0.0, gradient), gradient))
     finally:
         set_num_threads()
     image = torch.from_numpy(ours).double().requires_grad_()

@@ -163,14 +163,16 @@ def _normals(
     ordered = np.sort(scales, axis=1)
     step = points[neighbours] - points[:, None]
 
-    def axes(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def axes(step: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         centred = step - ((weight[..., None] * step).sum(1) / weight.sum(1)[:, None])[:, None]
         values, vectors = np.linalg.eigh((weight[..., None] * centred).transpose(0, 2, 1) @ centred)
         return vectors[:, :, 0], (values[:, 1] - values[:, 0]) / np.maximum(values[:, 2], 1e-12)
 
-    rough = np.where((ordered[:, 0] < 0.5 * ordered[:, 1])[:, None], own, axes(np.ones(neighbours.shape))[0])
+    rough = own
+    others = np.flatnonzero(~(ordered[:, 0] < 0.5 * ordered[:, 1]))
+    rough[others] = axes(step[others], np.ones((len(others), neighbours.shape[1])))[0]
     off = (step @ rough[..., None])[..., 0]
-    return axes(np.exp(-0.5 * (off / 0.025) ** 2) + 1e-6)
+    return axes(step, np.exp(-0.5 * (off / 0.025) ** 2) + 1e-6)
 
 
 class _Surface:

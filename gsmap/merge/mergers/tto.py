@@ -3,8 +3,8 @@
 Graph-GSReg's merging (voxelise the union, then minimise the difference to renders of the originals; no photographs
 needed) with what measurably helps: in every cell the capture that shows most of it is the one that starts there, what
 is nowhere seen goes, what is most alike becomes one where there is too much, the newest capture wins where the place
-changed, and exposures can be balanced. With `owner_cells` off, both preferred, an `ssim_weight` and `min_weight` of 0
-and a `keep` of 1 it is the published method: an L1 fit of all voxels of the union.
+changed, and exposures can be balanced. With `owner_cells` off, both preferred, an `ssim_weight`, `huber_delta` and
+`min_weight` of 0 and a `keep` of 1 it is the published method: an L1 fit of all voxels of the union.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from gsmap.render.fit import Fitter, LearningRates
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
-VERSION = 7
+VERSION = 8
 STEPS: str | None = "steps"
 RENDERS = True
 
@@ -48,19 +48,22 @@ class Rates:
         sh_base: of colours.
         sh_rest: of what colours depend on the direction.
         last: the last step as a share of the first, reached exponentially.
+        momentum: share of the gradients before that a step keeps. What pays in training is too much here: a Gaussian is
+            moved a hundred times, each by another view than the last.
     """
 
     means: float = 0.07
-    quats: float = 4e-3
-    log_scales: float = 2e-2
+    quats: float = 8e-3
+    log_scales: float = 4e-2
     logit_opacities: float = 0.25
     sh_base: float = 4e-2
     sh_rest: float = 5e-3
     last: float = 0.1
+    momentum: float = 0.5
 
     def at(self, progress: float, size_m: float) -> LearningRates:
         """The steps at a share of the optimisation, for Gaussians of a size."""
-        first = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "last"}
+        first = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("last", "momentum")}
         first |= {"means": self.means * size_m}
         return LearningRates(**{name: rate * self.last**progress for name, rate in first.items()})
 
@@ -93,7 +96,9 @@ class Params:
             surface do not lie over one another.
         cell_m: side of these cells.
         cover_m: an owner's Gaussian this near stands for another capture's.
-        ssim_weight: share of 1 - SSIM in the loss; the rest is L1.
+        ssim_weight: share of 1 - SSIM in the loss; the rest is Huber's.
+        huber_delta: differences of colours below this, of [0, 1], count by their square, so that steps shorten as the
+            fit gets near; 0 is L1.
         passes: how often each view is used, where steps are not given; fewer when it no longer gains.
         steps: how many optimisation steps, exactly.
         halo_m: how far around a tile its surroundings are rendered along, the outer half of it frozen.
@@ -119,6 +124,7 @@ class Params:
     cell_m: float = 0.5
     cover_m: float = 0.1
     ssim_weight: float = 0.2
+    huber_delta: float = 0.05
     passes: float = 4.0
     steps: int | None = None
     halo_m: float = 1.0
@@ -140,12 +146,14 @@ class Params:
         for name in ("voxel_m", "cell_m", "longest_side_px"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("cover_m", "passes", "halo_m", "reach_m", "min_cameras", "min_weight"):
+        for name in ("cover_m", "passes", "halo_m", "reach_m", "min_cameras", "min_weight", "huber_delta"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in ("keep", "ssim_weight"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be a share in [0, 1], got {getattr(self, name)}")
+        if not 0 <= self.rates.momentum < 1:
+            raise ConfigError(f"rates.momentum must be in [0, 1), got {self.rates.momentum}")
 
 
 def reach_m(params: Params) -> float:
@@ -274,7 +282,13 @@ def _fit(
     stopping = params.stopping
     one_pass = max(stopping.min_pass_steps, round(wanted.view_weights.sum()))
     steps = params.steps if params.steps is not None else round(params.passes * one_pass)
-    fitter = Fitter(start, frozen=frozen, ssim_weight=params.ssim_weight)
+    fitter = Fitter(
+        start,
+        frozen=frozen,
+        ssim_weight=params.ssim_weight,
+        huber_delta=params.huber_delta,
+        betas=(params.rates.momentum, 0.999),
+    )
     cameras = [wanted.cameras[v] for v in range(len(wanted))]
     size_m = float(np.exp(np.median(start.log_scales.max(1))))
     losses: list[float] = []
