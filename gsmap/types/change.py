@@ -35,7 +35,7 @@ class Change:
         S_after_before: of a thing that moved: takes a point of it from where it stood to where it stands.
         symmetry: of a thing that moved: ``none``, or the turn about the vertical that nothing tells apart, ``half`` or
             ``any``; its yaw is known up to that.
-        confidence: in [0, 1], that there is a change of this kind here.
+        confidence: in [0, 1], how probable it is that something changed here, of as many right ones as wrong.
         evidence: numbers behind it, by name, such as the views that looked through.
     """
 

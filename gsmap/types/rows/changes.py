@@ -57,7 +57,7 @@ class ChangeRow(VisitPairRef):
         S_after_before: of a thing that moved: takes a point of it from where it stood to where it stands, map frame.
         symmetry: of a thing that moved: ``none``, or the turn about the vertical up to which its yaw is known: ``half``
             or ``any``.
-        confidence: in [0, 1], that there is a change of this kind here.
+        confidence: in [0, 1], how probable it is that something changed here, of as many right ones as wrong.
         evidence: numbers behind it, by name.
         status: what people say of it: ``open``, ``confirmed`` or ``rejected``.
         picture: file with the thing before and after, where pictures were asked for; else null.
