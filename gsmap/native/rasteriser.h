@@ -116,7 +116,7 @@ struct Kernels {
                              const SceneGradient &, double *pose);
     // One Adam update of rows [begin, begin + n) that are touched; clears their gradients, not `touched`.
     void (*adam)(const AdamArrays &, const AdamStep &, int64_t begin, int n, const uint8_t *touched, float *gradient);
-    // One row of pixels of weight * sum mask |a - b|: adds its gradient to g, returns the sum. mask may be null.
+    // One row of pixels of weight * sum mask huber(a - b): adds its gradient to g, returns the sum. mask may be null.
     float (*huber)(const float *a, const float *b, const float *mask, int pixels, float delta, float weight, float *g);
     // Structural similarity of some rows of two images, and its gradient. Scratch: ssim_scratch(width) floats.
     void (*ssim)(const SsimTask &, float *scratch);
