@@ -134,12 +134,16 @@ class World:
 
     def truth(self, shot: Shot, scene: str) -> np.ndarray:
         """(4, 4) the camera in the frame of the map that a scene says."""
+        return self.truth_of(shot.T_world_camera, scene)
+
+    def truth_of(self, T_world_camera: np.ndarray, scene: str) -> np.ndarray:
+        """The same of a pose in the world."""
         placed = self.localizer.placed[scene]
         unit = self.localizer.metres.get(placed.component, 1.0)
         S = placed.S_metric_scene @ self.S_scene_world[scene]
         out = np.eye(4)
-        out[:3, :3] = S.rotation @ shot.T_world_camera[:3, :3]
-        out[:3, 3] = S.apply(shot.T_world_camera[:3, 3]) / unit
+        out[:3, :3] = S.rotation @ T_world_camera[:3, :3]
+        out[:3, 3] = S.apply(T_world_camera[:3, 3]) / unit
         return out
 
 

@@ -38,7 +38,7 @@ from scipy.optimize import minimize
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
-from gsmap.localize import aligning, features, localizing, settling, words
+from gsmap.localize import aligning, covariance, features, localizing, settling, words
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
@@ -72,6 +72,12 @@ def places(folder: Path, split: str, cache: Path, params: Params) -> list[Place]
 
 
 def _place(folder: Path, cache: Path, params: Params) -> Place:
+    scenes = load_place(folder, cache, params)
+    return Place(folder.name, scenes, json.loads((folder / "photos.json").read_text()), folder)
+
+
+def load_place(folder: Path, cache: Path, params: Params) -> list[PlacedFeatures]:
+    """The captures in a folder where they truly lie, with their features, which are kept."""
     scenes = []
     for path in sorted(folder.glob("*.ply")):
         truth = np.array(json.loads((folder / "truth" / f"{path.stem}.json").read_text())["T_scene_world"])
@@ -79,7 +85,7 @@ def _place(folder: Path, cache: Path, params: Params) -> Place:
         found = partial(_features, path, cache, params)
         scene = f"{folder.name}/{path.stem}"
         scenes.append(PlacedFeatures(scene, Sim3.from_matrix(truth).inverse(), 0, None, read, found))
-    return Place(folder.name, scenes, json.loads((folder / "photos.json").read_text()), folder)
+    return scenes
 
 
 def _gaussians(path: Path):
@@ -386,19 +392,24 @@ def report(name: str, rows: list[Row], odds: np.ndarray) -> None:
 
 
 def fit_sigma(found: list[Place], params: Params) -> None:
-    """By how much residuals are too sure, and what leaves none: the likeliest of a grid.
+    """By how much residuals are too sure, and the more so the less the render agrees, and what leaves none: the
+    likeliest of a grid.
 
-    Started near the truth, so that all poses are right; every sixth photo. Likelihoods are of Student's t of 8 degrees
+    Started near the truth, so that all poses are right; every other photo. Likelihoods are of Student's t of 8 degrees
     of freedom, since a few photos are placed on a part of a map that is bent.
     """
-    plain_sigma = replace(params.covariance, swell=1.0, swell_aligned=1.0, hidden_m=0.0, hidden_rad=0.0, differing=0.0)
+    plain_sigma = covariance.Params(
+        swell=1.0, swell_aligned=1.0, disagreeing=0.0, hidden_m=0.0, hidden_rad=0.0, differing=0.0
+    )
     params = replace(params, covariance=plain_sigma)
-    told: list[tuple[np.ndarray, ...]] = []  # error, what patches and what colours tell, and by what these differ
+    told: list[
+        tuple[np.ndarray, ...]
+    ] = []  # error, what patches and what colours tell, by what these differ, agreement
     rng, between = np.random.default_rng(7), settling._between
 
     for place in found:
         own = {scene.scene: scene for scene in place.scenes}
-        for photo_told in place.photos[::6]:
+        for photo_told in place.photos[::2]:
             photo, truth = place.photo(photo_told), np.array(photo_told["T_world_camera"])
             picture, _ = localizing.prepared(photo, params)
             both: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -411,26 +422,33 @@ def fit_sigma(found: list[Place], params: Params) -> None:
             xi = np.r_[rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.05]
             start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
             judged = localizing.judged_pose(picture, start, own, params)
-            if both and judged.probability > 0.9:
-                told.append((_error(judged.settled.T_metric_camera, truth), *both[0]))
+            if both and judged.probability > 0.5:
+                agreement = np.array(judged.settled.agreement)
+                told.append((_error(judged.settled.T_metric_camera, truth), *both[-1], agreement))
     settling._between = between
+    error, by_patches, by_colours, apart, agreement = (np.stack(column) for column in zip(*told, strict=True))
     tried = []
-    for patches, aligned in product((1.5, 2.1, 2.6), (1.5, 2.6, 3.7, 4.7)):
+    for patches, aligned, disagreeing in product(
+        (0.5, 0.7, 1.0, 1.5, 2.1), (0.7, 1.0, 1.5, 2.1, 3.0), (0, 1, 1.5, 2, 3)
+    ):
+        parts = by_patches * patches**2, by_colours * aligned**2
+        residual = 2 * np.linalg.inv(np.linalg.inv(parts[0]) + np.linalg.inv(parts[1]))
+        doubt = covariance.doubt_of(agreement, disagreeing)[:, None, None] ** 2
         for hidden_m, hidden_rad, differing in product(
-            (0.002, 0.004, 0.007, 0.01), (0.0005, 0.001, 0.002), (0.0, 0.1, 0.25, 0.5)
+            (0.002, 0.004, 0.007), (0.0005, 0.001, 0.0015), (0.0, 0.1, 0.25)
         ):
-            nees, likely = [], []
-            for error, by_patches, by_colours, apart in told:
-                parts = by_patches * patches**2, by_colours * aligned**2
-                known = 2 * np.linalg.inv(sum(np.linalg.inv(part) for part in parts))
-                known += differing * np.outer(apart, apart)
-                known += np.diag(np.r_[np.full(3, hidden_rad), np.full(3, hidden_m)] ** 2)
-                nees.append(error @ np.linalg.solve(known, error))
-                likely.append(-0.5 * np.linalg.slogdet(known)[1] - 7 * np.log1p(nees[-1] / 8))
-            settings = f"swell {patches}, swell_aligned {aligned}, hidden_m {hidden_m}, hidden_rad {hidden_rad}, "
-            tried.append((np.mean(likely), settings + f"differing {differing}", *np.quantile(nees, (0.5, 0.9))))
-    for likely_, settings, middle, most in sorted(tried, reverse=True)[:8]:
-        print(f"likelihood {likely_:.2f}: {settings}; NEES {middle:.1f}, 90th {most:.1f}")
+            known = doubt * (residual + differing * apart[:, :, None] * apart[:, None, :])
+            known += np.diag(np.r_[np.full(3, hidden_rad), np.full(3, hidden_m)] ** 2)
+            nees = np.einsum("ni,ni->n", error, np.linalg.solve(known, error[..., None])[..., 0])
+            likely = (-0.5 * np.linalg.slogdet(known)[1] - 7 * np.log1p(nees / 8)).mean()
+            settings = f"swell {patches}, swell_aligned {aligned}, disagreeing {disagreeing}, hidden_m {hidden_m}, "
+            settings += f"hidden_rad {hidden_rad}, differing {differing}"
+            low = np.median(nees[agreement < 0.45])
+            tried.append((likely, settings, *np.quantile(nees, (0.5, 0.9)), low, np.median(nees[agreement > 0.6])))
+    print(f"{len(error)} poses")
+    for likely_, settings, middle, most, low, high in sorted(tried, reverse=True)[:12]:
+        by = f"median {low:.1f} where renders agree by less than .45, {high:.1f} by more than .6"
+        print(f"likelihood {likely_:.3f}: {settings}; NEES {middle:.1f}, 90th {most:.1f}; {by}")
 
 
 # --- placed ----------------------------------------------------------------------------------------------------------

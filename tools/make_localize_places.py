@@ -15,7 +15,9 @@ import contextlib
 import json
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -52,13 +54,19 @@ def make(folder: Path, seed: int) -> None:
         return
     began = time.process_time()
     rng = np.random.default_rng([seed, 31])
-    twin = bool(rng.random() < 0.2)
-    place = synthetic.make_place(seed, rooms=3, twin=twin, texel_m=0.008)
+    twin = bool(rng.random() < 0.2)  # as `made_place` draws it
+    place = made_place(seed)
     for k, route in enumerate(default_routes(place, 2)):
         synthetic.write_captures(folder, [_capture(place, route, k, seed, rng)])
     _photograph(place, folder, rng)
     (folder / "done").touch()
     print(f"{seed}: {'a twin, ' if twin else ''}{time.process_time() - began:.0f} CPU s", flush=True)
+
+
+def made_place(seed: int) -> Place:
+    """The place of a seed."""
+    twin = bool(np.random.default_rng([seed, 31]).random() < 0.2)
+    return synthetic.make_place(seed, rooms=3, twin=twin, texel_m=0.008)
 
 
 def _capture(
@@ -84,14 +92,24 @@ def _capture(
 
 
 def _photograph(place: Place, folder: Path, rng: np.random.Generator) -> None:
-    """Photographs: along other walks and from anywhere, by other lenses, in other light, of what has changed."""
     (folder / "photos").mkdir(exist_ok=True)
     changed = place
     with contextlib.suppress(ConfigError):  # some rooms hold too little to change so much of
         changed = edit_place(place, random_edits(place, rng, rooms=list(range(len(place.rooms))), share=0.3))
     told = []
-    for i in range(PHOTOS):
-        pose = _pose(place, rng)
+    for i, (image, said) in enumerate(photographs(place, changed, range(len(place.rooms)), PHOTOS, rng)):
+        Image.fromarray(image).save(folder / "photos" / f"p{i:03d}.jpg", quality=88)
+        told.append({"file": f"p{i:03d}.jpg", **said})
+    (folder / "photos.json").write_text(json.dumps(told))
+
+
+def photographs(
+    place: Place, changed: Place, rooms: Sequence[int], count: int, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
+    """Photographs (H, W, 3) and what is true of them: along other walks and from anywhere, by other lenses, in other
+    light, every fourth of what has changed, in every sixth somebody."""
+    for i in range(count):
+        pose = _pose(place, rooms, rng)
         width = PHOTO_PX[0]
         focal, gain, gamma = rng.uniform(0.55, 0.95), rng.uniform(0.6, 1.4), rng.uniform(0.85, 1.2)
         seen = changed if i % 4 == 3 else place
@@ -101,24 +119,22 @@ def _photograph(place: Place, folder: Path, rng: np.random.Generator) -> None:
         occluded = 0.0
         if i % 6 == 5:
             shot, occluded = _occluded(shot, rng)
-        Image.fromarray(shot).save(folder / "photos" / f"p{i:03d}.jpg", quality=88)
-        told.append(
+        yield (
+            shot,
             {
-                "file": f"p{i:03d}.jpg",
                 "T_world_camera": pose.tolist(),
                 "intrinsics": [focal * width, focal * width, width / 2, PHOTO_PX[1] / 2],
                 "gain": gain,
                 "changed": seen is not place,
                 "occluded": occluded,
-            }
+            },
         )
-    (folder / "photos.json").write_text(json.dumps(told))
 
 
-def _pose(place: Place, rng: np.random.Generator) -> np.ndarray:
-    """A standpoint in the free part of a room, at the height of a hand, looking about level."""
+def _pose(place: Place, rooms: Sequence[int], rng: np.random.Generator) -> np.ndarray:
+    """A standpoint in the free part of one of some rooms, at the height of a hand, looking about level."""
     while True:
-        room = place.rooms[int(rng.integers(len(place.rooms)))]
+        room = place.rooms[rooms[int(rng.integers(len(rooms)))]]
         xy = room.center + (rng.random(2) - 0.5) * (room.size_m - 0.6)
         if room.is_free(xy[None])[0]:
             break

@@ -25,17 +25,20 @@ class Params:
         hidden_rad: the same of a rotation.
         swell: by how many times the standard deviations that residuals of patches tell are too small on made places.
         swell_aligned: the same of what differences of colours tell.
+        disagreeing: both are the more too small, the less the render agrees with the photo: of one that agrees less by
+            .1 by so many tenths (of the logarithm).
         differing: by what poses by patches and by colours differ either may be wrong: so large a share of its square is
             added.
     """
 
     blocks: tuple[int, int] = (6, 4)
     least_px: float = 0.15
-    hidden_m: float = 0.007
-    hidden_rad: float = 0.001
+    hidden_m: float = 0.003
+    hidden_rad: float = 0.0005
     swell: float = 2.1
-    swell_aligned: float = 3.7
-    differing: float = 0.25
+    swell_aligned: float = 4.7
+    disagreeing: float = 2.0
+    differing: float = 0.5
 
 
 def pose_covariance(
@@ -74,6 +77,15 @@ def of_aligned(fit: aligning.Aligned, size_px: tuple[int, int], params: Params, 
     prior = noise / focal_sigma**2 if 0 < focal_sigma < np.inf else 0.0
     told = _sandwich(fit.jacobian, fit.weights, fit.residuals, fit.pixels / size_px, 0.0, prior, params.blocks)
     return told * params.swell_aligned**2
+
+
+def doubt_of(agreement: np.ndarray | float, disagreeing: float) -> np.ndarray:
+    """By how many times standard deviations are larger than where a render agrees by one half with the photo.
+
+    Where it agrees less the splats show less, from farther away, and where nobody looked from that side: their errors
+    are of many pixels together, and residuals do not tell them.
+    """
+    return np.exp(disagreeing * (0.5 - np.asarray(agreement)))
 
 
 def with_hidden(told: np.ndarray, params: Params) -> np.ndarray:

@@ -186,6 +186,7 @@ def _settled(
         fit = replace(fit, residuals_px=patches.pixels - at)
     if told is None:
         return _nowhere(pose, lens, agreement)
+    told = told * covariance.doubt_of(agreement, known.disagreeing) ** 2
     return Settled(
         pose,
         lens,

@@ -69,6 +69,15 @@ def test_the_jacobian_is_that_of_differences() -> None:
         assert np.allclose(numeric, at.jacobian[:, :, k], rtol=1e-3, atol=1e-2)
 
 
+def test_a_render_that_agrees_less_is_less_sure() -> None:
+    """The median error of poses on made places falls fourfold from an agreement of .35 to one of .75."""
+    params = covariance.Params()
+    sure, unsure = (float(covariance.doubt_of(agreement, params.disagreeing)) for agreement in (0.75, 0.35))
+    assert sure < 1 < unsure
+    assert 1.5 < unsure / sure < 6
+    assert covariance.doubt_of(0.1, 0.0) == 1
+
+
 def test_the_covariance_is_that_of_repeated_noise() -> None:
     """Independent noise of a pixel: what the residuals tell is what repetitions show, within a factor."""
     pose, points, clean = points_seen(300)

@@ -12,6 +12,7 @@ from gsmap.geometry.rotations import exp_so3
 from gsmap.localize import Params, localize_together, read_clip
 from gsmap.localize import clips as reading
 from gsmap.localize.extractors import sift
+from gsmap.localize.localizing import judged_poses, placement, prepared
 from gsmap_synthetic import film
 
 SIFT = sift.make({}, sift.Params())
@@ -28,6 +29,19 @@ def test_whoever_is_placed_helps_the_others(world) -> None:
         assert one.is_placed, one.reason
         assert np.linalg.norm(one.T_map_camera[:3, 3] - truth[:3, 3]) < 0.06
     assert min(one.probability for one in placed) > 0.95
+
+
+def test_a_pose_by_another_photos_features_alone_is_said_by_its_scene(world) -> None:
+    """The map was not rendered from there, so no render says which scene it is."""
+    picture, scale = prepared(world.photos[1], Params())
+    scenes = {"scene": world.placed}
+    found = judged_poses(picture, world.index, scenes, SIFT, Params())[0][0]
+    pixels = found.settled.pixels
+    unseen = replace(found.settled, looks=[], scene=np.zeros(len(pixels), int))
+    said = placement("beside", replace(found, settled=unseen), 0.0, picture, scale, scenes, Params())
+    assert said.is_placed, said.reason
+    assert said.scenes == ("scene",)
+    assert said.num_gaussians == 0
 
 
 def test_photos_of_other_places_stay_refused_together(world, elsewhere) -> None:
