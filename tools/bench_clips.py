@@ -28,11 +28,10 @@ from pathlib import Path
 
 import numpy as np
 from bench_localize import World, house_shots, world
-from fit_localize import WRONG_DEG, WRONG_M, Place, index_of, places
+from fit_localize import WRONG_DEG, WRONG_M, Place, index_of, places, camera_error
 from make_localize_places import made_place
 
 import gsmap_synthetic as synthetic
-from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import localize_photo, localize_together
 from gsmap.localize.looks import look
 from gsmap.localize.params import Params
@@ -120,14 +119,9 @@ def house_clips(data: Path, held: World) -> Iterator[tuple[list[Frame], set[str]
 def answer(frame: Frame, said: Placement, truth: np.ndarray, metres_per_unit: float) -> Answer:
     if said.T_map_camera is None:
         return Answer(frame.coverage)
-    pose = said.T_map_camera
-    turn = rotation_vectors(pose[:3, :3].T @ truth[:3, :3])[0]
-    shift = pose[:3, :3].T @ (truth[:3, 3] - pose[:3, 3])
-    xi = np.r_[turn, shift]
-    nees = np.nan if said.covariance is None else float(xi @ np.linalg.solve(said.covariance, xi))
-    return Answer(
-        frame.coverage, float(np.degrees(np.linalg.norm(turn))), float(np.linalg.norm(shift) * metres_per_unit), nees
-    )
+    xi = camera_error(said.T_map_camera, truth)
+    deg, metres = float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]) * metres_per_unit)
+    return Answer(frame.coverage, deg, metres, float(xi @ np.linalg.solve(said.covariance, xi)))
 
 
 def say(name: str, answers: Sequence[Answer], seconds: float) -> None:

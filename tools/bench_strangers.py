@@ -21,7 +21,6 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import argparse
-import contextlib
 import sys
 import time
 from collections.abc import Iterator
@@ -30,19 +29,16 @@ from pathlib import Path
 
 import numpy as np
 from fit_localize import index_of, load_place, places
-from make_localize_places import CAPTURE_PX, PHOTO_PX, PHOTOS, photographs
+from make_localize_places import CAPTURE_PX, PHOTO_PX, PHOTOS, changed_place, photographs
 
 import gsmap_synthetic as synthetic
-from gsmap.errors import ConfigError
 from gsmap.localize import localize_photo
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.methods import family
 from gsmap.types.localization import Photo, Placement
 from gsmap_synthetic.capture import unused_doors
-from gsmap_synthetic.edits import edit_place
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
-from gsmap_synthetic.script import random_edits
 from gsmap_synthetic.streets import make_street, street_routes
 
 FIRST_SEED = 70_000  # of places that are strangers to all that is fitted and tested
@@ -69,9 +65,7 @@ def strangers(count: int) -> Iterator[tuple[np.ndarray, dict, str]]:
         seed = FIRST_SEED + number
         place = synthetic.make_place(seed, rooms=3, texel_m=0.008)
         rng = np.random.default_rng([seed, 31])
-        changed = place
-        with contextlib.suppress(ConfigError):
-            changed = edit_place(place, random_edits(place, rng, rooms=list(range(len(place.rooms))), share=0.3))
+        changed = changed_place(place, rng)
         of_place = min(PHOTOS, count - number * PHOTOS)
         for k, (image, told) in enumerate(photographs(place, changed, range(len(place.rooms)), of_place, rng)):
             yield image, told, f"{seed} photo {k}"

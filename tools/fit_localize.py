@@ -279,14 +279,14 @@ def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], f
     """Error in degrees and metres, and the normalised squared error by the covariance."""
     if kind == "elsewhere":
         return (180.0, np.inf), np.nan
-    xi = _error(judged.settled.T_metric_camera, truth)
+    xi = camera_error(judged.settled.T_metric_camera, truth)
     error = float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]))
     if judged.covariance is None:
         return error, np.nan
     return error, float(xi @ np.linalg.solve(judged.covariance, xi))
 
 
-def _error(T: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def camera_error(T: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """(6,) [rot_rad, trans] by which a pose is off, on the camera's side."""
     turn, shift = rotation_vectors(T[:3, :3].T @ truth[:3, :3])[0], T[:3, :3].T @ (truth[:3, 3] - T[:3, 3])
     return np.r_[turn, shift]
@@ -395,47 +395,45 @@ def fit_sigma(found: list[Place], params: Params) -> None:
     """By how much residuals are too sure, and the more so the less the render agrees, and what leaves none: the
     likeliest of a grid.
 
-    Started near the truth, so that all poses are right; every other photo. Likelihoods are of Student's t of 8 degrees
-    of freedom, since a few photos are placed on a part of a map that is bent.
+    Started near the truth; poses that settle right and are more probable than not. Likelihoods are of Student's t of 8
+    degrees of freedom, since a few photos are placed on a part of a map that is bent.
     """
     plain_sigma = covariance.Params(
         swell=1.0, swell_aligned=1.0, disagreeing=0.0, hidden_m=0.0, hidden_rad=0.0, differing=0.0
     )
     params = replace(params, covariance=plain_sigma)
-    told: list[
-        tuple[np.ndarray, ...]
-    ] = []  # error, what patches and what colours tell, by what these differ, agreement
+    # Errors, what patches and what colours tell, by what the two differ, and how well the render agreed.
+    told: list[tuple[np.ndarray, ...]] = []
     rng, between = np.random.default_rng(7), settling._between
 
     for place in found:
         own = {scene.scene: scene for scene in place.scenes}
-        for photo_told in place.photos[::2]:
+        for photo_told in place.photos:
             photo, truth = place.photo(photo_told), np.array(photo_told["T_world_camera"])
             picture, _ = localizing.prepared(photo, params)
             both: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
             def noted(pose, lens, by_colours, fit, by_patches, differing, both=both):
-                both.append((by_patches, by_colours, _error(pose, fit.T_map_camera)))
+                both.append((by_patches, by_colours, camera_error(pose, fit.T_map_camera)))
                 return between(pose, lens, by_colours, fit, by_patches, differing)
 
             settling._between = noted
             xi = np.r_[rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.05]
             start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
             judged = localizing.judged_pose(picture, start, own, params)
-            if both and judged.probability > 0.5:
-                agreement = np.array(judged.settled.agreement)
-                told.append((_error(judged.settled.T_metric_camera, truth), *both[-1], agreement))
+            off = camera_error(judged.settled.T_metric_camera, truth)
+            right = np.linalg.norm(off[:3]) < np.radians(WRONG_DEG) and np.linalg.norm(off[3:]) < WRONG_M
+            if both and right and judged.probability > 0.5:
+                told.append((off, *both[-1], np.array(judged.settled.agreement)))
     settling._between = between
     error, by_patches, by_colours, apart, agreement = (np.stack(column) for column in zip(*told, strict=True))
     tried = []
-    for patches, aligned, disagreeing in product(
-        (0.5, 0.7, 1.0, 1.5, 2.1), (0.7, 1.0, 1.5, 2.1, 3.0), (0, 1, 1.5, 2, 3)
-    ):
+    for patches, aligned, disagreeing in product((1.5, 2.1, 2.6), (2.6, 3.7, 4.7, 5.9), (0.0, 1.0, 1.5, 2.0, 2.5, 3.0)):
         parts = by_patches * patches**2, by_colours * aligned**2
         residual = 2 * np.linalg.inv(np.linalg.inv(parts[0]) + np.linalg.inv(parts[1]))
         doubt = covariance.doubt_of(agreement, disagreeing)[:, None, None] ** 2
         for hidden_m, hidden_rad, differing in product(
-            (0.002, 0.004, 0.007), (0.0005, 0.001, 0.0015), (0.0, 0.1, 0.25)
+            (0.002, 0.003, 0.005, 0.007), (0.0003, 0.0005, 0.001), (0.1, 0.25, 0.5, 1.0)
         ):
             known = doubt * (residual + differing * apart[:, :, None] * apart[:, None, :])
             known += np.diag(np.r_[np.full(3, hidden_rad), np.full(3, hidden_m)] ** 2)

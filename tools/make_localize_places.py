@@ -53,8 +53,7 @@ def make(folder: Path, seed: int) -> None:
     if (folder / "done").exists():
         return
     began = time.process_time()
-    rng = np.random.default_rng([seed, 31])
-    twin = bool(rng.random() < 0.2)  # as `made_place` draws it
+    rng, twin = drawn(seed)
     place = made_place(seed)
     for k, route in enumerate(default_routes(place, 2)):
         synthetic.write_captures(folder, [_capture(place, route, k, seed, rng)])
@@ -63,10 +62,22 @@ def make(folder: Path, seed: int) -> None:
     print(f"{seed}: {'a twin, ' if twin else ''}{time.process_time() - began:.0f} CPU s", flush=True)
 
 
+def drawn(seed: int) -> tuple[np.random.Generator, bool]:
+    """What a place's captures and photographs are drawn from, and whether it has a twin."""
+    rng = np.random.default_rng([seed, 31])
+    return rng, bool(rng.random() < 0.2)
+
+
 def made_place(seed: int) -> Place:
     """The place of a seed."""
-    twin = bool(np.random.default_rng([seed, 31]).random() < 0.2)
-    return synthetic.make_place(seed, rooms=3, twin=twin, texel_m=0.008)
+    return synthetic.make_place(seed, rooms=3, twin=drawn(seed)[1], texel_m=0.008)
+
+
+def changed_place(place: Place, rng: np.random.Generator) -> Place:
+    """The same after a third of its furniture was changed."""
+    with contextlib.suppress(ConfigError):  # some rooms hold too little to change so much of
+        return edit_place(place, random_edits(place, rng, rooms=list(range(len(place.rooms))), share=0.3))
+    return place
 
 
 def _capture(
@@ -93,9 +104,7 @@ def _capture(
 
 def _photograph(place: Place, folder: Path, rng: np.random.Generator) -> None:
     (folder / "photos").mkdir(exist_ok=True)
-    changed = place
-    with contextlib.suppress(ConfigError):  # some rooms hold too little to change so much of
-        changed = edit_place(place, random_edits(place, rng, rooms=list(range(len(place.rooms))), share=0.3))
+    changed = changed_place(place, rng)
     told = []
     for i, (image, said) in enumerate(photographs(place, changed, range(len(place.rooms)), PHOTOS, rng)):
         Image.fromarray(image).save(folder / "photos" / f"p{i:03d}.jpg", quality=88)

@@ -23,10 +23,10 @@ class Params:
         hidden_m: standard deviation of a translation that leaves no residual: the splats of a capture lie beside the
             surface that its photographs show; fitted on made places by ``tools/fit_localize.py``.
         hidden_rad: the same of a rotation.
-        swell: by how many times the standard deviations that residuals of patches tell are too small on made places.
+        swell: by how many times the standard deviations that residuals of patches tell are too small on made places,
+            where a render agrees by one half with the photo.
         swell_aligned: the same of what differences of colours tell.
-        disagreeing: both are the more too small, the less the render agrees with the photo: of one that agrees less by
-            .1 by so many tenths (of the logarithm).
+        disagreeing: where it agrees less or more they are multiplied by exp(disagreeing * (0.5 - agreement)).
         differing: by what poses by patches and by colours differ either may be wrong: so large a share of its square is
             added.
     """
@@ -84,6 +84,10 @@ def doubt_of(agreement: np.ndarray | float, disagreeing: float) -> np.ndarray:
 
     Where it agrees less the splats show less, from farther away, and where nobody looked from that side: their errors
     are of many pixels together, and residuals do not tell them.
+
+    Args:
+        agreement: of the render that was laid over it last, in [0, 1] (`gsmap.localize.aligning.Aligned`).
+        disagreeing: of `Params`.
     """
     return np.exp(disagreeing * (0.5 - np.asarray(agreement)))
 

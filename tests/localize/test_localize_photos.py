@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gsmap.geometry.rotations import angle_between
-from gsmap.localize import Params, localize_photo
+from gsmap.localize import Params, covariance, localize_photo, localizing
+from gsmap.localize.candidates import Candidate
 from gsmap.localize.extractors import sift
 from gsmap.types.localization import Photo, Placement
 
@@ -79,3 +82,16 @@ def test_the_same_photo_gives_the_same_bits(world) -> None:
     assert np.array_equal(one.T_map_camera, two.T_map_camera)
     assert np.array_equal(one.covariance, two.covariance)
     assert one.probability == two.probability
+
+
+def test_what_residuals_tell_counts_by_how_well_the_render_agrees(world) -> None:
+    params = Params()
+    blind = replace(params, covariance=replace(params.covariance, disagreeing=0.0))
+    picture, _ = localizing.prepared(world.photos[1], params)
+    start = Candidate(0, world.poses[1], picture.intrinsics_px, 40, ("scene",))
+    one, other = (localizing.judged_pose(picture, start, {"scene": world.placed}, p) for p in (params, blind))
+    assert np.array_equal(one.settled.T_metric_camera, other.settled.T_metric_camera)
+    assert one.settled.agreement > 0.5
+    hidden = covariance.with_hidden(np.zeros((6, 6)), params.covariance)
+    doubt = np.exp(2 * params.covariance.disagreeing * (0.5 - one.settled.agreement))
+    np.testing.assert_allclose(one.covariance - hidden, doubt * (other.covariance - hidden), rtol=1e-6, atol=1e-12)
