@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_localize import World, house_shots, world
-from fit_localize import WRONG_DEG, WRONG_M, Place, index_of, places, camera_error
+from fit_localize import WRONG_DEG, WRONG_M, Place, camera_error, index_of, places
 from make_localize_places import made_place
 
 import gsmap_synthetic as synthetic
