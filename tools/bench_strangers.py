@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 from fit_localize import index_of, load_place, places
-from make_localize_places import CAPTURE_PX, PHOTO_PX, PHOTOS, changed_place, photographs
+from make_localize_places import CAPTURE_PX, PHOTOS, changed_place, photographs, photographs_alike
 
 import gsmap_synthetic as synthetic
 from gsmap.localize import localize_photo
@@ -43,7 +43,6 @@ from gsmap_synthetic.streets import make_street, street_routes
 
 FIRST_SEED = 70_000  # of places that are strangers to all that is fitted and tested
 STREET_SEED, DECORATIONS, ROOMS = 81, 5, 15
-DIFFERS = 0.1
 
 
 class Map:
@@ -127,21 +126,10 @@ def main() -> int:
         place, folder = street(args.work)
         held, rows, seconds = Map(load_place(folder, args.work / "features", params), params), [], 0.0
         rng = np.random.default_rng(STREET_SEED)
-        pitch = place.rooms[DECORATIONS].center - place.rooms[0].center
-        others = range(DECORATIONS, ROOMS)
-        for k, (image, told) in enumerate(photographs(place, place, others, args.alike, rng)):
+        for k, (image, told, differs) in enumerate(photographs_alike(place, DECORATIONS, args.alike, rng)):
             began = time.process_time()
             said = held.ask(image, told["intrinsics"], f"photo {k}")
             seconds += time.process_time() - began
-            twin = np.array(told["T_world_camera"])
-            room = min(others, key=lambda r: np.linalg.norm(place.rooms[r].center - twin[:2, 3]))
-            twin[:2, 3] -= pitch * (room // DECORATIONS)
-            focal = told["intrinsics"][0] / PHOTO_PX[0]
-            views = [
-                synthetic.film(place, pose[None], size_px=PHOTO_PX, focal=focal).images[0].astype(float)
-                for pose in (np.array(told["T_world_camera"]), twin)
-            ]
-            differs = float((np.abs(views[0] - views[1]).max(2) > DIFFERS * 255).mean())
             rows.append((f"photo {k}", said, differs))
         share = np.array([differs for _, _, differs in rows])
         for low, high in ((0, 0.05), (0.05, 0.15), (0.15, 0.3), (0.3, 1.01)):

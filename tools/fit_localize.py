@@ -2,6 +2,7 @@
 
     python tools/make_localize_places.py PLACES --set fit && python tools/make_localize_places.py PLACES --set test
     python tools/fit_localize.py PLACES words --cache FOLDER     # writes gsmap/localize/words.npz
+    python tools/fit_localize.py PLACES cells --cache FOLDER     # writes gsmap/localize/unlike.npz
     python tools/fit_localize.py PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
     python tools/fit_localize.py PLACES sigma --cache FOLDER     # says which `localize.covariance` fits best
     python tools/fit_localize.py PLACES agreement --cache FOLDER # what a `localize.settling.min_agreement` costs
@@ -38,8 +39,10 @@ from scipy.optimize import minimize
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
-from gsmap.localize import aligning, covariance, features, localizing, settling, words
+from gsmap.localize import aligning, covariance, features, localizing, settling, unlike, words
 from gsmap.localize.candidates import Candidate
+from gsmap.localize.filters import means
+from gsmap.localize.looks import smaller
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.resection import moved
@@ -69,6 +72,11 @@ class Place:
 def places(folder: Path, split: str, cache: Path, params: Params) -> list[Place]:
     """The places of a set, with the features of their captures, which are kept."""
     return [_place(path, cache, params) for path in sorted((folder / split).iterdir()) if (path / "done").exists()]
+
+
+def places_and_streets(folder: Path, split: str, cache: Path, params: Params) -> list[Place]:
+    """The places of a set and its streets, whose rooms look alike."""
+    return places(folder, split, cache, params) + places(folder, f"{split}_streets", cache, params)
 
 
 def _place(folder: Path, cache: Path, params: Params) -> Place:
@@ -192,11 +200,89 @@ def _chance(
     return np.cumsum(counts) / max(pairs, 1)
 
 
+# --- cells -----------------------------------------------------------------------------------------------------------
+
+HIDDEN, STEPS, BATCH = 24, 1500, 4096
+CELLS = 400  # of a render
+
+
+def fit_cells(found: list[Place], params: Params) -> None:
+    """The network that says which cells of a photo show something else than a render: of photos where they were taken,
+    and of rooms that look alike where those of the map are, from near which they are settled."""
+    parts = [_cells(place, params) for place in found]
+    features, truth = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    fold = np.repeat(np.arange(len(parts)) % 4, [len(part[1]) for part in parts])
+    print(f"{len(truth)} cells, {truth.mean():.1%} of them show something else")
+    for k in range(4):
+        _save_network(features[fold != k], truth[fold != k])
+        said = unlike.probabilities(features[fold == k][None])[0]
+        right = truth[fold == k]
+        ranks = np.argsort(np.argsort(said))
+        area = (ranks[right].mean() - (right.sum() - 1) / 2) / (~right).sum()
+        found = (f"{(said[right] > b).mean():.1%} (wrongly {(said[~right] > b).mean():.2%})" for b in (0.5, 0.8))
+        print(f"  places left out: area under the curve {area:.3f}; said to be others: {', '.join(found)}")
+    _save_network(features, truth)
+
+
+def _cells(place: Place, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """(N, F) features of cells of a place's photos, and (N,) bool whether they show something else."""
+    rng, own = np.random.default_rng([int(place.seed), 6]), {scene.scene: scene for scene in place.scenes}
+    features, truth = [], []
+    with np.load(place.folder / "differs.npz") as held:
+        told = list(zip(held["photo"], held["T_map_camera"], held["apart"], strict=True))
+    for number, pose, apart in told:
+        picture, _ = localizing.prepared(place.photo(place.photos[number]), params)
+        start = moved(pose, rng.normal(size=6) * np.r_[np.full(3, 0.02), np.full(3, 0.05)])
+        settled = localizing.settled_pose(
+            picture, Candidate(0, start, picture.intrinsics_px, 0, tuple(own)), own, params
+        )
+        off = camera_error(settled.T_metric_camera, pose)
+        if np.degrees(np.linalg.norm(off[:3])) > RIGHT_DEG or np.linalg.norm(off[3:]) > RIGHT_M:
+            continue
+        for one in settled.looks:
+            here, known = unlike.cells(smaller(picture.rgb, 2), one)
+            differs = apart[sorted(own).index(one.scene)].astype(np.float32)
+            share = means(differs, unlike.SIDE, step=unlike.STEP)[: known.shape[0], : known.shape[1]]
+            rows = np.flatnonzero(known & ((share > 0.5) | (share < 0.05)))  # at edges neither is true
+            rows = rng.permutation(rows)[:CELLS]
+            features.append(here.reshape(-1, here.shape[2])[rows])
+            truth.append(share.ravel()[rows] > 0.5)
+    print(f"{place.seed}: {len(features)} renders, {time.process_time():.0f} CPU s", flush=True)
+    return np.concatenate(features), np.concatenate(truth)
+
+
+def _save_network(features: np.ndarray, truth: np.ndarray) -> None:
+    """Logistic loss by Adam, and the weights written where gsmap reads them."""
+    import torch
+
+    torch.manual_seed(0)
+    mean, spread = features.mean(0, dtype=np.float64), features.std(0, dtype=np.float64) + 1e-6
+    x = torch.tensor(unlike.scaled(features, mean, spread), dtype=torch.float32)
+    y = torch.tensor(truth, dtype=torch.float32)
+    sizes = (x.shape[1], HIDDEN, HIDDEN, 1)
+    layers = [torch.nn.Linear(a, b) for a, b in pairwise(sizes)]
+    network = torch.nn.Sequential(layers[0], torch.nn.Tanh(), layers[1], torch.nn.Tanh(), layers[2])
+    optimiser = torch.optim.AdamW(network.parameters(), 4e-3, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
+    for _ in range(STEPS):
+        some = torch.randint(len(x), (BATCH,))
+        optimiser.zero_grad()
+        torch.nn.functional.binary_cross_entropy_with_logits(network(x[some])[:, 0], y[some]).backward()
+        optimiser.step()
+        schedule.step()
+    kept = {"mean": mean, "spread": spread}
+    for k, layer in enumerate(layers):
+        kept |= {f"weights{k}": layer.weight.detach().numpy().T, f"offsets{k}": layer.bias.detach().numpy()}
+    np.savez(ROOT / "unlike.npz", **{name: np.asarray(value, np.float32) for name, value in kept.items()})
+    unlike.network.cache_clear()
+
+
 # --- verdict ---------------------------------------------------------------------------------------------------------
 
 RIGHT_DEG, RIGHT_M = 3.0, 0.15
 WRONG_DEG, WRONG_M = 5.0, 0.3  # between the two a pose is neither
 FEWEST = 6  # inliers of a pose that nobody found, to be worth a judgement
+LEAST_TOLD = 0.05  # share of a photo that must differ to tell two rooms apart
 RISES = {"matches", "inliers", "found_again", "laid", "spread", "explained", "explained_coarsely", "compared", "colour"}
 RISES |= {"seen"}
 KNOTS = {
@@ -209,6 +295,9 @@ KNOTS = {
     "contradicted": (0.05, 0.1, 0.2, 0.3, 0.45, 0.6),
     "explained_coarsely": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9),
     "contradicted_coarsely": (0.03, 0.07, 0.12, 0.2, 0.35, 0.5),
+    "unlike": (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45),
+    "unlike_likely": (0.0, 0.01, 0.02, 0.04, 0.08, 0.15),
+    "unlike_surely": (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.15),
     "compared": tuple(np.log10(np.array([31.0, 101, 301, 801, 1501]))),
     "colour": (0.0, 0.2, 0.4, 0.6, 0.8, 0.95),
     "seen": (0.1, 0.3, 0.5, 0.8),
@@ -222,11 +311,12 @@ class Row:
     """One pose that was looked into, and what is known of it."""
 
     photo: str
-    kind: str  # found, elsewhere, moved
+    kind: str  # found, elsewhere, moved, alike
     evidence: dict[str, float]
     error: tuple[float, float]  # deg, m; inf in another place
     nees: float
     changed: bool
+    differs: float = 1.0  # share of a photo that tells its room from the one of the map that looks like it
 
     @property
     def right(self) -> bool:
@@ -235,8 +325,9 @@ class Row:
     @property
     def tells(self) -> bool:
         """Whether it teaches anything: not a pose that is neither right nor wrong, nor one on the exact twin of its
-        wing, which nothing in the picture tells apart."""
+        wing or in a room that looks alike, where nothing in the picture tells them apart."""
         twin = self.kind != "elsewhere" and self.error[0] < RIGHT_DEG and self.error[1] > 4.0
+        twin |= self.differs < LEAST_TOLD
         between = not self.right and self.error[0] < WRONG_DEG and self.error[1] < WRONG_M
         idle = self.kind == "moved" and self.evidence["inliers"] < np.log10(FEWEST + 1)
         return not (twin or between or idle)
@@ -244,9 +335,10 @@ class Row:
 
 def judge_all(found: list[Place], params: Params) -> list[Row]:
     """Poses of every photo in its own place, and of every other one in another place, as they are looked into (more of
-    them than where photos are placed), and poses that settle from near the truth and from far of it."""
+    them than where photos are placed), and poses that settle from near the truth and from far of it; of photos of rooms
+    that look like those of the map, the poses that are found there."""
     extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
-    params = replace(params, max_candidates=4, sure=2.0)
+    params = replace(params, max_candidates=4, sure=2.0, evidence=replace(params.evidence, ask_from=0.0))
     fewer, out = replace(params, max_candidates=2), []
     indexes = {place.seed: index_of(place.scenes, params) for place in found}
     for number, place in enumerate(found):
@@ -258,9 +350,13 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
             picture, _ = localizing.prepared(photo, params)
 
             def row(judged, kind, truth=truth, told=told, name=photo.name):
-                return Row(name, kind, dict(judged.evidence), *errors(judged, truth, kind), told["changed"])
+                error, nees = errors(judged, truth, kind)
+                return Row(name, kind, dict(judged.evidence), error, nees, told["changed"], told.get("differs", 1.0))
 
             judged, _ = localizing.judged_poses(picture, indexes[place.seed], own, extractor, params)
+            if "differs" in told:
+                out += [row(one, "alike") for one in judged]
+                continue
             out += [row(one, "found") for one in judged]
             if count % 2 == 0:
                 judged, _ = localizing.judged_poses(picture, indexes[stranger.seed], other, extractor, fewer)
@@ -277,7 +373,7 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
 
 def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], float]:
     """Error in degrees and metres, and the normalised squared error by the covariance."""
-    if kind == "elsewhere":
+    if kind in ("elsewhere", "alike"):
         return (180.0, np.inf), np.nan
     xi = camera_error(judged.settled.T_metric_camera, truth)
     error = float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]))
@@ -310,7 +406,7 @@ def design(rows: list[dict[str, float]]) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def fit(rows: list[Row], penalty: float = 0.0005) -> Odds:
+def fit(rows: list[Row], penalty: float = 0.0002) -> Odds:
     """Monotone curves of largest likelihood with a penalty on steep ones; right and wrong poses weigh the same."""
     x = design([row.evidence for row in rows])
     y = np.array([row.right for row in rows], float)
@@ -539,7 +635,7 @@ def save(model: Odds) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
-    parser.add_argument("what", choices=("words", "sigma", "agreement", "placed", "verdict", "test"))
+    parser.add_argument("what", choices=("words", "sigma", "agreement", "placed", "cells", "verdict", "test"))
     parser.add_argument("--cache", type=Path, required=True)
     args = parser.parse_args()
     params = Params()
@@ -552,13 +648,16 @@ def main() -> int:
     if args.what == "agreement":
         fit_agreement(places(args.places, "fit", args.cache, params), params)
         return 0
+    if args.what == "cells":
+        fit_cells(places_and_streets(args.places, "fit", args.cache, params), params)
+        return 0
     if args.what == "placed":
         place_all(places(args.places, "test", args.cache, params), params)
         return 0
     split = "fit" if args.what == "verdict" else "test"
     kept = args.cache / f"judged-{split}.pickle"
     if not kept.exists():
-        kept.write_bytes(pickle.dumps(judge_all(places(args.places, split, args.cache, params), params)))
+        kept.write_bytes(pickle.dumps(judge_all(places_and_streets(args.places, split, args.cache, params), params)))
     rows = [row for row in pickle.loads(kept.read_bytes()) if row.tells]
     if args.what == "verdict":
         save(calibrated(rows))

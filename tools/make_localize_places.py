@@ -6,6 +6,11 @@
 Of a place: captures (NAME.ply, NAME.cameras.json, truth/NAME.json with ``T_scene_world``), photos/NAME.jpg taken at
 other times by other lenses from other standpoints, and photos.json with the truth of each. Seeds of the two sets are
 apart, and so are their places. What is made already is not made again.
+
+Beside them, in OUT/fit_streets and OUT/test_streets, streets whose decorations come again exactly, with their
+furniture standing elsewhere (`gsmap_synthetic.streets`): captures are of the first room of each decoration, and so are
+some photographs; the others are of later rooms, which look alike and are not in the map. Of those ``differs`` says what
+share of the pixels differs (by more than a tenth of the range) from the same photograph taken in the room of the map.
 """
 
 from __future__ import annotations
@@ -30,10 +35,15 @@ from gsmap_synthetic.edits import edit_place
 from gsmap_synthetic.make import fit_frames, put_in_own_frame
 from gsmap_synthetic.place import Place
 from gsmap_synthetic.script import random_edits
+from gsmap_synthetic.streets import make_street, street_routes
 
 SETS = {"fit": range(50_000, 50_012), "test": range(60_000, 60_006)}
+STREETS = {"fit": range(50_100, 50_108), "test": range(60_100, 60_104)}
 CAPTURE_PX, PHOTO_PX = (400, 300), (480, 360)
 PHOTOS = 24
+DECORATIONS, TIMES = 3, 4  # of a street, and how often each comes
+PHOTOS_OF_MAP, PHOTOS_ALIKE = 24, 36
+DIFFERS = 0.1
 
 
 def main() -> int:
@@ -45,6 +55,9 @@ def main() -> int:
     for seed in SETS[args.set]:
         if args.only in (None, seed):
             make(args.out / args.set / str(seed), seed)
+    for seed in STREETS[args.set]:
+        if args.only in (None, seed):
+            make_alike(args.out / f"{args.set}_streets" / str(seed), seed)
     return 0
 
 
@@ -55,11 +68,92 @@ def make(folder: Path, seed: int) -> None:
     began = time.process_time()
     rng, twin = drawn(seed)
     place = made_place(seed)
-    for k, route in enumerate(default_routes(place, 2)):
+    routes = default_routes(place, 2)
+    for k, route in enumerate(routes):
         synthetic.write_captures(folder, [_capture(place, route, k, seed, rng)])
     _photograph(place, folder, rng)
+    write_differences(place, folder, routes, len(place.rooms))
     (folder / "done").touch()
     print(f"{seed}: {'a twin, ' if twin else ''}{time.process_time() - began:.0f} CPU s", flush=True)
+
+
+def make_alike(folder: Path, seed: int) -> None:
+    """A street, captures of its first rooms, photographs of these and of the rooms that look like them."""
+    if (folder / "done").exists():
+        return
+    began = time.process_time()
+    rng = np.random.default_rng([seed, 31])
+    place = make_street(seed, rooms=DECORATIONS * TIMES, decorations=DECORATIONS, texel_m=0.008)
+    routes = street_routes(DECORATIONS)
+    for k, route in enumerate(routes):
+        synthetic.write_captures(folder, [_capture(place, route, k, seed, rng)])
+    (folder / "photos").mkdir(exist_ok=True)
+    changed, told = changed_place(place, rng), []
+    shots = [({}, shot) for shot in photographs(place, changed, range(DECORATIONS), PHOTOS_OF_MAP, rng)]
+    shots += [
+        ({"differs": differs}, (image, said))
+        for image, said, differs in photographs_alike(place, DECORATIONS, PHOTOS_ALIKE, rng)
+    ]
+    for i, (more, (image, said)) in enumerate(shots):
+        Image.fromarray(image).save(folder / "photos" / f"p{i:03d}.jpg", quality=88)
+        told.append({"file": f"p{i:03d}.jpg", **said, **more})
+    (folder / "photos.json").write_text(json.dumps(told))
+    write_differences(place, folder, routes, DECORATIONS)
+    (folder / "done").touch()
+    print(f"{seed}: a street, {time.process_time() - began:.0f} CPU s", flush=True)
+
+
+def photographs_alike(
+    place: Place, decorations: int, count: int, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, dict[str, Any], float]]:
+    """Photographs of the rooms of a street whose decorations came before, as `photographs`, and what share of their
+    pixels differs from the same photograph taken where the decoration comes first."""
+    for image, told in photographs(place, place, range(decorations, len(place.rooms)), count, rng):
+        here = np.array(told["T_world_camera"])
+        poses = np.stack([here, where_first(place, decorations, here)])
+        focal = told["intrinsics"][0] / PHOTO_PX[0]
+        views = synthetic.film(place, poses, size_px=PHOTO_PX, focal=focal).images
+        yield image, told, float(apart(*views).mean())
+
+
+def where_first(place: Place, decorations: int, T_world_camera: np.ndarray) -> np.ndarray:
+    """(4, 4) the same standpoint in the room of a street where its decoration comes first."""
+    xy = T_world_camera[:2, 3]
+    room = int(np.argmin([np.linalg.norm(one.center - xy) for one in place.rooms]))
+    out = T_world_camera.copy()
+    out[:2, 3] -= (place.rooms[1].center - place.rooms[0].center) * (room - room % decorations)
+    return out
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(H, W) bool: where two pictures (H, W, 3) uint8 differ."""
+    out: np.ndarray = np.abs(one.astype(np.int16) - other).max(2) > DIFFERS * 255
+    return out
+
+
+def write_differences(place: Place, folder: Path, routes: Sequence[tuple[int, ...]], decorations: int) -> None:
+    """differs.npz: where captures show what photographs do (``T_map_camera`` of the place: their own standpoints, or in
+    the room that looks like theirs), and which pixels of those then are others (``apart``, photo by capture, at half
+    size): the doors that the walk left shut, and in rooms that look alike the furniture.
+
+    Of photographs in which nothing has changed and nobody stands; ``photo`` are their numbers.
+    """
+    poses, differ, numbers = [], [], []
+    size = (PHOTO_PX[0] // 2, PHOTO_PX[1] // 2)
+    for number, told in enumerate(json.loads((folder / "photos.json").read_text())):
+        if told["changed"] or told["occluded"]:
+            continue
+        here, focal = np.array(told["T_world_camera"]), told["intrinsics"][0] / PHOTO_PX[0]
+        there = where_first(place, decorations, here)
+        photo = synthetic.film(place, here[None], size_px=size, focal=focal).images[0]
+        seen = [
+            synthetic.film(place, there[None], size_px=size, focal=focal, shut=unused_doors(place, route)).images[0]
+            for route in routes
+        ]
+        poses.append(there)
+        differ.append(np.stack([apart(photo, one) for one in seen]))
+        numbers.append(number)
+    np.savez_compressed(folder / "differs.npz", T_map_camera=poses, apart=np.stack(differ), photo=numbers)
 
 
 def drawn(seed: int) -> tuple[np.random.Generator, bool]:

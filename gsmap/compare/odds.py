@@ -58,14 +58,14 @@ class Odds:
         return cls(curves, stored["base"], stored["least"])
 
     def worth(self, evidence: Mapping[str, float]) -> dict[str, float]:
-        """Log-odds that each piece adds, by its name."""
-        return {name: self.curves[name].at(value) for name, value in evidence.items()}
+        """Log-odds that each piece adds, by its name; what has no curve is worth nothing."""
+        return {name: self.curves[name].at(value) for name, value in evidence.items() if name in self.curves}
 
     def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
         """The names of the evidence that could be had, what lacks most of what it could be worth first."""
         lacks = {}
         for name, value in evidence.items():
-            if not np.isnan(value):
+            if not np.isnan(value) and name in self.curves:
                 lacks[name] = max(self.curves[name].worth) - self.curves[name].at(value)
         return sorted(lacks, key=lambda name: -lacks[name])
 
@@ -75,5 +75,13 @@ class Odds:
         Args:
             prior: share of what is judged that is right before anything is known of it.
         """
-        odds = self.base + np.log(prior / (1 - prior)) + sum(self.worth(evidence).values())
+        return self._probability(sum(self.worth(evidence).values()), prior)
+
+    def at_most(self, evidence: Mapping[str, float], prior: float) -> float:
+        """How probable it is if all that is not named were as good as can be."""
+        best = sum(max(curve.worth) for name, curve in self.curves.items() if name not in evidence)
+        return self._probability(sum(self.worth(evidence).values()) + best, prior)
+
+    def _probability(self, worth: float, prior: float) -> float:
+        odds = self.base + np.log(prior / (1 - prior)) + worth
         return float(np.clip(1 / (1 + np.exp(-odds)), self.least, 1 - self.least))

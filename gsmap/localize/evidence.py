@@ -26,6 +26,8 @@ class Params:
         inlier_px: a patch that is found again this near to where the pose predicts it is an inlier, at 480 pixels.
         blocks: columns and rows of the picture over which inliers should be spread.
         coarse: patterns are compared once more in pictures so many times smaller, where renders are as sharp as photos.
+        likely, surely: so probably a cell of the photo shows something else than the map (`gsmap.localize.unlike`).
+        ask_from: where all else leaves a lower probability at most, that is not asked.
         near_m: surfaces nearer than this stand in a camera's face.
     """
 
@@ -37,6 +39,9 @@ class Params:
     inlier_px: float = 2.0
     blocks: tuple[int, int] = (8, 6)
     coarse: int = 4
+    likely: float = 0.5
+    surely: float = 0.8
+    ask_from: float = 0.05
     near_m: float = 0.1
 
 

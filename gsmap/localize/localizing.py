@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from PIL import Image
 
-from gsmap.localize import covariance, evidence, matching, probability, resection, verdict
+from gsmap.localize import covariance, evidence, matching, probability, resection, unlike, verdict
 from gsmap.localize.candidates import Candidate, candidates, matches_by_component, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.filters import blurred
@@ -202,7 +202,24 @@ def _together(parts: Sequence[Keypoints]) -> Keypoints:
 
 def judged_pose(picture: Picture, candidate: Candidate, scenes: Mapping[str, PlacedFeatures], params: Params) -> Judged:
     """A rough pose, sharpened and compared with what the map shows there."""
-    settled = settle(
+    settled = settled_pose(picture, candidate, scenes, params)
+    comparison = evidence.compare(picture.rgb, settled.looks, params.evidence)
+    coarse = evidence.compare_coarsely(picture.rgb, settled.looks, params.evidence)
+    known, model = settled.covariance, probability.model()
+    told = probability.evidence_of(
+        picture, settled, comparison, coarse, sigmas_of(known), candidate.num_inliers, params.evidence
+    )
+    hopeless = model.at_most(told, params.verdict.prior) < params.evidence.ask_from
+    other = unlike.unlike(picture.rgb, [] if hopeless else settled.looks)
+    told |= probability.evidence_of_unlike(other, params.evidence)
+    return Judged(candidate, settled, known, told, model.probability(told, params.verdict.prior))
+
+
+def settled_pose(
+    picture: Picture, candidate: Candidate, scenes: Mapping[str, PlacedFeatures], params: Params
+) -> Settled:
+    """A rough pose, sharpened."""
+    return settle(
         picture,
         candidate.T_metric_camera,
         candidate.intrinsics_px,
@@ -214,13 +231,6 @@ def judged_pose(picture: Picture, candidate: Candidate, scenes: Mapping[str, Pla
         params.aligning,
         params.covariance,
     )
-    comparison = evidence.compare(picture.rgb, settled.looks, params.evidence)
-    coarse = evidence.compare_coarsely(picture.rgb, settled.looks, params.evidence)
-    known = settled.covariance
-    told = probability.evidence_of(
-        picture, settled, comparison, coarse, sigmas_of(known), candidate.num_inliers, params.evidence
-    )
-    return Judged(candidate, settled, known, told, probability.model().probability(told, params.verdict.prior))
 
 
 def sigmas_of(covariance: np.ndarray | None) -> tuple[float, float]:

@@ -14,6 +14,7 @@ import numpy as np
 from gsmap.compare.odds import Odds
 from gsmap.localize import evidence
 from gsmap.localize.settling import Picture, Settled, inliers
+from gsmap.localize.unlike import Unlike
 
 _FILE = "probability.json"
 
@@ -33,7 +34,8 @@ def evidence_of(
     num_matches: int,
     params: evidence.Params,
 ) -> dict[str, float]:
-    """The pieces of evidence that have a curve, each such that a step of it means about the same everywhere.
+    """The pieces of evidence that have a curve, each such that a step of it means about the same everywhere, but for
+    those of `evidence_of_unlike`.
 
     NaN where one could not be had.
 
@@ -59,4 +61,14 @@ def evidence_of(
         "seen": comparison.seen,
         "blocked": comparison.blocked,
         "sigma_m": float(np.log10(np.clip(sigmas[1], 1e-4, 10.0))),
+    }
+
+
+def evidence_of_unlike(other: Unlike, params: evidence.Params) -> dict[str, float]:
+    """What speaks against a room that looks like it: how much of the photo shows something else, and how much of that
+    lies in several places."""
+    return {
+        "unlike": other.share(),
+        "unlike_likely": other.elsewhere(params.likely),
+        "unlike_surely": other.elsewhere(params.surely),
     }

@@ -1,0 +1,145 @@
+"""Which parts of a photograph show something else than a render from its pose, and how much of it that is.
+
+A room that looks like another one has its walls and its pictures and other furniture before them; the room itself, its
+doors open, or with somebody in it, differs in one part and agrees in the rest. So it is asked cell by cell, by a small
+network that ``tools/fit_localize.py`` fits on made places, where it is known what differs: a render is blurred where
+cameras saw little, and shows the same all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+
+import numpy as np
+from scipy.ndimage import label
+
+from gsmap.compare.colours import balance
+from gsmap.localize.filters import blurred, means
+from gsmap.localize.looks import GREY, Look, smaller
+
+_FILE = "unlike.npz"
+STEP, SIDE, _WIDE = 4, 9, 17  # pixels, at half the size of the picture
+_LIGHT = 5.0  # cells over which light changes (standard deviation of a Gaussian)
+_EVERY = 5  # of the pixels so many are asked for the light
+_OPAQUE = 0.9
+_KNOWN = 0.6  # of a cell must be opaque
+_LEAST = 1e-3  # of what a logarithm is taken
+_FAR = 6.0  # standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Unlike:
+    """How probable it is, cell by cell, that a photograph shows something else than the map.
+
+    Args:
+        probability: (R, C) of the scene that is most like it; NaN where none shows anything.
+    """
+
+    probability: np.ndarray
+
+    def share(self) -> float:
+        """Of what can be compared, that is expected to be something else; NaN of nothing."""
+        known = self.probability[np.isfinite(self.probability)]
+        return float(known.mean()) if len(known) else float("nan")
+
+    def elsewhere(self, bar: float) -> float:
+        """Share of the cells that are something else by this probability, without the largest connected part of them:
+        one thing may have come or gone, or somebody stand there; NaN where nothing can be compared."""
+        known = np.isfinite(self.probability)
+        if not known.any():
+            return float("nan")
+        labels, count = label(known & (self.probability > bar))
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+        return float((sizes.sum() - sizes.max(initial=0)) / known.sum())
+
+
+@lru_cache(maxsize=1)
+def network() -> tuple[np.ndarray, ...]:
+    """What gsmap comes with: mean and spread of the features, then weights and offsets of each layer."""
+    with np.load(str(files("gsmap.localize") / _FILE)) as held:
+        return tuple(held[name].astype(np.float32) for name in held.files)
+
+
+def unlike(rgb: np.ndarray, looks: Sequence[Look]) -> Unlike:
+    """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose, of its size."""
+    half = smaller(rgb, 2)
+    least: np.ndarray | None = None
+    for one in looks:
+        features, known = cells(half, one)
+        found = np.where(known, probabilities(features), np.inf)
+        least = found if least is None else np.minimum(least, found)
+    if least is None:
+        least = np.full((1, 1), np.inf)
+    return Unlike(np.where(np.isfinite(least), least, np.nan))
+
+
+def probabilities(features: np.ndarray) -> np.ndarray:
+    """(R, C) of features (R, C, F)."""
+    mean, spread, *layers = network()
+    x = scaled(features, mean, spread)
+    for weights, offsets in zip(layers[:-2:2], layers[1:-2:2], strict=True):
+        x = np.tanh(x @ weights + offsets)
+    out: np.ndarray = 1 / (1 + np.exp(-(x @ layers[-2] + layers[-1])[..., 0]))
+    return out
+
+
+def scaled(features: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Features as the network takes them; what is far from all that it has seen is brought nearer."""
+    out: np.ndarray = np.clip((features - mean) / spread, -_FAR, _FAR)
+    return out
+
+
+def cells(half: np.ndarray, one: Look) -> tuple[np.ndarray, np.ndarray]:
+    """(R, C, F) float32 of what each cell shows in a photo of half size and in a render of full size, and which (R, C)
+    are known."""
+    shown, opaque = smaller(one.rgb, 2), smaller(one.alpha, 2) > _OPAQUE
+    a, b = half @ GREY, shown @ GREY
+    hue, light, spreads = _colours(half, shown, opaque)
+    fine = [(x - blurred(x, 1.0)) ** 2 for x in (a, b)]
+    patterns = [a, b, a * a, b * b, a * b]
+    planes = [opaque, smaller(one.sound, 2), hue, light, np.abs(light), *fine]
+    near = means(np.stack([*patterns, *planes], axis=2), SIDE, step=STEP)
+    wide = means(np.stack(patterns, axis=2), _WIDE, step=STEP)
+    share, sound, hue, light, lightness, fine_a, fine_b = np.moveaxis(near[..., 5:], 2, 0)
+    hue, light, lightness = (x / np.maximum(share, _LEAST) for x in (hue, light, lightness))
+    field = blurred(light * share, _LIGHT) / np.maximum(blurred(share, _LIGHT), _LEAST)
+    columns = [
+        *_alike(near),
+        *_alike(wide),
+        np.minimum(hue, 2),
+        np.clip(light - field, -2, 2),
+        np.minimum(lightness, 2),
+        share,
+        sound,
+        *(_log(np.sqrt(x)) for x in (fine_a, fine_b)),
+        np.log(np.clip(smaller(one.depth_m, 2)[::STEP, ::STEP], 0.1, 20)),
+        *(_log(np.full_like(share, spread)) for spread in spreads),
+    ]
+    return np.stack(columns, axis=2), share > _KNOWN
+
+
+def _alike(found: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Correlation of two patterns, and the logarithm of the contrast of each, of means of both, squares and product."""
+    a, b, square_a, square_b, product = np.moveaxis(found[..., :5], 2, 0)
+    var_a, var_b = np.maximum(square_a - a**2, 0), np.maximum(square_b - b**2, 0)
+    correlation = (product - a * b) / np.sqrt(np.maximum(var_a * var_b, 1e-10))
+    return correlation, _log(np.sqrt(var_a)), _log(np.sqrt(var_b))
+
+
+def _colours(
+    half: np.ndarray, shown: np.ndarray, opaque: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """How far hue and lightness are apart after light is taken out (0 where nothing is), and what of both no line
+    explains."""
+    line = balance(shown[opaque][::_EVERY], half[opaque][::_EVERY])
+    chroma, light = line.differences(shown, half, opaque)
+    hue, light = (np.where(opaque, plane, np.float32(0)) for plane in (np.abs(chroma).max(2), light))
+    return hue, light, (line.chroma_spread, line.lightness_spread)
+
+
+def _log(values: np.ndarray) -> np.ndarray:
+    out: np.ndarray = np.log10(np.maximum(values, _LEAST), dtype=np.float32)
+    return out
