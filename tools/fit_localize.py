@@ -33,16 +33,17 @@ from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
+from make_localize_places import occluded
 from PIL import Image
 from scipy.optimize import minimize
 
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
-from gsmap.localize import aligning, covariance, features, localizing, settling, unlike, words
+from gsmap.localize import aligning, covariance, features, localizing, probability, settling, unlike, words
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.filters import means
-from gsmap.localize.looks import smaller
+from gsmap.localize.looks import GREY, smaller
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.resection import moved
@@ -239,8 +240,9 @@ def _cells(place: Place, params: Params) -> tuple[np.ndarray, np.ndarray]:
         off = camera_error(settled.T_metric_camera, pose)
         if np.degrees(np.linalg.norm(off[:3])) > RIGHT_DEG or np.linalg.norm(off[3:]) > RIGHT_M:
             continue
+        lit = np.clip(picture.rgb * np.float32(2 ** (rng.uniform(-1, 1) / 2.2)), 0, 1)
         for one in settled.looks:
-            here, known = unlike.cells(smaller(picture.rgb, 2), one)
+            here, known = unlike.cells(smaller(lit, 2), one)
             differs = apart[sorted(own).index(one.scene)].astype(np.float32)
             share = means(differs, unlike.SIDE, step=unlike.STEP)[: known.shape[0], : known.shape[1]]
             rows = np.flatnonzero(known & ((share > 0.5) | (share < 0.05)))  # at edges neither is true
@@ -282,6 +284,7 @@ def _save_network(features: np.ndarray, truth: np.ndarray) -> None:
 RIGHT_DEG, RIGHT_M = 3.0, 0.15
 WRONG_DEG, WRONG_M = 5.0, 0.3  # between the two a pose is neither
 FEWEST = 6  # inliers of a pose that nobody found, to be worth a judgement
+HOPELESS = -2.0  # log-odds under which it does not matter how improbable a pose is
 LEAST_TOLD = 0.05  # share of a photo that must differ to tell two rooms apart
 RISES = {"matches", "inliers", "found_again", "laid", "spread", "explained", "explained_coarsely", "compared", "colour"}
 RISES |= {"seen"}
@@ -295,7 +298,8 @@ KNOTS = {
     "contradicted": (0.05, 0.1, 0.2, 0.3, 0.45, 0.6),
     "explained_coarsely": (0.2, 0.35, 0.5, 0.65, 0.8, 0.9),
     "contradicted_coarsely": (0.03, 0.07, 0.12, 0.2, 0.35, 0.5),
-    "unlike": (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45),
+    "unlike_part": (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.45),
+    "unlike": (0.0, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.25),
     "unlike_likely": (0.0, 0.01, 0.02, 0.04, 0.08, 0.15),
     "unlike_surely": (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.15),
     "compared": tuple(np.log10(np.array([31.0, 101, 301, 801, 1501]))),
@@ -311,7 +315,7 @@ class Row:
     """One pose that was looked into, and what is known of it."""
 
     photo: str
-    kind: str  # found, elsewhere, moved, alike
+    kind: str  # found, elsewhere, moved, hidden, lit, alike
     evidence: dict[str, float]
     error: tuple[float, float]  # deg, m; inf in another place
     nees: float
@@ -329,7 +333,7 @@ class Row:
         twin = self.kind != "elsewhere" and self.error[0] < RIGHT_DEG and self.error[1] > 4.0
         twin |= self.differs < LEAST_TOLD
         between = not self.right and self.error[0] < WRONG_DEG and self.error[1] < WRONG_M
-        idle = self.kind == "moved" and self.evidence["inliers"] < np.log10(FEWEST + 1)
+        idle = self.kind in ("moved", "hidden", "lit") and self.evidence["inliers"] < np.log10(FEWEST + 1)
         return not (twin or between or idle)
 
 
@@ -361,14 +365,24 @@ def judge_all(found: list[Place], params: Params) -> list[Row]:
             if count % 2 == 0:
                 judged, _ = localizing.judged_poses(picture, indexes[stranger.seed], other, extractor, fewer)
                 out += [row(one, "elsewhere") for one in judged]
-            for size in (0.05, rng.uniform(0.1, 0.4), rng.uniform(0.2, 1.2)):
+            hidden, lit = hidden_and_lit(picture, rng)
+            near = (("hidden", hidden, 0.05), ("lit", lit, 0.05))
+            sizes = (0.05, rng.uniform(0.1, 0.4), rng.uniform(0.2, 1.2))
+            for kind, shown, size in (*(("moved", picture, size) for size in sizes), *near):
                 xi = np.r_[rng.normal(size=3) * size * 0.4, rng.normal(size=3) * size]
                 start = Candidate(0, moved(truth, xi), picture.intrinsics_px, 0, tuple(own))
-                one = localizing.judged_pose(picture, start, own, params)
+                one = localizing.judged_pose(shown, start, own, params)
                 one.evidence["matches"] = float("nan")
-                out.append(row(one, "moved"))
+                out.append(row(one, kind))
         print(f"{place.seed}: {len(out)} poses, {time.process_time():.0f} CPU s", flush=True)
     return out
+
+
+def hidden_and_lit(picture: settling.Picture, rng: np.random.Generator) -> tuple[settling.Picture, settling.Picture]:
+    """The same with somebody in about a tenth of it, and a stop brighter or darker."""
+    hidden = occluded((picture.rgb * 255).astype(np.uint8), rng, (0.05, 0.13))[0].astype(np.float32) / 255
+    lit = np.clip(picture.rgb * np.float32(2 ** (rng.choice([-1, 1]) * rng.uniform(0.5, 1) / 2.2)), 0, 1)
+    return tuple(replace(picture, rgb=rgb, grey=rgb @ GREY) for rgb in (hidden, lit))
 
 
 def errors(judged, truth: np.ndarray, kind: str) -> tuple[tuple[float, float], float]:
@@ -391,6 +405,22 @@ def camera_error(T: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def index_of(scenes: list[PlacedFeatures], params: Params) -> ViewIndex:
     """All views of some scenes."""
     return view_index([new_segment([(scene.features, scene.scene) for scene in scenes], params.features.indexed)])
+
+
+def completed(rows: list[Row]) -> list[Row]:
+    """Poses that nobody found have no matches: they get those of the found pose that is right or wrong like them and
+    is most like them else (a hot deck). Left out, their absence would tell which is right."""
+    asked = ("inliers", "laid", "spread", "explained")
+    kinds = np.array([np.isnan(row.evidence["matches"]) for row in rows])
+    right = np.array([row.right for row in rows])
+    told = np.array([[row.evidence[name] for name in asked] for row in rows])
+    told = (told - told.mean(0)) / told.std(0)
+    out = list(rows)
+    for k in np.flatnonzero(kinds):
+        known = np.flatnonzero(~kinds & (right == right[k]))
+        one = known[np.argmin(((told[known] - told[k]) ** 2).sum(1))]
+        out[k] = replace(rows[k], evidence={**rows[k].evidence, "matches": rows[one].evidence["matches"]})
+    return out
 
 
 def design(rows: list[dict[str, float]]) -> np.ndarray:
@@ -440,16 +470,44 @@ def log_odds(model: Odds, rows: list[Row]) -> np.ndarray:
     return np.array([model.base + sum(model.worth(row.evidence).values()) for row in rows])
 
 
-def calibrated(rows: list[Row], folds: int = 6) -> Odds:
-    """The curves, stretched until places that were left out bear out what they say (Platt 1999)."""
-    model = fit(rows)
+def fit_verdict(rows: list[Row]) -> None:
+    """Right poses against wrong ones of other places, and against those of rooms that look alike; and what share of
+    either is how probable, of places that were left out."""
+    alike = np.array([row.kind == "alike" for row in rows])
+    right = np.array([row.right for row in rows])
+    other, odds_other = calibrated(rows, ~alike)
+    rooms, odds_rooms = calibrated(rows, right | alike)
+    save(other=other, alike=rooms)
+    prior = Params().verdict.prior
+    for share in (0.35, 0.2, 0.1, 0.05, 0.02, 0.005):
+        against = np.exp(-odds_other) * (1 - prior - share) + np.exp(-odds_rooms) * share
+        p = prior / (prior + against)
+        if share == Params().verdict.alike:
+            report("places left out", rows, p)
+        differs = np.array([row.differs for row in rows])
+        bands = ((LEAST_TOLD, 0.15), (0.15, 0.3), (0.3, 1.01))
+        wrong = (f"{(alike & (differs >= a) & (differs < b) & (p >= 0.95)).sum()}" for a, b in bands)
+        kinds = [np.array([row.kind == kind for row in rows]) & right for kind in ("found", "hidden", "lit")]
+        good = (f"{(kind & (p >= 0.95)).sum()} of {kind.sum()}" for kind in kinds)
+        print(f"alike {share}: found, with somebody before them, in other light {', '.join(good)}; ", end="")
+        print(f"wrong of rooms that look alike, from 5, 15 and 30 % that differ {', '.join(wrong)}; ", end="")
+        print(f"of other places {(~alike & ~right & (p >= 0.95)).sum()}")
+
+
+def calibrated(rows: list[Row], asked: np.ndarray, folds: int = 6) -> tuple[Odds, np.ndarray]:
+    """The curves of the rows that are asked, stretched until places that were left out bear out what they say (Platt
+    1999), and what they say of every row where its place was left out."""
+    some = [row for row, one in zip(rows, asked, strict=True) if one]
+    model = fit(some)
     seeds = sorted({row.photo.split("/")[0] for row in rows})
     fold = np.array([seeds.index(row.photo.split("/")[0]) % folds for row in rows])
     odds, y = np.zeros(len(rows)), np.array([row.right for row in rows], float)
     for k in range(folds):
         held = np.flatnonzero(fold == k)
-        odds[held] = log_odds(fit([row for row, f in zip(rows, fold, strict=True) if f != k]), [rows[i] for i in held])
-    weight = np.where(y > 0, 0.5 / y.sum(), 0.5 / (1 - y).sum())
+        rest = [row for row, f, one in zip(rows, fold, asked, strict=True) if f != k and one]
+        odds[held] = log_odds(fit(rest), [rows[i] for i in held])
+    weight = asked * np.where(y > 0, 0.5 / y[asked].sum(), 0.5 / (1 - y)[asked].sum())
+    weight[odds < HOPELESS] = 0  # of these nothing is asked
 
     def loss(ab: np.ndarray) -> float:
         z = ab[0] * odds + ab[1]
@@ -457,14 +515,12 @@ def calibrated(rows: list[Row], folds: int = 6) -> Odds:
 
     a, b = minimize(loss, [1.0, 0.0], method="Nelder-Mead").x
     curves = {n: Curve(c.knots, tuple(a * v for v in c.worth), a * c.missing) for n, c in model.curves.items()}
-    print(f"left out: stretched by {a:.2f}, moved by {b:.2f}")
-    report("places left out", rows, a * odds + b)
-    return Odds(curves, a * model.base + b, 1.0 / max((y == 0).sum(), 1))
+    print(f"{len(some)} poses; left out: stretched by {a:.2f}, moved by {b:.2f}")
+    return Odds(curves, a * model.base + b, 1.0 / max((y[asked] == 0).sum(), 1)), a * odds + b
 
 
-def report(name: str, rows: list[Row], odds: np.ndarray) -> None:
-    prior = Params().verdict.prior
-    p = 1 / (1 + np.exp(-(odds + np.log(prior / (1 - prior)))))
+def report(name: str, rows: list[Row], p: np.ndarray) -> None:
+    """How often poses that are so probable are right."""
     right = np.array([row.right for row in rows])
     print(f"{name}: {right.sum()} right poses, {(~right).sum()} wrong ones")
     for bar in (0.5, 0.8, 0.9, 0.95, 0.99):
@@ -619,17 +675,20 @@ def fit_agreement(found: list[Place], params: Params) -> None:
         print(f"  min_agreement {bar}: {lost}; {(under & ~right).sum()} wrong ones")
 
 
-def save(model: Odds) -> None:
-    curves = {
-        name: {
-            "knots": [round(v, 5) for v in c.knots],
-            "worth": [round(v, 4) for v in c.worth],
-            "missing": round(c.missing, 4),
+def save(**models: Odds) -> None:
+    told = {}
+    for kind, model in models.items():
+        curves = {
+            name: {
+                "knots": [round(v, 5) for v in c.knots],
+                "worth": [round(v, 4) for v in c.worth],
+                "missing": round(c.missing, 4),
+            }
+            for name, c in model.curves.items()
         }
-        for name, c in model.curves.items()
-    }
-    text = json.dumps({"base": round(model.base, 4), "least": model.least, "curves": curves}, indent=1)
-    (ROOT / "probability.json").write_text(text + "\n")
+        told[kind] = {"base": round(model.base, 4), "least": model.least, "curves": curves}
+    (ROOT / "probability.json").write_text(json.dumps(told, indent=1) + "\n")
+    probability.model.cache_clear()
 
 
 def main() -> int:
@@ -658,11 +717,13 @@ def main() -> int:
     kept = args.cache / f"judged-{split}.pickle"
     if not kept.exists():
         kept.write_bytes(pickle.dumps(judge_all(places_and_streets(args.places, split, args.cache, params), params)))
-    rows = [row for row in pickle.loads(kept.read_bytes()) if row.tells]
+    rows = completed([row for row in pickle.loads(kept.read_bytes()) if row.tells])
     if args.what == "verdict":
-        save(calibrated(rows))
+        fit_verdict(rows)
     else:
-        report("test", rows, log_odds(Odds.of_json((ROOT / "probability.json").read_text()), rows))
+        bars = params.verdict
+        told = [probability.model().probability(row.evidence, bars.prior, bars.alike) for row in rows]
+        report("test", rows, np.array(told))
     return 0
 
 

@@ -219,9 +219,9 @@ def photographs(
         shot = synthetic.film(
             seen, pose[None], size_px=PHOTO_PX, gain=gain * rng.uniform(0.95, 1.05, 3), gamma=gamma, focal=focal
         ).images[0]
-        occluded = 0.0
+        hidden = 0.0
         if i % 6 == 5:
-            shot, occluded = _occluded(shot, rng)
+            shot, hidden = occluded(shot, rng)
         yield (
             shot,
             {
@@ -229,7 +229,7 @@ def photographs(
                 "intrinsics": [focal * width, focal * width, width / 2, PHOTO_PX[1] / 2],
                 "gain": gain,
                 "changed": seen is not place,
-                "occluded": occluded,
+                "occluded": hidden,
             },
         )
 
@@ -244,10 +244,12 @@ def _pose(place: Place, rooms: Sequence[int], rng: np.random.Generator) -> np.nd
     return look_along(*xy, rng.uniform(0.9, 1.8), rng.uniform(0, 2 * np.pi), rng.normal(-0.1, 0.2))
 
 
-def _occluded(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """Somebody stands in the picture: an upright blob of 5 to 20 % of it, clothed in stripes."""
+def occluded(
+    image: np.ndarray, rng: np.random.Generator, shares: tuple[float, float] = (0.05, 0.2)
+) -> tuple[np.ndarray, float]:
+    """Somebody stands in the picture (H, W, 3) uint8: an upright blob of such a share of it, clothed in stripes."""
     height, width = image.shape[:2]
-    share = rng.uniform(0.05, 0.2)
+    share = rng.uniform(*shares)
     tall = rng.uniform(0.5, 0.95) * height
     wide = share * width * height / tall
     x = rng.uniform(wide / 2, width - wide / 2)

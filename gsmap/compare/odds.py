@@ -75,13 +75,14 @@ class Odds:
         Args:
             prior: share of what is judged that is right before anything is known of it.
         """
-        return self._probability(sum(self.worth(evidence).values()), prior)
-
-    def at_most(self, evidence: Mapping[str, float], prior: float) -> float:
-        """How probable it is if all that is not named were as good as can be."""
-        best = sum(max(curve.worth) for name, curve in self.curves.items() if name not in evidence)
-        return self._probability(sum(self.worth(evidence).values()) + best, prior)
-
-    def _probability(self, worth: float, prior: float) -> float:
-        odds = self.base + np.log(prior / (1 - prior)) + worth
+        odds = self.log_odds(evidence) + np.log(prior / (1 - prior))
         return float(np.clip(1 / (1 + np.exp(-odds)), self.least, 1 - self.least))
+
+    def log_odds(self, evidence: Mapping[str, float], *, at_best: bool = False) -> float:
+        """Of what is judged, where right is as frequent as wrong.
+
+        Args:
+            at_best: what is not named is as good as can be, else it is worth nothing.
+        """
+        rest = sum(max(curve.worth) for name, curve in self.curves.items() if name not in evidence) if at_best else 0.0
+        return self.base + sum(self.worth(evidence).values()) + rest

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsmap.localize.filters import means
 from gsmap.localize.looks import Look, smaller
+from gsmap.localize.unlike import Unlike
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,15 @@ class Comparison:
         return int(np.isfinite(self.correlation).sum())
 
 
-def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Comparison:
-    """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose."""
+def compare(
+    rgb: np.ndarray, looks: Sequence[Look], params: Params, other: Unlike | None = None, times: int = 1
+) -> Comparison:
+    """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose.
+
+    Args:
+        other: a part of the photo that shows something else is left out.
+        times: the photo was so many times larger when that was asked.
+    """
     grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
     # Of patches around every so many pixels: means of the photo, of its square, and of its colours.
     around = partial(
@@ -87,17 +95,20 @@ def compare(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Compariso
     variance = np.maximum(square - mean**2, 0)
     best = np.full(mean.shape, -np.inf, np.float32)
     judged = np.zeros(best.shape, bool)
+    asked = np.ones(best.shape, bool)
+    if other is not None:
+        asked = ~other.covers(best.shape, times * params.half_px, times * params.step_px)
     seen, blocked = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
     shown = np.zeros((*best.shape, 3), np.float32)
     for one in looks:
         opaque = one.alpha > 0.9
         seen |= opaque
         blocked |= opaque & (one.depth_m < params.near_m)
-        other = around(one.grey)
-        spread = np.maximum(around(one.grey**2) - other**2, 0)
-        both = around(grey * one.grey) - mean * other
+        level = around(one.grey)
+        spread = np.maximum(around(one.grey**2) - level**2, 0)
+        both = around(grey * one.grey) - mean * level
         correlation = both / np.sqrt(np.maximum(variance * spread, 1e-12))
-        whole = around(opaque.astype(np.float32)) > 0.95
+        whole = asked & (around(opaque.astype(np.float32)) > 0.95)
         tells = whole & (np.maximum(variance, spread) > params.min_structure**2) & (np.minimum(variance, spread) > 4e-5)
         correlation = np.where(tells, correlation, -np.inf)
         better = correlation > best
@@ -114,10 +125,11 @@ def _around(image: np.ndarray, rows: int, columns: int, params: Params) -> np.nd
     return found[: -(-rows // params.step_px), : -(-columns // params.step_px)]
 
 
-def compare_coarsely(rgb: np.ndarray, looks: Sequence[Look], params: Params) -> Comparison:
+def compare_coarsely(rgb: np.ndarray, looks: Sequence[Look], params: Params, other: Unlike | None = None) -> Comparison:
     """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
     fewer = replace(params, step_px=params.half_px // 2)
-    return compare(smaller(rgb, params.coarse), [one.smaller(params.coarse) for one in looks], fewer)
+    small = [one.smaller(params.coarse) for one in looks]
+    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse)
 
 
 def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:

@@ -160,7 +160,7 @@ def judged_poses(
 
 def _settles_at(candidate: Candidate, found: Judged, picture: Picture, params: Params) -> bool:
     """Whether a rough pose is that of a place that was found: most of its matches agree with the sharp pose as well."""
-    if found.probability < params.verdict.min_probability or candidate.component != found.candidate.component:
+    if found.probability < params.likely or candidate.component != found.candidate.component:
         return False
     settled = (found.settled.T_metric_camera, found.settled.intrinsics_px, picture.size_px)
     agree = resection.agreeing(candidate.pixels, candidate.points, *settled, params.resection)
@@ -203,16 +203,15 @@ def _together(parts: Sequence[Keypoints]) -> Keypoints:
 def judged_pose(picture: Picture, candidate: Candidate, scenes: Mapping[str, PlacedFeatures], params: Params) -> Judged:
     """A rough pose, sharpened and compared with what the map shows there."""
     settled = settled_pose(picture, candidate, scenes, params)
-    comparison = evidence.compare(picture.rgb, settled.looks, params.evidence)
-    coarse = evidence.compare_coarsely(picture.rgb, settled.looks, params.evidence)
-    known, model = settled.covariance, probability.model()
-    told = probability.evidence_of(
-        picture, settled, comparison, coarse, sigmas_of(known), candidate.num_inliers, params.evidence
-    )
-    hopeless = model.at_most(told, params.verdict.prior) < params.evidence.ask_from
-    other = unlike.unlike(picture.rgb, [] if hopeless else settled.looks)
-    told |= probability.evidence_of_unlike(other, params.evidence)
-    return Judged(candidate, settled, known, told, model.probability(told, params.verdict.prior))
+    known, asked, model = settled.covariance, params.evidence, probability.model()
+    before = params.verdict.prior, params.verdict.alike
+    told = probability.evidence_of_settling(picture, settled, sigmas_of(known), candidate.num_inliers, asked)
+    hopeless = model.probability(told, *before, at_best=True) < asked.ask_from
+    other = unlike.unlike(picture.rgb, [] if hopeless else settled.looks, asked.likely)
+    comparison = evidence.compare(picture.rgb, settled.looks, asked, other)
+    coarse = evidence.compare_coarsely(picture.rgb, settled.looks, asked, other)
+    told |= probability.evidence_of_looks(comparison, coarse, other, asked)
+    return Judged(candidate, settled, known, told, model.probability(told, *before))
 
 
 def settled_pose(

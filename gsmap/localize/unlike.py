@@ -14,7 +14,7 @@ from functools import lru_cache
 from importlib.resources import files
 
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import binary_dilation, label
 
 from gsmap.compare.colours import balance
 from gsmap.localize.filters import blurred, means
@@ -22,10 +22,12 @@ from gsmap.localize.looks import GREY, Look, smaller
 
 _FILE = "unlike.npz"
 STEP, SIDE, _WIDE = 4, 9, 17  # pixels, at half the size of the picture
+EVERY_PX = 2 * STEP
 _LIGHT = 5.0  # cells over which light changes (standard deviation of a Gaussian)
 _EVERY = 5  # of the pixels so many are asked for the light
 _OPAQUE = 0.9
-_KNOWN = 0.6  # of a cell must be opaque
+_CLIPPED = 0.98  # colours of the photo from which on they tell nothing
+_KNOWN = 0.6  # of a cell must be opaque, and not clipped
 _LEAST = 1e-3  # of what a logarithm is taken
 _FAR = 6.0  # standard deviations
 
@@ -35,25 +37,48 @@ class Unlike:
     """How probable it is, cell by cell, that a photograph shows something else than the map.
 
     Args:
-        probability: (R, C) of the scene that is most like it; NaN where none shows anything.
+        probability: (R, C) of the scene that is most like it; NaN where none shows anything. Cells lie `EVERY_PX`
+            pixels of the photo apart, the first one at its corner.
+        part: (R, C) bool: the largest connected part of it that is likely something else: one thing may have come or
+            gone, a door be open, or somebody stand there.
     """
 
     probability: np.ndarray
+    part: np.ndarray
 
-    def share(self) -> float:
-        """Of what can be compared, that is expected to be something else; NaN of nothing."""
-        known = self.probability[np.isfinite(self.probability)]
-        return float(known.mean()) if len(known) else float("nan")
+    @classmethod
+    def of(cls, probability: np.ndarray, likely: float) -> Unlike:
+        """With the part that is something else by so high a probability."""
+        labels, count = label(np.nan_to_num(probability) > likely)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+        return cls(probability, labels == 1 + sizes.argmax() if count else np.zeros(probability.shape, bool))
 
-    def elsewhere(self, bar: float) -> float:
-        """Share of the cells that are something else by this probability, without the largest connected part of them:
-        one thing may have come or gone, or somebody stand there; NaN where nothing can be compared."""
+    def in_part(self) -> float:
+        """Share of what can be compared that the part has; NaN of nothing."""
+        known = np.isfinite(self.probability)
+        return float(self.part.sum() / known.sum()) if known.any() else float("nan")
+
+    def outside(self) -> float:
+        """Of what lies outside, the share that is expected to be something else; NaN of nothing."""
+        rest = self.probability[np.isfinite(self.probability) & ~binary_dilation(self.part)]
+        return float(rest.mean()) if len(rest) else float("nan")
+
+    def surely_outside(self, bar: float) -> float:
+        """Share of what can be compared that lies outside and is something else by this probability; NaN of nothing."""
         known = np.isfinite(self.probability)
         if not known.any():
             return float("nan")
-        labels, count = label(known & (self.probability > bar))
-        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-        return float((sizes.sum() - sizes.max(initial=0)) / known.sum())
+        return float(((np.nan_to_num(self.probability) > bar) & ~self.part).sum() / known.sum())
+
+    def covers(self, shape: tuple[int, ...], first_px: int, step_px: int) -> np.ndarray:
+        """(R, C) bool of patches, the first of which lies so many pixels from the photo's corner, whether the part (and
+        a cell around it) covers them."""
+        wide = binary_dilation(self.part)
+        rows, columns = (
+            np.minimum((first_px + step_px * np.arange(n)) // EVERY_PX, m - 1)
+            for n, m in zip(shape, wide.shape, strict=True)
+        )
+        return wide[np.ix_(rows, columns)]
 
 
 @lru_cache(maxsize=1)
@@ -63,8 +88,12 @@ def network() -> tuple[np.ndarray, ...]:
         return tuple(held[name].astype(np.float32) for name in held.files)
 
 
-def unlike(rgb: np.ndarray, looks: Sequence[Look]) -> Unlike:
-    """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose, of its size."""
+def unlike(rgb: np.ndarray, looks: Sequence[Look], likely: float) -> Unlike:
+    """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose, of its size.
+
+    Args:
+        likely: of `Unlike.of`.
+    """
     half = smaller(rgb, 2)
     least: np.ndarray | None = None
     for one in looks:
@@ -73,7 +102,7 @@ def unlike(rgb: np.ndarray, looks: Sequence[Look]) -> Unlike:
         least = found if least is None else np.minimum(least, found)
     if least is None:
         least = np.full((1, 1), np.inf)
-    return Unlike(np.where(np.isfinite(least), least, np.nan))
+    return Unlike.of(np.where(np.isfinite(least), least, np.nan), likely)
 
 
 def probabilities(features: np.ndarray) -> np.ndarray:
@@ -95,12 +124,13 @@ def scaled(features: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.nda
 def cells(half: np.ndarray, one: Look) -> tuple[np.ndarray, np.ndarray]:
     """(R, C, F) float32 of what each cell shows in a photo of half size and in a render of full size, and which (R, C)
     are known."""
-    shown, opaque = smaller(one.rgb, 2), smaller(one.alpha, 2) > _OPAQUE
+    shown = smaller(one.rgb, 2)
+    tells = (smaller(one.alpha, 2) > _OPAQUE) & (half.max(2) < _CLIPPED)
     a, b = half @ GREY, shown @ GREY
-    hue, light, spreads = _colours(half, shown, opaque)
+    hue, light, spreads = _colours(half, shown, tells)
     fine = [(x - blurred(x, 1.0)) ** 2 for x in (a, b)]
     patterns = [a, b, a * a, b * b, a * b]
-    planes = [opaque, smaller(one.sound, 2), hue, light, np.abs(light), *fine]
+    planes = [tells, smaller(one.sound, 2), hue, light, np.abs(light), *fine]
     near = means(np.stack([*patterns, *planes], axis=2), SIDE, step=STEP)
     wide = means(np.stack(patterns, axis=2), _WIDE, step=STEP)
     share, sound, hue, light, lightness, fine_a, fine_b = np.moveaxis(near[..., 5:], 2, 0)
@@ -130,13 +160,13 @@ def _alike(found: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _colours(
-    half: np.ndarray, shown: np.ndarray, opaque: np.ndarray
+    half: np.ndarray, shown: np.ndarray, tells: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """How far hue and lightness are apart after light is taken out (0 where nothing is), and what of both no line
+    """How far hue and lightness are apart after light is taken out (0 where nothing tells), and what of both no line
     explains."""
-    line = balance(shown[opaque][::_EVERY], half[opaque][::_EVERY])
-    chroma, light = line.differences(shown, half, opaque)
-    hue, light = (np.where(opaque, plane, np.float32(0)) for plane in (np.abs(chroma).max(2), light))
+    line = balance(shown[tells][::_EVERY], half[tells][::_EVERY])
+    chroma, light = line.differences(shown, half, tells)
+    hue, light = (np.where(tells, plane, np.float32(0)) for plane in (np.abs(chroma).max(2), light))
     return hue, light, (line.chroma_spread, line.lightness_spread)
 
 

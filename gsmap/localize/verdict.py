@@ -16,7 +16,9 @@ class Params:
 
     Args:
         min_probability: that it is right, of all evidence together.
-        prior: share of the poses that are looked into that are right before anything is known of them.
+        prior: share of the poses that are looked into that are right before anything is known of them ...
+        alike: ... and of those that are of a room that looks like one of the map, and is not in it: more in a hotel or
+            a school, less where no two rooms are alike (``docs/localize.md`` says what either costs).
         min_inliers: patches of renders that are found again in the photo where the pose predicts them.
         max_rival: another place may be this probable at most: what looks alike twice is not told apart.
         max_rotation_sigma_deg: a pose that is known less well is not said ...
@@ -25,7 +27,8 @@ class Params:
 
     min_probability: float = 0.95
     prior: float = 0.3
-    min_inliers: int = 6
+    alike: float = 0.1
+    min_inliers: int = 1
     max_rival: float = 0.2
     max_rotation_sigma_deg: float = 3.0
     max_translation_sigma_m: float = 0.25
@@ -37,7 +40,7 @@ def judge(
     """Empty when the pose is said, else the reason why not.
 
     Args:
-        evidence: by name (`gsmap.localize.probability.evidence_of`).
+        evidence: by name (`gsmap.localize.localizing.judged_pose`).
         sigmas: largest standard deviation of rotation (rad) and translation (metres).
         rival: probability of the best pose at another place.
     """
@@ -66,9 +69,10 @@ def _weakest(evidence: Mapping[str, float]) -> str:
         "contradicted": f"{evidence['contradicted']:.0%} of what can be compared differs",
         "explained_coarsely": f"the map explains {evidence['explained_coarsely']:.0%} of the coarse picture",
         "contradicted_coarsely": f"{evidence['contradicted_coarsely']:.0%} of the coarse picture differs",
-        "unlike": f"{evidence['unlike']:.0%} of what can be compared is something else",
-        "unlike_likely": f"{evidence['unlike_likely']:.0%} of it in several places",
-        "unlike_surely": f"{evidence['unlike_surely']:.0%} of it surely so in several places",
+        "unlike_part": f"one part, {evidence['unlike_part']:.0%} of the picture, is something else",
+        "unlike": f"{evidence['unlike']:.0%} of the rest is something else",
+        "unlike_likely": f"{evidence['unlike_likely']:.0%} of the rest is likely something else",
+        "unlike_surely": f"{evidence['unlike_surely']:.0%} of the rest is surely something else",
         "compared": "little can be compared",
         "colour": f"colours agree by {evidence['colour']:.2f}",
         "seen": f"the map covers {evidence['seen']:.0%} of the picture",

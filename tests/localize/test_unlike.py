@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsmap.localize import Params, unlike
+from gsmap.localize import Params, evidence, unlike
 from gsmap.localize.localizing import prepared
 from gsmap.localize.looks import look
 
@@ -32,44 +32,67 @@ def pasted(rgb: np.ndarray, other: np.ndarray, *places: tuple[int, int]) -> np.n
     return out
 
 
+def share(rgb: np.ndarray, looks) -> float:
+    """Of what can be compared, that is expected to be something else."""
+    return float(np.nanmean(unlike.unlike(rgb, looks, 0.5).probability))
+
+
 def test_a_photo_of_the_place_shows_little_else(seen) -> None:
     rgb, looks = seen
-    found = unlike.unlike(rgb, looks)
-    assert found.share() < 0.12
-    assert found.elsewhere(0.5) < 0.04
+    assert share(rgb, looks) < 0.12
+    assert unlike.unlike(rgb, looks, 0.5).surely_outside(0.8) < 0.02
 
 
 def test_a_photo_of_another_place_does(seen, other) -> None:
-    assert unlike.unlike(other, seen[1]).share() > 0.4
+    assert share(other, seen[1]) > 0.4
 
 
-@pytest.mark.parametrize(("gain", "gamma"), [(0.6, 1.0), (1.15, 0.85)])
+@pytest.mark.parametrize(("gain", "gamma"), [(0.6, 1.0), (1.15, 0.85), (1.5, 1.0)])
 def test_light_is_nothing_else(seen, gain: float, gamma: float) -> None:
     rgb, looks = seen
     lit = np.clip(gain * rgb**gamma * np.array([1.05, 1.0, 0.93], np.float32), 0, 1)
-    assert unlike.unlike(lit, looks).share() < unlike.unlike(rgb, looks).share() + 0.04
+    assert share(lit, looks) < share(rgb, looks) + 0.04
 
 
 def test_as_much_as_came_is_something_else(seen, other) -> None:
     rgb, looks = seen
-    before = unlike.unlike(rgb, looks).share()
+    before = share(rgb, looks)
     part = 120 * 120 / rgb[..., 0].size
-    one = unlike.unlike(pasted(rgb, other, (40, 60)), looks).share()
-    two = unlike.unlike(pasted(rgb, other, (40, 60), (180, 320)), looks).share()
-    assert one - before == pytest.approx(part, abs=0.04)
-    assert two - before == pytest.approx(2 * part, abs=0.08)
+    assert share(pasted(rgb, other, (40, 60)), looks) - before == pytest.approx(part, abs=0.04)
+    assert share(pasted(rgb, other, (40, 60), (180, 320)), looks) - before == pytest.approx(2 * part, abs=0.08)
 
 
 def test_one_connected_part_may_be_one_thing() -> None:
-    """The largest part does not count among what lies elsewhere; what is not known is no part of the whole."""
+    """The largest part does not count among the rest; what is not known is no part of the whole."""
     probability = np.zeros((10, 12))
     probability[1:4, 1:5] = 0.9
     probability[:, 10:] = np.nan
-    assert unlike.Unlike(probability).elsewhere(0.5) == 0
-    assert unlike.Unlike(probability).share() == pytest.approx(0.9 * 12 / 100)
+    one = unlike.Unlike.of(probability, 0.5)
+    assert one.in_part() == pytest.approx(12 / 100)
+    assert one.outside() == one.surely_outside(0.5) == 0
     probability[6:8, 2:4] = 0.6
-    assert unlike.Unlike(probability).elsewhere(0.5) == pytest.approx(4 / 100)
-    assert unlike.Unlike(probability).elsewhere(0.8) == 0
+    two = unlike.Unlike.of(probability, 0.5)
+    assert np.array_equal(two.part, one.part)
+    assert two.surely_outside(0.5) == pytest.approx(4 / 100)
+    assert two.surely_outside(0.8) == 0
+    around = 3 * 4 + 2 * 3 + 2 * 4  # the part and the cells beside it
+    assert two.outside() == pytest.approx(0.6 * 4 / (100 - around))
+
+
+def test_what_the_part_covers_is_not_compared(seen, other) -> None:
+    """Somebody before a wall takes nothing from how well the rest agrees."""
+    rgb, looks = seen
+    params = Params().evidence
+    hidden = pasted(rgb, other, (120, 200))
+    found = unlike.unlike(hidden, looks, params.likely)
+    row, column = np.nonzero(found.part)
+    assert abs(np.median(row) - 180 / unlike.EVERY_PX) < 4
+    assert abs(np.median(column) - 260 / unlike.EVERY_PX) < 4
+    for compare in (evidence.compare, evidence.compare_coarsely):
+        free, whole, less = (compare(x, looks, params, y) for x, y in ((rgb, None), (hidden, None), (hidden, found)))
+        assert less.num_judged < whole.num_judged
+        assert less.explained(params.agree) > whole.explained(params.agree) + 0.02
+        assert less.explained(params.agree) == pytest.approx(free.explained(params.agree), abs=0.06)
 
 
 def test_the_scene_that_shows_it_is_believed(seen, other) -> None:
@@ -77,11 +100,12 @@ def test_the_scene_that_shows_it_is_believed(seen, other) -> None:
     rgb, looks = seen
     (one,) = looks
     blank = replace(one, rgb=np.ascontiguousarray(other), scene="other")
-    assert unlike.unlike(rgb, [blank]).share() > 0.4
-    assert unlike.unlike(rgb, [blank, one]).share() <= unlike.unlike(rgb, [one]).share()
+    assert share(rgb, [blank]) > 0.4
+    assert share(rgb, [blank, one]) <= share(rgb, [one])
 
 
 def test_nothing_known_is_nothing_said() -> None:
-    found = unlike.unlike(np.zeros((48, 64, 3), np.float32), [])
-    assert np.isnan(found.share())
-    assert np.isnan(found.elsewhere(0.5))
+    found = unlike.unlike(np.zeros((48, 64, 3), np.float32), [], 0.5)
+    assert np.isnan(found.in_part())
+    assert np.isnan(found.outside())
+    assert np.isnan(found.surely_outside(0.5))
