@@ -78,7 +78,7 @@ def test_matches_of_a_place_that_was_found_are_not_looked_into_again(judged):
     assert localizing._settles_at(same, found, picture, PARAMS)
     assert not localizing._settles_at(other, found, picture, PARAMS)
     assert not localizing._settles_at(replace(same, component=1), found, picture, PARAMS)
-    assert not localizing._settles_at(same, replace(found, probability=0.5), picture, PARAMS)
+    assert not localizing._settles_at(same, replace(found, probability=0.4), picture, PARAMS)
 
 
 @pytest.mark.parametrize(("first", "second", "kept"), [(0.6, 0.7, "first"), (0.3, 0.4, "second"), (0.3, 0.2, "first")])
