@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.localize import covariance, matching, resection, tying
+from gsmap.localize import covariance, matching, probability, resection
 from gsmap.localize.candidates import Candidate, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.localizing import Judged, judged_pose, judged_poses, photo_features, placement, prepared, rival_of
@@ -39,6 +39,7 @@ class _Shot:
     judged: list[Judged]
     why: str
     helped: bool = False  # whether it has helped its neighbours from the pose that it has now
+    leans: bool = False  # on another photo's features alone: its evidence is not of the pose that it has now
 
     @property
     def best(self) -> Judged | None:
@@ -72,7 +73,7 @@ def localize_together(
         k = max(ready, key=lambda one: shots[one].probability)
         shots[k].helped = True
         _help(k, shots, near[k], scenes, params, ties)
-    together = _probabilities(shots, ties, params.together)
+    together = _probabilities(shots, ties, params)
     out = []
     for shot, probable in zip(shots, together, strict=True):
         if shot.best is None:
@@ -149,10 +150,11 @@ def _help(
             ties[k, other] = True
             continue
         judged = judged_pose(shot.picture, start, scenes, params)
-        if judged.settled.covariance is None or not _same(judged, start, params):
+        leans = judged.settled.covariance is None or not _same(judged, start, params)
+        if leans:
             judged = _by_matches(shot, start, pixels[pose.inliers], places[pose.inliers], helper.best, judged, params)
         if max(judged.probability, helper.probability) >= shot.probability:
-            shot.judged, shot.helped = [judged, *shot.judged], False
+            shot.judged, shot.helped, shot.leans = [judged, *shot.judged], False, leans
             ties[k, other] = True
 
 
@@ -223,25 +225,47 @@ def _same(judged: Judged, candidate: Candidate, params: Params) -> bool:
     return near_to(settled, candidate, params.resection)
 
 
-def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool], params: tying.Params) -> list[float]:
-    """Of each photo, that it is right by its own evidence or by that of the two surest that it is tied to.
+def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool], params: Params) -> list[float]:
+    """Of each photo, that it is right.
 
-    Only what a photo shows itself counts for others, less what the ties between them are worth: no two make each other
-    surer in a circle.
+    That matches are there by chance, its own evidence speaks against or that of the two surest that it is tied to: only
+    what a photo shows itself counts for others, less what the ties between them are worth, so that no two make each
+    other surer in a circle. That it is a room that looks alike holds for all of them or for none: what each shows for
+    and against that adds up, that of others in part, since they show much the same.
     """
-    own = [shot.probability for shot in shots]
+    bars, model = params.verdict, probability.model()
+    own, alike = [], []
+    for shot in shots:
+        told = None if shot.best is None else shot.best.evidence
+        if told is None or shot.leans:
+            own.append(shot.probability)
+            alike.append(0.0)
+        else:
+            own.append(model.probability(told, bars.prior, 0.0))
+            alike.append(model.alike.log_odds(told))
     out = []
     for k in range(len(shots)):
-        reached, fringe = {k: 1.0}, [k]
-        while fringe:
-            at = fringe.pop()
-            for (a, b), holds in ties.items():
-                if holds and at in (a, b):
-                    other = b if at == a else a
-                    worth = reached[at] * params.tie
-                    if worth > reached.get(other, 0.0):
-                        reached[other] = worth
-                        fringe.append(other)
-        others = sorted((worth * own[one] for one, worth in reached.items() if one != k), reverse=True)[:2]
-        out.append(float(1 - (1 - own[k]) * np.prod([1 - probable for probable in others])))
+        if not (reached := _tied(k, ties, params.together.tie))[1:]:
+            out.append(shots[k].probability)
+            continue
+        others = sorted((worth * own[one] for one, worth in reached[1:]), reverse=True)[:2]
+        chance = (1 - own[k]) * np.prod([1 - probable for probable in others])
+        rooms = alike[k] + params.together.alike * sum(alike[one] for one, _ in reached[1:])
+        against = chance / (1 - chance) + bars.alike / bars.prior * np.exp(-rooms)
+        out.append(float(1 / (1 + against)))
     return out
+
+
+def _tied(k: int, ties: Mapping[tuple[int, int], bool], tie: float) -> list[tuple[int, float]]:
+    """A photo, and those that it is tied to, over others as well; what the ties between are worth."""
+    reached, fringe = {k: 1.0}, [k]
+    while fringe:
+        at = fringe.pop()
+        for (a, b), holds in ties.items():
+            if holds and at in (a, b):
+                other = b if at == a else a
+                worth = reached[at] * tie
+                if worth > reached.get(other, 0.0):
+                    reached[other] = worth
+                    fringe.append(other)
+    return list(reached.items())

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.errors import ConfigError
 from gsmap.localize.probability import model
 
 
@@ -27,11 +28,18 @@ class Params:
 
     min_probability: float = 0.95
     prior: float = 0.3
-    alike: float = 0.1
+    alike: float = 0.2
     min_inliers: int = 1
     max_rival: float = 0.2
     max_rotation_sigma_deg: float = 3.0
     max_translation_sigma_m: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not (self.prior > 0 and self.alike >= 0 and self.prior + self.alike < 1):
+            raise ConfigError(
+                "prior and alike are shares of the poses that are looked into: prior above 0, alike 0 or more, "
+                f"together less than 1; got prior={self.prior}, alike={self.alike}"
+            )
 
 
 def judge(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_localize_verdict import GOOD
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
-from gsmap.localize import Params, localize_together, read_clip
+from gsmap.localize import Params, localize_together, probability, read_clip, verdict
 from gsmap.localize import clips as reading
+from gsmap.localize import together as together_module
 from gsmap.localize.extractors import sift
 from gsmap.localize.localizing import judged_poses, placement, prepared
 from gsmap_synthetic import film
@@ -77,3 +80,39 @@ def test_what_is_no_clip_is_refused(tmp_path) -> None:
     (tmp_path / "text.mp4").write_text("no clip")
     with pytest.raises(InputError, match="not a clip"):
         read_clip(tmp_path / "text.mp4")
+
+
+def shots_of(*told: dict[str, float]) -> list[SimpleNamespace]:
+    """Photos of which nothing is known but their evidence."""
+    bars = verdict.Params()
+    found = [probability.model().probability(one, bars.prior, bars.alike) for one in told]
+    return [
+        SimpleNamespace(best=SimpleNamespace(evidence=one), probability=p, leans=False)
+        for one, p in zip(told, found, strict=True)
+    ]
+
+
+def test_frames_of_a_room_that_looks_alike_do_not_make_each_other_sure() -> None:
+    """Each may be of the room or of one that looks like it, and all are of the same one: furniture that stands
+    elsewhere in some of them tells against all."""
+    ties = {(0, 1): True, (1, 2): True}
+    half = GOOD | {"unlike_part": 0.2, "unlike": 0.06, "unlike_likely": 0.03, "unlike_surely": 0.015, "explained": 0.7}
+    half |= {"contradicted": 0.12, "explained_coarsely": 0.85, "colour": 0.7, "laid": 0.55}
+    elsewhere = half | {"unlike_likely": 0.12, "unlike_surely": 0.08, "unlike": 0.2, "colour": 0.4, "explained": 0.5}
+    alone = shots_of(half, elsewhere, elsewhere)
+    together = together_module._probabilities(alone, ties, Params())
+    assert 0.3 < alone[0].probability < 0.95
+    assert together[0] < alone[0].probability
+    assert max(together) < 0.95
+    good = shots_of(half, GOOD, GOOD)
+    assert together_module._probabilities(good, ties, Params())[0] > 0.95 > good[0].probability
+    assert together_module._probabilities(good, {}, Params())[0] == good[0].probability
+
+
+def test_what_chance_explains_it_does_not_for_two() -> None:
+    """A photo that few features place is sure once another one, tied to it, shows the place as well."""
+    few = GOOD | {"matches": 0.9, "inliers": 0.9, "found_again": 0.03, "spread": 0.06, "laid": 0.3, "compared": 2.3}
+    few |= {"explained": 0.55, "explained_coarsely": 0.6, "seen": 0.4, "sigma_m": -1.3}
+    shots = shots_of(few, GOOD)
+    together = together_module._probabilities(shots, {(0, 1): True}, Params())
+    assert shots[0].probability < 0.95 < together[0]

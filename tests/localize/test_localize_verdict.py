@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.rotations import exp_so3, retract
 from gsmap.localize import verdict
 from gsmap.localize.covariance import with_scene
@@ -64,6 +65,12 @@ def test_a_room_that_looks_alike_is_as_improbable_as_it_is_rare() -> None:
     assert often < seldom < never
     assert often < 0.5
     assert probability(somebody) > 0.95
+
+
+@pytest.mark.parametrize("settings", [{"prior": 0.0}, {"alike": -0.1}, {"prior": 0.6, "alike": 0.4}])
+def test_shares_of_what_may_be_are_shares(settings: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="together less than 1"):
+        verdict.Params(**settings)
 
 
 def test_all_that_is_not_asked_yet_may_be_as_good_as_can_be() -> None:
