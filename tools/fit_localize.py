@@ -220,8 +220,8 @@ def fit_cells(found: list[Place], params: Params) -> None:
         right = truth[fold == k]
         ranks = np.argsort(np.argsort(said))
         area = (ranks[right].mean() - (right.sum() - 1) / 2) / (~right).sum()
-        found = (f"{(said[right] > b).mean():.1%} (wrongly {(said[~right] > b).mean():.2%})" for b in (0.5, 0.8))
-        print(f"  places left out: area under the curve {area:.3f}; said to be others: {', '.join(found)}")
+        shares = (f"{(said[right] > b).mean():.1%} (wrongly {(said[~right] > b).mean():.2%})" for b in (0.5, 0.8))
+        print(f"  places left out: area under the curve {area:.3f}; said to be others: {', '.join(shares)}")
     _save_network(features, truth)
 
 
@@ -411,13 +411,13 @@ def completed(rows: list[Row]) -> list[Row]:
     """Poses that nobody found have no matches: they get those of the found pose that is right or wrong like them and
     is most like them else (a hot deck). Left out, their absence would tell which is right."""
     asked = ("inliers", "laid", "spread", "explained")
-    kinds = np.array([np.isnan(row.evidence["matches"]) for row in rows])
+    lacking = np.array([np.isnan(row.evidence["matches"]) for row in rows])
     right = np.array([row.right for row in rows])
     told = np.array([[row.evidence[name] for name in asked] for row in rows])
     told = (told - told.mean(0)) / told.std(0)
     out = list(rows)
-    for k in np.flatnonzero(kinds):
-        known = np.flatnonzero(~kinds & (right == right[k]))
+    for k in np.flatnonzero(lacking):
+        known = np.flatnonzero(~lacking & (right == right[k]))
         one = known[np.argmin(((told[known] - told[k]) ** 2).sum(1))]
         out[k] = replace(rows[k], evidence={**rows[k].evidence, "matches": rows[one].evidence["matches"]})
     return out
@@ -467,31 +467,32 @@ def fit(rows: list[Row], penalty: float = 0.0002) -> Odds:
 
 
 def log_odds(model: Odds, rows: list[Row]) -> np.ndarray:
-    return np.array([model.base + sum(model.worth(row.evidence).values()) for row in rows])
+    return np.array([model.log_odds(row.evidence) for row in rows])
 
 
 def fit_verdict(rows: list[Row]) -> None:
-    """Right poses against wrong ones of other places, and against those of rooms that look alike; and what share of
-    either is how probable, of places that were left out."""
+    """Curves of right poses against wrong ones of other places, and of right poses against those of rooms that look
+    alike; and what comes of `localize.verdict.alike`, of places that were left out."""
     alike = np.array([row.kind == "alike" for row in rows])
     right = np.array([row.right for row in rows])
     other, odds_other = calibrated(rows, ~alike)
     rooms, odds_rooms = calibrated(rows, right | alike)
     save(other=other, alike=rooms)
-    prior = Params().verdict.prior
+    bars = Params().verdict
+    prior, bar = bars.prior, bars.min_probability
     for share in (0.35, 0.2, 0.1, 0.05, 0.02, 0.005):
         against = np.exp(-odds_other) * (1 - prior - share) + np.exp(-odds_rooms) * share
         p = prior / (prior + against)
-        if share == Params().verdict.alike:
+        if share == bars.alike:
             report("places left out", rows, p)
         differs = np.array([row.differs for row in rows])
         bands = ((LEAST_TOLD, 0.15), (0.15, 0.3), (0.3, 1.01))
-        wrong = (f"{(alike & (differs >= a) & (differs < b) & (p >= 0.95)).sum()}" for a, b in bands)
+        wrong = (f"{(alike & (differs >= a) & (differs < b) & (p >= bar)).sum()}" for a, b in bands)
         kinds = [np.array([row.kind == kind for row in rows]) & right for kind in ("found", "hidden", "lit")]
-        good = (f"{(kind & (p >= 0.95)).sum()} of {kind.sum()}" for kind in kinds)
+        good = (f"{(kind & (p >= bar)).sum()} of {kind.sum()}" for kind in kinds)
         print(f"alike {share}: found, with somebody before them, in other light {', '.join(good)}; ", end="")
         print(f"wrong of rooms that look alike, from 5, 15 and 30 % that differ {', '.join(wrong)}; ", end="")
-        print(f"of other places {(~alike & ~right & (p >= 0.95)).sum()}")
+        print(f"of other places {(~alike & ~right & (p >= bar)).sum()}")
 
 
 def calibrated(rows: list[Row], asked: np.ndarray, folds: int = 6) -> tuple[Odds, np.ndarray]:

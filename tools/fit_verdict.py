@@ -252,7 +252,7 @@ def fit(rows: list[Judged], penalty: float = 0.005) -> Model:
 
 def log_odds(model: Model, rows: list[Judged]) -> np.ndarray:
     """Of every pose, with no prior."""
-    return np.array([model.base + sum(model.curves[n].at(v) for n, v in row.evidence.items()) for row in rows])
+    return np.array([model.log_odds(row.evidence) for row in rows])
 
 
 def left_out(rows: list[Judged], folds: int = 6) -> np.ndarray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -51,21 +51,25 @@ class Odds:
     @classmethod
     def of_json(cls, text: str) -> Self:
         """From what `to_json` wrote."""
-        stored = json.loads(text)
+        return cls.of_stored(json.loads(text))
+
+    @classmethod
+    def of_stored(cls, stored: Mapping[str, Any]) -> Self:
+        """From what was written as JSON among other things."""
         curves = {
             name: Curve(tuple(c["knots"]), tuple(c["worth"]), c["missing"]) for name, c in stored["curves"].items()
         }
         return cls(curves, stored["base"], stored["least"])
 
     def worth(self, evidence: Mapping[str, float]) -> dict[str, float]:
-        """Log-odds that each piece adds, by its name; what has no curve is worth nothing."""
-        return {name: self.curves[name].at(value) for name, value in evidence.items() if name in self.curves}
+        """Log-odds that each piece adds, by its name."""
+        return {name: self.curves[name].at(value) for name, value in evidence.items()}
 
     def shortfalls(self, evidence: Mapping[str, float]) -> list[str]:
         """The names of the evidence that could be had, what lacks most of what it could be worth first."""
         lacks = {}
         for name, value in evidence.items():
-            if not np.isnan(value) and name in self.curves:
+            if not np.isnan(value):
                 lacks[name] = max(self.curves[name].worth) - self.curves[name].at(value)
         return sorted(lacks, key=lambda name: -lacks[name])
 

@@ -160,7 +160,7 @@ def judged_poses(
 
 def _settles_at(candidate: Candidate, found: Judged, picture: Picture, params: Params) -> bool:
     """Whether a rough pose is that of a place that was found: most of its matches agree with the sharp pose as well."""
-    if found.probability < params.likely or candidate.component != found.candidate.component:
+    if found.probability < params.skip_from or candidate.component != found.candidate.component:
         return False
     settled = (found.settled.T_metric_camera, found.settled.intrinsics_px, picture.size_px)
     agree = resection.agreeing(candidate.pixels, candidate.points, *settled, params.resection)

@@ -52,7 +52,7 @@ class Params:
         max_candidates: rough poses that are looked into.
         sure: once one is this probable, others are looked into only ...
         rival_inliers: ... where so large a share of its matches agrees on them.
-        likely: a rough pose whose matches agree with one that is this probable is not looked into.
+        skip_from: a rough pose whose matches agree with one that is this probable is not looked into.
         apart_m: settled poses farther from each other than this are different places.
     """
 
@@ -77,7 +77,7 @@ class Params:
     max_candidates: int = 5
     sure: float = 0.97
     rival_inliers: float = 0.5
-    likely: float = 0.5
+    skip_from: float = 0.5
     apart_m: float = 0.5
 
     def __post_init__(self) -> None:

@@ -59,7 +59,7 @@ class Model:
 def model() -> Model:
     """The model that gsmap comes with."""
     stored = json.loads((files("gsmap.localize") / _FILE).read_text())
-    return Model(*(Odds.of_json(json.dumps(stored[name])) for name in ("other", "alike")))
+    return Model(Odds.of_stored(stored["other"]), Odds.of_stored(stored["alike"]))
 
 
 def evidence_of_settling(

@@ -250,7 +250,7 @@ def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool],
             continue
         others = sorted((worth * own[one] for one, worth in reached[1:]), reverse=True)[:2]
         chance = (1 - own[k]) * np.prod([1 - probable for probable in others])
-        rooms = alike[k] + params.together.alike * sum(alike[one] for one, _ in reached[1:])
+        rooms = alike[k] + params.together.shared * sum(alike[one] for one, _ in reached[1:])
         against = chance / (1 - chance) + bars.alike / bars.prior * np.exp(-rooms)
         out.append(float(1 / (1 + against)))
     return out

@@ -14,7 +14,7 @@ class Params:
         min_tie: features of a photo that must agree with a pose by another one's, for the two to be tied.
         anchor: a photo that is this probable may help others; it is sure only once others bear it out.
         tie: how probable it is that two photos that are tied lie to each other as they are said to.
-        alike: what a photo shows for or against a room that looks alike counts so much for those that it is tied to,
+        shared: what a photo shows for or against a room that looks alike counts so much for those that it is tied to,
             for they show much the same.
     """
 
@@ -22,4 +22,4 @@ class Params:
     min_tie: int = 20
     anchor: float = 0.3
     tie: float = 0.97
-    alike: float = 0.5
+    shared: float = 0.5

@@ -21,6 +21,7 @@ from gsmap.localize.filters import blurred, means
 from gsmap.localize.looks import GREY, Look, smaller
 
 _FILE = "unlike.npz"
+# What the network was fitted with: it means nothing with other values, so none of these is a setting.
 STEP, SIDE, _WIDE = 4, 9, 17  # pixels, at half the size of the picture
 EVERY_PX = 2 * STEP
 _LIGHT = 5.0  # cells over which light changes (standard deviation of a Gaussian)

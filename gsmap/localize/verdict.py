@@ -28,7 +28,7 @@ class Params:
 
     min_probability: float = 0.95
     prior: float = 0.3
-    alike: float = 0.2
+    alike: float = 0.1
     min_inliers: int = 1
     max_rival: float = 0.2
     max_rotation_sigma_deg: float = 3.0
@@ -77,10 +77,10 @@ def _weakest(evidence: Mapping[str, float]) -> str:
         "contradicted": f"{evidence['contradicted']:.0%} of what can be compared differs",
         "explained_coarsely": f"the map explains {evidence['explained_coarsely']:.0%} of the coarse picture",
         "contradicted_coarsely": f"{evidence['contradicted_coarsely']:.0%} of the coarse picture differs",
-        "unlike_part": f"one part, {evidence['unlike_part']:.0%} of the picture, is something else",
+        "unlike_part": f"one part, {evidence['unlike_part']:.0%} of what is compared, is something else",
         "unlike": f"{evidence['unlike']:.0%} of the rest is something else",
-        "unlike_likely": f"{evidence['unlike_likely']:.0%} of the rest is likely something else",
-        "unlike_surely": f"{evidence['unlike_surely']:.0%} of the rest is surely something else",
+        "unlike_likely": f"other parts, {evidence['unlike_likely']:.0%} of what is compared, are likely something else",
+        "unlike_surely": f"other parts, {evidence['unlike_surely']:.0%} of what is compared, are surely something else",
         "compared": "little can be compared",
         "colour": f"colours agree by {evidence['colour']:.2f}",
         "seen": f"the map covers {evidence['seen']:.0%} of the picture",

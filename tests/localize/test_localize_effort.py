@@ -81,6 +81,17 @@ def test_matches_of_a_place_that_was_found_are_not_looked_into_again(judged):
     assert not localizing._settles_at(same, replace(found, probability=0.4), picture, PARAMS)
 
 
+def test_what_is_hopeless_is_not_asked_what_it_shows_otherwise(world, judged):
+    picture, found = judged
+    never = replace(PARAMS, evidence=replace(PARAMS.evidence, ask_from=1.0))
+    asked, spared = (
+        localizing.judged_pose(picture, found.candidate, {"scene": world.placed}, params) for params in (PARAMS, never)
+    )
+    assert np.isfinite(asked.evidence["unlike_part"])
+    assert np.isnan(spared.evidence["unlike_part"])
+    assert np.array_equal(asked.settled.T_metric_camera, spared.settled.T_metric_camera)
+
+
 @pytest.mark.parametrize(("first", "second", "kept"), [(0.6, 0.7, "first"), (0.3, 0.4, "second"), (0.3, 0.2, "first")])
 def test_where_a_render_agrees_little_its_pose_is_settled_once_more(judged, monkeypatch, first, second, kept):
     picture, found = judged

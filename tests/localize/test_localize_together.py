@@ -107,6 +107,10 @@ def test_frames_of_a_room_that_looks_alike_do_not_make_each_other_sure() -> None
     good = shots_of(half, GOOD, GOOD)
     assert together_module._probabilities(good, ties, Params())[0] > 0.95 > good[0].probability
     assert together_module._probabilities(good, {}, Params())[0] == good[0].probability
+    beside = shots_of(half, GOOD, elsewhere)
+    before = together_module._probabilities(beside, ties, Params())[0]
+    beside[2].leans = True  # what its render shows is not from the pose that its neighbours give it
+    assert together_module._probabilities(beside, ties, Params())[0] > before
 
 
 def test_what_chance_explains_it_does_not_for_two() -> None:

@@ -107,6 +107,8 @@ def test_a_pose_that_is_hardly_known_is_not_said() -> None:
     assert "only to" in verdict.judge(GOOD, 0.99, (0.2, 0.01), 0.0, verdict.Params())
     assert "only to" in verdict.judge(GOOD, 0.99, (0.01, 2.0), 0.0, verdict.Params())
     assert "0 patches" in verdict.judge(GOOD | {"inliers": 0.0}, 0.99, SURE, 0.0, verdict.Params())
+    strict = verdict.Params(min_inliers=6)
+    assert "3 patches" in verdict.judge(GOOD | {"inliers": np.log10(4)}, 0.99, SURE, 0.0, strict)
 
 
 def test_what_scenes_err_is_carried_to_the_camera() -> None:

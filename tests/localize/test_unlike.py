@@ -54,6 +54,16 @@ def test_light_is_nothing_else(seen, gain: float, gamma: float) -> None:
     assert share(lit, looks) < share(rgb, looks) + 0.04
 
 
+def test_colours_that_are_clipped_tell_nothing(seen) -> None:
+    rgb, looks = seen
+    white = rgb.copy()
+    white[120:240, 200:320] = 1.0
+    probability = unlike.unlike(white, looks, 0.5).probability
+    step = unlike.EVERY_PX
+    assert np.isnan(probability[144 // step : 216 // step, 224 // step : 296 // step]).all()
+    assert share(white, looks) < share(rgb, looks) + 0.04
+
+
 def test_as_much_as_came_is_something_else(seen, other) -> None:
     rgb, looks = seen
     before = share(rgb, looks)
