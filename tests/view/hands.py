@@ -78,13 +78,22 @@ class Hands:
         self.wait(f"{found}.includes({json.dumps(text)})", timeout_s)
 
     def middle(self, selector: str, text: str | None = None) -> tuple[float, float]:
+        """Where it is once it stands still: a picture that arrives, or a dialog that closes, moves what is below it."""
         found = f"find({json.dumps(selector)}, {json.dumps(text)})"
-        self.wait(found)
-        x, y = self.value(
-            f"(() => {{ const e = {found}; e.scrollIntoView({{block: 'nearest'}}); const r = e.getBoundingClientRect();"
-            " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+        self.wait(f"{found} && findAll('img').every((e) => e.complete)")
+        at = self._middle_of(found)
+        for _ in range(200):
+            self.value("new Promise((rest) => requestAnimationFrame(() => requestAnimationFrame(rest)))")
+            before, at = at, self._middle_of(found)
+            if at is not None and at == before:
+                return at[0], at[1]
+        raise AssertionError(f"{found} never stands still")
+
+    def _middle_of(self, found: str) -> list[float] | None:
+        return self.value(
+            f"(() => {{ const e = {found}; if (!e) return null; e.scrollIntoView({{block: 'nearest'}});"
+            " const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
-        return x, y
 
     def click(self, selector: str, text: str | None = None) -> None:
         """At the middle of what is shown, by a mouse, so what covers it would be hit instead."""
