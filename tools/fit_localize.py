@@ -5,6 +5,7 @@
     python tools/fit_localize.py PLACES cells --cache FOLDER     # writes gsmap/localize/unlike.npz
     python tools/fit_localize.py PLACES verdict --cache FOLDER   # writes gsmap/localize/probability.json
     python tools/fit_localize.py PLACES sigma --cache FOLDER     # says which `localize.covariance` fits best
+    python tools/fit_localize.py PLACES displaced --cache FOLDER # says which `localize.displacing` fits best
     python tools/fit_localize.py PLACES agreement --cache FOLDER # what a `localize.settling.min_agreement` costs
     python tools/fit_localize.py PLACES placed --cache FOLDER    # says what photos of these are placed, and their cost
     python tools/fit_localize.py PLACES test --cache FOLDER      # says how both do on places that they have not seen
@@ -40,7 +41,18 @@ from scipy.optimize import minimize
 from gsmap.compare.odds import Curve, Odds
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.ingest import read_captures
-from gsmap.localize import aligning, covariance, features, localizing, probability, settling, unlike, words
+from gsmap.localize import (
+    aligning,
+    covariance,
+    features,
+    localizing,
+    looks,
+    probability,
+    settling,
+    tracking,
+    unlike,
+    words,
+)
 from gsmap.localize.candidates import Candidate
 from gsmap.localize.filters import means
 from gsmap.localize.looks import GREY, smaller
@@ -602,6 +614,44 @@ def fit_sigma(found: list[Place], params: Params) -> None:
         print(f"likelihood {likely_:.3f}: {settings}; NEES {middle:.1f}, 90th {most:.1f}; {by}")
 
 
+# --- displaced -------------------------------------------------------------------------------------------------------
+
+
+def fit_displaced(found: list[Place], params: Params) -> None:
+    """By how much what renders show lies elsewhere than where it is seen from the true pose, as a share of how far off
+    the middles of Gaussians are that they show; and how much further out it lies before and after."""
+    whole = replace(params.displacing, share=1.0)
+    away, seen, radius = [], [], []
+    for place in found:
+        for told in place.photos:
+            if told["changed"] or told["occluded"]:
+                continue
+            picture, _ = localizing.prepared(place.photo(told), params)
+            view = np.array(told["T_world_camera"]), picture.intrinsics_px, picture.size_px
+            for one in looks.look(place.scenes, *view, params.features, displaced=whole):
+                hits = tracking.track(one.grey, one.sound, picture.grey, params.settling.near_px, params.tracking)
+                if hits.found.sum() < FEWEST:
+                    continue
+                pixels = hits.render_px[hits.found]
+                middle = np.array(picture.size_px) / 2
+                radius.append(pixels - middle)
+                seen.append(hits.photo_px[hits.found] - pixels)
+                away.append(one.displaced_px(pixels))
+    seen, away, radius = (np.concatenate(part).astype(np.float64) for part in (seen, away, radius))
+    weights, share = np.ones(seen.shape), 0.0
+    for _ in range(30):  # Cauchy's loss
+        share = float((weights * seen * away).sum() / (weights * away**2).sum())
+        left = seen - share * away
+        weights = 1 / (1 + (left / (1.4826 * np.median(np.abs(left)))) ** 2)
+    print(f"{len(seen)} patches: share {share:.3f}; half of them are off by {np.median(np.abs(seen)):.3f} px in either")
+    print(f"direction, and by {np.median(np.abs(left)):.3f} px after")
+    far = np.linalg.norm(radius, axis=1)
+    for low in range(0, 300, 50):
+        rows = (far >= low) & (far < low + 50)
+        before, after = (np.median((part * radius).sum(1)[rows] / far[rows]) for part in (seen, left))
+        print(f"  {low} to {low + 50} px from the middle: {before:+.3f} px outwards, {after:+.3f} after")
+
+
 # --- placed ----------------------------------------------------------------------------------------------------------
 
 
@@ -695,7 +745,7 @@ def save(**models: Odds) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
-    parser.add_argument("what", choices=("words", "sigma", "agreement", "placed", "cells", "verdict", "test"))
+    parser.add_argument("what", choices=("words", "sigma", "displaced", "agreement", "placed", "cells", "verdict", "test"))
     parser.add_argument("--cache", type=Path, required=True)
     args = parser.parse_args()
     params = Params()
@@ -704,6 +754,9 @@ def main() -> int:
         return 0
     if args.what == "sigma":
         fit_sigma(places(args.places, "fit", args.cache, params), params)
+        return 0
+    if args.what == "displaced":
+        fit_displaced(places(args.places, "fit", args.cache, params), params)
         return 0
     if args.what == "agreement":
         fit_agreement(places(args.places, "fit", args.cache, params), params)

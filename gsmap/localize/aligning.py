@@ -110,7 +110,7 @@ def align(
         return nothing
     laid = _Laid(
         np.concatenate([photo, slopes(photo).reshape(*photo.shape[:2], 6)], axis=2),
-        one.points(pixels),
+        one.places(pixels),
         shown,
         slope,
         trust,

@@ -34,11 +34,11 @@ class Params:
     blocks: tuple[int, int] = (6, 4)
     least_px: float = 0.15
     hidden_m: float = 0.003
-    hidden_rad: float = 0.0005
+    hidden_rad: float = 0.0003
     swell: float = 2.1
     swell_aligned: float = 4.7
     disagreeing: float = 2.0
-    differing: float = 0.5
+    differing: float = 0.25
 
 
 def pose_covariance(

@@ -228,6 +228,7 @@ def settled_pose(
         params.tracking,
         params.resection,
         params.aligning,
+        params.displacing,
         params.covariance,
     )
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.geometry.projection import project
-from gsmap.localize import features
+from gsmap.localize import displacing, features
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.render import render
 
@@ -38,6 +38,7 @@ class Look:
         sound: (H, W) bool: opaque, and not at an edge in depth.
         T_metric_camera: (4, 4) camera-to-component, metres.
         intrinsics_px: (4,) of this size.
+        displacement: (R, C, 2) of `gsmap.localize.displacing`, or None where it was not asked for.
     """
 
     scene: str
@@ -48,6 +49,7 @@ class Look:
     sound: np.ndarray
     T_metric_camera: np.ndarray
     intrinsics_px: np.ndarray
+    displacement: np.ndarray | None = None
 
     def smaller(self, by: int) -> Look:
         """The same, so many times smaller; sound is what is not wholly empty."""
@@ -63,6 +65,22 @@ class Look:
         local = np.stack([(pixels[:, 0] - cx) / fx * z, (pixels[:, 1] - cy) / fy * z, z], axis=1)
         out: np.ndarray = local @ self.T_metric_camera[:3, :3].T + self.T_metric_camera[:3, 3]
         return out
+
+    def displaced_px(self, pixels: np.ndarray) -> np.ndarray:
+        """(K, 2) by how much what pixels (K, 2) show lies elsewhere; 0 where that was not asked for."""
+        if self.displacement is None:
+            return np.zeros((len(pixels), 2))
+        rows, columns = self.displacement.shape[:2]
+        height, width = self.depth_m.shape
+        column = np.minimum(pixels[:, 0] / width * columns, columns - 1).astype(np.int64)
+        row = np.minimum(pixels[:, 1] / height * rows, rows - 1).astype(np.int64)
+        out: np.ndarray = self.displacement[row, column]
+        return out
+
+    def places(self, pixels: np.ndarray) -> np.ndarray:
+        """(K, 3) places in the map, in metres, of what pixels (K, 2) show: that is elsewhere by `displaced_px`."""
+        most = np.array(self.depth_m.shape[1::-1]) - 1e-3
+        return self.points(np.clip(pixels + self.displaced_px(pixels), 0, most))
 
     def moved_px(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray) -> float:
         """How far most of what it shows lies from there through another camera; inf where it shows nothing."""
@@ -82,11 +100,13 @@ def look(
     params: features.Params,
     known: Sequence[Look] = (),
     within_px: float = 0.0,
+    displaced: displacing.Params | None = None,
 ) -> list[Look]:
     """Every scene through one camera of the map; each alone, for two captures laid over each other blur each other.
 
     Args:
         known: renders of this size; what has not moved by more than ``within_px`` since is not rendered again.
+        displaced: asks as well by how much what they show lies elsewhere.
     """
     still = {one.scene: one for one in known if one.moved_px(T_metric_camera, intrinsics_px) <= within_px}
     out = []
@@ -99,5 +119,9 @@ def look(
         rgb = np.clip(np.nan_to_num(shown.colour[0]), 0, 1)
         depth = shown.depth[0] * np.float32(one.S_metric_scene.scale)
         sound = features.sound_depth(shown, params) > 0
-        out.append(Look(one.scene, rgb, rgb @ GREY, shown.alpha[0], depth, sound, T_metric_camera, intrinsics_px))
+        away = None
+        if displaced is not None and displaced.share > 0:
+            away = displacing.displacement(one, T_metric_camera, intrinsics_px, size_px, displaced)
+        alpha = shown.alpha[0]
+        out.append(Look(one.scene, rgb, rgb @ GREY, alpha, depth, sound, T_metric_camera, intrinsics_px, away))
     return out

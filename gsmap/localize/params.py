@@ -9,6 +9,7 @@ from gsmap.localize import (
     clips,
     covariance,
     differing,
+    displacing,
     evidence,
     features,
     matching,
@@ -41,6 +42,7 @@ class Params:
         settling: how a rough pose is sharpened.
         tracking: how patches of renders are found again in a photo.
         aligning: how renders are laid over a photo.
+        displacing: how far from its pixel is what a render shows.
         evidence: how a photo is compared with renders.
         covariance: how well a pose is known.
         verdict: the bars that a pose must clear.
@@ -66,6 +68,7 @@ class Params:
     settling: settling.Params = field(default_factory=settling.Params)
     tracking: tracking.Params = field(default_factory=tracking.Params)
     aligning: aligning.Params = field(default_factory=aligning.Params)
+    displacing: displacing.Params = field(default_factory=displacing.Params)
     evidence: evidence.Params = field(default_factory=evidence.Params)
     covariance: covariance.Params = field(default_factory=covariance.Params)
     verdict: verdict.Params = field(default_factory=verdict.Params)

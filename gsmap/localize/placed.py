@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from gsmap.geometry.sh import sh0_of_rgb
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
 
@@ -39,10 +40,24 @@ class PlacedFeatures:
     def features(self) -> SceneFeatures:
         return self.read_features()
 
+    @cached_property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """(3,) the least coordinates of the Gaussians' middles, scene frame, and (3,) how far they reach from there."""
+        low = self.gaussians.means.min(0).astype(np.float64)
+        return low, np.maximum(self.gaussians.means.max(0) - low, 1e-9)
+
+    @cached_property
+    def coloured_by_place(self) -> Gaussians:
+        """The Gaussians, each of the colour that is the place of its middle in their box: a render of these says which
+        place a pixel shows."""
+        low, span = self.box
+        sh = sh0_of_rgb((self.gaussians.means - low) / span)[:, None].astype(np.float32)
+        return replace(self.gaussians, sh=sh)
+
     def drop(self) -> None:
         """Let go of the arrays."""
-        self.__dict__.pop("gaussians", None)
-        self.__dict__.pop("features", None)
+        for name in ("gaussians", "features", "box", "coloured_by_place"):
+            self.__dict__.pop(name, None)
 
     def camera(self, T_metric_camera: np.ndarray, intrinsics_px: np.ndarray, size_px: tuple[int, int]) -> Cameras:
         """A camera of the map as one of the scene's frame and unit."""

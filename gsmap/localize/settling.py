@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmap.geometry.projection import project
 from gsmap.geometry.similarities import rotation_vectors
-from gsmap.localize import aligning, covariance, evidence, features, resection, tracking
+from gsmap.localize import aligning, covariance, displacing, evidence, features, resection, tracking
 from gsmap.localize.looks import GREY, Look, look, smaller
 from gsmap.localize.placed import PlacedFeatures
 
@@ -108,6 +108,7 @@ def settle(
     tracks: tracking.Params,
     poses: resection.Params,
     laying: aligning.Params,
+    displaced: displacing.Params,
     known: covariance.Params,
 ) -> Settled:
     """Find patches from far, lay renders over the photo, find patches again; what both tell is one pose.
@@ -120,7 +121,7 @@ def settle(
         intrinsics_px: (4,) of the picture's size, as far as they are known.
         scenes: that may show the place, those that matter most first.
     """
-    rest = scenes, params, lifting, tracks, poses, laying, known
+    rest = scenes, params, lifting, tracks, poses, laying, displaced, known
     found = _settled(picture, T_metric_camera, intrinsics_px, *rest)
     if found.fit is None or found.agreement >= params.settle_again_under:
         return found
@@ -138,6 +139,7 @@ def _settled(
     tracks: tracking.Params,
     poses: resection.Params,
     laying: aligning.Params,
+    displaced: displacing.Params,
     known: covariance.Params,
 ) -> Settled:
     """`settle`, once."""
@@ -162,7 +164,8 @@ def _settled(
     best = int(np.argmax(counts))
     aligned, agreement = None, 0.0
     for blur in laying.blur_px:
-        looks = look([scenes[best]], pose, lens / 2, half.size_px, lifting, looks, params.again_blurs * blur / 2)
+        again_px = params.again_blurs * blur / 2
+        looks = look([scenes[best]], pose, lens / 2, half.size_px, lifting, looks, again_px, displaced)
         (one,) = looks
         laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
         agreement = float(np.nan_to_num(laid.agreement))
@@ -171,7 +174,7 @@ def _settled(
         if len(laid.pixels):
             aligned, pose, lens = laid, laid.T_metric_camera, 2 * laid.intrinsics_px
 
-    looks = look(scenes, pose, lens, picture.size_px, lifting)
+    looks = look(scenes, pose, lens, picture.size_px, lifting, displaced=displaced)
     patches = _found_again(picture, 1.0, looks, params.near_px, tracks)
     told = None if aligned is None else covariance.of_aligned(aligned, half.size_px, known, picture.focal_sigma)
     fit: resection.Refined | None = None
@@ -255,7 +258,7 @@ def _found_again(
         keep = hits.found
         tried += len(keep)
         found.append(hits.photo_px[keep] / factor)
-        places.append(one.points(hits.render_px[keep]))
+        places.append(one.places(hits.render_px[keep]))
         whose.append(np.full(int(keep.sum()), place))
     return _Patches(np.concatenate(found), np.concatenate(places), np.concatenate(whose), tried)
 

@@ -60,7 +60,7 @@ def test_where_the_map_shows_something_else_nothing_is_looked_into_further(world
     away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1.0, -1.0])  # it looks the other way
     sizes = []
     look = localizing.settle.__globals__["look"]
-    monkeypatch.setitem(localizing.settle.__globals__, "look", lambda *a: (sizes.append(a[3]), look(*a))[1])
+    monkeypatch.setitem(localizing.settle.__globals__, "look", lambda *a, **k: (sizes.append(a[3]), look(*a, **k))[1])
     wrong = Candidate(0, away, picture.intrinsics_px, 8, ("scene",))
     one = localizing.judged_pose(picture, wrong, {"scene": world.placed}, PARAMS)
     assert one.covariance is None
@@ -104,7 +104,7 @@ def test_where_a_render_agrees_little_its_pose_is_settled_once_more(judged, monk
 
     monkeypatch.setattr(settling, "_settled", settled)
     rough = moved(found.settled.T_metric_camera, np.full(6, 0.1))
-    answer = settling.settle(picture, rough, picture.intrinsics_px, (), PARAMS.settling, *[None] * 5)
+    answer = settling.settle(picture, rough, picture.intrinsics_px, (), PARAMS.settling, *[None] * 6)
     assert answer.agreement == {"first": first, "second": second}[kept]
     assert len(starts) == (1 if first > PARAMS.settling.settle_again_under else 2)
     assert np.array_equal(starts[-1], rough if len(starts) == 1 else found.settled.T_metric_camera)

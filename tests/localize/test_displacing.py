@@ -1,0 +1,121 @@
+"""What a render of overlapping Gaussians shows, and where that lies: against sums of single Gaussians in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsmap.geometry.projection import project
+from gsmap.geometry.rotations import exp_so3
+from gsmap.localize import Params, localizing
+from gsmap.localize.candidates import Candidate
+from gsmap.localize.displacing import Params as Displacing
+from gsmap.localize.displacing import displacement
+from gsmap.localize.features import Params as Features
+from gsmap.localize.looks import look
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.localize.resection import moved
+from gsmap.types import Gaussians, Sim3
+
+LENS, SIZE = np.array([240.0, 240, 120, 90]), (240, 180)
+PLAIN = Displacing(share=1.0, most_px=50.0, around_px=1.0, width_px=240)  # every pixel alone, nothing cut off
+
+
+def _plane(slant_rad: float, S: Sim3) -> PlacedFeatures:
+    """A plane of overlapping balls before the camera, nearer at its top the more it slants, in a frame of its own."""
+    u, v = np.random.default_rng(0).uniform(-3, 3, (2, 14_000))
+    turn = exp_so3(np.array([slant_rad, 0, 0]))
+    at = np.stack([u, v, np.zeros_like(u)], axis=1) @ turn.T + np.array([0, 0, 3.0])
+    means = S.inverse().apply(at).astype(np.float32)
+    n = len(means)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (n, 1))
+    size = np.full((n, 3), np.log(0.05 / S.scale), np.float32)
+    opacity = np.full(n, 1.5, np.float32)
+    gaussians = Gaussians(means, quats, size, opacity, np.zeros((n, 1, 3), np.float32))
+    return PlacedFeatures("plane", S, 0, None, lambda: gaussians, lambda: None)
+
+
+@pytest.fixture(scope="module")
+def frame() -> Sim3:
+    return Sim3(exp_so3(np.array([0.3, -1.0, 0.5])), np.array([4.0, -2.0, 1.0]), 2.5)
+
+
+def _mean_of_middles(scene: PlacedFeatures, pixel: np.ndarray) -> np.ndarray:
+    """(2,) where the mean of the Gaussians' middles lies that a pixel shows, one after the other, front to back."""
+    at = scene.S_metric_scene.apply(scene.gaussians.means.astype(np.float64))
+    middles, z = project(at, np.eye(4), LENS)
+    sigma = float(np.exp(scene.gaussians.log_scales[0, 0])) * scene.S_metric_scene.scale
+    total, weight, through = np.zeros(3), 0.0, 1.0
+    for k in np.argsort(z):
+        x, y, depth = at[k]
+        J = np.array([[LENS[0] / depth, 0, -LENS[0] * x / depth**2], [0, LENS[1] / depth, -LENS[1] * y / depth**2]])
+        cov = sigma**2 * J @ J.T + 0.3 * np.eye(2)
+        away = pixel - middles[k]
+        alpha = min(0.99, float(np.exp(-0.5 * away @ np.linalg.solve(cov, away)) / (1 + np.exp(-1.5))))
+        if alpha < 1 / 255:
+            continue
+        if through * (1 - alpha) <= 1e-4:
+            break
+        total, weight, through = total + through * alpha * at[k], weight + through * alpha, through * (1 - alpha)
+    return project(total[None] / weight, np.eye(4), LENS)[0][0]
+
+
+@pytest.mark.parametrize("slant_rad", [0.02, 0.9, -0.7])
+def test_it_is_how_far_the_middles_are_of_what_a_pixel_shows(frame, slant_rad):
+    scene = _plane(slant_rad, frame)
+    found = displacement(scene, np.eye(4), LENS, SIZE, PLAIN)
+    for column, row in ((120, 90), (60, 40), (200, 130), (150, 20)):
+        pixel = np.array([column, row]) + 0.5
+        assert found[row, column] == pytest.approx(_mean_of_middles(scene, pixel) - pixel, abs=0.02)
+
+
+def test_what_is_shown_belongs_on_the_nearer_side(frame):
+    """Nearer is lower on a floor: what is shown there lies further down; of a wall head on, nowhere else."""
+    wall, floor = (displacement(_plane(slant, frame), np.eye(4), LENS, SIZE, PLAIN) for slant in (0.0, -0.9))
+    assert np.abs(wall[60:120, 80:160].mean((0, 1))).max() < 0.3
+    assert floor[60:120, 80:160, 1].mean() > 3
+    assert abs(floor[60:120, 80:160, 0].mean()) < 0.3
+
+
+def test_it_is_a_share_is_cut_off_and_is_asked_of_a_small_render(frame):
+    scene = _plane(0.9, frame)
+    whole = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0))
+    half = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0, share=0.5))
+    small = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0, width_px=60))
+    least = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, most_px=0.4))
+    assert np.allclose(half, whole / 2, atol=1e-6)
+    assert np.abs(least).max() == pytest.approx(0.4 * SIZE[0] / 480, rel=1e-5)
+    assert small.shape == (45, 60, 2)
+    assert small[20:25, 25:35].mean((0, 1)) == pytest.approx(whole[80:100, 100:140].mean((0, 1)), rel=0.25, abs=0.3)
+
+
+def test_a_look_says_where_what_it_shows_lies(frame):
+    scene = _plane(0.9, frame)
+    plain, displaced = (
+        look([scene], np.eye(4), LENS, SIZE, Features(), displaced=asked)[0] for asked in (None, Displacing(share=0.5))
+    )
+    pixels = np.array([[60.5, 40.5], [120.5, 90.5], [200.5, 150.5]])
+    assert np.array_equal(plain.places(pixels), plain.points(pixels))
+    assert np.array_equal(displaced.points(pixels), plain.points(pixels))
+    way = displaced.displaced_px(pixels)
+    assert np.abs(way).max() > 0.05
+    at, _ = project(displaced.places(pixels), np.eye(4), LENS)
+    assert np.allclose(at, pixels + way, atol=1e-6)
+    assert look([scene], np.eye(4), LENS, SIZE, Features(), displaced=Displacing(share=0.0))[0].displacement is None
+
+
+def test_poses_lie_further_back_by_it(world):
+    """By both that are found: what is laid over whole and patches; as much as what is seen lies further out."""
+    picture, _ = localizing.prepared(world.photos[1], Params())
+    candidate = Candidate(0, world.poses[1], picture.intrinsics_px, 40, ("scene",))
+    without, twice = (
+        localizing.settled_pose(
+            picture, candidate, {"scene": world.placed}, replace(Params(), displacing=Displacing(share=share))
+        )
+        for share in (0.0, 0.4)
+    )
+    back = (np.linalg.inv(without.T_metric_camera) @ twice.T_metric_camera)[2, 3]
+    depth = np.median(without.looks[0].depth_m[without.looks[0].alpha > 0.9])
+    assert -0.01 * depth < back < -0.0002 * depth
