@@ -293,8 +293,8 @@ def nearer(photo: Photo) -> Photo:
     return Photo(rgb, np.array([fx, fy, cx - x, cy - y]) * factor, 0.0, photo.name)
 
 
-def hidden(photo: Photo) -> Photo:
-    """Somebody upright in a tenth of the picture."""
+def hidden(photo: Photo, *, masked: bool = False) -> Photo:
+    """Somebody upright in a tenth of the picture; told by a mask, or not."""
     width, height = photo.size_px
     rng = np.random.default_rng(sum(photo.name.encode()))
     tall, wide = 0.8 * height, 0.125 * width
@@ -303,7 +303,7 @@ def hidden(photo: Photo) -> Photo:
     body = (np.abs(u - x) < wide / 2) & (v > height - tall)
     stripes = rng.uniform(0, 255, (8, 3))[(v // 25) % 8] + rng.normal(0, 12, photo.rgb.shape)
     rgb = np.where(body[..., None], np.clip(stripes, 0, 255), photo.rgb).astype(np.uint8)
-    return Photo(rgb, photo.intrinsics_px, 0.0, photo.name)
+    return Photo(rgb, photo.intrinsics_px, 0.0, photo.name, known=~body if masked else None)
 
 
 def unknown_focal(photo: Photo) -> Photo:
@@ -319,6 +319,7 @@ PERTURBED: dict[str, Callable[[Photo], Photo]] = {
     "half resolution": halved,
     "another focal length": nearer,
     "a tenth hidden": hidden,
+    "a tenth hidden, masked": partial(hidden, masked=True),
     "focal length unknown": unknown_focal,
 }
 

@@ -745,7 +745,9 @@ def save(**models: Odds) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
-    parser.add_argument("what", choices=("words", "sigma", "displaced", "agreement", "placed", "cells", "verdict", "test"))
+    parser.add_argument(
+        "what", choices=("words", "sigma", "displaced", "agreement", "placed", "cells", "verdict", "test")
+    )
     parser.add_argument("--cache", type=Path, required=True)
     args = parser.parse_args()
     params = Params()

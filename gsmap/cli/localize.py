@@ -53,6 +53,12 @@ def command(
     video: Annotated[
         str | None, typer.Option("--video", metavar="FILE", help="A clip: its sharpest frames, together.")
     ] = None,
+    masks: Annotated[
+        str | None,
+        typer.Option(
+            "--masks", metavar="DIR", help="A mask of each photo, black where people stand: PHOTO.jpg.png, as COLMAP's."
+        ),
+    ] = None,
     depth: Annotated[
         str | None,
         typer.Option("--depth", metavar="PNG", help="A depth picture of the one photo's view; needs --intrinsics."),
@@ -101,6 +107,7 @@ def command(
                 near=near,
                 together=together,
                 video=video,
+                masks=masks,
                 values=dict(parse(one) for one in sets or ()),
                 preset=preset,
             )
@@ -114,6 +121,7 @@ def command(
             near=near,
             together=together,
             video=video,
+            masks=masks,
             depth=depth,
             depth_scale=depth_scale,
             changes=changes,

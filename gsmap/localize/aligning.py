@@ -74,10 +74,12 @@ class Aligned:
     agreement: float = np.nan
 
 
-def agreements(rgb: np.ndarray, looks: Sequence[Look], blur_px: float, params: Params) -> np.ndarray:
+def agreements(
+    rgb: np.ndarray, looks: Sequence[Look], blur_px: float, params: Params, known: np.ndarray | None = None
+) -> np.ndarray:
     """(L,) how many pixels of each render look like a photo's where they lie: the sum of what each is trusted."""
-    photo = _band(rgb, None, blur_px, params.band)
-    return np.array([_pixels(photo, one, blur_px, params)[3].sum() for one in looks])
+    photo = _band(rgb, known, blur_px, params.band)
+    return np.array([_pixels(photo, one, blur_px, params, known)[3].sum() for one in looks])
 
 
 def align(
@@ -88,6 +90,7 @@ def align(
     blur_px: float,
     params: Params,
     focal: tuple[float, float] | None = None,
+    known: np.ndarray | None = None,
 ) -> Aligned:
     """Minimise robust differences of a photo's and a render's band of detail over the pose (Gauss-Newton).
 
@@ -101,11 +104,12 @@ def align(
         intrinsics_px: (4,) of this size.
         blur_px: of this round, at this size.
         focal: its expected value and ``focal_sigma``, where it is free.
+        known: (H, W) bool: pixels of the photo that count; None of all.
     """
     empty = np.zeros((0, 3))
     nothing = Aligned(T_metric_camera, intrinsics_px, empty[:, :2], empty, empty, np.zeros((0, 3, 6)))
-    photo = _band(rgb, None, blur_px, params.band)
-    pixels, shown, slope, trust = _pixels(photo, one, blur_px, params)
+    photo = _band(rgb, known, blur_px, params.band)
+    pixels, shown, slope, trust = _pixels(photo, one, blur_px, params, known)
     if len(pixels) < params.min_points:
         return nothing
     laid = _Laid(
@@ -243,7 +247,7 @@ def _linear(
 
 
 def _pixels(
-    photo: np.ndarray, one: Look, blur: float, params: Params
+    photo: np.ndarray, one: Look, blur: float, params: Params, known: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Those of a render that are laid over a photo: where (K, 2), colours (K, 3), slopes (K, 2, 3), trust (K,)."""
     band = _band(one.rgb, one.alpha > params.min_alpha, blur, params.band)
@@ -252,10 +256,15 @@ def _pixels(
     width = 2 * round(params.around_px * blur / 2) + 1
     relative = contrast / (means(contrast, width) + 1e-4)
     relative[~_smooth(one, params)] = 0
+    if known is not None:
+        relative[~known] = 0
     count = min(params.max_points, int((relative > 0).sum()))
     rows = np.sort(np.argpartition(-relative.ravel(), max(count - 1, 0))[:count])
     row, column = np.divmod(rows, relative.shape[1])
-    products = [np.einsum("hwc,hwc->hw", a, b) for a, b in ((photo, band), (photo, photo), (band, band))]
+    shown = band
+    if known is not None:  # what stands before the place agrees with nothing, and says nothing
+        photo, shown = (image * known[..., None] for image in (photo, band))
+    products = [np.einsum("hwc,hwc->hw", a, b) for a, b in ((photo, shown), (photo, photo), (shown, shown))]
     both, mine, theirs = means(np.stack(products, axis=2), width)[row, column].T
     agree = both / np.sqrt(np.maximum(mine * theirs, 1e-12))
     trust = np.clip(agree.astype(np.float64), params.least_trust, 1.0) ** params.trust

@@ -130,6 +130,8 @@ def compare_photo(
         places = _points(one, T_metric_camera, lens)
         off = _uncertainty_px(one.depth_m, covariance, lens)
         usable = _away_from_edges(one.sound, off)
+        if picture.known is not None:
+            usable &= picture.known
         rows = np.flatnonzero(usable)
         if len(rows) < told.min_share * usable.size:
             continue

@@ -53,10 +53,8 @@ def displacement(
     """
     by = max(1, round(size_px[0] / params.width_px))
     small = (size_px[0] // by, size_px[1] // by)
-    shown = render(
-        scene.coloured_by_place, scene.camera(T_metric_camera, intrinsics_px / by, small), dominant_id=False, depth=False,
-        backend="native",
-    )  # fmt: skip
+    camera = scene.camera(T_metric_camera, intrinsics_px / by, small)
+    shown = render(scene.coloured_by_place, camera, depth=False, dominant_id=False, backend="native")
     alpha = shown.alpha[0]
     low, span = scene.box
     middles = shown.colour[0] / np.maximum(alpha, 1e-3)[..., None] * span + low

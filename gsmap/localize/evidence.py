@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from gsmap.localize.filters import means
-from gsmap.localize.looks import Look, smaller
+from gsmap.localize.looks import Look, smaller, wholly
 from gsmap.localize.unlike import Unlike
 
 
@@ -78,13 +78,19 @@ class Comparison:
 
 
 def compare(
-    rgb: np.ndarray, looks: Sequence[Look], params: Params, other: Unlike | None = None, times: int = 1
+    rgb: np.ndarray,
+    looks: Sequence[Look],
+    params: Params,
+    other: Unlike | None = None,
+    times: int = 1,
+    known: np.ndarray | None = None,
 ) -> Comparison:
     """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose.
 
     Args:
         other: a part of the photo that shows something else is left out.
         times: the photo was so many times larger when that was asked.
+        known: (H, W) bool: pixels of the photo that count; None of all.
     """
     grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
     # Of patches around every so many pixels: means of the photo, of its square, and of its colours.
@@ -102,6 +108,8 @@ def compare(
     shown = np.zeros((*best.shape, 3), np.float32)
     for one in looks:
         opaque = one.alpha > 0.9
+        if known is not None:
+            opaque &= known
         seen |= opaque
         blocked |= opaque & (one.depth_m < params.near_m)
         level = around(one.grey)
@@ -116,7 +124,9 @@ def compare(
         best = np.maximum(best, correlation)
         judged |= tells
     best = np.where(judged, best, np.nan)
-    return Comparison(best, float(seen.mean()), _chroma(photo_colour[judged], shown[judged]), float(blocked.mean()))
+    of_picture = 1.0 if known is None else max(float(known.mean()), 1e-9)
+    shares = float(seen.mean()) / of_picture, float(blocked.mean()) / of_picture
+    return Comparison(best, shares[0], _chroma(photo_colour[judged], shown[judged]), shares[1])
 
 
 def _around(image: np.ndarray, rows: int, columns: int, params: Params) -> np.ndarray:
@@ -125,11 +135,18 @@ def _around(image: np.ndarray, rows: int, columns: int, params: Params) -> np.nd
     return found[: -(-rows // params.step_px), : -(-columns // params.step_px)]
 
 
-def compare_coarsely(rgb: np.ndarray, looks: Sequence[Look], params: Params, other: Unlike | None = None) -> Comparison:
+def compare_coarsely(
+    rgb: np.ndarray,
+    looks: Sequence[Look],
+    params: Params,
+    other: Unlike | None = None,
+    known: np.ndarray | None = None,
+) -> Comparison:
     """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
     fewer = replace(params, step_px=params.half_px // 2)
     small = [one.smaller(params.coarse) for one in looks]
-    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse)
+    fewer_known = None if known is None else wholly(known, params.coarse)
+    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse, fewer_known)
 
 
 def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:

@@ -12,7 +12,7 @@ from gsmap.localize import covariance, evidence, matching, probability, resectio
 from gsmap.localize.candidates import Candidate, candidates, matches_by_component, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.filters import blurred
-from gsmap.localize.looks import GREY
+from gsmap.localize.looks import GREY, at_pixels
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.retrieval import ViewIndex, most_alike
@@ -119,8 +119,11 @@ def prepared(photo: Photo, params: Params) -> tuple[Picture, np.ndarray]:
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
         rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BOX, reducing_gap=3.0))
         scale = np.tile([size[0] / width, size[1] / height], 2)
-    real = rgb.astype(np.float32) / 255
-    return Picture(real, real @ GREY, photo.intrinsics_px * scale, photo.focal_sigma), scale
+    real, known = rgb.astype(np.float32) / 255, photo.known
+    if known is not None and factor < 1:  # a pixel that is hidden in part is hidden
+        box = Image.fromarray(np.where(known, 255, 0).astype(np.uint8))
+        known = np.asarray(box.resize(rgb.shape[1::-1], Image.Resampling.BOX)) == 255
+    return Picture(real, real @ GREY, photo.intrinsics_px * scale, photo.focal_sigma, known), scale
 
 
 def judged_poses(
@@ -186,9 +189,14 @@ def _rough_poses(
 
 
 def photo_features(picture: Picture, extractor: Extractor, smooth_px: float) -> Keypoints:
-    """Features of a photo, without what is finer than renders are."""
+    """Features of a photo where it shows the place, without what is finer than renders are."""
     rgb = blurred(picture.rgb, smooth_px) if smooth_px > 0 else picture.rgb
-    return extractor.extract((rgb * 255 + 0.5).astype(np.uint8))
+    found = extractor.extract((rgb * 255 + 0.5).astype(np.uint8))
+    if picture.known is None:
+        return found
+    keep = at_pixels(picture.known, found.pixels)
+    angles, sizes = (None if column is None else column[keep] for column in (found.angles_rad, found.sizes_px))
+    return Keypoints(found.pixels[keep], found.descriptors[keep], angles, sizes)
 
 
 def _together(parts: Sequence[Keypoints]) -> Keypoints:
@@ -207,9 +215,10 @@ def judged_pose(picture: Picture, candidate: Candidate, scenes: Mapping[str, Pla
     before = params.verdict.prior, params.verdict.alike
     told = probability.evidence_of_settling(picture, settled, sigmas_of(known), candidate.num_inliers, asked)
     hopeless = model.probability(told, *before, at_best=True) < asked.ask_from
-    other = unlike.unlike(picture.rgb, [] if hopeless else settled.looks, asked.likely)
-    comparison = evidence.compare(picture.rgb, settled.looks, asked, other)
-    coarse = evidence.compare_coarsely(picture.rgb, settled.looks, asked, other)
+    rgb, shows = picture.rgb, picture.known
+    other = unlike.unlike(rgb, [] if hopeless else settled.looks, asked.likely, shows)
+    comparison = evidence.compare(rgb, settled.looks, asked, other, known=shows)
+    coarse = evidence.compare_coarsely(rgb, settled.looks, asked, other, shows)
     told |= probability.evidence_of_looks(comparison, coarse, other, asked)
     return Judged(candidate, settled, known, told, model.probability(told, *before))
 

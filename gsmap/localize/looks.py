@@ -25,6 +25,19 @@ def smaller(image: np.ndarray, by: int) -> np.ndarray:
     return out
 
 
+def wholly(mask: np.ndarray, by: int) -> np.ndarray:
+    """(H // by, W // by) bool: blocks of a mask (H, W) all of which is true."""
+    out: np.ndarray = smaller(mask, by) == 1
+    return out
+
+
+def at_pixels(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(K,) bool of pixels (K, 2): what a mask (H, W) says there; outside as at its edge."""
+    column, row = np.clip(pixels, 0, np.array(mask.shape[1::-1]) - 1).astype(np.int64).T
+    out: np.ndarray = mask[row, column]
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Look:
     """A render of one scene through a camera of the map.

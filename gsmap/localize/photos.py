@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,12 +37,17 @@ class Lens:
             raise ConfigError("intrinsics are fx,fy,cx,cy in pixels, and a focal length is in pixels: all above 0")
 
 
-def read_photo(path: str | os.PathLike[str], lens: Lens | None = None) -> Photo:
+def read_photo(
+    path: str | os.PathLike[str], lens: Lens | None = None, masks: str | os.PathLike[str] | None = None
+) -> Photo:
     """Read a picture, turned the way its EXIF says it was held.
 
+    Args:
+        masks: the folder that its mask is in (`read_mask`).
+
     Raises:
-        NotFoundError: no such file.
-        InputError: not a picture that Pillow reads, or an implausibly large one.
+        NotFoundError: no such file, or no mask of it.
+        InputError: not a picture that Pillow reads, or an implausibly large one; or its mask is none.
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
 
@@ -64,7 +69,42 @@ def read_photo(path: str | os.PathLike[str], lens: Lens | None = None) -> Photo:
         raise InputError(
             f"{path} is not a picture that can be read ({error}): give a JPEG, PNG, WebP or TIFF"
         ) from error
-    return taken_with(rgb, lens, focal_35mm, path.name)
+    photo = taken_with(rgb, lens, focal_35mm, path.name)
+    return photo if masks is None else replace(photo, known=read_mask(path, masks, photo.size_px))
+
+
+def read_mask(path: str | os.PathLike[str], masks: str | os.PathLike[str], size_px: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool of a photo: what its mask in a folder of masks leaves.
+
+    As COLMAP has them: of ``photo.jpg`` the mask is ``photo.jpg.png``, of the photo's size once that is upright, and
+    black where the photo does not count. ``photo.png`` is taken as well.
+
+    Raises:
+        NotFoundError: no such folder or mask; a photo whose mask is missing is not taken as a whole.
+        InputError: not a picture, of another size, or black everywhere.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    folder, name = Path(masks), Path(path)
+    if not folder.is_dir():
+        raise NotFoundError(f"no folder of masks at {folder}")
+    offered = [folder / f"{name.name}.png", folder / f"{name.stem}.png"]
+    found = next((one for one in offered if one.is_file()), None)
+    if found is None:
+        raise NotFoundError(f"{name.name} has no mask in {folder}: call it {offered[0].name}, white where all counts")
+    try:
+        with Image.open(found) as picture:
+            known = np.asarray(picture.convert("L")) > 0
+    except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise InputError(f"{found} is not a picture that can be read ({error}): masks are PNG") from error
+    if known.shape[::-1] != size_px:
+        raise InputError(
+            f"{found} has {known.shape[1]} x {known.shape[0]} pixels, its photo {size_px[0]} x {size_px[1]}: "
+            "masks are of the upright photo's size"
+        )
+    if not known.any():
+        raise InputError(f"{found} is black everywhere: it leaves nothing of its photo")
+    return known
 
 
 def taken_with(rgb: np.ndarray, lens: Lens, focal_35mm: object = None, name: str = "photo") -> Photo:

@@ -10,7 +10,7 @@ import numpy as np
 from gsmap.geometry.projection import project
 from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import aligning, covariance, displacing, evidence, features, resection, tracking
-from gsmap.localize.looks import GREY, Look, look, smaller
+from gsmap.localize.looks import GREY, Look, at_pixels, look, smaller, wholly
 from gsmap.localize.placed import PlacedFeatures
 
 
@@ -51,12 +51,14 @@ class Picture:
         grey: (H, W) float32.
         intrinsics_px: (4,) of this size.
         focal_sigma: as in `gsmap.types.localization.Photo`.
+        known: (H, W) bool: pixels that show the place; None where all may.
     """
 
     rgb: np.ndarray
     grey: np.ndarray
     intrinsics_px: np.ndarray
     focal_sigma: float
+    known: np.ndarray | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -64,7 +66,8 @@ class Picture:
 
     def halved(self) -> Picture:
         rgb = smaller(self.rgb, 2)
-        return Picture(rgb, rgb @ GREY, self.intrinsics_px / 2, self.focal_sigma)
+        known = None if self.known is None else wholly(self.known, 2)
+        return Picture(rgb, rgb @ GREY, self.intrinsics_px / 2, self.focal_sigma, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,14 +163,15 @@ def _settled(
     counts = np.bincount(patches.scene, minlength=len(scenes))
     if counts.max() < params.min_found:
         looks = look(scenes, pose, lens / 2, half.size_px, lifting)
-        counts = aligning.agreements(half.rgb, looks, laying.blur_px[0] / 2, laying)
+        counts = aligning.agreements(half.rgb, looks, laying.blur_px[0] / 2, laying, half.known)
     best = int(np.argmax(counts))
     aligned, agreement = None, 0.0
     for blur in laying.blur_px:
         again_px = params.again_blurs * blur / 2
         looks = look([scenes[best]], pose, lens / 2, half.size_px, lifting, looks, again_px, displaced)
         (one,) = looks
-        laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=free and (free[0] / 2, free[1]))
+        focal = free and (free[0] / 2, free[1])
+        laid = aligning.align(half.rgb, one, pose, lens / 2, blur / 2, laying, focal=focal, known=half.known)
         agreement = float(np.nan_to_num(laid.agreement))
         if aligned is not None and laid.agreement < params.min_agreement:
             return _nowhere(pose, lens, agreement)
@@ -255,8 +259,11 @@ def _found_again(
     found, places, whose, tried = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros(0, int)], 0
     for place, one in enumerate(looks):
         hits = tracking.track(one.grey, one.sound, seen.grey, int(np.ceil(reach_px * factor)), tracks)
-        keep = hits.found
-        tried += len(keep)
+        keep, asked = hits.found, np.ones(len(hits.found), bool)
+        if seen.known is not None:
+            asked = at_pixels(seen.known, hits.render_px)
+            keep = keep & asked & at_pixels(seen.known, hits.photo_px)
+        tried += int(asked.sum())
         found.append(hits.photo_px[keep] / factor)
         places.append(one.places(hits.render_px[keep]))
         whose.append(np.full(int(keep.sum()), place))

@@ -18,7 +18,7 @@ from scipy.ndimage import binary_dilation, label
 
 from gsmap.compare.colours import balance
 from gsmap.localize.filters import blurred, means
-from gsmap.localize.looks import GREY, Look, smaller
+from gsmap.localize.looks import GREY, Look, smaller, wholly
 
 _FILE = "unlike.npz"
 # What the network was fitted with: it means nothing with other values, so none of these is a setting.
@@ -89,17 +89,18 @@ def network() -> tuple[np.ndarray, ...]:
         return tuple(held[name].astype(np.float32) for name in held.files)
 
 
-def unlike(rgb: np.ndarray, looks: Sequence[Look], likely: float) -> Unlike:
+def unlike(rgb: np.ndarray, looks: Sequence[Look], likely: float, known: np.ndarray | None = None) -> Unlike:
     """Compare a photo (H, W, 3) float32 in [0, 1] with renders from its pose, of its size.
 
     Args:
         likely: of `Unlike.of`.
+        known: (H, W) bool: pixels of the photo that count; None of all.
     """
-    half = smaller(rgb, 2)
+    half, shows = smaller(rgb, 2), None if known is None else wholly(known, 2)
     least: np.ndarray | None = None
     for one in looks:
-        features, known = cells(half, one)
-        found = np.where(known, probabilities(features), np.inf)
+        features, told = cells(half, one, shows)
+        found = np.where(told, probabilities(features), np.inf)
         least = found if least is None else np.minimum(least, found)
     if least is None:
         least = np.full((1, 1), np.inf)
@@ -122,11 +123,13 @@ def scaled(features: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.nda
     return out
 
 
-def cells(half: np.ndarray, one: Look) -> tuple[np.ndarray, np.ndarray]:
+def cells(half: np.ndarray, one: Look, known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """(R, C, F) float32 of what each cell shows in a photo of half size and in a render of full size, and which (R, C)
-    are known."""
+    are known; of the photo's pixels all, or those that ``known`` (H, W) says."""
     shown = smaller(one.rgb, 2)
     tells = (smaller(one.alpha, 2) > _OPAQUE) & (half.max(2) < _CLIPPED)
+    if known is not None:
+        tells &= known
     a, b = half @ GREY, shown @ GREY
     hue, light, spreads = _colours(half, shown, tells)
     fine = [(x - blurred(x, 1.0)) ** 2 for x in (a, b)]
@@ -149,7 +152,10 @@ def cells(half: np.ndarray, one: Look) -> tuple[np.ndarray, np.ndarray]:
         np.log(np.clip(smaller(one.depth_m, 2)[::STEP, ::STEP], 0.1, 20)),
         *(_log(np.full_like(share, spread)) for spread in spreads),
     ]
-    return np.stack(columns, axis=2), share > _KNOWN
+    told = share > _KNOWN
+    if known is not None:  # nothing of what stands before the place may reach into a pattern
+        told &= means(known.astype(np.float32), _WIDE, step=STEP) > 0.95
+    return np.stack(columns, axis=2), told
 
 
 def _alike(found: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -66,6 +66,7 @@ def localize_files(
     together: bool,
     video: str | os.PathLike[str] | None,
     progress: StageProgress,
+    masks: str | os.PathLike[str] | None = None,
     depth: str | os.PathLike[str] | None = None,
     depth_scale: float = 1000.0,
     tells: Tells | None = None,
@@ -75,6 +76,7 @@ def localize_files(
     Args:
         together: the photographs show one place.
         video: a clip, in place of files.
+        masks: a folder with a mask of each photograph: black where it does not count.
         depth: a depth picture of the view of the one photo given, which makes a scan of it.
         depth_scale: its values that make a metre.
         tells: what else is asked of photographs that are placed.
@@ -82,11 +84,13 @@ def localize_files(
     tells = tells or Tells()
     if tells.add and not store.catalog.writable:
         raise ReadOnlyError(f"{store.location} is open to be read only: photographs can be placed in it, but not kept")
-    check_named(files, video)
+    check_named(files, video, masks)
+    if depth is not None and masks is not None:
+        raise ConfigError("--masks are of photographs: of a depth picture, set what does not count to 0")
     lens = parse_lens(intrinsics, focal)
     if video is not None:
         return _of_pictures(store, settings, frames_of(video, lens, settings), near, True, progress, tells)
-    pictures = photos_of([path for path in files if depth is None and not is_scan(path)], lens)
+    pictures = photos_of([path for path in files if depth is None and not is_scan(path)], lens, masks)
     of_scans, notes = scan_rows(store, settings, files, depth, depth_scale, lens, near, progress)
     report = LocalizeReport(results=())
     if pictures:
@@ -96,15 +100,23 @@ def localize_files(
     return LocalizeReport(results=rows, notes=(*notes, *report.notes))
 
 
-def check_named(files: Sequence[str | os.PathLike[str]], video: str | os.PathLike[str] | None) -> None:
-    """Refuse photographs beside a clip, and neither."""
+def check_named(
+    files: Sequence[str | os.PathLike[str]],
+    video: str | os.PathLike[str] | None,
+    masks: str | os.PathLike[str] | None = None,
+) -> None:
+    """Refuse photographs beside a clip, and neither; and masks of a clip."""
+    if video is not None and masks is not None:
+        raise ConfigError("--masks are of photographs, by their names: a clip's frames have none")
     if bool(files) == (video is not None):
         raise ConfigError("name the photographs to localise, or one clip by --video")
 
 
-def photos_of(files: Sequence[str | os.PathLike[str]], lens: Lens) -> list[tuple[str, Photo]]:
-    """Photographs by name."""
-    return [(os.fspath(path), read_photo(path, lens)) for path in files]
+def photos_of(
+    files: Sequence[str | os.PathLike[str]], lens: Lens, masks: str | os.PathLike[str] | None = None
+) -> list[tuple[str, Photo]]:
+    """Photographs by name, each with its mask where there are some."""
+    return [(os.fspath(path), read_photo(path, lens, masks)) for path in files]
 
 
 def frames_of(video: str | os.PathLike[str], lens: Lens, settings: Settings) -> list[tuple[str, Photo]]:

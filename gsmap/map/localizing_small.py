@@ -25,6 +25,7 @@ def localize_small(
     near: str | None = None,
     together: bool = False,
     video: str | os.PathLike[str] | None = None,
+    masks: str | os.PathLike[str] | None = None,
     values: Mapping[str, object] | None = None,
     preset: str | None = None,
 ) -> LocalizeReport:
@@ -39,12 +40,12 @@ def localize_small(
         CorruptError: the small map is damaged.
         NotFoundError, InputError: as `Map.localize`.
     """
-    check_named(files, video)
+    check_named(files, video, masks)
     scans = [os.fspath(path) for path in files if is_scan(path)]
     if scans:
         raise ConfigError(f"{scans[0]} is a scan: a small map places photographs alone; ask the map that it is of")
     lens, settings = parse_lens(intrinsics, focal), settings_of(dict(values or {}), preset)
-    named = photos_of(files, lens) if video is None else frames_of(video, lens, settings)
+    named = photos_of(files, lens, masks) if video is None else frames_of(video, lens, settings)
     localizer = SmallLocalizer(folder, settings)
     where = None if near is None else localizer.near(near)
     found = find_all(localizer, named, where, together or video is not None, logged(progress))

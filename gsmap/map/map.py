@@ -526,6 +526,7 @@ class Map(AbstractContextManager["Map"]):
         near: str | None = None,
         together: bool = False,
         video: str | os.PathLike[str] | None = None,
+        masks: str | os.PathLike[str] | None = None,
         depth: str | os.PathLike[str] | None = None,
         depth_scale: float = 1000.0,
         changes: bool = False,
@@ -543,6 +544,8 @@ class Map(AbstractContextManager["Map"]):
             near: only what this scene shows, or ``X,Y,Z,R`` around a point of the map.
             together: the photos show one place and overlap: whoever is placed helps the others.
             video: a clip, whose sharpest frames are photos of one place; needs the extra ``video``.
+            masks: a folder with a mask of each photo, black where it does not count (people, cars, the own hand): of
+                ``photo.jpg`` it is ``photo.jpg.png``.
             depth, depth_scale: a depth picture of the view of the one photo given, and its values that make a metre.
             changes: say where a placed photo shows something else than the map; ``pictures`` draws it in a folder.
             add: keep placed photos as evidence of what stood there, dated by ``captured_at`` or their EXIF.
@@ -565,6 +568,7 @@ class Map(AbstractContextManager["Map"]):
                 together=together,
                 video=video,
                 progress=self._progress,
+                masks=masks,
                 depth=depth,
                 depth_scale=depth_scale,
                 tells=Tells(changes, pictures, add, captured_at),

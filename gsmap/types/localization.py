@@ -21,15 +21,17 @@ class Photo:
         focal_sigma: by which share the focal length may be off (one standard deviation): 0 where it is known, inf
             where nothing is.
         name: to speak of it.
+        known: (H, W) bool: pixels that show the place, and not who or what stood before it; None where all may.
 
     Raises:
-        InputError: no picture, or intrinsics that cannot be.
+        InputError: no picture, or intrinsics or a mask that cannot be.
     """
 
     rgb: np.ndarray
     intrinsics_px: np.ndarray
     focal_sigma: float = 0.0
     name: str = "photo"
+    known: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         intrinsics = np.array(self.intrinsics_px, dtype=np.float64)
@@ -37,6 +39,9 @@ class Photo:
             raise InputError(f"{self.name}: a photo is (H, W, 3) uint8, got {self.rgb.shape} {self.rgb.dtype}")
         if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or (intrinsics[:2] <= 0).any():
             raise InputError(f"{self.name}: intrinsics are fx,fy,cx,cy in pixels, focal lengths above 0")
+        if self.known is not None and (self.known.shape != self.rgb.shape[:2] or self.known.dtype != bool):
+            told = f"{self.known.shape} {self.known.dtype}"
+            raise InputError(f"{self.name}: a mask is {self.rgb.shape[:2]} bool, as its photo, got {told}")
         object.__setattr__(self, "intrinsics_px", intrinsics)
 
     @property

@@ -16,7 +16,6 @@ from gsmap.localize.displacing import displacement
 from gsmap.localize.features import Params as Features
 from gsmap.localize.looks import look
 from gsmap.localize.placed import PlacedFeatures
-from gsmap.localize.resection import moved
 from gsmap.types import Gaussians, Sim3
 
 LENS, SIZE = np.array([240.0, 240, 120, 90]), (240, 180)

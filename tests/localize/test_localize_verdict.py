@@ -57,7 +57,7 @@ def test_good_evidence_is_probable_and_bad_is_not() -> None:
 def test_a_room_that_looks_alike_is_as_improbable_as_it_is_rare() -> None:
     """Furniture that stands elsewhere tells against a place, the more the more rooms look alike; somebody in the
     picture, by far less."""
-    alike = GOOD | {"unlike_part": 0.2, "unlike": 0.12, "unlike_likely": 0.08, "unlike_surely": 0.06, "explained": 0.7}
+    alike = GOOD | {"unlike_part": 0.2, "unlike": 0.15, "unlike_likely": 0.12, "unlike_surely": 0.1, "explained": 0.7}
     alike |= {"contradicted": 0.15, "colour": 0.6, "laid": 0.5}
     somebody = GOOD | {"unlike_part": 0.1}
     never, seldom, often = (probability(alike, alike=share) for share in (0.0, 0.02, 0.35))

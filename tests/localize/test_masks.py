@@ -1,0 +1,175 @@
+"""What a mask hides of a photograph counts nowhere: neither for its pose nor for whether that is believed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import gsmap.map
+from gsmap.cli.app import run
+from gsmap.errors import ConfigError, InputError, NotFoundError
+from gsmap.localize import Params, aligning, evidence, localize_photo, localizing, read_photo, settling, unlike
+from gsmap.localize.candidates import Candidate
+from gsmap.localize.extractors import sift
+from gsmap.localize.features import Params as Features
+from gsmap.localize.looks import look
+from gsmap.types.localization import Photo
+
+SIFT = sift.make({}, sift.Params())
+PARAMS = Params()
+
+
+def _hidden(photo: Photo, seed: int) -> Photo:
+    """Two people full of detail before a photo, and their mask."""
+    height, width = photo.rgb.shape[:2]
+    known = np.ones((height, width), bool)
+    known[height // 4 :, width // 8 : 3 * width // 8] = False
+    known[height // 4 :, 5 * width // 8 : 7 * width // 8] = False
+    noise = np.random.default_rng(seed).integers(0, 255, (height // 4 + 1, width // 4 + 1, 3), np.uint8)
+    crowd = np.kron(noise, np.ones((4, 4, 1), np.uint8))[:height, :width]
+    return replace(photo, rgb=np.where(known[..., None], photo.rgb, crowd), known=known)
+
+
+@pytest.fixture(scope="module")
+def crowds(world) -> list[Photo]:
+    return [_hidden(world.photos[1], seed) for seed in (0, 1)]
+
+
+def _found(world, photo: Photo):
+    return localize_photo(photo, world.index, {"scene": world.placed}, SIFT, PARAMS)
+
+
+def test_what_is_hidden_does_not_matter(world, crowds) -> None:
+    one, other, plain = (_found(world, photo) for photo in (*crowds, world.photos[1]))
+    unsaid = _found(world, replace(crowds[0], known=None))
+    assert not unsaid.is_placed
+    assert one.is_placed, one.reason
+    assert other.is_placed, other.reason
+    assert np.linalg.norm(one.T_map_camera[:3, 3] - world.poses[1][:3, 3]) < 0.05
+    assert np.abs(one.T_map_camera - other.T_map_camera).max() < 2e-3
+    assert np.abs(one.T_map_camera - plain.T_map_camera).max() < 0.02
+    for name in ("explained", "explained_coarsely", "laid", "found_again", "seen"):
+        assert one.evidence[name] == pytest.approx(plain.evidence[name], abs=0.15), name
+    for name in ("contradicted", "contradicted_coarsely", "unlike_part", "unlike"):
+        assert one.evidence[name] < plain.evidence[name] + 0.05, name
+
+
+def test_no_step_looks_at_what_is_hidden(world, crowds) -> None:
+    picture, _ = localizing.prepared(crowds[0], PARAMS)
+    looks = look([world.placed], world.poses[1], picture.intrinsics_px, picture.size_px, Features())
+    here = picture.known
+    found = localizing.photo_features(picture, SIFT, 0.0)
+    column, row = found.pixels.astype(int).T
+    assert here[row, column].all()
+    assert len(found.angles_rad) == len(found.sizes_px) == len(found) > 50
+    patches = settling._found_again(picture, 1.0, looks, 6, PARAMS.tracking)
+    column, row = patches.pixels.astype(int).T
+    assert here[row, column].all()
+    assert patches.tried < settling._found_again(replace(picture, known=None), 1.0, looks, 6, PARAMS.tracking).tried
+    half = picture.halved()
+    small = look([world.placed], world.poses[1], half.intrinsics_px, half.size_px, Features())
+    laid = aligning.align(
+        half.rgb, small[0], world.poses[1], half.intrinsics_px, 2.0, PARAMS.aligning, None, half.known
+    )
+    column, row = np.clip(laid.pixels, 0, np.array(half.size_px) - 1).astype(int).T
+    assert half.known[row, column].mean() > 0.98  # points move with the pose, and some come to lie behind its edge
+    cells = unlike.unlike(picture.rgb, looks, 0.5, here).probability
+    assert np.isnan(cells[15:, 9:21]).all()
+    assert np.isfinite(cells).mean() > 0.2
+    other, _ = localizing.prepared(crowds[1], PARAMS)
+    apart = np.abs(cells - unlike.unlike(other.rgb, looks, 0.5, here).probability)
+    assert np.nanmax(apart) < 1e-3  # the light as well is that of the place
+    for compared, patch in (
+        (evidence.compare(picture.rgb, looks, PARAMS.evidence, known=here), (slice(14, None), slice(8, 21))),
+        (evidence.compare_coarsely(picture.rgb, looks, PARAMS.evidence, known=here), (slice(6, None), slice(4, 9))),
+    ):
+        assert np.isnan(compared.correlation[patch]).all()
+        assert compared.num_judged > 20
+        assert compared.seen > 0.9
+
+
+def test_a_mask_is_halved_and_made_smaller_to_what_is_wholly_seen() -> None:
+    rgb = np.zeros((720, 960, 3), np.uint8)
+    known = np.ones((720, 960), bool)
+    known[101, 201] = False
+    picture, _ = localizing.prepared(Photo(rgb, np.array([700.0, 700, 480, 360]), known=known), PARAMS)
+    assert picture.known.shape == picture.grey.shape == (360, 480)
+    assert np.argwhere(~picture.known).tolist() == [[50, 100]]
+    assert np.argwhere(~picture.halved().known).tolist() == [[25, 50]]
+
+
+def test_a_pose_that_is_settled_by_half_a_photo_is_that_of_all_of_it(world) -> None:
+    photo = world.photos[0]
+    known = np.zeros(photo.rgb.shape[:2], bool)
+    known[:, : known.shape[1] * 2 // 3] = True
+    picture, _ = localizing.prepared(replace(photo, known=known), PARAMS)
+    start = Candidate(0, world.poses[0], picture.intrinsics_px, 20, ("scene",))
+    settled = localizing.settled_pose(picture, start, {"scene": world.placed}, PARAMS)
+    assert np.linalg.norm(settled.T_metric_camera[:3, 3] - world.poses[0][:3, 3]) < 0.05
+    assert (settled.pixels[:, 0] < 320).all()
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path, crowds):
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(crowds[0].rgb).save(tmp_path / "photo.png")
+    Image.fromarray(crowds[0].known).save(tmp_path / "masks" / "photo.png.png")
+    return tmp_path
+
+
+def test_masks_are_read_by_the_photos_name(folder, crowds) -> None:
+    assert np.array_equal(read_photo(folder / "photo.png", masks=folder / "masks").known, crowds[0].known)
+    (folder / "masks" / "photo.png.png").rename(folder / "masks" / "photo.png")
+    assert np.array_equal(read_photo(folder / "photo.png", masks=folder / "masks").known, crowds[0].known)
+    assert read_photo(folder / "photo.png").known is None
+
+
+@pytest.mark.parametrize(
+    ("what", "error", "said"),
+    [
+        ("none", NotFoundError, "has no mask"),
+        ("folder", NotFoundError, "no folder of masks"),
+        ("size", InputError, "upright photo's size"),
+        ("black", InputError, "black everywhere"),
+        ("text", InputError, "cannot be read|can be read"),
+    ],
+)
+def test_a_mask_that_is_none_is_told(folder, what: str, error: type[Exception], said: str) -> None:
+    path, masks = folder / "masks" / "photo.png.png", folder / "masks"
+    if what == "none":
+        path.unlink()
+    elif what == "folder":
+        masks = folder / "nowhere"
+    elif what == "text":
+        path.write_text("not a picture")
+    else:
+        size = (10, 10) if what == "size" else (480, 360)
+        Image.new("L", size, 0 if what == "black" else 255).save(path)
+    with pytest.raises(error, match=said):
+        read_photo(folder / "photo.png", masks=masks)
+
+
+def test_the_command_line_takes_masks(folder, world, crowds, capsys) -> None:
+    lens = ",".join(f"{value:.3f}" for value in crowds[0].intrinsics_px)
+    site = folder / "m.gsmap"
+    with gsmap.map.create(site) as m:
+        m.ingest(world.capture.gaussians, cameras=world.capture.cameras, name="room")
+        m.optimize()
+    asked = ["localize", str(site), str(folder / "photo.png"), "--intrinsics", lens]
+    for more, status in (((), "refused"), (("--masks", str(folder / "masks")), "placed")):
+        with pytest.raises(SystemExit) as ended:
+            run(["-q", *asked, *more, "--json"])
+        assert not ended.value.code
+        assert [row["status"] for row in json.loads(capsys.readouterr().out)["results"]] == [status]
+    with gsmap.map.open(site) as m:
+        with pytest.raises(ConfigError, match="a clip's frames"):
+            m.localize(video=folder / "clip.mp4", masks=folder / "masks")
+        with pytest.raises(ConfigError, match="of a depth picture"):
+            m.localize(folder / "photo.png", depth=folder / "photo.png", masks=folder / "masks", intrinsics=lens)
