@@ -2,12 +2,15 @@
 
     python tools/bench_clips.py PLACES WORK                  # clips of ten frames through made places
     python tools/bench_clips.py PLACES WORK --house DATA     # and the house's photographs, ten of one capture at a time
+    python tools/bench_clips.py PLACES WORK --alike          # clips of rooms that look like those of the map instead
 
 PLACES is what ``tools/make_localize_places.py`` made; clips are of its places for testing. Somebody walks with a phone
 through two rooms in other light, one frame every half second (a step, and some twelve degrees of turn); the place is as
 its captures show it. Truth is exact. A frame's coverage is the share of its pixels whose surface a capture shows where
 it is (5 cm and 2 % of the depth), as ``tools/bench_localize.py`` has it. The house's photographs are every sixth frame
-of a capture, in the map of the others: farther apart than a clip's frames.
+of a capture, in the map of the others: farther apart than a clip's frames. Rooms that look alike are those of streets
+whose decorations come again, with their furniture elsewhere; a map holds the first three rooms of each, and of a clip
+through the others no frame may be placed. Clips through the map's own rooms stand beside them.
 """
 
 # Thread counts must be set before numpy comes in.
@@ -29,7 +32,7 @@ from pathlib import Path
 import numpy as np
 from bench_localize import World, house_shots, world
 from fit_localize import WRONG_DEG, WRONG_M, Place, camera_error, index_of, places
-from make_localize_places import made_place
+from make_localize_places import DECORATIONS, TIMES, made_place
 
 import gsmap_synthetic as synthetic
 from gsmap.localize import localize_photo, localize_together
@@ -38,6 +41,7 @@ from gsmap.localize.params import Params
 from gsmap.methods import family
 from gsmap.types.localization import Photo, Placement
 from gsmap_synthetic.capture import default_routes
+from gsmap_synthetic.streets import make_street
 
 FRAMES, STEPS, CLIPS = 10, 120, 4
 CLOSE_DEG, CLOSE_M = 1.0, 0.05
@@ -105,6 +109,22 @@ def made_clips(place: Place, params: Params) -> Iterator[list[Frame]]:
         yield frames
 
 
+def street_clips(place: Place) -> Iterator[tuple[str, list[Frame]]]:
+    """Clips through the rooms of a street that a map holds (``own``), and through those that look alike (``alike``)."""
+    seed = int(place.seed)
+    real = make_street(seed, rooms=DECORATIONS * TIMES, decorations=DECORATIONS, texel_m=0.008)
+    own = [(a, a + 1) for a in range(DECORATIONS - 1)]
+    alike = [(a, a + 1) for a in range(DECORATIONS, DECORATIONS * TIMES - 1, DECORATIONS)]
+    for kind, routes in (("own", own), ("alike", alike)):
+        for route in routes:
+            rng = np.random.default_rng([seed, route[0]])
+            poses = synthetic.walk(real, route, 60, seed=77)[10 : 10 + 4 * FRAMES : 4]
+            shot = synthetic.film(real, poses, size_px=(480, 360), focal=0.7, gain=rng.uniform(0.8, 1.2))
+            name = f"{seed} rooms {route[0]} and {route[1]}"
+            photos = (Photo(shot.images[k], shot.cameras.intrinsics_px[k], 0.0, f"{name} {k}") for k in range(FRAMES))
+            yield kind, [Frame(photo, pose, 1.0) for photo, pose in zip(photos, poses, strict=True)]
+
+
 def house_clips(data: Path, held: World) -> Iterator[tuple[list[Frame], set[str]]]:
     """Ten photographs of one capture, and the scenes of the others; each photograph in one clip at the least."""
     for name in ("c0", "c1", "c2", "c3"):
@@ -148,6 +168,7 @@ def main() -> int:
     parser.add_argument("work", type=Path)
     parser.add_argument("--set", default="test", choices=("fit", "test"))
     parser.add_argument("--house", type=Path, metavar="DATA")
+    parser.add_argument("--alike", action="store_true")
     parser.add_argument("-v", action="store_true")
     args = parser.parse_args()
     params = Params()
@@ -172,6 +193,26 @@ def main() -> int:
                     told = error if last.placed else one.reason
                     print(f"  {frame.photo.name} covered {frame.coverage:.0%}: {told}", flush=True)
 
+    if args.alike:
+        told: dict[tuple[str, str], list[Answer]] = {}
+        for place in places(args.places, f"{args.set}_streets", args.work / "features", params):
+            scenes = {scene.scene: scene for scene in place.scenes}
+            index = index_of(place.scenes, params)
+            for kind, frames in street_clips(place):
+                before = {name: len(answers) for name, answers in said.items()}
+                ask(frames, lambda frame, one: (frame.T_metric_camera, 1.0), index, scenes, extractor, params)
+                for name, answers in said.items():
+                    told.setdefault((kind, name), []).extend(answers[before[name] :])
+        for name in said:
+            own, alike = told["own", name], [one.placed for one in told["alike", name]]
+            right = sum(one.within(WRONG_DEG, WRONG_M) for one in own)
+            print(
+                f"clips through a street, {name}: {right} of {len(own)} frames placed right in the map's own rooms, "
+                f"{sum(one.placed for one in own) - right} wrong; of rooms that look alike {sum(alike)} "
+                f"of {len(alike)} placed",
+                flush=True,
+            )
+        return 0
     for place in places(args.places, args.set, args.work / "features", params):
         scenes = {scene.scene: scene for scene in place.scenes}
         index = index_of(place.scenes, params)

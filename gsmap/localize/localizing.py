@@ -268,12 +268,7 @@ def _support(
 ) -> tuple[list[tuple[PlacedFeatures, float]], int]:
     """The scenes in which patches were found again, with their shares, most first; and how many of their Gaussians the
     photo shows.
-
-    A pose that rests on another photo's features alone (`gsmap.localize.together`) was never rendered: it is where the
-    scene of that photo says.
     """
-    if not best.settled.looks:
-        return [(scenes[best.candidate.scenes[0]], 1.0)], 0
     kept = inliers(best.settled, params.evidence, picture.size_px)
     counts = np.bincount(best.settled.scene[kept], minlength=len(best.settled.looks))
     order = [k for k in np.argsort(-counts, kind="stable") if counts[k]]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.localize import covariance, matching, probability, resection
+from gsmap.localize import matching, probability, resection
 from gsmap.localize.candidates import Candidate, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.localizing import Judged, judged_pose, judged_poses, photo_features, placement, prepared, rival_of
@@ -21,7 +21,7 @@ from gsmap.localize.looks import look
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.retrieval import ViewIndex
-from gsmap.localize.settling import Picture, Settled
+from gsmap.localize.settling import Picture
 from gsmap.localize.words import words_for
 from gsmap.methods.extractor import Extractor
 from gsmap.types.localization import Keypoints, Photo, Placement
@@ -39,7 +39,6 @@ class _Shot:
     judged: list[Judged]
     why: str
     helped: bool = False  # whether it has helped its neighbours from the pose that it has now
-    leans: bool = False  # on another photo's features alone: its evidence is not of the pose that it has now
 
     @property
     def best(self) -> Judged | None:
@@ -150,11 +149,10 @@ def _help(
             ties[k, other] = True
             continue
         judged = judged_pose(shot.picture, start, scenes, params)
-        leans = judged.settled.covariance is None or not _same(judged, start, params)
-        if leans:
-            judged = _by_matches(shot, start, pixels[pose.inliers], places[pose.inliers], helper.best, judged, params)
+        if judged.settled.covariance is None or not _same(judged, start, params):
+            continue  # the map shows something else there, or leads away: another photo's features alone are not enough
         if max(judged.probability, helper.probability) >= shot.probability:
-            shot.judged, shot.helped, shot.leans = [judged, *shot.judged], False, leans
+            shot.judged, shot.helped = [judged, *shot.judged], False
             ties[k, other] = True
 
 
@@ -177,48 +175,6 @@ def _lifted(
     return points[rows], rows
 
 
-def _by_matches(
-    shot: _Shot,
-    start: Candidate,
-    pixels: np.ndarray,
-    points: np.ndarray,
-    helper: Judged,
-    judged: Judged,
-    params: Params,
-) -> Judged:
-    """A pose that rests on another photo's features alone: what the map shows there was not found, or led away."""
-    fit = resection.refine(pixels, points, start.T_metric_camera, start.intrinsics_px, params.resection)
-    own = covariance.pose_covariance(fit, pixels, shot.picture.size_px, params.covariance)
-    if helper.covariance is not None:
-        own = own + _carried(helper, fit.T_map_camera)
-    settled = Settled(
-        fit.T_map_camera,
-        fit.intrinsics_px,
-        fit,
-        own,
-        pixels,
-        points,
-        np.zeros(len(pixels), int),
-        len(pixels),
-        judged.settled.agreement,
-        judged.settled.looks,
-    )
-    return Judged(start, settled, own, judged.evidence, min(judged.probability, 0.5))
-
-
-def _carried(helper: Judged, T_metric_camera: np.ndarray) -> np.ndarray:
-    """(6, 6) of a camera that is fixed to the helper's."""
-    from gsmap.geometry.rotations import skew
-
-    relative = np.linalg.inv(T_metric_camera) @ helper.settled.T_metric_camera  # helper in camera
-    R, t = relative[:3, :3], relative[:3, 3]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = R
-    adjoint[3:, :3] = skew(t) @ R
-    assert helper.covariance is not None
-    return adjoint @ helper.covariance @ adjoint.T
-
-
 def _same(judged: Judged, candidate: Candidate, params: Params) -> bool:
     """Whether a pose that was looked into is the one that another photo says."""
     settled = replace(judged.candidate, T_metric_camera=judged.settled.T_metric_camera)
@@ -230,29 +186,25 @@ def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool],
 
     That matches are there by chance, its own evidence speaks against or that of the two surest that it is tied to: only
     what a photo shows itself counts for others, less what the ties between them are worth, so that no two make each
-    other surer in a circle. That it is a room that looks alike holds for all of them or for none: what each shows for
-    and against that adds up, that of others in part, since they show much the same.
+    other surer in a circle. That the place is a room that looks alike holds for all of them or for none, tied or not:
+    what each shows for and against that adds up, that of others in part, since they show much the same.
     """
     bars, model = params.verdict, probability.model()
-    own, alike = [], []
-    for shot in shots:
-        told = None if shot.best is None else shot.best.evidence
-        if told is None or shot.leans:
-            own.append(shot.probability)
-            alike.append(0.0)
-        else:
-            own.append(model.probability(told, bars.prior, 0.0))
-            alike.append(model.alike.log_odds(told))
+    own, rooms = np.zeros((2, len(shots)))
+    for k, shot in enumerate(shots):
+        if shot.best is not None:
+            told = shot.best.evidence
+            own[k] = model.probability(told, bars.prior / (1 - bars.alike), 0.0)
+            rooms[k] = model.alike.log_odds(told)
+    bound = params.together.most
+    lends = params.together.shared * own * np.clip(rooms - params.together.usual, -bound, bound)
     out = []
     for k in range(len(shots)):
-        if not (reached := _tied(k, ties, params.together.tie))[1:]:
-            out.append(shots[k].probability)
-            continue
+        reached = _tied(k, ties, params.together.tie)
         others = sorted((worth * own[one] for one, worth in reached[1:]), reverse=True)[:2]
         chance = (1 - own[k]) * np.prod([1 - probable for probable in others])
-        rooms = alike[k] + params.together.shared * sum(alike[one] for one, _ in reached[1:])
-        against = chance / (1 - chance) + bars.alike / bars.prior * np.exp(-rooms)
-        out.append(float(1 / (1 + against)))
+        alike = bars.alike / bars.prior * np.exp(-(rooms[k] + lends.sum() - lends[k]))
+        out.append(0.0 if shots[k].best is None else float(1 / (1 + chance / (1 - chance) + alike)))
     return out
 
 

@@ -53,7 +53,7 @@ def judge(
         rival: probability of the best pose at another place.
     """
     inliers = round(10 ** evidence["inliers"] - 1)
-    if inliers < params.min_inliers:
+    if inliers < params.min_inliers or not np.isfinite(sigmas).all():
         return f"what the map shows there is not in the picture: {inliers} patches found, needs {params.min_inliers}"
     if probability < params.min_probability:
         return f"not probable enough: {probability:.1%}, needs {params.min_probability:.0%}: {_weakest(evidence)}"

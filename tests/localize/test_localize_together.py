@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_localize_verdict import GOOD
+from test_localize_verdict import BAD, GOOD
 
 from gsmap.errors import InputError, NotFoundError
 from gsmap.geometry.rotations import exp_so3
@@ -15,7 +15,6 @@ from gsmap.localize import Params, localize_together, probability, read_clip, ve
 from gsmap.localize import clips as reading
 from gsmap.localize import together as together_module
 from gsmap.localize.extractors import sift
-from gsmap.localize.localizing import judged_poses, placement, prepared
 from gsmap_synthetic import film
 
 SIFT = sift.make({}, sift.Params())
@@ -34,17 +33,28 @@ def test_whoever_is_placed_helps_the_others(world) -> None:
     assert min(one.probability for one in placed) > 0.95
 
 
-def test_a_pose_by_another_photos_features_alone_is_said_by_its_scene(world) -> None:
-    """The map was not rendered from there, so no render says which scene it is."""
-    picture, scale = prepared(world.photos[1], Params())
-    scenes = {"scene": world.placed}
-    found = judged_poses(picture, world.index, scenes, SIFT, Params())[0][0]
-    pixels = found.settled.pixels
-    unseen = replace(found.settled, looks=[], scene=np.zeros(len(pixels), int))
-    said = placement("beside", replace(found, settled=unseen), 0.0, picture, scale, scenes, Params())
-    assert said.is_placed, said.reason
-    assert said.scenes == ("scene",)
-    assert said.num_gaussians == 0
+def test_another_photos_features_alone_are_not_enough(world, monkeypatch) -> None:
+    """Where the map leads away from the pose that a neighbour lends, what was found before stays."""
+    scenes, params = {"scene": world.placed}, Params()
+    shots = [together_module._shot(photo, world.index, scenes, SIFT, params) for photo in [world.photos[1]] * 2]
+    shots[1].judged = []  # so that only its neighbour may place it
+    ties: dict[tuple[int, int], bool] = {}
+    judge = together_module.judged_pose
+
+    def away(*given):
+        one = judge(*given)
+        pose = one.settled.T_metric_camera.copy()
+        pose[:3, 3] += 1.0
+        return replace(one, settled=replace(one.settled, T_metric_camera=pose))
+
+    monkeypatch.setattr(together_module, "judged_pose", away)
+    together_module._help(0, shots, [1], scenes, params, ties)
+    assert not shots[1].judged
+    assert not ties
+    monkeypatch.setattr(together_module, "judged_pose", judge)
+    together_module._help(0, shots, [1], scenes, params, ties)
+    assert shots[1].probability > 0.9
+    assert ties == {(0, 1): True}
 
 
 def test_photos_of_other_places_stay_refused_together(world, elsewhere) -> None:
@@ -87,8 +97,7 @@ def shots_of(*told: dict[str, float]) -> list[SimpleNamespace]:
     bars = verdict.Params()
     found = [probability.model().probability(one, bars.prior, bars.alike) for one in told]
     return [
-        SimpleNamespace(best=SimpleNamespace(evidence=one), probability=p, leans=False)
-        for one, p in zip(told, found, strict=True)
+        SimpleNamespace(best=SimpleNamespace(evidence=one), probability=p) for one, p in zip(told, found, strict=True)
     ]
 
 
@@ -106,11 +115,24 @@ def test_frames_of_a_room_that_looks_alike_do_not_make_each_other_sure() -> None
     assert max(together) < 0.95
     good = shots_of(half, GOOD, GOOD)
     assert together_module._probabilities(good, ties, Params())[0] > 0.95 > good[0].probability
-    assert together_module._probabilities(good, {}, Params())[0] == good[0].probability
-    beside = shots_of(half, GOOD, elsewhere)
-    before = together_module._probabilities(beside, ties, Params())[0]
-    beside[2].leans = True  # what its render shows is not from the pose that its neighbours give it
-    assert together_module._probabilities(beside, ties, Params())[0] > before
+    assert together_module._probabilities(good, {}, Params())[0] > good[0].probability, "tied or not"
+    assert together_module._probabilities(alone, {}, Params())[0] < alone[0].probability
+
+
+def test_a_photo_alone_is_as_probable_together() -> None:
+    half = GOOD | {"unlike_part": 0.2, "unlike": 0.06, "colour": 0.7, "laid": 0.3, "matches": 0.9}
+    (one,) = shots_of(half)
+    assert together_module._probabilities([one], {}, Params())[0] == pytest.approx(one.probability, abs=1e-6)
+
+
+def test_a_photo_of_another_place_says_nothing_of_rooms() -> None:
+    """It is there by chance, whatever it would show of a room."""
+    half = GOOD | {"unlike_part": 0.2, "unlike": 0.06, "unlike_likely": 0.03, "unlike_surely": 0.015, "explained": 0.7}
+    few, more = (together_module._probabilities(shots_of(half, GOOD, *[BAD] * n), {}, Params()) for n in (0, 8))
+    assert few[0] == pytest.approx(more[0], abs=0.01)
+    assert max(more[2:]) < 0.05
+    nothing = SimpleNamespace(best=None, probability=0.0)
+    assert together_module._probabilities([*shots_of(half, GOOD), nothing], {}, Params())[2] == 0.0
 
 
 def test_what_chance_explains_it_does_not_for_two() -> None:
