@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.projection import project
 from gsmap.localize.filters import means
 from gsmap.localize.placed import PlacedFeatures
@@ -37,6 +38,13 @@ class Params:
     most_px: float = 2.0
     around_px: float = 36.0
     width_px: int = 120
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.share <= 1 and self.most_px >= 0 and self.around_px >= 0 and self.width_px >= 8):
+            raise ConfigError(
+                "of displacing, share lies in [0, 1], most_px and around_px are 0 or more, width_px is 8 or more; got "
+                f"share={self.share}, most_px={self.most_px}, around_px={self.around_px}, width_px={self.width_px}"
+            )
 
 
 def displacement(

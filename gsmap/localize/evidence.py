@@ -145,8 +145,8 @@ def compare_coarsely(
     """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
     fewer = replace(params, step_px=params.half_px // 2)
     small = [one.smaller(params.coarse) for one in looks]
-    fewer_known = None if known is None else wholly(known, params.coarse)
-    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse, fewer_known)
+    shows = None if known is None else wholly(known, params.coarse)
+    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse, shows)
 
 
 def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:

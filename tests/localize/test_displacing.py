@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3
 from gsmap.localize import Params, localizing
@@ -88,6 +89,12 @@ def test_it_is_a_share_is_cut_off_and_is_asked_of_a_small_render(frame):
     assert np.abs(least).max() == pytest.approx(0.4 * SIZE[0] / 480, rel=1e-5)
     assert small.shape == (45, 60, 2)
     assert small[20:25, 25:35].mean((0, 1)) == pytest.approx(whole[80:100, 100:140].mean((0, 1)), rel=0.25, abs=0.3)
+
+
+@pytest.mark.parametrize("wrong", [{"share": -0.1}, {"share": 1.5}, {"share": float("nan")}, {"width_px": 0}])
+def test_settings_that_mean_nothing_are_refused(wrong) -> None:
+    with pytest.raises(ConfigError, match="displacing"):
+        Displacing(**wrong)
 
 
 def test_a_look_says_where_what_it_shows_lies(frame):
