@@ -142,9 +142,10 @@ def _help(
         )
         if pose is None or len(np.unique(rows[pose.inliers])) < params.together.min_tie:
             continue
-        component = helper.best.candidate.component
-        count = len(np.unique(rows[pose.inliers]))
-        start = Candidate(component, pose.T_map_camera, pose.intrinsics_px, count, helper.best.candidate.scenes)
+        component, agree = helper.best.candidate.component, pose.inliers
+        lent = resection.refine(pixels[agree], places[agree], pose.T_map_camera, pose.intrinsics_px, params.resection)
+        count = len(np.unique(rows[agree]))
+        start = Candidate(component, lent.T_map_camera, pose.intrinsics_px, count, helper.best.candidate.scenes)
         if shot.best is not None and _same(shot.best, start, params):
             ties[k, other] = True
             continue
