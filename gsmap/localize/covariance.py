@@ -41,21 +41,11 @@ class Params:
     differing: float = 0.25
 
 
-def pose_covariance(
-    fit: resection.Refined,
-    pixels: np.ndarray,
-    size_px: tuple[int, int],
-    params: Params,
-) -> np.ndarray:
-    """(6, 6) over [rot_rad, trans] on the camera's side, in the unit of the points, of one photograph's adjustment to
-    patches at pixels (K, 2), whose focal length is known."""
-    return with_hidden(of_patches(fit, pixels, size_px, params, 0.0), params)
-
-
 def of_patches(
     fit: resection.Refined, pixels: np.ndarray, size_px: tuple[int, int], params: Params, focal_sigma: float
 ) -> np.ndarray:
-    """(dim, dim) of what the residuals of patches tell alone.
+    """(dim, dim) over [rot_rad, trans, log focal length] on the camera's side, in the unit of the points, of what the
+    residuals of patches at pixels (K, 2) tell alone.
 
     Args:
         focal_sigma: as in `Photo`; what a focal length that was solved for costs the pose is in.

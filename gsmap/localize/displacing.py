@@ -31,19 +31,20 @@ class Params:
         most_px: that way is cut off here in either direction, at a picture of 480 pixels: larger Gaussians show nothing
             that has a place.
         around_px: its mean over so wide a square counts, at 480 pixels.
-        width_px: of the small render that it is asked of.
+        longest_side_px: of the small render that it is asked of.
     """
 
     share: float = 0.16
     most_px: float = 2.0
     around_px: float = 36.0
-    width_px: int = 120
+    longest_side_px: int = 120
 
     def __post_init__(self) -> None:
-        if not (0 <= self.share <= 1 and self.most_px >= 0 and self.around_px >= 0 and self.width_px >= 8):
+        if not (0 <= self.share <= 1 and self.most_px >= 0 and self.around_px >= 0 and self.longest_side_px >= 8):
             raise ConfigError(
-                "of displacing, share lies in [0, 1], most_px and around_px are 0 or more, width_px is 8 or more; got "
-                f"share={self.share}, most_px={self.most_px}, around_px={self.around_px}, width_px={self.width_px}"
+                "of displacing, share lies in [0, 1], most_px and around_px are 0 or more, longest_side_px is 8 or "
+                f"more; got share={self.share}, most_px={self.most_px}, around_px={self.around_px}, "
+                f"longest_side_px={self.longest_side_px}"
             )
 
 
@@ -59,7 +60,8 @@ def displacement(
     Args:
         intrinsics_px: (4,) of the render, which is of this size.
     """
-    by = max(1, round(size_px[0] / params.width_px))
+    longest = max(size_px)
+    by = max(1, round(longest / params.longest_side_px))
     small = (size_px[0] // by, size_px[1] // by)
     camera = scene.camera(T_metric_camera, intrinsics_px / by, small)
     shown = render(scene.coloured_by_place, camera, depth=False, dominant_id=False, backend="native")
@@ -71,8 +73,8 @@ def displacement(
     row, column = np.mgrid[0 : small[1], 0 : small[0]]
     away = (at - np.stack([column, row], axis=2).reshape(-1, 2) - 0.5) * by
     away[(depth <= 0) | (alpha.ravel() < 0.9)] = 0
-    most = params.most_px * size_px[0] / 480
-    wide = 2 * round(params.around_px * size_px[0] / 480 / by / 2) + 1
+    most = params.most_px * longest / 480
+    wide = 2 * round(params.around_px * longest / 480 / by / 2) + 1
     away = np.clip(away, -most, most).reshape(*alpha.shape, 2).astype(np.float32)
     out: np.ndarray = np.float32(params.share) * means(away, wide)
     return out

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from gsmap.localize.filters import means
-from gsmap.localize.looks import Look, smaller, wholly
+from gsmap.localize.looks import GREY, Look, smaller, wholly
 from gsmap.localize.unlike import Unlike
 
 
@@ -92,7 +92,7 @@ def compare(
         times: the photo was so many times larger when that was asked.
         known: (H, W) bool: pixels of the photo that count; None of all.
     """
-    grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
+    grey = rgb @ GREY
     # Of patches around every so many pixels: means of the photo, of its square, and of its colours.
     around = partial(
         _around, rows=rgb.shape[0] - 2 * params.half_px, columns=rgb.shape[1] - 2 * params.half_px, params=params
@@ -145,8 +145,7 @@ def compare_coarsely(
     """The same in pictures that are ``coarse`` times smaller, each patch as many pixels wide as before."""
     fewer = replace(params, step_px=params.half_px // 2)
     small = [one.smaller(params.coarse) for one in looks]
-    shows = None if known is None else wholly(known, params.coarse)
-    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse, shows)
+    return compare(smaller(rgb, params.coarse), small, fewer, other, params.coarse, wholly(known, params.coarse))
 
 
 def _chroma(photo: np.ndarray, shown: np.ndarray) -> float:

@@ -25,10 +25,9 @@ def smaller(image: np.ndarray, by: int) -> np.ndarray:
     return out
 
 
-def wholly(mask: np.ndarray, by: int) -> np.ndarray:
-    """(H // by, W // by) bool: blocks of a mask (H, W) all of which is true."""
-    out: np.ndarray = smaller(mask, by) == 1
-    return out
+def wholly(mask: np.ndarray | None, by: int) -> np.ndarray | None:
+    """(H // by, W // by) bool: blocks of a mask (H, W) all of which is true; of no mask none."""
+    return None if mask is None else smaller(mask, by) == 1
 
 
 def at_pixels(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:

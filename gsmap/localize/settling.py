@@ -66,8 +66,7 @@ class Picture:
 
     def halved(self) -> Picture:
         rgb = smaller(self.rgb, 2)
-        known = None if self.known is None else wholly(self.known, 2)
-        return Picture(rgb, rgb @ GREY, self.intrinsics_px / 2, self.focal_sigma, known)
+        return Picture(rgb, rgb @ GREY, self.intrinsics_px / 2, self.focal_sigma, wholly(self.known, 2))
 
 
 @dataclass(frozen=True, eq=False)

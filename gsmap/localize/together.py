@@ -17,7 +17,7 @@ from gsmap.localize import matching, probability, resection
 from gsmap.localize.candidates import Candidate, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.localizing import Judged, judged_pose, judged_poses, photo_features, placement, prepared, rival_of
-from gsmap.localize.looks import look
+from gsmap.localize.looks import at_pixels
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.retrieval import ViewIndex
@@ -129,7 +129,7 @@ def _help(
     """Give a photo's neighbours poses by its features, and keep those that are more probable than what they had."""
     helper = shots[k]
     assert helper.best is not None
-    points, known = _lifted(helper, helper.best, scenes, params)
+    points, known = _lifted(helper, helper.best)
     if not len(known):
         return
     mine = matching.Described(helper.described.descriptors[known], helper.described.angles[known])
@@ -157,19 +157,12 @@ def _help(
             ties[k, other] = True
 
 
-def _lifted(
-    shot: _Shot, best: Judged, scenes: Mapping[str, PlacedFeatures], params: Params
-) -> tuple[np.ndarray, np.ndarray]:
+def _lifted(shot: _Shot, best: Judged) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) places of a placed photo's features by the depth of the scene that shows most there, and their rows."""
-    held = [scenes[scene] for scene in best.candidate.scenes[: params.settling.max_scenes]]
-    looks = best.settled.looks or look(
-        held, best.settled.T_metric_camera, best.settled.intrinsics_px, shot.picture.size_px, params.features
-    )
     pixels = shot.found.pixels
-    column, row = np.clip(pixels.astype(np.int64), 0, np.array(shot.picture.size_px) - 1).T
     points, known = np.zeros((len(pixels), 3)), np.zeros(len(pixels), bool)
-    for one in looks:
-        new = one.sound[row, column] & ~known
+    for one in best.settled.looks:
+        new = at_pixels(one.sound, pixels) & ~known
         points[new] = one.points(pixels[new])
         known |= new
     rows = np.flatnonzero(known)

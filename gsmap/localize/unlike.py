@@ -96,7 +96,7 @@ def unlike(rgb: np.ndarray, looks: Sequence[Look], likely: float, known: np.ndar
         likely: of `Unlike.of`.
         known: (H, W) bool: pixels of the photo that count; None of all.
     """
-    half, shows = smaller(rgb, 2), None if known is None else wholly(known, 2)
+    half, shows = smaller(rgb, 2), wholly(known, 2)
     least: np.ndarray | None = None
     for one in looks:
         features, told = cells(half, one, shows)

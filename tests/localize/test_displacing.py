@@ -20,7 +20,7 @@ from gsmap.localize.placed import PlacedFeatures
 from gsmap.types import Gaussians, Sim3
 
 LENS, SIZE = np.array([240.0, 240, 120, 90]), (240, 180)
-PLAIN = Displacing(share=1.0, most_px=50.0, around_px=1.0, width_px=240)  # every pixel alone, nothing cut off
+PLAIN = Displacing(share=1.0, most_px=50.0, around_px=1.0, longest_side_px=240)  # every pixel alone, nothing cut off
 
 
 def _plane(slant_rad: float, S: Sim3) -> PlacedFeatures:
@@ -83,7 +83,7 @@ def test_it_is_a_share_is_cut_off_and_is_asked_of_a_small_render(frame):
     scene = _plane(0.9, frame)
     whole = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0))
     half = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0, share=0.5))
-    small = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0, width_px=60))
+    small = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, around_px=61.0, longest_side_px=60))
     least = displacement(scene, np.eye(4), LENS, SIZE, replace(PLAIN, most_px=0.4))
     assert np.allclose(half, whole / 2, atol=1e-6)
     assert np.abs(least).max() == pytest.approx(0.4 * SIZE[0] / 480, rel=1e-5)
@@ -91,10 +91,20 @@ def test_it_is_a_share_is_cut_off_and_is_asked_of_a_small_render(frame):
     assert small[20:25, 25:35].mean((0, 1)) == pytest.approx(whole[80:100, 100:140].mean((0, 1)), rel=0.25, abs=0.3)
 
 
-@pytest.mark.parametrize("wrong", [{"share": -0.1}, {"share": 1.5}, {"share": float("nan")}, {"width_px": 0}])
+@pytest.mark.parametrize("wrong", [{"share": -0.1}, {"share": 1.5}, {"share": float("nan")}, {"longest_side_px": 0}])
 def test_settings_that_mean_nothing_are_refused(wrong) -> None:
     with pytest.raises(ConfigError, match="displacing"):
         Displacing(**wrong)
+
+
+def test_a_portrait_is_asked_as_a_landscape_is(frame) -> None:
+    """What is told for 480 pixels is so of the longer side."""
+    scene, asked = _plane(0.9, frame), Displacing(share=1.0, around_px=1.0)
+    wide = displacement(scene, np.eye(4), LENS, SIZE, asked)
+    tall = displacement(scene, np.eye(4), LENS[[1, 0, 3, 2]], SIZE[::-1], asked)
+    assert wide.shape == (90, 120, 2)
+    assert tall.shape == (120, 90, 2)
+    assert np.abs(tall).max() == np.abs(wide).max() == pytest.approx(2.0 * SIZE[0] / 480)
 
 
 def test_a_look_says_where_what_it_shows_lies(frame):

@@ -15,6 +15,7 @@ from gsmap.localize import Params, localize_together, probability, read_clip, ve
 from gsmap.localize import clips as reading
 from gsmap.localize import together as together_module
 from gsmap.localize.extractors import sift
+from gsmap.localize.resection import moved
 from gsmap_synthetic import film
 
 SIFT = sift.make({}, sift.Params())
@@ -55,6 +56,25 @@ def test_another_photos_features_alone_are_not_enough(world, monkeypatch) -> Non
     together_module._help(0, shots, [1], scenes, params, ties)
     assert shots[1].probability > 0.9
     assert ties == {(0, 1): True}
+
+
+def test_a_lent_pose_is_adjusted_before_it_is_settled(world, monkeypatch) -> None:
+    """What agreed on a sample's pose tells a better one."""
+    scenes, params = {"scene": world.placed}, Params()
+    shots = [together_module._shot(photo, world.index, scenes, SIFT, params) for photo in [world.photos[1]] * 2]
+    shots[1].judged, starts = [], []
+    judge, resect = together_module.judged_pose, together_module.resection.resect
+
+    def rough(*given):
+        found = resect(*given)
+        return replace(found, T_map_camera=moved(found.T_map_camera, np.array([0.01, 0, 0, 0.05, 0, 0])))
+
+    monkeypatch.setattr(together_module.resection, "resect", rough)
+    monkeypatch.setattr(together_module, "judged_pose", lambda *given: (starts.append(given[1]), judge(*given))[1])
+    together_module._help(0, shots, [1], scenes, params, {})
+    far = [np.linalg.norm(one.T_metric_camera[:3, 3] - world.poses[1][:3, 3]) for one in starts]
+    assert len(far) == 1
+    assert far[0] < 0.03
 
 
 def test_photos_of_other_places_stay_refused_together(world, elsewhere) -> None:
