@@ -8,7 +8,8 @@
     python tools/bench_localize.py DATA WORK --beside        # and retrieval alone, and SIFT + PnP on photographs
     python tools/bench_localize.py DATA WORK --sift          # and our features beside COLMAP's
     python tools/bench_localize.py DATA WORK --started       # and what settles of poses 10 cm and 3 degrees off
-    python tools/bench_localize.py DATA WORK --small 0.05    # and a small map in so much of the captures' bytes
+    python tools/bench_localize.py DATA WORK --small 0.05    # and a small map in so much of the captures' bytes (with
+                                                             # --perturb: photographs in other light and lenses by both)
     python tools/bench_localize.py DATA WORK --crowd 1000 --places PLACES    # and in a map of so many scenes
 
 DATA is the folder of the given captures; maps are made in WORK once. The captures' poses in the map are gsmap's own,
@@ -592,9 +593,10 @@ def main() -> int:
         placed = [held.localize(photo, set(held.ids.values()))[0] for photo in strangers]
         print(f"photographs of another place: {sum(p.is_placed for p in placed)} of {len(placed)} placed")
         return 0
-    for name, change in PERTURBED.items() if args.perturb else [("as it is", PERTURBED["as it is"])]:
-        say(name, measure(held, shots, change, args.v), deg, metres)
     as_is = PERTURBED["as it is"]
+    changes = PERTURBED if args.perturb else {"as it is": as_is}
+    for name, change in changes.items():
+        say(name, measure(held, shots, change, args.v), deg, metres)
     if args.sift:
         sift_beside_colmap(shots)
     if args.started:
@@ -615,8 +617,9 @@ def main() -> int:
         say(f"among {args.crowd} scenes", measure(held, shots, as_is, args.v), deg, metres)
     if args.small is not None:
         small = small_map(held, data, args.work, args.small)
-        rows = measure(held, shots, as_is, args.v, lambda *asked: held.localize(*asked, within=small))
-        say("the small map", rows, deg, metres)
+        for name, change in changes.items():
+            rows = measure(held, shots, change, args.v, lambda *asked: held.localize(*asked, within=small))
+            say(f"the small map, {name}", rows, deg, metres)
     return 0
 
 

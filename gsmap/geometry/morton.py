@@ -22,21 +22,36 @@ def morton_codes(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     that holds them all."""
     low, high = box.astype(np.float64)
     step = max((high - low).max(), np.finfo(np.float32).tiny) / ((1 << BITS) - 1)
-    code = np.zeros(len(points), np.uint64)
+    return codes_of_cells(((points - low) / step).astype(np.uint64))
+
+
+def codes_of_cells(cells: np.ndarray) -> np.ndarray:
+    """(N,) uint64 place of cells (N, 3) uint64, each of 21 bits, along the Z-order curve."""
+    code = np.zeros(len(cells), np.uint64)
     for axis in range(3):
-        cell = ((points[:, axis] - low[axis]) / step).astype(np.uint64)
-        code |= _spread(cell) << np.uint64(2 - axis)
+        code |= _spread(cells[:, axis]) << np.uint64(2 - axis)
     return code
+
+
+def cells_of_codes(codes: np.ndarray) -> np.ndarray:
+    """(N, 3) uint64 the cells again."""
+    return np.stack([_gathered(codes >> np.uint64(2 - axis)) for axis in range(3)], axis=1)
+
+
+_MASKS = (0x1FFFFF, 0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
+_SHIFTS = (32, 16, 8, 4, 2)
 
 
 def _spread(cell: np.ndarray) -> np.ndarray:
     """Two zero bits before each of the low 21 bits."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
+    for shift, mask in zip(_SHIFTS, _MASKS[1:], strict=True):
         cell = (cell | (cell << np.uint64(shift))) & np.uint64(mask)
     return cell
+
+
+def _gathered(code: np.ndarray) -> np.ndarray:
+    """Every third bit, together."""
+    code = code & np.uint64(_MASKS[-1])
+    for shift, mask in zip(_SHIFTS[::-1], _MASKS[-2::-1], strict=True):
+        code = (code | (code >> np.uint64(shift))) & np.uint64(mask)
+    return code

@@ -1,27 +1,23 @@
-"""What localisation needs of a scene, in few bytes: features at four bits a number, and Gaussians merged.
+"""Which of a scene localisation needs, where few bytes are to be had: what of it shows, and features of every view.
 
 Features of a view are kept in the order in which its extractor gave them, as many of every view: views are far apart,
 so what is kept covers what the scene shows. Gaussians that hardly show in the scene's own pictures go, and so does what
-depends on the direction; the others are merged (`gsmap.export.levels`).
+depends on the direction; the others are merged (`gsmap.export.levels`) as far as must be. What is kept is rounded and
+packed (`gsmap.localize.packed_features`, `gsmap.localize.packed_gaussians`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.errors import CorruptError, InputError
+from gsmap.geometry.sh import SH_C0
+from gsmap.geometry.transforms import sh_basis
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians
 from gsmap.types.localization import SceneFeatures
-
-_LEVELS = 15.0
-_MOST = 127.0
-_UNIT = 254.0  # length of a descriptor, see `gsmap.localize.features.quantised`
-_STEPS = 65535.0
 
 
 @dataclass(frozen=True)
@@ -35,7 +31,9 @@ class Params:
         pictures: of its own in which Gaussians are weighed, evenly along its path.
         longest_side_px: size of these.
         min_weight: a Gaussian that nowhere makes up this share of a pixel goes in any case.
-        refine_steps: of fitting what was merged to renders of what it stands for, ...
+        refine_below: where less than this share of the Gaussians is left, they are fitted to renders of what they stand
+            for; where more is, merging alone is nearer.
+        refine_steps: of that fit, ...
         refine_views: ... from so many of the scene's cameras.
     """
 
@@ -44,28 +42,45 @@ class Params:
     min_gaussians: float = 0.15
     pictures: int = 32
     longest_side_px: int = 240
-    min_weight: float = 0.01
-    refine_steps: int = 150
+    min_weight: float = 0.02
+    refine_below: float = 0.5
+    refine_steps: int = 100
     refine_views: int = 32
 
 
-def weights(scene: PlacedFeatures, cameras: Cameras | None, params: Params) -> np.ndarray:
-    """(N,) float32 how much each Gaussian shows: the largest share of a pixel that it makes up, in any picture.
+def shown(scene: PlacedFeatures, cameras: Cameras | None, params: Params) -> tuple[np.ndarray, Gaussians]:
+    """How the Gaussians of a scene show in its own pictures.
 
     Args:
         cameras: of the scene, its frame and unit; with none, the views that photographs are found by.
+
+    Returns:
+        (N,) float32 the largest share of a pixel that each makes up, in any picture; and the Gaussians in one colour
+        each, the mean of what they show.
     """
     own = cameras if cameras is not None and len(cameras) else scene.features.cameras
     small = own.evenly(params.pictures).resized(params.longest_side_px)
-    largest = np.zeros(len(scene.gaussians), np.float32)
+    gaussians = scene.gaussians
+    largest = np.zeros(len(gaussians), np.float32)
+    colours, total = np.zeros((len(gaussians), 3)), np.zeros((len(gaussians), 1))
     for row in range(len(small)):
-        seen = render(scene.gaussians, small[row], depth=False, dominant_id=False, max_weight=True, backend="native")
+        seen = render(gaussians, small[row], depth=False, dominant_id=False, max_weight=True, backend="native")
         np.maximum(largest, seen.max_weight, out=largest)
-    return largest
+        rows = np.flatnonzero(seen.max_weight > 0)
+        away = gaussians.means[rows] - small.centers[row]
+        basis = sh_basis(away / np.linalg.norm(away, axis=1, keepdims=True), gaussians.sh_degree)
+        weight = seen.max_weight[rows, None]
+        colours[rows] += weight * np.einsum("nk,nkc->nc", basis, gaussians.sh[rows]) / SH_C0
+        total[rows] += weight
+    mean = np.where(total > 0, colours / np.maximum(total, 1e-12), gaussians.sh[:, 0])
+    return largest, replace(gaussians, sh=mean[:, None].astype(np.float32))
 
 
-def fewer(features: SceneFeatures, most: int) -> SceneFeatures:
-    """At most so many features of every view, those that came first."""
+def fewer(features: SceneFeatures, total: int) -> SceneFeatures:
+    """So many features at most, those that came first in each view: as many of every view that has them."""
+    counts = np.sort(np.diff(features.starts))
+    rest = total - np.r_[0, np.cumsum(counts)[:-1]]  # for these and all larger ones, once the smaller are whole
+    most = int(np.max(np.minimum(rest // np.arange(len(counts), 0, -1), counts), initial=1))
     rows = [np.arange(a, min(b, a + most)) for a, b in zip(features.starts[:-1], features.starts[1:], strict=True)]
     keep = np.concatenate([np.zeros(0, np.int64), *rows])
     return replace(
@@ -91,70 +106,3 @@ def without(features: SceneFeatures, means: np.ndarray, left_out: np.ndarray) ->
         descriptors=features.descriptors[keep],
         angles=features.angles[keep],
     )
-
-
-def without_direction(gaussians: Gaussians) -> Gaussians:
-    """Gaussians of one colour each."""
-    return replace(gaussians, sh=gaussians.sh[:, :1])
-
-
-def pack_features(features: SceneFeatures) -> dict[str, np.ndarray]:
-    """Arrays of a scene's features, a good half as large: places at 16 bits in their box, descriptors at 4."""
-    points = features.points.astype(np.float64)
-    low = points.min(0) if len(points) else np.zeros(3)
-    size = np.maximum(points.max(0) - low, 1e-12) if len(points) else np.ones(3)
-    values = features.descriptors.astype(np.float64)
-    least, greatest = (float(np.quantile(values, q)) for q in (0.001, 0.999)) if values.size else (0.0, 1.0)
-    step = max((greatest - least) / _LEVELS, 1.0)
-    if features.descriptors.shape[1] % 2:
-        raise InputError(f"descriptors of {features.descriptors.shape[1]} numbers cannot be packed in pairs")
-    nibbles = np.clip(np.round((values - least) / step), 0, _LEVELS).astype(np.uint8)
-    return {
-        "starts": features.starts.astype(np.int64),
-        "box": np.stack([low, size]),
-        "points": np.round((points - low) / size * _STEPS).astype(np.uint16),
-        "range": np.array([least, step]),
-        "descriptors": (nibbles[:, 0::2] << 4) | nibbles[:, 1::2],
-        "angles": features.angles.astype(np.uint8),
-        "poses": features.cameras.T_frame_camera.reshape(-1, 16).astype(np.float64),
-        "intrinsics": features.cameras.intrinsics_px.astype(np.float64),
-        "sizes": features.cameras.sizes_px.astype(np.int64),
-    }
-
-
-def unpack_features(scene: str, arrays: Mapping[str, np.ndarray]) -> SceneFeatures:
-    """The features again.
-
-    Raises:
-        CorruptError: these are no arrays of `pack_features`.
-    """
-    try:
-        starts, packed = arrays["starts"], arrays["descriptors"]
-        count, views = len(arrays["points"]), len(arrays["poses"])
-        shapes = {"box": (2, 3), "range": (2,), "points": (count, 3), "angles": (count,), "starts": (views + 1,)}
-        if any(arrays[name].shape != shape for name, shape in shapes.items()) or len(packed) != count:
-            raise ValueError("arrays that do not fit each other")
-        if starts.dtype != np.int64 or starts[0] != 0 or starts[-1] != count or (np.diff(starts) < 0).any():
-            raise ValueError("views that do not divide their features")
-        if packed.dtype != np.uint8 or arrays["points"].dtype != np.uint16:
-            raise ValueError("arrays of other types")
-        (low, size), (least, step) = arrays["box"], arrays["range"]
-        if not (np.isfinite(arrays["box"]).all() and np.isfinite(arrays["range"]).all()):
-            raise ValueError("numbers that are not finite")
-        nibbles = np.empty((count, 2 * packed.shape[1]), np.float64)
-        nibbles[:, 0::2], nibbles[:, 1::2] = packed >> 4, packed & 15
-        values = least + nibbles * step
-        norms = np.linalg.norm(values, axis=1, keepdims=True)
-        values *= _UNIT / np.maximum(norms, 1e-9)  # what was rounded is a unit vector again
-        return SceneFeatures(
-            scene,
-            Cameras(arrays["poses"].reshape(-1, 4, 4), arrays["intrinsics"], arrays["sizes"]),
-            starts,
-            (low + arrays["points"] / _STEPS * size).astype(np.float32),
-            np.clip(np.round(values), -_MOST, _MOST).astype(np.int8),
-            arrays["angles"].astype(np.uint8),
-        )
-    except (KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
-        raise CorruptError(
-            f"the features of scene {scene[:12]} make no sense ({error}): export the small map again"
-        ) from error

@@ -22,28 +22,35 @@ from gsmap.errors import MALFORMED, ConfigError, CorruptError, GsmapError, NotFo
 from gsmap.export.levels import Params as LevelParams
 from gsmap.export.levels import make_level
 from gsmap.geometry.metres import in_metres
-from gsmap.geometry.morton import morton_order
-from gsmap.localize import PlacedFeatures, ViewIndex, new_segment, packing, view_index
+from gsmap.localize import (
+    PlacedFeatures,
+    ViewIndex,
+    new_segment,
+    packed_features,
+    packed_gaussians,
+    packing,
+    view_index,
+)
 from gsmap.map import persisting
 from gsmap.map.objects import Known
 from gsmap.map.persisting import what_passes
 from gsmap.map.settings import Settings, settings_of
 from gsmap.map.stages.localize import Localizer, Near
 from gsmap.methods import family
-from gsmap.store import Store, compact, staging
+from gsmap.store import Store, staging
 from gsmap.types import Cameras, Gaussians, Sim3
 from gsmap.types.localization import SceneFeatures
 from gsmap.types.progress import StageProgress
 from gsmap.types.rows.exports import SmallMapReport, SmallSceneRow
 
 FILE_NAME = "localize.json"
-_FORMAT, _VERSION = "gsmap small map", 1
+_FORMAT, _VERSION = "gsmap small map", 2
 _MAX_JSON, _MAX_SCENE = 1 << 26, 1 << 31
 _HEADER_BYTES = 1500  # of a scene in localize.json, about
 _ROUNDS = 3
-_GAUSSIAN_BYTES = 14.5  # of one, packed
-_DEVIATION_PX = 2.0  # of merged Gaussians in the pictures that they are fitted to
-_FEATURES = ("starts", "box", "points", "range", "descriptors", "angles", "poses", "intrinsics", "sizes")
+_DEVIATION_PX = 4.0  # of merged Gaussians in the pictures that they are fitted to: as sharp as photographs ask for
+_COARSE = (0.5, 0.7, 1.0, 1.25, 1.5)  # steps that Gaussians are rounded to, before any is merged: `packed_gaussians`
+_SPARSER = 0.11  # of N Gaussians merged to n each takes (N / n) ** 0.11 times the bytes: neighbours are less alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,31 +106,24 @@ def export_small(
     localizer = Localizer(store, settings, progress)
     params = settings.localize.small
     scenes = sorted(localizer.placed)
-    weights: dict[str, np.ndarray] = {}
-    own: dict[str, Cameras | None] = {}
-    left_out: dict[str, np.ndarray | bool] = {}
     passing = {} if known is None else what_passes(store, known)
+    wanted: dict[str, int] = {}
+    shown: dict[str, int] = {}
     for number, scene in enumerate(scenes):
-        progress("export", 0.5 * number / len(scenes), f"what of {localizer.scenes[scene].name} shows")
-        placed = localizer.placed[scene]
-        held = store.scenes.cameras(scene)
-        own[scene] = None if held is None or held.synthesised else held
-        gone = persisting.rows(store, scene, passing[scene]) if scene in passing else _gone(store, scene)
-        left_out[scene] = gone if scene in passing else False
-        weights[scene] = np.where(gone, 0, packing.weights(placed, own[scene], params)).astype(np.float32)
-    shown = {scene: int((weights[scene] >= params.min_weight).sum()) for scene in scenes}
-    share = {scene: shown[scene] / max(sum(shown.values()), 1) for scene in scenes}
+        progress("export", 0.4 * number / len(scenes), f"what of {localizer.scenes[scene].name} shows")
+        whole = _whole(localizer, scene, passing.get(scene))
+        wanted[scene], shown[scene] = whole.num_bytes, len(whole.gaussians)
     free = budget_bytes - _HEADER_BYTES * len(scenes) - 500
-    factor = 1.0
+    factor = free / max(sum(wanted.values()), 1)
     files: dict[str, bytes] = {}
     rows: list[SmallSceneRow] = []
     total = 0
     for _ in range(_ROUNDS):
         files, rows = {}, []
         for number, scene in enumerate(scenes):
-            progress("export", 0.5 + 0.4 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
-            size = factor * free * share[scene]
-            content, row = _packed(localizer, scene, weights[scene], left_out[scene], own[scene], size, params)
+            progress("export", 0.4 + 0.5 * number / len(scenes), f"packing {localizer.scenes[scene].name}")
+            whole = _whole(localizer, scene, passing.get(scene))
+            content, row = _packed(localizer, whole, factor * wanted[scene], params)
             files[scene] = content
             rows.append(row)
         total = sum(map(len, files.values())) + _HEADER_BYTES * len(scenes) + 500
@@ -146,6 +146,56 @@ def export_small(
     return SmallMapReport(out=os.fspath(out), scenes=tuple(rows), num_bytes=num_bytes, budget_bytes=budget_bytes)
 
 
+@dataclass(frozen=True, eq=False)
+class _Whole:
+    """What of a scene a small map may hold.
+
+    Args:
+        scene: its id.
+        features: of its views.
+        gaussians: that show in its own pictures, in one colour each.
+        cameras: of these pictures; None where the scene has none.
+        first: features of a view that photographs are looked for by.
+    """
+
+    scene: str
+    features: SceneFeatures
+    gaussians: Gaussians
+    cameras: Cameras | None
+    first: int
+
+    @property
+    def step(self) -> float:
+        return packed_gaussians.place_step(self.gaussians)
+
+    @property
+    def num_bytes(self) -> int:
+        """Packed, but for the coarser steps that fewer bytes take."""
+        features = packed_features.pack(self.features, self.step, self.first)
+        return len(_npz(features)) + len(_npz(packed_gaussians.pack(self.gaussians)))
+
+
+def _whole(localizer: Localizer, scene: str, passing: persisting.Passing | None) -> _Whole:
+    """What a small map may hold of a scene.
+
+    Args:
+        passing: what of it does not persist; None where what changes say is gone is left out.
+    """
+    store, params, placed = localizer.store, localizer.params.small, localizer.placed[scene]
+    held = store.scenes.cameras(scene)
+    own = None if held is None or held.synthesised else held
+    features = placed.features
+    if passing is None:
+        gone = _gone(store, scene)
+    else:
+        gone = persisting.rows(store, scene, passing)
+        features = packing.without(features, placed.gaussians.means, gone)
+    weights, coloured = packing.shown(placed, own, params)
+    kept = coloured[np.flatnonzero((weights >= params.min_weight) & ~np.asarray(gone))]
+    placed.drop()
+    return _Whole(scene, features, kept, own, localizer.params.features.indexed)
+
+
 def _gone(store: Store, scene: str) -> np.ndarray | bool:
     """Which Gaussians of a scene are of things that changes say are gone since; none where nobody looked."""
     out: np.ndarray | bool = False
@@ -163,41 +213,38 @@ def _gone(store: Store, scene: str) -> np.ndarray | bool:
 
 
 def _packed(
-    localizer: Localizer,
-    scene: str,
-    weight: np.ndarray,
-    left_out: np.ndarray | bool,
-    cameras: Cameras | None,
-    num_bytes: float,
-    params: packing.Params,
+    localizer: Localizer, whole: _Whole, num_bytes: float, params: packing.Params
 ) -> tuple[bytes, SmallSceneRow]:
-    """A scene's file of about so many bytes."""
-    placed = localizer.placed[scene]
-    features, gaussians = placed.features, placed.gaussians
-    if np.any(left_out):
-        features = packing.without(features, gaussians.means, np.asarray(left_out))
-    per_feature = features.descriptors.shape[1] / 2 + 7
-    most = int(params.features_share * num_bytes / per_feature / max(features.num_views, 1))
-    kept = packing.fewer(features, max(most, 1))
-    arrays = packing.pack_features(kept)
-    head = _npz(arrays)
-    count = max(int((num_bytes - len(head)) / _GAUSSIAN_BYTES), 1)
-    shown = packing.without_direction(gaussians[np.flatnonzero(weight >= params.min_weight)])
-    told = LevelParams(views=params.refine_views, steps=params.refine_steps, deviation_px=_DEVIATION_PX)
-    merged = make_level(shown, count, cameras, told).gaussians if len(shown) > count else shown
-    chosen = merged[morton_order(merged.means)]
-    content = _npz(arrays | compact.pack(chosen))
+    """A scene's file of about so many bytes: what shows is rounded coarser, and then merged, as far as must be."""
+    shown = whole.gaussians
+    all_features = _npz(packed_features.pack(whole.features, whole.step, whole.first))
+    part = params.features_share * num_bytes / len(all_features)
+    kept = packing.fewer(whole.features, int(part * whole.features.num_features))
+    arrays = packed_features.pack(kept, whole.step, whole.first)
+    free = max(num_bytes - len(_npz(arrays)), 1)
+    for coarse in _COARSE:
+        packed = packed_gaussians.pack(shown, coarse)
+        taken = len(_npz(packed))
+        if taken <= free:
+            break
+    else:
+        count = max(int(len(shown) * (free / taken) ** (1 / (1 - _SPARSER))), 1)
+        views = params.refine_views if count < params.refine_below * len(shown) else 0
+        told = LevelParams(views=views, steps=params.refine_steps, deviation_px=_DEVIATION_PX)
+        shown = make_level(shown, count, whole.cameras, told).gaussians
+        packed = packed_gaussians.pack(shown, coarse)
+    content = _npz(arrays | packed)
+    about = localizer.scenes[whole.scene]
     row = SmallSceneRow(
-        scene=scene,
-        scene_name=localizer.scenes[scene].name,
+        scene=whole.scene,
+        scene_name=about.name,
         num_views=kept.num_views,
         num_features=kept.num_features,
-        features_of=features.num_features,
-        num_gaussians=len(chosen),
-        gaussians_of=len(gaussians),
+        features_of=whole.features.num_features,
+        num_gaussians=len(shown),
+        gaussians_of=about.num_gaussians,
         num_bytes=len(content),
     )
-    localizer.placed[scene].drop()
     return content, row
 
 
@@ -330,22 +377,22 @@ class SmallLocalizer(Localizer):
 
     def _small_gaussians(self, scene: str) -> Gaussians:
         self._use(scene)
-        arrays = self._arrays(scene, [*compact.shapes(0, 0)])
+        arrays, size = self._arrays(scene, packed_gaussians.NAMES)
         try:
-            count = len(arrays["compact.quats"])
-            wanted = compact.shapes(count, 0)
-            if any(arrays[name].shape != shape for name, shape in wanted.items()):
-                raise ValueError("arrays that do not fit each other")
-            return compact.unpack(arrays, np.arange(count))
+            return packed_gaussians.unpack(arrays, size)
         except MALFORMED as error:
             raise _corrupt(self.folder / f"{scene}.npz", error) from error
 
     def _small_features(self, scene: str) -> SceneFeatures:
         self._use(scene)
-        return packing.unpack_features(scene, self._arrays(scene, _FEATURES))
+        arrays, size = self._arrays(scene, packed_features.NAMES)
+        try:
+            return packed_features.unpack(scene, arrays, size)
+        except (GsmapError, *MALFORMED) as error:
+            raise _corrupt(self.folder / f"{scene}.npz", error) from error
 
-    def _arrays(self, scene: str, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Arrays of a scene's file, whose bytes are those that were written."""
+    def _arrays(self, scene: str, names: Sequence[str]) -> tuple[dict[str, np.ndarray], int]:
+        """Arrays of a scene's file, whose bytes are those that were written, and how many bytes these are."""
         import hashlib
 
         path = self.folder / f"{scene}.npz"
@@ -355,7 +402,7 @@ class SmallLocalizer(Localizer):
             if len(content) > _MAX_SCENE or hashlib.sha256(content).hexdigest() != self.small[scene].sha256:
                 raise ValueError("its bytes differ from what was written")
             with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-                return {name: stored[name] for name in names}
+                return {name: stored[name] for name in names}, len(content)
         except FileNotFoundError as error:
             raise CorruptError(f"{path} is missing: export the small map again") from error
         except (OSError, EOFError, *MALFORMED) as error:
