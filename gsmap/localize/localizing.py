@@ -271,6 +271,8 @@ def _support(
     """
     kept = inliers(best.settled, params.evidence, picture.size_px)
     counts = np.bincount(best.settled.scene[kept], minlength=len(best.settled.looks))
+    if not counts.any():  # found by other photos: what the map has there
+        counts = np.array([int((one.alpha > 0.5).sum()) for one in best.settled.looks])
     order = [k for k in np.argsort(-counts, kind="stable") if counts[k]]
     held = [(scenes[best.settled.looks[k].scene], counts[k] / counts.sum()) for k in order]
     return held, sum(_num_seen(scene, best.settled, picture) for scene, _ in held)

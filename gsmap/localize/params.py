@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from gsmap.localize import (
     aligning,
+    bundle,
     clips,
     covariance,
     differing,
@@ -47,6 +48,7 @@ class Params:
         covariance: how well a pose is known.
         verdict: the bars that a pose must clear.
         together: how photographs of one place help each other.
+        bundle: how they are adjusted at once.
         clips: which frames of a clip are looked at.
         differences: when a placed photo shows something else than the map.
         sighted: when a placed photo says that a thing is there, or gone.
@@ -73,6 +75,7 @@ class Params:
     covariance: covariance.Params = field(default_factory=covariance.Params)
     verdict: verdict.Params = field(default_factory=verdict.Params)
     together: tying.Params = field(default_factory=tying.Params)
+    bundle: bundle.Params = field(default_factory=bundle.Params)
     clips: clips.Params = field(default_factory=clips.Params)
     differences: differing.Params = field(default_factory=differing.Params)
     sighted: sighted.Params = field(default_factory=sighted.Params)

@@ -3,7 +3,8 @@
 Photographs match each other far better than renders. Once one is placed, the map's depth from there lifts its
 features to the map, and the next photo finds its pose by them, to be sharpened and judged on renders like any other.
 What a photo shows itself and what its neighbours show are evidence together: where two photos are tied to each other by
-matches, both are right or both are wrong.
+matches, both are right or both are wrong. In the end all that are placed are adjusted at once, and others are found
+by several of them (`gsmap.localize.bundle`).
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmap.localize import matching, probability, resection
+from gsmap.localize import bundle, matching, probability, resection
 from gsmap.localize.candidates import Candidate, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.localizing import Judged, judged_pose, judged_poses, photo_features, placement, prepared, rival_of
-from gsmap.localize.looks import at_pixels
+from gsmap.localize.looks import at_pixels, look
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.retrieval import ViewIndex
@@ -28,8 +29,19 @@ from gsmap.types.localization import Keypoints, Photo, Placement
 
 
 @dataclass(eq=False)
-class _Shot:
-    """A photo on its way."""
+class Shot:
+    """A photo on its way.
+
+    Args:
+        photo: as it was given.
+        picture, scale: as it is worked on (`gsmap.localize.localizing.prepared`).
+        found, described: its features.
+        judged: poses that were looked into, the one that is believed first.
+        why: there is none, where there is none.
+        helped: whether it has helped its neighbours from the pose that it has now.
+        led: whether the map shows nothing of it where others say that it lies.
+        apart: whether others lead it far from where the map places it.
+    """
 
     photo: Photo
     picture: Picture
@@ -38,7 +50,9 @@ class _Shot:
     described: matching.Described
     judged: list[Judged]
     why: str
-    helped: bool = False  # whether it has helped its neighbours from the pose that it has now
+    helped: bool = False
+    led: bool = False
+    apart: bool = False
 
     @property
     def best(self) -> Judged | None:
@@ -62,19 +76,43 @@ def localize_together(
     Returns:
         A placement for each, in order.
     """
+    shots, near, ties = looked_into(photos, index, scenes, extractor, params)
+    placed = _placements(shots, ties, scenes, params, metres_per_unit)
+    if _adjust(shots, placed, near, scenes, params, ties):
+        placed = _placements(shots, ties, scenes, params, metres_per_unit)
+    return placed
+
+
+def looked_into(
+    photos: Sequence[Photo],
+    index: ViewIndex,
+    scenes: Mapping[str, PlacedFeatures],
+    extractor: Extractor,
+    params: Params,
+) -> tuple[list[Shot], list[list[int]], dict[tuple[int, int], bool]]:
+    """Photographs with the poses that were looked into, the neighbours of each, and which of them are tied."""
     shots = [_shot(photo, index, scenes, extractor, params) for photo in photos]
     near = _neighbours(shots, params.together.neighbours)
     ties: dict[tuple[int, int], bool] = {}
     while True:
         ready = [k for k, shot in enumerate(shots) if not shot.helped and shot.probability >= params.together.anchor]
         if not ready:
-            break
+            return shots, near, ties
         k = max(ready, key=lambda one: shots[one].probability)
         shots[k].helped = True
         _help(k, shots, near[k], scenes, params, ties)
-    together = _probabilities(shots, ties, params)
+
+
+def _placements(
+    shots: Sequence[Shot],
+    ties: Mapping[tuple[int, int], bool],
+    scenes: Mapping[str, PlacedFeatures],
+    params: Params,
+    metres_per_unit: Mapping[int, float] | None,
+) -> list[Placement]:
+    """What is said of each photo, by its own evidence and that of the others."""
     out = []
-    for shot, probable in zip(shots, together, strict=True):
+    for shot, probable in zip(shots, probabilities(shots, ties, params), strict=True):
         if shot.best is None:
             out.append(Placement(shot.photo.name, shot.why))
             continue
@@ -82,21 +120,109 @@ def localize_together(
         if probable > shot.probability:  # what it lacks itself, those that it is tied to show
             bars = replace(params, verdict=replace(params.verdict, min_inliers=0))
         rival = rival_of([best, *shot.judged[1:]], params)
-        out.append(placement(shot.photo.name, best, rival, shot.picture, shot.scale, scenes, bars, metres_per_unit))
+        said = placement(shot.photo.name, best, rival, shot.picture, shot.scale, scenes, bars, metres_per_unit)
+        if shot.apart and said.is_placed:
+            why = "ambiguous: other photographs lead it elsewhere"
+            said = Placement(said.name, why, component=said.component, probability=probable, evidence=said.evidence)
+        out.append(said)
     return out
+
+
+def _adjust(
+    shots: Sequence[Shot],
+    placed: Sequence[Placement],
+    near: Sequence[Sequence[int]],
+    scenes: Mapping[str, PlacedFeatures],
+    params: Params,
+    ties: dict[tuple[int, int], bool],
+) -> bool:
+    """Adjust the photos that are placed at once, and find others by them; whether anything has changed."""
+    by_component: dict[int, list[int]] = {}
+    for k, one in enumerate(placed):
+        if one.is_placed:
+            by_component.setdefault(shots[k].judged[0].candidate.component, []).append(k)
+    by_component = {component: mine for component, mine in by_component.items() if len(mine) > 1}
+    if not by_component:
+        return False
+    matches = matches_of(shots, near, params)
+    left = {k for k, one in enumerate(placed) if not one.is_placed}
+    for component, mine in sorted(by_component.items(), key=lambda one: -len(one[1])):
+        take_part = sorted([*mine, *left])
+        known = [shown(shots[k], k in mine) for k in take_part]
+        number = {k: place for place, k in enumerate(take_part)}
+        among = {(number[a], number[b]): same for (a, b), same in matches.items() if a in number and b in number}
+        adjusted, apart = bundle.adjusted(known, among, params.bundle, params.resection)
+        for place in apart:
+            shots[take_part[place]].apart = True
+        for place, pose in adjusted.items():
+            k, by = take_part[place], [take_part[other] for other in pose.by]
+            _move(shots[k], pose, component, shots[by[0]].judged[0].candidate.scenes if by else (), scenes, params)
+            ties.update({(other, k): True for other in by[:2]})
+            left.discard(k)
+    return True
+
+
+def matches_of(shots: Sequence[Shot], near: Sequence[Sequence[int]], params: Params) -> bundle.Matches:
+    """The features that photos share with their neighbours."""
+    out: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+    for k, other in sorted({(max(k, other), min(k, other)) for k, others in enumerate(near) for other in others}):
+        rows, columns = matching.matched(shots[k].described, shots[other].described, params.matching)
+        out[k, other], out[other, k] = (rows, columns), (columns, rows)
+    return out
+
+
+def shown(shot: Shot, placed: bool) -> bundle.Shown:
+    """A photo as it is adjusted with others."""
+    picture = shot.picture
+    pixels = shot.found.pixels.astype(np.float64)
+    if not placed:
+        return bundle.Shown(pixels, picture.intrinsics_px, picture.size_px, picture.focal_sigma)
+    best = shot.judged[0]
+    points, rows = _lifted(shot, best)
+    pose, lens = best.settled.T_metric_camera, best.settled.intrinsics_px
+    return bundle.Shown(pixels, lens, picture.size_px, picture.focal_sigma, pose, best.covariance, rows, points)
+
+
+def _move(
+    shot: Shot,
+    adjusted: bundle.Adjusted,
+    component: int,
+    shown_by: tuple[str, ...],
+    scenes: Mapping[str, PlacedFeatures],
+    params: Params,
+) -> None:
+    """Give a photo the pose that all say; where others found it, what the map shows there is evidence as for any other.
+
+    Args:
+        shown_by: scenes that the photo which says most of it shows, where others found it.
+    """
+    pose, lens = adjusted.T_metric_camera, adjusted.intrinsics_px
+    if not adjusted.by:
+        best = shot.judged[0]
+    else:
+        start = Candidate(component, pose, lens, adjusted.num_points, shown_by)
+        best = judged_pose(shot.picture, start, scenes, params)
+        shot.led = best.settled.covariance is None or not _same(best, start, params)
+        if shot.led:
+            seen = [scenes[scene] for scene in shown_by[: params.settling.max_scenes]]
+            looks = look(seen, pose, lens, shot.picture.size_px, params.features)
+            best = replace(best, candidate=start, settled=replace(best.settled, fit=None, looks=looks))
+        shot.judged.insert(0, best)
+    settled = replace(best.settled, T_metric_camera=pose, intrinsics_px=lens)
+    shot.judged[0] = replace(best, settled=settled, covariance=adjusted.covariance)
 
 
 def _shot(
     photo: Photo, index: ViewIndex, scenes: Mapping[str, PlacedFeatures], extractor: Extractor, params: Params
-) -> _Shot:
+) -> Shot:
     picture, scale = prepared(photo, params)
     found = photo_features(picture, extractor, 0.0)  # photos hold what renders do not
     described = matching.Described(quantised(found.descriptors), turns(found))
     judged, why = judged_poses(picture, index, scenes, extractor, params)
-    return _Shot(photo, picture, scale, found, described, judged, why)
+    return Shot(photo, picture, scale, found, described, judged, why)
 
 
-def _neighbours(shots: Sequence[_Shot], count: int) -> list[list[int]]:
+def _neighbours(shots: Sequence[Shot], count: int) -> list[list[int]]:
     """Of each photo those that look most alike, and those given just before and after it."""
     vectors = np.stack([words_of(shot.found) for shot in shots])
     cosines = vectors @ vectors.T
@@ -120,7 +246,7 @@ def words_of(found: Keypoints) -> np.ndarray:
 
 def _help(
     k: int,
-    shots: Sequence[_Shot],
+    shots: Sequence[Shot],
     near: Sequence[int],
     scenes: Mapping[str, PlacedFeatures],
     params: Params,
@@ -157,7 +283,7 @@ def _help(
             ties[k, other] = True
 
 
-def _lifted(shot: _Shot, best: Judged) -> tuple[np.ndarray, np.ndarray]:
+def _lifted(shot: Shot, best: Judged) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) places of a placed photo's features by the depth of the scene that shows most there, and their rows."""
     pixels = shot.found.pixels
     points, known = np.zeros((len(pixels), 3)), np.zeros(len(pixels), bool)
@@ -175,7 +301,7 @@ def _same(judged: Judged, candidate: Candidate, params: Params) -> bool:
     return near_to(settled, candidate, params.resection)
 
 
-def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool], params: Params) -> list[float]:
+def probabilities(shots: Sequence[Shot], ties: Mapping[tuple[int, int], bool], params: Params) -> list[float]:
     """Of each photo, that it is right.
 
     That matches are there by chance, its own evidence speaks against or that of the two surest that it is tied to: only
@@ -186,7 +312,7 @@ def _probabilities(shots: Sequence[_Shot], ties: Mapping[tuple[int, int], bool],
     bars, model = params.verdict, probability.model()
     own, rooms = np.zeros((2, len(shots)))
     for k, shot in enumerate(shots):
-        if shot.best is not None:
+        if shot.best is not None and not shot.led:
             told = shot.best.evidence
             own[k] = model.probability(told, bars.prior / (1 - bars.alike), 0.0)
             rooms[k] = model.alike.log_odds(told)

@@ -61,7 +61,7 @@ HOMES = {
     "sqlalchemy": {"store"},
     "alembic": {"store"},
     "zarr": {"store"},
-    "gtsam": {"optimize"},
+    "gtsam": {"localize", "optimize"},
     "networkx": {"optimize", "objects"},
     "onnxruntime": {"networks"},
     "small_gicp": {"register"},

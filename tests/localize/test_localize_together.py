@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -77,6 +78,60 @@ def test_a_lent_pose_is_adjusted_before_it_is_settled(world, monkeypatch) -> Non
     assert far[0] < 0.03
 
 
+@pytest.fixture(scope="module")
+def beside_each_other(world):
+    """Four photographs a step apart, and their poses."""
+    poses = np.tile(world.poses[1], (4, 1, 1))
+    for k in range(4):
+        poses[k, :3, :3] = poses[k, :3, :3] @ exp_so3(np.array([0.0, 0.03 * (k - 1.5), 0.0]))
+        poses[k, :3, 3] += poses[k, :3, 0] * 0.15 * (k - 1.5)
+    frames = film(world.place, poses, size_px=(480, 360), focal=world.focal)
+    photos = [replace(world.photos[1], rgb=image, name=f"step {k}") for k, image in enumerate(frames.images)]
+    return photos, poses
+
+
+@pytest.mark.parametrize("map_shows_it", [True, False])
+def test_a_photo_is_found_by_two_that_the_map_places(world, beside_each_other, monkeypatch, map_shows_it) -> None:
+    """The map finds nothing of the last one; whether it shows anything of it where the others lead does not matter."""
+    photos, poses = beside_each_other
+    find, judge = together_module.judged_poses, together_module.judged_pose
+    monkeypatch.setattr(
+        together_module,
+        "judged_poses",
+        lambda picture, *rest: find(picture, *rest) if len(asked.append(0) or asked) < 4 else ([], "forbidden"),
+    )
+    monkeypatch.setattr(together_module, "_help", lambda *given: None)
+
+    def hidden(*given):
+        one = judge(*given)
+        return replace(one, settled=replace(one.settled, covariance=None, looks=[]), covariance=None)
+
+    if not map_shows_it:
+        monkeypatch.setattr(together_module, "judged_pose", hidden)
+    asked: list[int] = []
+    *others, last = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
+    assert all(one.is_placed for one in others)
+    assert last.is_placed, last.reason
+    assert last.scenes == ("scene",)
+    assert last.num_gaussians > 0
+    assert last.probability > 0.95
+    apart = np.linalg.inv(last.T_map_camera) @ poses[3]
+    assert np.linalg.norm(apart[:3, 3]) < 0.03
+    assert np.linalg.norm(apart[:3, :3] - np.eye(3)) < 0.02
+    assert np.sqrt(np.diag(last.covariance)[3:]).max() < 0.1
+
+
+def test_photos_of_one_place_are_adjusted_at_once(world, beside_each_other) -> None:
+    photos, poses = beside_each_other
+    together = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
+    off = [np.linalg.norm(one.T_map_camera[:3, 3] - truth[:3, 3]) for one, truth in zip(together, poses, strict=True)]
+    between = [np.linalg.inv(a.T_map_camera) @ b.T_map_camera for a, b in pairwise(together)]
+    true = [np.linalg.inv(a) @ b for a, b in pairwise(poses)]
+    steps = [np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(between, true, strict=True)]
+    assert max(off) < 0.02
+    assert max(steps) < 0.004, "they lie to each other as they were taken"
+
+
 def test_photos_of_other_places_stay_refused_together(world, elsewhere) -> None:
     placed = localize_together(elsewhere.photos, world.index, {"scene": world.placed}, SIFT, Params())
     assert not any(one.is_placed for one in placed)
@@ -117,7 +172,8 @@ def shots_of(*told: dict[str, float]) -> list[SimpleNamespace]:
     bars = verdict.Params()
     found = [probability.model().probability(one, bars.prior, bars.alike) for one in told]
     return [
-        SimpleNamespace(best=SimpleNamespace(evidence=one), probability=p) for one, p in zip(told, found, strict=True)
+        SimpleNamespace(best=SimpleNamespace(evidence=one), probability=p, led=False)
+        for one, p in zip(told, found, strict=True)
     ]
 
 
@@ -129,30 +185,30 @@ def test_frames_of_a_room_that_looks_alike_do_not_make_each_other_sure() -> None
     half |= {"contradicted": 0.12, "explained_coarsely": 0.85, "colour": 0.7, "laid": 0.55}
     elsewhere = half | {"unlike_likely": 0.12, "unlike_surely": 0.08, "unlike": 0.2, "colour": 0.4, "explained": 0.5}
     alone = shots_of(half, elsewhere, elsewhere)
-    together = together_module._probabilities(alone, ties, Params())
+    together = together_module.probabilities(alone, ties, Params())
     assert 0.3 < alone[0].probability < 0.95
     assert together[0] < alone[0].probability
     assert max(together) < 0.95
     good = shots_of(half, GOOD, GOOD)
-    assert together_module._probabilities(good, ties, Params())[0] > 0.95 > good[0].probability
-    assert together_module._probabilities(good, {}, Params())[0] > good[0].probability, "tied or not"
-    assert together_module._probabilities(alone, {}, Params())[0] < alone[0].probability
+    assert together_module.probabilities(good, ties, Params())[0] > 0.95 > good[0].probability
+    assert together_module.probabilities(good, {}, Params())[0] > good[0].probability, "tied or not"
+    assert together_module.probabilities(alone, {}, Params())[0] < alone[0].probability
 
 
 def test_a_photo_alone_is_as_probable_together() -> None:
     half = GOOD | {"unlike_part": 0.2, "unlike": 0.06, "colour": 0.7, "laid": 0.3, "matches": 0.9}
     (one,) = shots_of(half)
-    assert together_module._probabilities([one], {}, Params())[0] == pytest.approx(one.probability, abs=1e-6)
+    assert together_module.probabilities([one], {}, Params())[0] == pytest.approx(one.probability, abs=1e-6)
 
 
 def test_a_photo_of_another_place_says_nothing_of_rooms() -> None:
     """It is there by chance, whatever it would show of a room."""
     half = GOOD | {"unlike_part": 0.2, "unlike": 0.06, "unlike_likely": 0.03, "unlike_surely": 0.015, "explained": 0.7}
-    few, more = (together_module._probabilities(shots_of(half, GOOD, *[BAD] * n), {}, Params()) for n in (0, 8))
+    few, more = (together_module.probabilities(shots_of(half, GOOD, *[BAD] * n), {}, Params()) for n in (0, 8))
     assert few[0] == pytest.approx(more[0], abs=0.01)
     assert max(more[2:]) < 0.05
-    nothing = SimpleNamespace(best=None, probability=0.0)
-    assert together_module._probabilities([*shots_of(half, GOOD), nothing], {}, Params())[2] == 0.0
+    nothing = SimpleNamespace(best=None, probability=0.0, led=False)
+    assert together_module.probabilities([*shots_of(half, GOOD), nothing], {}, Params())[2] == 0.0
 
 
 def test_what_chance_explains_it_does_not_for_two() -> None:
@@ -160,5 +216,15 @@ def test_what_chance_explains_it_does_not_for_two() -> None:
     few = GOOD | {"matches": 0.9, "inliers": 0.9, "found_again": 0.03, "spread": 0.06, "laid": 0.3, "compared": 2.3}
     few |= {"explained": 0.55, "explained_coarsely": 0.6, "seen": 0.4, "sigma_m": -1.3}
     shots = shots_of(few, GOOD)
-    together = together_module._probabilities(shots, {(0, 1): True}, Params())
+    together = together_module.probabilities(shots, {(0, 1): True}, Params())
     assert shots[0].probability < 0.95 < together[0]
+
+
+def test_a_photo_that_others_lead_elsewhere_is_not_said(world, beside_each_other, monkeypatch) -> None:
+    photos, _ = beside_each_other
+    adjust = together_module.bundle.adjusted
+    monkeypatch.setattr(together_module.bundle, "adjusted", lambda *given: (adjust(*given)[0], [2]))
+    placed = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
+    assert [one.is_placed for one in placed] == [True, True, False, True]
+    assert "lead it elsewhere" in placed[2].reason
+    assert placed[2].T_map_camera is None
