@@ -7,7 +7,7 @@ photo shows of the points, and what the map said of each pose.
 
 What the map says of neighbours errs alike, as a map bends and renders displace; and photographs find a feature beside
 where it is in the same way. So covariances are those of a problem in which poses by the map are known less well, the
-more there are of them, and features to two pixels; and they are scaled by how well these poses agree with how the
+more there are of them, and features less well too; and they are scaled by how well these poses agree with how the
 photographs lie to each other (the variance of unit weight).
 """
 
@@ -43,7 +43,7 @@ class Params:
         loose: ... times this, in one adjustment after another.
         max_off: a photo that is led by more sigmas from where the map placed it takes no part.
         min_sine: points are triangulated where the rays to them differ by so much.
-        max_points: in the adjustment, those that most photos show.
+        max_points: in the adjustment, for each photo; those that most photos show.
         feature_px: how well a feature is found ...
         doubt: ... and from so many times that on it counts less, as poses by the map do from so many of their sigmas.
         lifted_m: how well the map's depth says where a feature of one photo lies.
@@ -59,7 +59,7 @@ class Params:
     loose: tuple[float, ...] = (2.0, 1.0)
     max_off: float = 8.0
     min_sine: float = 0.02
-    max_points: int = 1500
+    max_points: int = 150
     feature_px: float = 1.0
     doubt: float = 1.0
     lifted_m: float = 0.05
@@ -125,8 +125,8 @@ def adjusted(
         photos: in one frame, metres.
 
     Returns:
-        The poses; and photos that others led far from where the map placed them: of these one of both is wrong, and
-        they took no part.
+        The poses; and photos that others led far from where the map placed them, and that took no part: what the map
+        says of these or of the others is wrong.
     """
     photos = _with_one_lens(photos)
     apart: list[int] = []
@@ -147,6 +147,8 @@ def adjusted(
         apart.append(worst)
         photos[worst] = replace(photos[worst], T_metric_camera=None)
         matches = {pair: rows for pair, rows in matches.items() if worst not in pair}
+    if apart:  # no two are left that agree, and which of the last is wrong nobody says
+        apart += [k for k, one in enumerate(photos) if one.T_metric_camera is not None]
     return {}, apart
 
 
@@ -301,7 +303,7 @@ def _triangulated(
     keep = sound[of] & ahead
     shown = np.bincount(of[keep], minlength=total)
     order = np.argsort(-shown, kind="stable")
-    order = order[shown[order] >= 2][: params.max_points]
+    order = order[shown[order] >= 2][: params.max_points * len(photos)]
     renumbered = np.full(total, -1)
     renumbered[order] = np.arange(len(order))
     keep &= renumbered[of] >= 0

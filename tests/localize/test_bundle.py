@@ -130,6 +130,14 @@ def test_a_photo_that_the_map_places_wrongly_takes_no_part() -> None:
     assert 4 not in out, "where it lies by the others is not said either: one of both is wrong"
 
 
+def test_of_two_that_contradict_each_other_neither_is_believed() -> None:
+    clip = Clip((2, 3))
+    clip.photos[3] = replace(clip.photos[3], T_metric_camera=moved(clip.truth[3], np.array([0, 0.1, 0, 0.3, 0, 0])))
+    out, apart = bundle.adjusted(clip.photos, clip.matches(), PARAMS, POSES)
+    assert out == {}
+    assert sorted(apart) == [2, 3]
+
+
 def test_what_is_found_a_little_beside_hardly_counts() -> None:
     """A fifth of the features of every other photo lie three pixels to the right: as near as matches that agree."""
     clip = Clip(range(8), noise_px=0.3)
