@@ -2,6 +2,7 @@
 
     python tools/bench_clips.py PLACES WORK                  # clips of ten frames through made places
     python tools/bench_clips.py PLACES WORK --house DATA     # and the house's photographs, ten of one capture at a time
+    python tools/bench_clips.py PLACES WORK --focal-unknown  # nothing is said of the lens
     python tools/bench_clips.py PLACES WORK --alike          # clips of rooms that look like those of the map instead
 
 PLACES is what ``tools/make_localize_places.py`` made; clips are of its places for testing. Somebody walks with a phone
@@ -30,7 +31,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from bench_localize import World, house_shots, world
+from bench_localize import World, house_shots, unknown_focal, world
 from fit_localize import WRONG_DEG, WRONG_M, Place, camera_error, index_of, places
 from make_localize_places import DECORATIONS, TIMES, made_place
 
@@ -169,6 +170,7 @@ def main() -> int:
     parser.add_argument("--set", default="test", choices=("fit", "test"))
     parser.add_argument("--house", type=Path, metavar="DATA")
     parser.add_argument("--alike", action="store_true")
+    parser.add_argument("--focal-unknown", action="store_true")
     parser.add_argument("-v", action="store_true")
     args = parser.parse_args()
     params = Params()
@@ -179,7 +181,7 @@ def main() -> int:
     def ask(frames, truth_of, *options):
         for name in said:
             began = time.process_time()
-            photos = [frame.photo for frame in frames]
+            photos = [unknown_focal(frame.photo) if args.focal_unknown else frame.photo for frame in frames]
             if name == "alone":
                 found = [localize_photo(photo, *options) for photo in photos]
             else:
