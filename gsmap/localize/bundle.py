@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.projection import project
-from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import resection
 
 _EXPECTED = 5.35  # median of chi squared, of six degrees of freedom
@@ -67,6 +67,16 @@ class Params:
     alike_px: float = 1.6
     weight: float = 2.5
     usual: float = 4.0
+
+    def __post_init__(self) -> None:
+        if not self.loose or min(self.loose) <= 0:
+            raise ConfigError(f"loose is one factor or more, each above 0, got {self.loose}")
+        for name in ("max_error_px", "max_off", "feature_px", "doubt", "lifted_m", "alike_px"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("min_sine", "alike", "weight", "usual", "max_points"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +194,7 @@ def _off(photo: Shown, pose: np.ndarray) -> float:
     """How far from where the map placed it a photo has come to lie: squared, in sigmas of that."""
     assert photo.T_metric_camera is not None
     assert photo.covariance is not None
-    apart = np.linalg.inv(photo.T_metric_camera) @ pose
-    xi = np.r_[rotation_vectors(apart[:3, :3])[0], apart[:3, 3]]
+    xi = resection.moved_by(photo.T_metric_camera, pose)
     return float(xi @ np.linalg.solve(photo.covariance, xi))
 
 
@@ -332,15 +341,10 @@ def _found(
     """A photo by what placed ones show; None where too little of it agrees."""
     rows, points, whose = [np.zeros(0, np.int64)], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for other in at:
-        mine, theirs = matches.get((k, other), (np.zeros(0, np.int64), np.zeros(0, np.int64)))
-        places = np.full((len(photos[other].pixels), 3), np.nan)
-        places[photos[other].rows] = photos[other].points
-        seen = structure.photo == other
-        places[structure.row[seen]] = structure.points[structure.point[seen]]
-        said = np.isfinite(places[theirs, 0])
-        rows.append(mine[said])
-        points.append(places[theirs[said]])
-        whose.append(np.full(int(said.sum()), other))
+        mine, places = _places_by(k, other, photos, matches, structure)
+        rows.append(mine)
+        points.append(places)
+        whose.append(np.full(len(mine), other))
     row, point, of = np.concatenate(rows), np.concatenate(points), np.concatenate(whose)
     if len(np.unique(row)) < params.min_points:
         return None
@@ -355,6 +359,23 @@ def _found(
         return None
     by = tuple(int(other) for other in np.argsort(-counts, kind="stable") if counts[other])
     return _Found(k, pose.T_map_camera, len(np.unique(row[agree])), by)
+
+
+def _places_by(
+    k: int, other: int, photos: Sequence[Shown], matches: Matches, structure: _Structure | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Features of a photo that another one shares whose places are known, and (n, 3) these: by what several show, if
+    that is given, or by the map's depth from the other one."""
+    if (k, other) not in matches:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    mine, theirs = matches[k, other]
+    places = np.full((len(photos[other].pixels), 3), np.nan)
+    places[photos[other].rows] = photos[other].points
+    if structure is not None:
+        seen = structure.photo == other
+        places[structure.row[seen]] = structure.points[structure.point[seen]]
+    said = np.isfinite(places[theirs, 0])
+    return mine[said], places[theirs[said]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -531,11 +552,8 @@ def _lifted(
         free = np.ones(len(photos[k].pixels), bool)
         free[structure.row[structure.photo == k]] = False
         for other in at:
-            mine, theirs = matches.get((k, other), (np.zeros(0, np.int64), np.zeros(0, np.int64)))
-            places = np.full((len(photos[other].pixels), 3), np.nan)
-            places[photos[other].rows] = photos[other].points
-            said = np.isfinite(places[theirs, 0]) & free[mine]
-            mine, point = mine[said], places[theirs[said]]
+            mine, point = _places_by(k, other, photos, matches)
+            mine, point = mine[free[mine]], point[free[mine]]
             agree = _near(photos[k], at[k], point, mine, loose, params)
             free[mine[agree]] = False
             points.append(point[agree])

@@ -84,7 +84,7 @@ def placement(
         rival: probability of the best pose at another place.
         scale: of `prepared`.
     """
-    reason = verdict.judge(best.evidence, best.probability, sigmas_of(best.covariance), rival, params.verdict)
+    reason = refusal(best, rival, params)
     component = best.candidate.component
     metres = (metres_per_unit or {}).get(component, 1.0)
     told = {**best.evidence, "rival": rival}
@@ -108,6 +108,11 @@ def placement(
         told,
         seen,
     )
+
+
+def refusal(best: Judged, rival: float, params: Params) -> str:
+    """Why a pose that was looked into is not said; empty where it is. See `placement`."""
+    return verdict.judge(best.evidence, best.probability, sigmas_of(best.covariance), rival, params.verdict)
 
 
 def prepared(photo: Photo, params: Params) -> tuple[Picture, np.ndarray]:

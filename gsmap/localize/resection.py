@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3, skew
+from gsmap.geometry.similarities import rotation_vectors
 
 
 @dataclass(frozen=True)
@@ -185,6 +186,12 @@ def moved(T_map_camera: np.ndarray, xi: np.ndarray) -> np.ndarray:
     out[:3, :3] = u @ vt
     out[:3, 3] = T_map_camera[:3, 3] + T_map_camera[:3, :3] @ xi[3:6]
     return out
+
+
+def moved_by(T_map_camera: np.ndarray, to: np.ndarray) -> np.ndarray:
+    """(6,) the xi by which `moved` takes a pose to another one."""
+    apart = np.linalg.inv(T_map_camera) @ to
+    return np.r_[rotation_vectors(apart[:3, :3])[0], apart[:3, 3]]
 
 
 def linearised(

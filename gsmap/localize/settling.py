@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmap.geometry.projection import project
-from gsmap.geometry.similarities import rotation_vectors
 from gsmap.localize import aligning, covariance, displacing, evidence, features, resection, tracking
 from gsmap.localize.looks import GREY, Look, at_pixels, look, smaller, wholly
 from gsmap.localize.placed import PlacedFeatures
@@ -226,8 +225,7 @@ def _between(
     intersection, Julier and Uhlmann 1997). Residuals do not tell all: a share of what the two differ by is added.
     """
     dim = len(told)
-    apart = np.linalg.inv(pose) @ fit.T_map_camera
-    xi = np.r_[rotation_vectors(apart[:3, :3])[0], apart[:3, 3], np.log(fit.intrinsics_px[0] / lens[0])][:dim]
+    xi = np.r_[resection.moved_by(pose, fit.T_map_camera), np.log(fit.intrinsics_px[0] / lens[0])][:dim]
     mine, theirs = np.linalg.pinv(told, hermitian=True), np.linalg.pinv(by_patches, hermitian=True)
     both = np.linalg.pinv(mine + theirs, hermitian=True)
     step = both @ theirs @ xi

@@ -17,7 +17,16 @@ import numpy as np
 from gsmap.localize import bundle, matching, probability, resection
 from gsmap.localize.candidates import Candidate, near_to
 from gsmap.localize.features import quantised, turns
-from gsmap.localize.localizing import Judged, judged_pose, judged_poses, photo_features, placement, prepared, rival_of
+from gsmap.localize.localizing import (
+    Judged,
+    judged_pose,
+    judged_poses,
+    photo_features,
+    placement,
+    prepared,
+    refusal,
+    rival_of,
+)
 from gsmap.localize.looks import at_pixels, look
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
@@ -77,10 +86,21 @@ def localize_together(
         A placement for each, in order.
     """
     shots, near, ties = looked_into(photos, index, scenes, extractor, params)
-    placed = _placements(shots, ties, scenes, params, metres_per_unit)
-    if _adjust(shots, placed, near, scenes, params, ties):
-        placed = _placements(shots, ties, scenes, params, metres_per_unit)
-    return placed
+    _adjust(shots, near, scenes, params, ties)
+    out = []
+    for shot, one in zip(shots, _believed(shots, ties, params), strict=True):
+        if one is None:
+            out.append(Placement(shot.photo.name, shot.why))
+            continue
+        best, rival, bars = one
+        said = placement(shot.photo.name, best, rival, shot.picture, shot.scale, scenes, bars, metres_per_unit)
+        if shot.apart and said.is_placed:
+            why = "ambiguous: other photographs lead it elsewhere"
+            said = Placement(
+                said.name, why, component=said.component, probability=said.probability, evidence=said.evidence
+            )
+        out.append(said)
+    return out
 
 
 def looked_into(
@@ -103,49 +123,42 @@ def looked_into(
         _help(k, shots, near[k], scenes, params, ties)
 
 
-def _placements(
-    shots: Sequence[Shot],
-    ties: Mapping[tuple[int, int], bool],
-    scenes: Mapping[str, PlacedFeatures],
-    params: Params,
-    metres_per_unit: Mapping[int, float] | None,
-) -> list[Placement]:
-    """What is said of each photo, by its own evidence and that of the others."""
-    out = []
+def _believed(
+    shots: Sequence[Shot], ties: Mapping[tuple[int, int], bool], params: Params
+) -> list[tuple[Judged, float, Params] | None]:
+    """Of each photo its best pose, as probable as its own evidence and that of the others make it, that of a rival at
+    another place, and the bars for it; None where there is no pose."""
+    out: list[tuple[Judged, float, Params] | None] = []
     for shot, probable in zip(shots, probabilities(shots, ties, params), strict=True):
         if shot.best is None:
-            out.append(Placement(shot.photo.name, shot.why))
+            out.append(None)
             continue
         best, bars = replace(shot.best, probability=probable), params
         if probable > shot.probability:  # what it lacks itself, those that it is tied to show
             bars = replace(params, verdict=replace(params.verdict, min_inliers=0))
-        rival = rival_of([best, *shot.judged[1:]], params)
-        said = placement(shot.photo.name, best, rival, shot.picture, shot.scale, scenes, bars, metres_per_unit)
-        if shot.apart and said.is_placed:
-            why = "ambiguous: other photographs lead it elsewhere"
-            said = Placement(said.name, why, component=said.component, probability=probable, evidence=said.evidence)
-        out.append(said)
+        out.append((best, rival_of([best, *shot.judged[1:]], params), bars))
     return out
 
 
 def _adjust(
     shots: Sequence[Shot],
-    placed: Sequence[Placement],
     near: Sequence[Sequence[int]],
     scenes: Mapping[str, PlacedFeatures],
     params: Params,
     ties: dict[tuple[int, int], bool],
-) -> bool:
-    """Adjust the photos that are placed at once, and find others by them; whether anything has changed."""
+) -> None:
+    """Adjust the photos that clear the bars at once, and find others by them."""
     by_component: dict[int, list[int]] = {}
-    for k, one in enumerate(placed):
-        if one.is_placed:
-            by_component.setdefault(shots[k].judged[0].candidate.component, []).append(k)
+    left: set[int] = set()
+    for k, one in enumerate(_believed(shots, ties, params)):
+        if one is None or refusal(*one):
+            left.add(k)
+        else:
+            by_component.setdefault(one[0].candidate.component, []).append(k)
     by_component = {component: mine for component, mine in by_component.items() if len(mine) > 1}
     if not by_component:
-        return False
+        return
     matches = matches_of(shots, near, params)
-    left = {k for k, one in enumerate(placed) if not one.is_placed}
     for component, mine in sorted(by_component.items(), key=lambda one: -len(one[1])):
         take_part = sorted([*mine, *left])
         known = [shown(shots[k], k in mine) for k in take_part]
@@ -159,7 +172,6 @@ def _adjust(
             _move(shots[k], pose, component, shots[by[0]].judged[0].candidate.scenes if by else (), scenes, params)
             ties.update({(other, k): True for other in by[:2]})
             left.discard(k)
-    return True
 
 
 def matches_of(shots: Sequence[Shot], near: Sequence[Sequence[int]], params: Params) -> bundle.Matches:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from gsmap.errors import ConfigError
 from gsmap.geometry.projection import in_image, project
 from gsmap.geometry.rotations import angle_between, exp_so3
 from gsmap.localize import bundle, resection
@@ -111,9 +113,14 @@ def test_one_photo_finds_nobody_and_neither_do_few_points() -> None:
     clip = Clip((3,))
     assert _adjusted(clip.photos, clip.matches(), PARAMS, POSES) == {}
     clip = Clip((0, 1))
-    few = {pair: tuple(rows[:9] for rows in both) if 5 in pair else both for pair, both in clip.matches().items()}
+    few = {}
+    for (k, other), (rows, columns) in clip.matches().items():
+        keep = (rows < 9) | (k != 5)
+        keep &= (columns < 9) | (other != 5)
+        few[k, other] = rows[keep], columns[keep]
     out = _adjusted(clip.photos, few, PARAMS, POSES)
-    assert 5 not in out or out[5].num_points >= PARAMS.min_points
+    assert 4 in out
+    assert 5 not in out
     only = {pair: both for pair, both in clip.matches().items() if 5 not in pair or pair in ((5, 0), (0, 5))}
     assert 5 not in _adjusted(clip.photos, only, PARAMS, POSES), "what repeats itself fools one"
 
@@ -210,3 +217,9 @@ def test_an_unknown_focal_length_is_adjusted_for_all_that_one_lens_took() -> Non
     assert abs(focals.pop() / (1.02 * LENS[0]) - 1) < 0.02
     fixed = _adjusted(clip.photos, clip.matches(), PARAMS, POSES)
     assert all((one.intrinsics_px == LENS).all() for one in fixed.values())
+
+
+@pytest.mark.parametrize("wrong", [{"loose": ()}, {"loose": (1.0, 0.0)}, {"doubt": 0.0}, {"alike": -0.1}])
+def test_settings_that_cannot_be_are_told(wrong) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        bundle.Params(**wrong)
