@@ -15,7 +15,8 @@ from gsmap.types.localization import Keypoints, SceneFeatures
 
 VERSION = 3
 
-_STEP = 254.0  # of quantised descriptors: unit vectors of 64 and more dimensions hardly have a part above a half
+UNIT = 254.0
+"""Length of quantised descriptors: unit vectors of 64 and more dimensions hardly have a part above a half."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def unprojected(pixels: np.ndarray, depth: np.ndarray, camera: Cameras) -> np.nd
 
 def quantised(descriptors: np.ndarray) -> np.ndarray:
     """(N, D) int8 of unit vectors, whose dot products are those of the vectors times 254 squared, to a percent."""
-    out: np.ndarray = np.clip(np.round(descriptors * _STEP), -127, 127).astype(np.int8)
+    out: np.ndarray = np.clip(np.round(descriptors * UNIT), -127, 127).astype(np.int8)
     return out
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
+
+from gsmap._native import mutual_nearest
+from gsmap.localize.features import UNIT
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,6 @@ class Described:
     descriptors: np.ndarray
     angles: np.ndarray
 
-    @cached_property
-    def floats(self) -> np.ndarray:
-        """(N, D) float32 of about unit length."""
-        out: np.ndarray = self.descriptors.astype(np.float32) / 254
-        return out
-
 
 def matched(photo: Described, view: Described, params: Params) -> tuple[np.ndarray, np.ndarray]:
     """Mutual nearest neighbours of a photo's features in a view, that stand out from the view's others.
@@ -58,15 +54,8 @@ def matched(photo: Described, view: Described, params: Params) -> tuple[np.ndarr
     """
     if len(photo.angles) < 2 or len(view.angles) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    products = photo.floats @ view.floats.T
-    best = products.argmax(axis=1)
-    rows = np.flatnonzero(products.argmax(axis=0)[best] == np.arange(len(best)))
-    columns = best[rows]
-    top = products[rows, columns]
-    others = products[rows]  # a copy
-    others[np.arange(len(rows)), columns] = -1
-    near = np.sqrt(np.maximum(2 - 2 * top, 0))
-    next_ = np.sqrt(np.maximum(2 - 2 * others.max(axis=1), 1e-12))
+    rows, columns, top, next_ = mutual_nearest(photo.descriptors, view.descriptors)
+    near, next_ = (np.sqrt(np.maximum(2 - 2 * product / UNIT**2, 0)) for product in (top, next_))
     keep = (near < params.max_ratio * next_) & (near < params.max_distance)
     rows, columns = rows[keep], columns[keep]
     keep = _held_alike(photo.angles[rows], view.angles[columns], params.max_turn)

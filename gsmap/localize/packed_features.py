@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from gsmap.localize import streams
+from gsmap.localize.features import UNIT
 from gsmap.types import Cameras
 from gsmap.types.localization import SceneFeatures
 
@@ -21,7 +22,6 @@ NAMES = (
     *("features.descriptors", "features.angles", "views.poses", "views.intrinsics", "views.sizes"),
 )
 
-_UNIT = 254.0  # length of a descriptor, see `gsmap.localize.features.quantised`
 _STEP = 0.08  # of a unit vector, along each axis
 _TELLS = 0.02  # an axis along which fewer features than this share differ from their mean is left out
 _AXIS = 127.0  # length of an axis
@@ -42,7 +42,7 @@ def pack(features: SceneFeatures, step: float, first: int) -> dict[str, np.ndarr
     codes = streams.codes_of(features.points, low, step)
     order = np.concatenate([a + np.argsort(codes[a:b], kind="stable") for a, b in pairwise(runs.tolist())])
     mean, axes = _principal(features.descriptors)
-    along = (features.descriptors[order].astype(np.float64) - mean) @ (axes / (_AXIS * _UNIT))
+    along = (features.descriptors[order].astype(np.float64) - mean) @ (axes / (_AXIS * UNIT))
     rounded = np.clip(np.round(along / _STEP), -127, 127).astype(np.int8)
     tell = (rounded != 0).sum(0) > _TELLS * len(rounded)
     return {
@@ -80,8 +80,8 @@ def unpack(scene: str, arrays: Mapping[str, np.ndarray], most: int) -> SceneFeat
     ends = np.cumsum(counts.T.reshape(-1))
     codes = streams.codes_between(streams.expanded(arrays["features.places"], (8, total), np.uint8), np.r_[0, ends])
     along = streams.expanded(arrays["features.descriptors"], (axes.shape[1], total), np.int8).T
-    values = mean + along * np.float32(_STEP * _UNIT) @ (axes.T / np.float32(_AXIS))
-    values *= _UNIT / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)  # a unit vector again
+    values = mean + along * np.float32(_STEP * UNIT) @ (axes.T / np.float32(_AXIS))
+    values *= UNIT / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)  # a unit vector again
     return SceneFeatures(
         scene,
         Cameras(poses.reshape(-1, 4, 4), arrays["views.intrinsics"], arrays["views.sizes"]),

@@ -17,6 +17,7 @@ import numpy as np
 
 from gsmap._native import near_signatures
 from gsmap.geometry.rotations import matrices_to_quats, multiply_quats
+from gsmap.localize.features import UNIT
 from gsmap.localize.words import VERSION, Words, words_for
 from gsmap.methods import RecipeKey
 from gsmap.types.localization import Keypoints, SceneFeatures
@@ -103,7 +104,7 @@ def new_segment(scenes: Sequence[tuple[SceneFeatures, str]], indexed: int) -> In
             continue
         view = np.repeat(np.arange(len(first)), [len(part) for part in first])
         words = words_for(found.descriptors.shape[1])
-        short = words.shortened(found.descriptors[kept] / np.float32(254))
+        short = words.shortened(found.descriptors[kept] / np.float32(UNIT))
         word = words.nearest(short)[:, 0]
         part = np.empty((len(kept), _WIDTH), np.uint8)
         part[:, _SIGNS] = words.signatures(short, word)[:, None].view(np.uint8)

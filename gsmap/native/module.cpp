@@ -15,6 +15,7 @@ void bind_fit(nb::module_ &);
 void bind_groups(nb::module_ &);
 void bind_landmarks(nb::module_ &);
 void bind_laying(nb::module_ &);
+void bind_matches(nb::module_ &);
 void bind_merging(nb::module_ &);
 void bind_moves(nb::module_ &);
 void bind_parts(nb::module_ &);
@@ -41,6 +42,7 @@ NB_MODULE(_native, m) {
     gsmap::bind_groups(m);
     gsmap::bind_landmarks(m);
     gsmap::bind_laying(m);
+    gsmap::bind_matches(m);
     gsmap::bind_merging(m);
     gsmap::bind_moves(m);
     gsmap::bind_parts(m);

@@ -4,6 +4,7 @@
 #include <cstdint>
 
 #include "correspondences.h"
+#include "matches.h"
 #include "merging.h"
 
 namespace gsmap {
@@ -141,6 +142,7 @@ struct Kernels {
     void (*blur_across)(const float *const *rows, const uint64_t *filled, const float *taps, int n, uint64_t wanted,
                         float *out);
     void (*blur_along)(const float *line, int step, const float *taps, int n, uint64_t wanted, float *out);
+    void (*nearest)(const Descriptors &mine, const Descriptors &theirs, void *room, const MutualNearest &out);
 };
 extern const Kernels *kernels_avx512, *kernels_avx2;  // null where the compiler could not build them
 extern const Kernels *kernels_baseline;

@@ -4,6 +4,7 @@
 #include "filters_kernel.h"
 #include "fit_kernel.h"
 #include "landmarks_kernel.h"
+#include "matches_kernel.h"
 #include "merging_kernel.h"
 #include "rasteriser_blend.h"
 #include "rasteriser_blend_backward.h"
@@ -21,5 +22,6 @@ static const gsmap::Kernels table = {GSMAP_STRING(GSMAP_ISA), GSMAP_ISA::project
                                      GSMAP_ISA::vote, GSMAP_ISA::weigh, GSMAP_ISA::highest,
                                      GSMAP_ISA::peaks, GSMAP_ISA::polar, GSMAP_ISA::near,
                                      GSMAP_ISA::pair_costs, GSMAP_ISA::find_nearest, GSMAP_ISA::settle_nearest,
-                                     GSMAP_ISA::within, GSMAP_ISA::blur_across, GSMAP_ISA::blur_along};
+                                     GSMAP_ISA::within, GSMAP_ISA::blur_across, GSMAP_ISA::blur_along,
+                                     GSMAP_ISA::nearest};
 const gsmap::Kernels *gsmap::GSMAP_JOIN(kernels_, GSMAP_ISA) = &table;
