@@ -13,8 +13,10 @@
     python tools/bench_localize.py DATA WORK --crowd 1000 --places PLACES    # and in a map of so many scenes
 
 DATA is the folder of the given captures; maps are made in WORK once. The captures' poses in the map are gsmap's own,
-and the truth of a photograph is taken to the map through the scene that supports it most. A photograph's coverage is
-the share of its pixels whose surface another capture of the map shows where it is (5 cm and 2 % of the depth).
+and the truth of a photograph is taken to the map through the scene that supports it most; where its covariance is asked
+(NEES), which holds what is not known of where scenes lie, through the scene that the map's frame is fixed to. A
+photograph's coverage is the share of its pixels whose surface another capture of the map shows where it is (5 cm and
+2 % of the depth).
 
 Beside it (of the house): the pose of the most alike view, alone; and what is done without renders of the map: SIFT of
 the captures' own photographs, lifted by their splats' depth, matched with the 20 most alike ones by ratio and mutually,
@@ -132,6 +134,12 @@ class World:
         store = gsmap.map.create(work / "crowd" / "crowd.gsmap").store
         store.indexes.put(index_recipe(), [m for m in whole.members if m is not None], whole.arrays, ())
         held.index = view_index([*held.index.segments, *store.indexes.segments(index_recipe())])
+
+    def anchor(self, component: int) -> str:
+        """The scene that a component's frame is fixed to."""
+        there = [scene for scene in self.ids.values() if self.localizer.placed[scene].component == component]
+        known = {scene: self.localizer.placed[scene].covariance for scene in there}
+        return min(there, key=lambda scene: 0.0 if (told := known[scene]) is None else float(np.trace(told)))
 
     def truth(self, shot: Shot, scene: str) -> np.ndarray:
         """(4, 4) the camera in the frame of the map that a scene says."""
@@ -523,11 +531,11 @@ def measure(
         if found.is_placed:
             truth = held.truth(shot, found.scenes[0])
             pose = found.T_map_camera
-            turn = pose[:3, :3].T @ truth[:3, :3]
             row["deg"] = float(np.degrees(angle_between(pose[:3, :3], truth[:3, :3])))
             unit = held.localizer.metres.get(found.component, 1.0)
             row["m"] = float(np.linalg.norm(pose[:3, 3] - truth[:3, 3]) * unit)
-            known = found.covariance
+            known, truth = found.covariance, held.truth(shot, held.anchor(found.component))
+            turn = pose[:3, :3].T @ truth[:3, :3]
             xi = np.r_[rotation_vectors(turn)[0], pose[:3, :3].T @ (truth[:3, 3] - pose[:3, 3])]
             row["nees"] = np.nan if known is None else float(xi @ np.linalg.solve(known, xi))
         rows.append(row)
