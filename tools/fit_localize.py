@@ -7,6 +7,7 @@
     python tools/fit_localize.py PLACES sigma --cache FOLDER     # says which `localize.covariance` fits best
     python tools/fit_localize.py PLACES displaced --cache FOLDER # says which `localize.displacing` fits best
     python tools/fit_localize.py PLACES agreement --cache FOLDER # what a `localize.settling.min_agreement` costs
+    python tools/fit_localize.py PLACES turned --cache FOLDER    # how alike turned matches lead to rough poses
     python tools/fit_localize.py PLACES placed --cache FOLDER    # says what photos of these are placed, and their cost
     python tools/fit_localize.py PLACES test --cache FOLDER      # says how both do on places that they have not seen
 
@@ -47,19 +48,21 @@ from gsmap.localize import (
     features,
     localizing,
     looks,
+    matching,
     probability,
     settling,
     tracking,
+    turned,
     unlike,
     words,
 )
-from gsmap.localize.candidates import Candidate
+from gsmap.localize.candidates import Candidate, candidates, matches_by_component
 from gsmap.localize.filters import means
 from gsmap.localize.looks import GREY, smaller
 from gsmap.localize.params import Params
 from gsmap.localize.placed import PlacedFeatures
 from gsmap.localize.resection import moved
-from gsmap.localize.retrieval import ViewIndex, new_segment, view_index
+from gsmap.localize.retrieval import ViewIndex, most_alike, new_segment, view_index
 from gsmap.methods import family
 from gsmap.types import Sim3
 from gsmap.types.localization import Photo, SceneFeatures
@@ -726,6 +729,50 @@ def fit_agreement(found: list[Place], params: Params) -> None:
         print(f"  min_agreement {bar}: {lost}; {(under & ~right).sum()} wrong ones")
 
 
+def fit_turned(found: list[Place], params: Params) -> None:
+    """Among how many rough poses there is one that is about right, and what looking for them costs, by how alike
+    matches must say that the camera was turned and how many of them must agree.
+
+    Of every photo with as many views as are asked first, and then with more; about right is from where poses settle.
+    """
+    extractor = family("extractor").get(params.extractor).make({}, params.extractors[params.extractor])
+    asked = []
+    for place in found:
+        own, index = {scene.scene: scene for scene in place.scenes}, index_of(place.scenes, params)
+        for told in place.photos:
+            picture, _ = localizing.prepared(place.photo(told), params)
+            finer = [localizing.photo_features(picture, extractor, px) for px in (params.matching.smooth_px, 0.0)]
+            for shown, views in (
+                (finer[0], params.matching.views),
+                (localizing.all_of(finer), params.matching.more_views),
+            ):
+                described = matching.Described(features.quantised(shown.descriptors), features.turns(shown))
+                chosen = most_alike(index, shown, picture.intrinsics_px, views, params.retrieval)
+                frames = turned.in_camera(shown, picture.intrinsics_px)
+                matches = matches_by_component(described, frames, chosen, own, params.matching)
+                asked.append((picture, shown.pixels, matches, np.array(told["T_world_camera"])))
+    print(f"{len(asked) // 2} photographs")
+    for deg, fewest, turns in (
+        *product((15.0, 20.0, 30.0, 40.0, 60.0), (3, 4, 5, 6), (10,)),
+        (30.0, 4, 3),
+        (30.0, 4, 20),
+    ):
+        bars = replace(params.resection, max_turn_deg=deg, min_agreeing=fewest, turns=turns)
+        right, wrong, began = np.zeros(2, int), np.zeros(2, int), time.process_time()
+        for number, (picture, pixels, matches, truth) in enumerate(asked):
+            rough = candidates(pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma, bars)
+            off = [camera_error(one.T_metric_camera, truth) for one in rough[: params.max_candidates]]
+            near = [np.degrees(np.linalg.norm(xi[:3])) < 8 and np.linalg.norm(xi[3:]) < 0.3 for xi in off]
+            right[number % 2] += any(near)
+            wrong[number % 2] += len(near) - sum(near)
+        spent = 1000 * (time.process_time() - began) / len(asked)
+        print(
+            f"max_turn_deg {deg:.0f}, min_agreeing {fewest}, turns {turns}: a pose that is about right for {right[0]} "
+            f"and {right[1]} of them, beside {wrong[0]} and {wrong[1]} others; {spent:.0f} CPU ms",
+            flush=True,
+        )
+
+
 def save(**models: Odds) -> None:
     told = {}
     for kind, model in models.items():
@@ -746,7 +793,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", type=Path)
     parser.add_argument(
-        "what", choices=("words", "sigma", "displaced", "agreement", "placed", "cells", "verdict", "test")
+        "what", choices=("words", "sigma", "displaced", "agreement", "turned", "placed", "cells", "verdict", "test")
     )
     parser.add_argument("--cache", type=Path, required=True)
     args = parser.parse_args()
@@ -762,6 +809,9 @@ def main() -> int:
         return 0
     if args.what == "agreement":
         fit_agreement(places(args.places, "fit", args.cache, params), params)
+        return 0
+    if args.what == "turned":
+        fit_turned(places(args.places, "fit", args.cache, params), params)
         return 0
     if args.what == "cells":
         fit_cells(places_and_streets(args.places, "fit", args.cache, params), params)

@@ -1,15 +1,22 @@
-"""Where a photograph may have been taken: views that look alike, matches with them, poses that these agree on."""
+"""Where a photograph may have been taken: views that look alike, matches with them, poses that these agree on.
+
+Most matches are wrong, and among a thousand a dozen agree on some pose by chance. But each match alone says about how
+the camera was turned (`gsmap.localize.turned`); so poses are looked for among matches that say the same of it, and
+those that say otherwise do not count for a pose. Then four that agree are worth a look.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsmap.geometry.rotations import angle_between
-from gsmap.localize import matching, resection
+from gsmap.geometry.rotations import angle_between, matrices_to_quats, multiply_quats
+from gsmap.localize import matching, resection, turned
 from gsmap.localize.placed import PlacedFeatures
+
+_SEEDS = 1000  # matches, at most, whose turn others are asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +50,7 @@ class Matches:
         points: (K, 3) in the frame of the component, metres.
         scene: (K,) whose, among ``scenes``.
         view: (K,) by which of the views.
+        turns: (K, 4) how the camera was turned in the frame of the component, as each alone says.
         scenes: ids.
     """
 
@@ -50,11 +58,13 @@ class Matches:
     points: np.ndarray
     scene: np.ndarray
     view: np.ndarray
+    turns: np.ndarray
     scenes: tuple[str, ...]
 
 
 def matches_by_component(
     photo: matching.Described,
+    turns: np.ndarray,
     views: Sequence[tuple[str, int]],
     scenes: Mapping[str, PlacedFeatures],
     params: matching.Params,
@@ -62,21 +72,26 @@ def matches_by_component(
     """What the features of a photo match in some views (of scenes, by number), by component of the map.
 
     Matches with all views of a component are one set, so that captures which each show a part of the place add up.
+
+    Args:
+        turns: (N, 4) of the photo's features in its camera (`gsmap.localize.turned`).
     """
     chosen: dict[int, list[tuple[str, int]]] = {}
     for scene, view in views:
         chosen.setdefault(scenes[scene].component, []).append((scene, view))
-    return {component: _matches(photo, mine, scenes, params) for component, mine in chosen.items()}
+    return {component: _matches(photo, turns, mine, scenes, params) for component, mine in chosen.items()}
 
 
 def _matches(
     photo: matching.Described,
+    turns: np.ndarray,
     views: Sequence[tuple[str, int]],
     scenes: Mapping[str, PlacedFeatures],
     params: matching.Params,
 ) -> Matches:
     names = tuple(dict.fromkeys(scene for scene, _ in views))
-    feature, points, whose, view_of = [], [], [], []
+    back = turns * np.array([1.0, -1, -1, -1])
+    feature, points, whose, view_of, turned_by = [], [], [], [], []
     for number, (scene, view) in enumerate(views):
         held = scenes[scene].features
         part = slice(int(held.starts[view]), int(held.starts[view + 1]))
@@ -85,8 +100,16 @@ def _matches(
         points.append(scenes[scene].S_metric_scene.apply(held.points[part][theirs]))
         whose.append(np.full(len(mine), names.index(scene)))
         view_of.append(np.full(len(mine), number))
+        in_scene = turned.in_scene(held, part.start + theirs, np.full(len(theirs), view))
+        frame = np.broadcast_to(matrices_to_quats(scenes[scene].S_metric_scene.rotation), in_scene.shape)
+        turned_by.append(multiply_quats(frame, multiply_quats(in_scene, back[mine])))
     return Matches(
-        np.concatenate(feature), np.concatenate(points), np.concatenate(whose), np.concatenate(view_of), names
+        np.concatenate(feature),
+        np.concatenate(points),
+        np.concatenate(whose),
+        np.concatenate(view_of),
+        np.concatenate(turned_by),
+        names,
     )
 
 
@@ -100,30 +123,62 @@ def candidates(
 ) -> list[Candidate]:
     """Poses that matches agree on, most inliers first, none twice.
 
-    A pose is looked for among all matches of a component, and among those with each view alone, where a view that
-    shows the same has a far larger share of right ones.
-
     Args:
         pixels: (N, 2) of all features of the photo.
     """
+    fewest = resection.fewest(focal_sigma, params)
+    bars = replace(params, min_inliers=fewest)
     out: list[Candidate] = []
     for component, matches in found.items():
         at = pixels[matches.feature]
-        sets = [np.arange(len(at)), *(np.flatnonzero(matches.view == view) for view in np.unique(matches.view))]
-        for rows in sets:
-            if len(np.unique(matches.feature[rows])) < params.min_inliers:
+        for rows in _turned_alike(matches, params):
+            if len(np.unique(matches.feature[rows])) < fewest:
                 continue
-            pose = resection.resect(at[rows], matches.points[rows], intrinsics_px, size_px, focal_sigma, params)
+            pose = resection.resect(at[rows], matches.points[rows], intrinsics_px, size_px, focal_sigma, bars)
             if pose is None:
                 continue
             agreeing = resection.agreeing(at, matches.points, pose.T_map_camera, pose.intrinsics_px, size_px, params)
+            turn = matrices_to_quats(pose.T_map_camera[None, :3, :3])
+            agreeing &= turned.alike(matches.turns, turn, params.max_turn_deg)[:, 0]
             count = len(np.unique(matches.feature[agreeing]))
-            if count >= params.min_inliers:
+            if count >= fewest:
                 scenes = _by_support(matches, agreeing)
                 agree = at[agreeing], matches.points[agreeing]
                 out.append(Candidate(component, pose.T_map_camera, pose.intrinsics_px, count, scenes, *agree))
     out.sort(key=lambda one: (-one.num_inliers, one.component))
     return _different(out, params)
+
+
+def _turned_alike(matches: Matches, params: resection.Params) -> list[np.ndarray]:
+    """Sets (n,) of matches that say about the same of how the camera was turned: of all, those of most features of the
+    photo, then of those that say otherwise, and so on; and of each view alone that of most.
+    """
+    if not len(matches.feature):
+        return []
+    seeds = np.unique(np.linspace(0, len(matches.feature) - 1, _SEEDS).astype(int))
+    alike = turned.alike(matches.turns[seeds], matches.turns, params.max_turn_deg)
+    count = _distinct(alike, matches.feature)
+    out = []
+    for _ in range(params.turns):
+        best = int(np.argmax(count))
+        if count[best] < params.min_agreeing:
+            break
+        out.append(np.flatnonzero(alike[best]))
+        near = turned.alike(matches.turns[seeds], matches.turns[seeds[best]][None], params.max_turn_deg / 3)
+        count[near[:, 0]] = 0
+    for view in np.unique(matches.view):
+        mine = np.flatnonzero(matches.view == view)
+        alike = turned.alike(matches.turns[mine], matches.turns[mine], params.max_turn_deg)
+        out.append(mine[alike[int(np.argmax(alike.sum(1)))]])
+    return out
+
+
+def _distinct(chosen: np.ndarray, feature: np.ndarray) -> np.ndarray:
+    """(S,) how many different features there are among those that are chosen (S, K)."""
+    order = np.argsort(feature, kind="stable")
+    first = np.flatnonzero(np.r_[True, np.diff(feature[order]) > 0])
+    out: np.ndarray = np.logical_or.reduceat(chosen[:, order], first, axis=1).sum(1)
+    return out
 
 
 def _different(found: Sequence[Candidate], params: resection.Params) -> list[Candidate]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from PIL import Image
 
-from gsmap.localize import covariance, evidence, matching, probability, resection, unlike, verdict
+from gsmap.localize import covariance, evidence, matching, probability, resection, turned, unlike, verdict
 from gsmap.localize.candidates import Candidate, candidates, matches_by_component, near_to
 from gsmap.localize.features import quantised, turns
 from gsmap.localize.filters import blurred
@@ -118,14 +118,15 @@ def refusal(best: Judged, rival: float, params: Params) -> str:
 def prepared(photo: Photo, params: Params) -> tuple[Picture, np.ndarray]:
     """The photo as it is worked on, and by what (4,) intrinsics of the original are multiplied to be of that."""
     width, height = photo.size_px
-    factor = min(1.0, params.views.image_size_px / max(width, height))
+    factor = min(params.max_enlarged, params.views.image_size_px / max(width, height))
     rgb, scale = photo.rgb, np.ones(4)
-    if factor < 1:
+    if factor != 1:
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
-        rgb = np.asarray(Image.fromarray(rgb).resize(size, Image.Resampling.BOX, reducing_gap=3.0))
+        how, gap = (Image.Resampling.BOX, 3.0) if factor < 1 else (Image.Resampling.BICUBIC, None)
+        rgb = np.asarray(Image.fromarray(rgb).resize(size, how, reducing_gap=gap))
         scale = np.tile([size[0] / width, size[1] / height], 2)
     real, known = rgb.astype(np.float32) / 255, photo.known
-    if known is not None and factor < 1:  # a pixel that is hidden in part is hidden
+    if known is not None and factor != 1:  # a pixel that is hidden in part is hidden
         box = Image.fromarray(np.where(known, 255, 0).astype(np.uint8))
         known = np.asarray(box.resize(rgb.shape[1::-1], Image.Resampling.BOX)) == 255
     return Picture(real, real @ GREY, photo.intrinsics_px * scale, photo.focal_sigma, known), scale
@@ -148,11 +149,11 @@ def judged_poses(
     # First what is as fine as renders are; where that places it nowhere, more views, and what is finer as well.
     for views, finer in ((params.matching.views, smooth), (params.matching.more_views, 0.0)):
         parts.append(photo_features(picture, extractor, finer))
-        found = _together(parts)
-        if len(found) < params.resection.min_inliers:
+        found = all_of(parts)
+        fewest = resection.fewest(picture.focal_sigma, params.resection)
+        if len(found) < fewest:
             return [], f"it shows too little: {len(found)} features"
         rough, most = _rough_poses(picture, found, index, scenes, replace(params.matching, views=views), params)
-        fewest = params.resection.min_inliers
         why = f"nothing in the map looks like it: {most} features match, no {fewest} agree on a pose"
         new = [one for one in rough if not any(near_to(one, other.candidate, params.resection) for other in out)]
         for candidate in new[: params.max_candidates]:
@@ -186,7 +187,8 @@ def _rough_poses(
     """Poses that matches agree on, and how many matches there were."""
     described = matching.Described(quantised(found.descriptors), turns(found))
     views = most_alike(index, found, picture.intrinsics_px, matched.views, params.retrieval)
-    matches = matches_by_component(described, views, scenes, matched)
+    frames = turned.in_camera(found, picture.intrinsics_px)
+    matches = matches_by_component(described, frames, views, scenes, matched)
     rough = candidates(
         found.pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma, params.resection
     )
@@ -204,7 +206,7 @@ def photo_features(picture: Picture, extractor: Extractor, smooth_px: float) -> 
     return Keypoints(found.pixels[keep], found.descriptors[keep], angles, sizes)
 
 
-def _together(parts: Sequence[Keypoints]) -> Keypoints:
+def all_of(parts: Sequence[Keypoints]) -> Keypoints:
     turned = [part.angles_rad for part in parts if part.angles_rad is not None]
     return Keypoints(
         np.concatenate([part.pixels for part in parts]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from gsmap.errors import ConfigError
 from gsmap.localize import (
     aligning,
     bundle,
@@ -53,6 +54,8 @@ class Params:
         differences: when a placed photo shows something else than the map.
         sighted: when a placed photo says that a thing is there, or gone.
         small: what a small map keeps.
+        max_enlarged: photos smaller than views are made as large, but no more times larger than this: patches and what
+            is laid over are of sizes in pixels.
         max_candidates: rough poses that are looked into.
         sure: once one is this probable, others are looked into only ...
         rival_inliers: ... where so large a share of its matches agrees on them.
@@ -80,6 +83,7 @@ class Params:
     differences: differing.Params = field(default_factory=differing.Params)
     sighted: sighted.Params = field(default_factory=sighted.Params)
     small: packing.Params = field(default_factory=packing.Params)
+    max_enlarged: float = 2.0
     max_candidates: int = 5
     sure: float = 0.97
     rival_inliers: float = 0.5
@@ -88,3 +92,5 @@ class Params:
 
     def __post_init__(self) -> None:
         family("extractor").get(self.extractor)
+        if not self.max_enlarged >= 1:
+            raise ConfigError(f"max_enlarged is 1 or more, got {self.max_enlarged}")

@@ -10,6 +10,9 @@ from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3, skew
 from gsmap.geometry.similarities import rotation_vectors
 
+FOCAL_KNOWN = 0.01
+"""A focal length that is known less well (standard deviation of its logarithm) is solved for."""
+
 
 @dataclass(frozen=True)
 class Params:
@@ -18,7 +21,10 @@ class Params:
     Args:
         max_error_px: of an inlier, at a picture of 480 pixels; in proportion to its longer side.
         max_trials: samples of three matches at most.
-        min_inliers: different features of the photo, for a pose to be looked into at all.
+        min_inliers: different features of the photo, for a pose to be looked into at all ...
+        min_agreeing: ... and where each also says about how the camera was turned.
+        max_turn_deg: by how much that may be otherwise than the pose.
+        turns: how many ways that the camera may have been turned are tried, those that most features say first.
         same_m, same_deg: poses that are nearer to each other are one candidate.
         doubt_px: residuals count less from about here on while the pose is refined.
         iterations: of that.
@@ -27,6 +33,9 @@ class Params:
     max_error_px: float = 6.0
     max_trials: int = 6000
     min_inliers: int = 6
+    min_agreeing: int = 4
+    max_turn_deg: float = 30.0
+    turns: int = 10
     same_m: float = 0.4
     same_deg: float = 12.0
     doubt_px: float = 1.5
@@ -48,6 +57,12 @@ class Resection:
     inliers: np.ndarray
 
 
+def fewest(focal_sigma: float, params: Params) -> int:
+    """How many features must agree on a pose, and say that the camera was turned so, for it to be looked into: four fix
+    one of an unknown focal length, whatever they are."""
+    return params.min_agreeing if focal_sigma <= FOCAL_KNOWN else params.min_inliers
+
+
 def resect(
     pixels: np.ndarray,
     points: np.ndarray,
@@ -61,14 +76,14 @@ def resect(
     Args:
         pixels: (K, 2) in the photo.
         points: (K, 3) map.
-        focal_sigma: as in `Photo`; above 0.01 the focal length is solved for.
+        focal_sigma: as in `Photo`; above `FOCAL_KNOWN` the focal length is solved for.
     """
     import pycolmap
 
     if len(pixels) < 4:
         return None
     fx, fy, cx, cy = intrinsics_px
-    free = focal_sigma > 0.01
+    free = focal_sigma > FOCAL_KNOWN
     camera = pycolmap.Camera(
         model="SIMPLE_PINHOLE" if free else "PINHOLE",
         width=size_px[0],

@@ -16,7 +16,8 @@ from itertools import pairwise
 import numpy as np
 
 from gsmap._native import near_signatures
-from gsmap.geometry.rotations import matrices_to_quats, multiply_quats
+from gsmap.geometry.rotations import multiply_quats
+from gsmap.localize import turned
 from gsmap.localize.features import UNIT
 from gsmap.localize.words import VERSION, Words, words_for
 from gsmap.methods import RecipeKey
@@ -108,7 +109,7 @@ def new_segment(scenes: Sequence[tuple[SceneFeatures, str]], indexed: int) -> In
         word = words.nearest(short)[:, 0]
         part = np.empty((len(kept), _WIDTH), np.uint8)
         part[:, _SIGNS] = words.signatures(short, word)[:, None].view(np.uint8)
-        part[:, _TURN] = _packed(_turns_of(found, kept, view)).view(np.uint8)
+        part[:, _TURN] = _packed(turned.in_scene(found, kept, view)).view(np.uint8)
         part[:, _VIEW] = view.astype("<u2")[:, None].view(np.uint8)
         write_places(part, place)
         rows.append(part)
@@ -133,13 +134,13 @@ def most_alike(
     if not len(index) or not len(found):
         return []
     matches = _matches(index, found, params)
-    photo = feature_turns(found.pixels, _angles(found), intrinsics_px)
+    photo = turned.in_camera(found, intrinsics_px)
     conjugate = photo * np.array([1.0, -1, -1, -1])
     scored = []
     for scene in _best(_by_feature(matches), params.first):
         mine = matches.of(scene, params.most)
-        turned = multiply_quats(mine.turn, conjugate[mine.feature]).astype(np.float32)
-        agree = np.abs(turned @ turned.T) > np.cos(np.radians(params.max_turn_deg / 2))
+        cameras = multiply_quats(mine.turn, conjugate[mine.feature]).astype(np.float32)
+        agree = np.abs(cameras @ cameras.T) > np.cos(np.radians(params.max_turn_deg / 2))
         scored.append((float(_agreeing(agree, mine.feature, mine.worth)), scene, mine, agree))
     scored.sort(key=lambda one: (-one[0], one[1]))
     views = []
@@ -150,20 +151,6 @@ def most_alike(
             views.append((own + params.of_scene * score, matches.scenes[scene], int(view)))
     views.sort(key=lambda one: (-one[0], one[1], one[2]))
     return [(scene, view) for _, scene, view in views[:count]]
-
-
-def feature_turns(pixels: np.ndarray, angles_rad: np.ndarray, intrinsics_px: np.ndarray) -> np.ndarray:
-    """(N, 4) quaternions ``wxyz`` of the frames of features in that of their camera.
-
-    The third axis is the ray of a feature; the first is across it, the way that it was turned before it was described.
-    """
-    fx, fy, cx, cy = intrinsics_px
-    ray = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    along = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(len(pixels))], axis=1)
-    along -= (along * ray).sum(1, keepdims=True) * ray
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    return matrices_to_quats(np.stack([along, np.cross(ray, along), ray], axis=2))
 
 
 # --- votes -----------------------------------------------------------------------------------------------------------
@@ -290,24 +277,6 @@ def _agreeing(agree: np.ndarray, feature: np.ndarray, worth: np.ndarray) -> floa
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
-
-
-def _turns_of(found: SceneFeatures, rows: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """(n, 4) of the frames of some features of views in that of their scene."""
-    cameras, out = found.cameras, np.empty((len(rows), 4))
-    for number in np.unique(view):
-        mine = np.flatnonzero(view == number)
-        T = cameras.T_frame_camera[number]
-        local = (found.points[rows[mine]] - T[:3, 3]) @ T[:3, :3]
-        fx, fy, cx, cy = cameras.intrinsics_px[number]
-        pixels = local[:, :2] / np.maximum(local[:, 2:], 1e-9) * [fx, fy] + [cx, cy]
-        turns = feature_turns(pixels, found.angles[rows[mine]] * (np.pi / 128), cameras.intrinsics_px[number])
-        out[mine] = multiply_quats(matrices_to_quats(T[:3, :3]), turns)
-    return out
-
-
-def _angles(found: Keypoints) -> np.ndarray:
-    return np.zeros(len(found)) if found.angles_rad is None else found.angles_rad
 
 
 def _packed(quats: np.ndarray) -> np.ndarray:

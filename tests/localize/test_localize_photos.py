@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsmap.geometry.rotations import angle_between
 from gsmap.localize import Params, covariance, localize_photo, localizing
@@ -70,6 +71,40 @@ def test_a_large_photo_answers_in_its_own_pixels(world) -> None:
     one = found(world, large)
     assert one.is_placed, one.reason
     assert np.allclose(one.intrinsics_px, photo.intrinsics_px * 2)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "size"), [(240, 180, (480, 360)), (100, 150, (200, 300)), (960, 600, (480, 300))]
+)
+def test_small_photos_are_enlarged_twice_at_most(width: int, height: int, size: tuple[int, int]) -> None:
+    """Rays through the corners stay as they were; so do masks."""
+    rng = np.random.default_rng(0)
+    known = np.ones((height, width), bool)
+    known[: height // 2] = False
+    photo = Photo(
+        rng.integers(0, 256, (height, width, 3)).astype(np.uint8), np.array([300.0, 310, 50, 70]), known=known
+    )
+    picture, scale = localizing.prepared(photo, Params())
+    assert picture.size_px == size
+    assert np.allclose(picture.intrinsics_px / photo.intrinsics_px, scale)
+    assert np.allclose(scale[:2] * [width, height], size)
+    assert picture.known is not None
+    assert not picture.known[: size[1] // 2].any()
+    assert picture.known[size[1] // 2 + 1 :].all()
+    assert picture.rgb.mean() == pytest.approx(photo.rgb.mean() / 255, abs=0.01)
+
+
+def test_a_small_photo_is_placed_as_exactly_as_what_it_shows(world) -> None:
+    """Half of the width and height: the answer is in its own pixels, and enlarging it makes it more exact."""
+    photo = world.photos[1]
+    small = np.asarray(Image.fromarray(photo.rgb).resize([side // 2 for side in photo.size_px], Image.Resampling.BOX))
+    errors = []
+    for params in (Params(), replace(Params(), max_enlarged=1.0)):
+        given = Photo(small, photo.intrinsics_px / 2)
+        found = localize_photo(given, world.index, {"scene": world.placed}, SIFT, params)
+        assert np.allclose(found.intrinsics_px, given.intrinsics_px)
+        errors.append(np.linalg.norm(found.T_map_camera[:3, 3] - world.poses[1][:3, 3]))
+    assert errors[0] < min(0.02, errors[1])
 
 
 def test_an_empty_picture_says_so(world) -> None:

@@ -9,6 +9,7 @@ from gsmap.errors import CorruptError
 from gsmap.geometry.rotations import exp_so3, matrices_to_quats, multiply_quats
 from gsmap.localize import Params, retrieval, together, words
 from gsmap.localize.features import quantised
+from gsmap.localize.turned import frames
 from gsmap.types import Cameras
 from gsmap.types.localization import Keypoints, SceneFeatures
 from gsmap.types.segments import InMemory, merged
@@ -119,10 +120,10 @@ def test_a_match_says_how_the_camera_was_turned(scenes) -> None:
     found, pixels = scenes[0]
     rng = np.random.default_rng(3)
     photo = _photo(rng, found, pixels, np.arange(OF_VIEW))
-    in_photo = retrieval.feature_turns(photo.pixels[:OF_VIEW], photo.angles_rad[:OF_VIEW], LENS)
+    in_photo = frames(photo.pixels[:OF_VIEW], photo.angles_rad[:OF_VIEW], LENS)
     in_scene = multiply_quats(
         matrices_to_quats(found.cameras.T_frame_camera[0, :3, :3]),
-        retrieval.feature_turns(pixels[:OF_VIEW], found.angles[:OF_VIEW] * (np.pi / 128), LENS),
+        frames(pixels[:OF_VIEW], found.angles[:OF_VIEW] * (np.pi / 128), LENS),
     )
     turn = np.eye(3)
     roll = np.radians(-50)

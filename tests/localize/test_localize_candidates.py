@@ -1,0 +1,141 @@
+"""Rough poses: found among few right matches by how each says that the camera was turned, and by nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsmap.geometry.projection import project
+from gsmap.geometry.rotations import angle_between, exp_so3, matrices_to_quats, multiply_quats
+from gsmap.localize import resection, turned
+from gsmap.localize.candidates import Matches, candidates, matches_by_component
+from gsmap.localize.features import quantised
+from gsmap.localize.matching import Described
+from gsmap.localize.matching import Params as Matching
+from gsmap.localize.placed import PlacedFeatures
+from gsmap.types import Cameras, Sim3
+from gsmap.types.localization import Keypoints, SceneFeatures
+
+PARAMS = resection.Params()
+LENS, SIZE = np.array([400.0, 400, 240, 180]), (480, 360)
+
+
+def camera(rng: np.random.Generator) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = exp_so3(rng.normal(size=3)), rng.normal(size=3)
+    return pose
+
+
+def seen(rng: np.random.Generator, pose: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and the points that they show."""
+    pixels = rng.uniform([10, 10], [470, 350], (count, 2))
+    depth = rng.uniform(2, 5, (count, 1))
+    local = np.concatenate([(pixels - LENS[2:]) / LENS[:2] * depth, depth], axis=1)
+    return pixels, local @ pose[:3, :3].T + pose[:3, 3]
+
+
+def turns(rng: np.random.Generator, pose: np.ndarray, count: int, sigma_deg: float) -> np.ndarray:
+    """How the camera was turned, as so many matches say."""
+    off = np.stack([exp_so3(rng.normal(size=3) * np.radians(sigma_deg)) for _ in range(count)])
+    return matrices_to_quats(pose[:3, :3] @ off)
+
+
+def made(rng: np.random.Generator, pose: np.ndarray, right: int, wrong: int) -> tuple[np.ndarray, Matches]:
+    """Right matches, turned to 8 degrees, among wrong ones that say anything."""
+    pixels, points = seen(rng, pose, right + wrong)
+    said = turns(rng, pose, right + wrong, 8)
+    points[right:] = rng.normal(size=(wrong, 3)) * 3
+    said[right:] = [turns(rng, camera(rng), 1, 0)[0] for _ in range(wrong)] or np.zeros((0, 4))
+    order = rng.permutation(right + wrong)
+    zeros = np.zeros(right + wrong, int)
+    view = rng.integers(0, 20, right + wrong)
+    return pixels, Matches(order, points[order], zeros, view[order], said[order], ("scene",))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_seven_right_matches_among_a_hundred_are_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose = camera(rng)
+    pixels, matches = made(rng, pose, 7, 100)
+    best, *others = candidates(pixels, {3: matches}, LENS, SIZE, 0.0, PARAMS)
+    assert np.abs(best.T_metric_camera - pose).max() < 0.05
+    assert best.component == 3
+    assert 7 <= best.num_inliers <= 10
+    assert all(one.num_inliers < best.num_inliers for one in others)
+
+
+def test_matches_that_say_another_turn_do_not_count() -> None:
+    """Twelve agree on a pose to the pixel, but say that the camera looked the other way."""
+    rng = np.random.default_rng(0)
+    pose = camera(rng)
+    pixels, matches = made(rng, pose, 12, 0)
+    back = multiply_quats(matches.turns, np.array([0.0, 0, 1, 0]))
+    assert len(candidates(pixels, {0: matches}, LENS, SIZE, 0.0, PARAMS)) == 1
+    assert candidates(pixels, {0: replace(matches, turns=back)}, LENS, SIZE, 0.0, PARAMS) == []
+    half = matches.turns.copy()
+    half[:6] = back[:6]
+    (one,) = candidates(pixels, {0: replace(matches, turns=half)}, LENS, SIZE, 0.0, PARAMS)
+    assert one.num_inliers == 6
+
+
+@pytest.mark.parametrize(("right", "focal_sigma", "found"), [(3, 0.0, 0), (4, 0.0, 1), (5, 1.0, 0), (7, 1.0, 1)])
+def test_how_many_must_agree_hangs_on_whether_the_lens_is_known(right: int, focal_sigma: float, found: int) -> None:
+    rng = np.random.default_rng(2)
+    pixels, matches = made(rng, camera(rng), right, 0)
+    assert len(candidates(pixels, {0: matches}, LENS, SIZE, focal_sigma, PARAMS)) == found
+
+
+def test_features_of_the_photo_count_once() -> None:
+    """Three features that four views show are no twelve."""
+    rng = np.random.default_rng(4)
+    pose = camera(rng)
+    pixels, points = seen(rng, pose, 3)
+    said = turns(rng, pose, 12, 3)
+    feature, view = np.tile(np.arange(3), 4), np.repeat(np.arange(4), 3)
+    matches = Matches(feature, np.tile(points, (4, 1)), np.zeros(12, int), view, said, ("scene",))
+    assert candidates(pixels, {0: matches}, LENS, SIZE, 0.0, PARAMS) == []
+
+
+def test_no_matches_lead_nowhere() -> None:
+    none = np.zeros(0, int)
+    matches = Matches(none, np.zeros((0, 3)), none, none, np.zeros((0, 4)), ())
+    assert candidates(np.zeros((0, 2)), {0: matches}, LENS, SIZE, 0.0, PARAMS) == []
+
+
+def test_a_match_says_how_the_camera_was_turned_in_the_component() -> None:
+    """A photo from where a view was, rolled, in a scene that lies turned and in another unit: all say the truth."""
+    rng = np.random.default_rng(7)
+    view, count = camera(rng), 40
+    _, points = seen(rng, view, count)
+    descriptors = rng.normal(size=(count, 64)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    angles = rng.uniform(0, 2 * np.pi, count)
+    held = SceneFeatures(
+        "scene",
+        Cameras(view[None], LENS[None], np.array([SIZE])),
+        np.array([0, count]),
+        points.astype(np.float32),
+        quantised(descriptors),
+        np.round(angles * 128 / np.pi).astype(np.int64).astype(np.uint8),
+    )
+    S = Sim3(exp_so3(rng.normal(size=3)), rng.normal(size=3), 0.3)
+    placed = PlacedFeatures("scene", S, 5, None, lambda: None, lambda: held)
+    roll = np.radians(35)
+    turn = exp_so3(np.array([0, 0, roll]))
+    at, _ = project(points, np.linalg.inv(view @ np.block([[turn, np.zeros((3, 1))], [np.zeros((1, 3)), 1.0]])), LENS)
+    photo = Keypoints(at, descriptors, (angles - roll).astype(np.float32))
+    described = Described(quantised(descriptors), np.zeros(count, np.uint8))
+    loose = replace(Matching(), max_turn=255)
+    frames = turned.in_camera(photo, LENS)
+    (matches,) = matches_by_component(described, frames, [("scene", 0)], {"scene": placed}, loose).values()
+    assert len(matches.feature) > 30
+    truth = matrices_to_quats((S.rotation @ view[:3, :3] @ turn)[None])[0]
+    off = np.degrees(2 * np.arccos(np.minimum(np.abs(matches.turns @ truth), 1)))
+    assert off.max() < 2.5  # angles are kept to 1.4
+    assert np.allclose(matches.points, S.apply(points[matches.feature]), atol=1e-5)
+    wrong = matrices_to_quats((S.rotation @ view[:3, :3])[None])
+    assert not turned.alike(matches.turns, wrong, 30).any()
+    assert turned.alike(matches.turns, wrong, 38).all()
+    assert np.degrees(angle_between(turn, np.eye(3))) == pytest.approx(35)
