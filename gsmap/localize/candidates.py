@@ -120,11 +120,15 @@ def candidates(
     size_px: tuple[int, int],
     focal_sigma: float,
     params: resection.Params,
+    *,
+    angles_known: bool = True,
 ) -> list[Candidate]:
     """Poses that matches agree on, most inliers first, none twice.
 
     Args:
         pixels: (N, 2) of all features of the photo.
+        angles_known: whether the extractor says how features are turned; else matches say how the camera was turned but
+            for a roll that they share.
     """
     fewest = resection.fewest(focal_sigma, params)
     bars = replace(params, min_inliers=fewest)
@@ -139,6 +143,8 @@ def candidates(
                 continue
             agreeing = resection.agreeing(at, matches.points, pose.T_map_camera, pose.intrinsics_px, size_px, params)
             turn = matrices_to_quats(pose.T_map_camera[None, :3, :3])
+            if not angles_known:
+                turn = turned.rolled(turn, matches.turns[agreeing])
             agreeing &= turned.alike(matches.turns, turn, params.max_turn_deg)[:, 0]
             count = len(np.unique(matches.feature[agreeing]))
             if count >= fewest:

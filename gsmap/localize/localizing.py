@@ -189,9 +189,9 @@ def _rough_poses(
     views = most_alike(index, found, picture.intrinsics_px, matched.views, params.retrieval)
     frames = turned.in_camera(found, picture.intrinsics_px)
     matches = matches_by_component(described, frames, views, scenes, matched)
-    rough = candidates(
-        found.pixels, matches, picture.intrinsics_px, picture.size_px, picture.focal_sigma, params.resection
-    )
+    lens = picture.intrinsics_px, picture.size_px, picture.focal_sigma
+    known = found.angles_rad is not None
+    rough = candidates(found.pixels, matches, *lens, params.resection, angles_known=known)
     return rough, max((len(one.feature) for one in matches.values()), default=0)
 
 

@@ -52,6 +52,15 @@ def frames(pixels: np.ndarray, angles_rad: np.ndarray, intrinsics_px: np.ndarray
     return matrices_to_quats(np.stack([along, np.cross(ray, along), ray], axis=2))
 
 
+def rolled(turn: np.ndarray, said: np.ndarray) -> np.ndarray:
+    """A camera's quaternion (1, 4) rolled about its axis, as most of what others say of it (N, 4) have it."""
+    off = multiply_quats(np.broadcast_to(turn * np.array([1.0, -1, -1, -1]), said.shape), said)
+    twist = (off[:, 0] + 1j * off[:, 3]) ** 2  # of twice the half angle, so that a quaternion and its negative are one
+    half = np.angle(twist.sum()) / 2
+    out: np.ndarray = multiply_quats(turn, np.array([[np.cos(half), 0.0, 0.0, np.sin(half)]]))
+    return out
+
+
 def alike(one: np.ndarray, other: np.ndarray, max_deg: float) -> np.ndarray:
     """(N, M) bool: quaternions (N, 4) and (M, 4) that are turned by so much at most from one to the other."""
     out: np.ndarray = np.abs(one @ other.T) >= np.cos(np.radians(max_deg / 2))

@@ -28,6 +28,12 @@ def camera(rng: np.random.Generator) -> np.ndarray:
     return pose
 
 
+def exp_roll(deg: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = exp_so3(np.array([0, 0, np.radians(deg)]))
+    return pose
+
+
 def seen(rng: np.random.Generator, pose: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and the points that they show."""
     pixels = rng.uniform([10, 10], [470, 350], (count, 2))
@@ -102,6 +108,18 @@ def test_no_matches_lead_nowhere() -> None:
     none = np.zeros(0, int)
     matches = Matches(none, np.zeros((0, 3)), none, none, np.zeros((0, 4)), ())
     assert candidates(np.zeros((0, 2)), {0: matches}, LENS, SIZE, 0.0, PARAMS) == []
+
+
+def test_a_roll_that_all_share_may_be_unknown() -> None:
+    """Without angles of features all say that the camera was held upright; it was rolled by 70 degrees."""
+    rng = np.random.default_rng(5)
+    pose = camera(rng)
+    pixels, matches = made(rng, pose, 9, 60)
+    upright = replace(matches, turns=multiply_quats(matches.turns, turns(rng, exp_roll(-70), 1, 0)))
+    assert candidates(pixels, {0: upright}, LENS, SIZE, 0.0, PARAMS) == []
+    best, *_ = candidates(pixels, {0: upright}, LENS, SIZE, 0.0, PARAMS, angles_known=False)
+    assert np.abs(best.T_metric_camera - pose).max() < 0.05
+    assert best.num_inliers >= 9
 
 
 def test_a_match_says_how_the_camera_was_turned_in_the_component() -> None:
