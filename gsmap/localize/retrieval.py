@@ -140,7 +140,7 @@ def most_alike(
     for scene in _best(_by_feature(matches), params.first):
         mine = matches.of(scene, params.most)
         cameras = multiply_quats(mine.turn, conjugate[mine.feature]).astype(np.float32)
-        agree = np.abs(cameras @ cameras.T) > np.cos(np.radians(params.max_turn_deg / 2))
+        agree = turned.alike(cameras, cameras, params.max_turn_deg)
         scored.append((float(_agreeing(agree, mine.feature, mine.worth)), scene, mine, agree))
     scored.sort(key=lambda one: (-one[0], one[1]))
     views = []
