@@ -133,9 +133,12 @@ def placed(clip: Clip, params: Params) -> list[bool]:
         for one in clip.seen
     ]
     out = []
-    for one, probable in zip(clip.seen, together.probabilities(shots, clip.ties, params), strict=True):
+    elsewhere = together.elsewhere([one.probability - one.rival for one in clip.seen], clip.ties, params)
+    probable_of = together.probabilities(shots, clip.ties, params)
+    for one, probable, with_others in zip(clip.seen, probable_of, elsewhere, strict=True):
         bars = replace(params.verdict, min_inliers=0) if probable > one.probability else params.verdict
-        said = one.evidence is not None and not verdict.judge(one.evidence, probable, one.sigmas, one.rival, bars)
+        rival = one.rival * with_others
+        said = one.evidence is not None and not verdict.judge(one.evidence, probable, one.sigmas, rival, bars)
         out.append(said and one.known is not None)
     return out
 

@@ -127,8 +127,11 @@ def _believed(
     shots: Sequence[Shot], ties: Mapping[tuple[int, int], bool], params: Params
 ) -> list[tuple[Judged, float, Params] | None]:
     """Of each photo its best pose, as probable as its own evidence and that of the others make it, that of a rival at
-    another place, and the bars for it; None where there is no pose."""
+    another place, where those that it is tied to would have to be as well, and the bars for it; None where there is no
+    pose."""
     out: list[tuple[Judged, float, Params] | None] = []
+    sure = [shot.probability - rival_of(shot.judged, params) if shot.best and not shot.led else 0.0 for shot in shots]
+    with_others = elsewhere(sure, ties, params)
     for shot, probable in zip(shots, probabilities(shots, ties, params), strict=True):
         if shot.best is None:
             out.append(None)
@@ -136,7 +139,22 @@ def _believed(
         best, bars = replace(shot.best, probability=probable), params
         if probable > shot.probability:  # what it lacks itself, those that it is tied to show
             bars = replace(params, verdict=replace(params.verdict, min_inliers=0))
-        out.append((best, rival_of([best, *shot.judged[1:]], params), bars))
+        rival = rival_of([best, *shot.judged[1:]], params)
+        out.append((best, rival * with_others[len(out)], bars))
+    return out
+
+
+def elsewhere(sure: Sequence[float], ties: Mapping[tuple[int, int], bool], params: Params) -> list[float]:
+    """Of each photo, how probable it is that those that it is tied to may be at another place with it.
+
+    Args:
+        sure: of each photo, by how much its place is more probable than the best other one.
+    """
+    out = []
+    for k in range(len(sure)):
+        tied = _tied(k, ties, params.together.tie)[1:]
+        others = sorted((worth * max(sure[one], 0.0) for one, worth in tied), reverse=True)
+        out.append(float(np.prod([1 - one for one in others[:2]])))
     return out
 
 

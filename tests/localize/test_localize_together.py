@@ -228,3 +228,42 @@ def test_a_photo_that_others_lead_elsewhere_is_not_said(world, beside_each_other
     assert [one.is_placed for one in placed] == [True, True, False, True]
     assert "lead it elsewhere" in placed[2].reason
     assert placed[2].T_map_camera is None
+
+
+def test_a_rival_is_one_only_where_those_tied_to_it_may_be_elsewhere_as_well() -> None:
+    """Neighbours that are sure of this place, and have no rival, leave a photo no other one; a map that shows the same
+    twice gives all of them rivals."""
+    ties = {(0, 1): True, (1, 2): True}
+    tie = Params().together.tie
+    told = together_module.elsewhere([0.5, 0.9, 0.8, 0.9], ties, Params())
+    assert told[0] == pytest.approx((1 - tie * 0.9) * (1 - tie**2 * 0.8))
+    assert told[1] == pytest.approx((1 - tie * 0.8) * (1 - tie * 0.5))
+    assert told[3] == 1.0, "tied to nobody"
+    twins = together_module.elsewhere([0.02, 0.0, -0.01], ties, Params())
+    assert min(twins) > 0.97
+    assert together_module.elsewhere([0.9, 0.9], {(0, 1): False}, Params()) == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("rivals", "placed"), [([0.9] * 4, [False] * 4), ([0.0, 0.0, 0.9, 0.0], [True] * 4)], ids=["all", "one"]
+)
+def test_a_map_that_shows_the_same_twice_tells_no_photo_where_it_is(
+    world, beside_each_other, monkeypatch, rivals, placed
+) -> None:
+    """Where all have rivals nobody is placed; a single one that has a rival is, for the others cannot be there."""
+    photos, _ = beside_each_other
+    looked, rival_by_candidate = together_module.looked_into, {}
+
+    def noted(*given):
+        shots, near, ties = looked(*given)
+        rival_by_candidate.update(
+            {id(shot.judged[0].candidate): rival for shot, rival in zip(shots, rivals, strict=True)}
+        )
+        return shots, near, ties
+
+    monkeypatch.setattr(together_module, "looked_into", noted)
+    monkeypatch.setattr(
+        together_module, "rival_of", lambda judged, params: rival_by_candidate.get(id(judged[0].candidate), 0.0)
+    )
+    said = localize_together(photos, world.index, {"scene": world.placed}, SIFT, Params())
+    assert [one.is_placed for one in said] == placed, [one.reason for one in said]
