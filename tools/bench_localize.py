@@ -137,9 +137,8 @@ class World:
 
     def anchor(self, component: int) -> str:
         """The scene that a component's frame is fixed to."""
-        there = [scene for scene in self.ids.values() if self.localizer.placed[scene].component == component]
-        known = {scene: self.localizer.placed[scene].covariance for scene in there}
-        return min(there, key=lambda scene: 0.0 if (told := known[scene]) is None else float(np.trace(told)))
+        there = [one for one in map(self.localizer.placed.get, self.ids.values()) if one.component == component]
+        return min(there, key=lambda one: 0.0 if one.covariance is None else float(np.trace(one.covariance))).scene
 
     def truth(self, shot: Shot, scene: str) -> np.ndarray:
         """(4, 4) the camera in the frame of the map that a scene says."""

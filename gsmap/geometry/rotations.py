@@ -39,6 +39,12 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
     return out
 
 
+def conjugate_quats(quats: np.ndarray) -> np.ndarray:
+    """(..., 4) the reverse rotations of unit ``wxyz`` quaternions."""
+    out: np.ndarray = np.asarray(quats) * np.array([1.0, -1.0, -1.0, -1.0])
+    return out
+
+
 def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product (..., 4) of ``wxyz`` quaternions: rotating by b, then by a."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)

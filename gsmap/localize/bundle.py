@@ -164,8 +164,8 @@ def adjusted(
 def _with_one_lens(photos: Sequence[Shown]) -> list[Shown]:
     """The photos; those of unknown focal length with the middle one of those of their size that the map places."""
     out = list(photos)
-    for size in {one.size_px for one in photos if one.focal_sigma > resection.FOCAL_KNOWN}:
-        mine = [k for k, one in enumerate(photos) if one.size_px == size and one.focal_sigma > resection.FOCAL_KNOWN]
+    for size in {one.size_px for one in photos if resection.is_free(one.focal_sigma)}:
+        mine = [k for k, one in enumerate(photos) if one.size_px == size and resection.is_free(one.focal_sigma)]
         said = [photos[k].intrinsics_px for k in mine if photos[k].T_metric_camera is not None]
         for k in mine if said else []:
             out[k] = replace(photos[k], intrinsics_px=np.median(said, axis=0))
@@ -420,16 +420,14 @@ class _Problem:
     def free_lenses(self) -> list[Shown]:
         """A photo by each lens whose focal length is adjusted."""
         free = {
-            self.photos[k].size_px: self.photos[k]
-            for k in self.at
-            if self.photos[k].focal_sigma > resection.FOCAL_KNOWN
+            self.photos[k].size_px: self.photos[k] for k in self.at if resection.is_free(self.photos[k].focal_sigma)
         }
         return [free[size] for size in sorted(free)]
 
     def lens_of(self, k: int) -> int | None:
         """Which of these took a photo."""
         sizes = [one.size_px for one in self.free_lenses()]
-        return sizes.index(self.photos[k].size_px) if self.photos[k].focal_sigma > resection.FOCAL_KNOWN else None
+        return sizes.index(self.photos[k].size_px) if resection.is_free(self.photos[k].focal_sigma) else None
 
     def values(self) -> Any:
         import gtsam

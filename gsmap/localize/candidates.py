@@ -17,6 +17,7 @@ from gsmap.localize import matching, resection, turned
 from gsmap.localize.placed import PlacedFeatures
 
 _SEEDS = 1000  # matches, at most, whose turn others are asked for
+_SAME_TURN = 1 / 3  # of what matches may differ by: nearer turns than this lead to the same set
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ def _matches(
     params: matching.Params,
 ) -> Matches:
     names = tuple(dict.fromkeys(scene for scene, _ in views))
-    back = turns * np.array([1.0, -1, -1, -1])
+    in_component = {scene: matrices_to_quats(scenes[scene].S_metric_scene.rotation) for scene in names}
     feature, points, whose, view_of, turned_by = [], [], [], [], []
     for number, (scene, view) in enumerate(views):
         held = scenes[scene].features
@@ -100,9 +101,8 @@ def _matches(
         points.append(scenes[scene].S_metric_scene.apply(held.points[part][theirs]))
         whose.append(np.full(len(mine), names.index(scene)))
         view_of.append(np.full(len(mine), number))
-        in_scene = turned.in_scene(held, part.start + theirs, np.full(len(theirs), view))
-        frame = np.broadcast_to(matrices_to_quats(scenes[scene].S_metric_scene.rotation), in_scene.shape)
-        turned_by.append(multiply_quats(frame, multiply_quats(in_scene, back[mine])))
+        there = turned.in_scene(held, part.start + theirs, np.full(len(theirs), view))
+        turned_by.append(multiply_quats(in_component[scene], turned.of_camera(there, turns[mine])))
     return Matches(
         np.concatenate(feature),
         np.concatenate(points),
@@ -170,7 +170,7 @@ def _turned_alike(matches: Matches, params: resection.Params) -> list[np.ndarray
         if count[best] < params.min_agreeing:
             break
         out.append(np.flatnonzero(alike[best]))
-        near = turned.alike(matches.turns[seeds], matches.turns[seeds[best]][None], params.max_turn_deg / 3)
+        near = turned.alike(matches.turns[seeds], matches.turns[seeds[best]][None], _SAME_TURN * params.max_turn_deg)
         count[near[:, 0]] = 0
     for view in np.unique(matches.view):
         mine = np.flatnonzero(matches.view == view)

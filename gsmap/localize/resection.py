@@ -10,8 +10,7 @@ from gsmap.geometry.projection import project
 from gsmap.geometry.rotations import exp_so3, skew
 from gsmap.geometry.similarities import rotation_vectors
 
-FOCAL_KNOWN = 0.01
-"""A focal length that is known less well (standard deviation of its logarithm) is solved for."""
+_FOCAL_KNOWN = 0.01  # standard deviation of the logarithm of a focal length that is taken as it is
 
 
 @dataclass(frozen=True)
@@ -57,10 +56,15 @@ class Resection:
     inliers: np.ndarray
 
 
+def is_free(focal_sigma: float) -> bool:
+    """Whether a focal length that is known so well (as in `Photo`) is solved for."""
+    return focal_sigma > _FOCAL_KNOWN
+
+
 def fewest(focal_sigma: float, params: Params) -> int:
     """How many features must agree on a pose, and say that the camera was turned so, for it to be looked into: four fix
     one of an unknown focal length, whatever they are."""
-    return params.min_agreeing if focal_sigma <= FOCAL_KNOWN else params.min_inliers
+    return params.min_inliers if is_free(focal_sigma) else params.min_agreeing
 
 
 def resect(
@@ -76,14 +80,14 @@ def resect(
     Args:
         pixels: (K, 2) in the photo.
         points: (K, 3) map.
-        focal_sigma: as in `Photo`; above `FOCAL_KNOWN` the focal length is solved for.
+        focal_sigma: as in `Photo`; see `is_free`.
     """
     import pycolmap
 
     if len(pixels) < 4:
         return None
     fx, fy, cx, cy = intrinsics_px
-    free = focal_sigma > FOCAL_KNOWN
+    free = is_free(focal_sigma)
     camera = pycolmap.Camera(
         model="SIMPLE_PINHOLE" if free else "PINHOLE",
         width=size_px[0],

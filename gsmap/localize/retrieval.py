@@ -16,7 +16,6 @@ from itertools import pairwise
 import numpy as np
 
 from gsmap._native import near_signatures
-from gsmap.geometry.rotations import multiply_quats
 from gsmap.localize import turned
 from gsmap.localize.features import UNIT
 from gsmap.localize.words import VERSION, Words, words_for
@@ -135,11 +134,10 @@ def most_alike(
         return []
     matches = _matches(index, found, params)
     photo = turned.in_camera(found, intrinsics_px)
-    conjugate = photo * np.array([1.0, -1, -1, -1])
     scored = []
     for scene in _best(_by_feature(matches), params.first):
         mine = matches.of(scene, params.most)
-        cameras = multiply_quats(mine.turn, conjugate[mine.feature]).astype(np.float32)
+        cameras = turned.of_camera(mine.turn, photo[mine.feature]).astype(np.float32)
         agree = turned.alike(cameras, cameras, params.max_turn_deg)
         scored.append((float(_agreeing(agree, mine.feature, mine.worth)), scene, mine, agree))
     scored.sort(key=lambda one: (-one[0], one[1]))

@@ -146,7 +146,7 @@ def _settled(
     """`settle`, once."""
     pose, lens = T_metric_camera, intrinsics_px
     scenes = scenes[: params.max_scenes]
-    free = None if picture.focal_sigma <= resection.FOCAL_KNOWN else (picture.intrinsics_px[0], picture.focal_sigma)
+    free = (picture.intrinsics_px[0], picture.focal_sigma) if resection.is_free(picture.focal_sigma) else None
     half = picture.halved()
 
     looks = look(scenes, pose, lens / 2, half.size_px, lifting)

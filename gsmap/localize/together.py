@@ -130,17 +130,18 @@ def _believed(
     another place, where those that it is tied to would have to be as well, and the bars for it; None where there is no
     pose."""
     out: list[tuple[Judged, float, Params] | None] = []
-    sure = [shot.probability - rival_of(shot.judged, params) if shot.best and not shot.led else 0.0 for shot in shots]
-    with_others = elsewhere(sure, ties, params)
-    for shot, probable in zip(shots, probabilities(shots, ties, params), strict=True):
+    rivals = [rival_of(shot.judged, params) if shot.judged else 0.0 for shot in shots]
+    sure = [0.0 if shot.led else shot.probability - rival for shot, rival in zip(shots, rivals, strict=True)]
+    others = elsewhere(sure, ties, params)
+    probable_of = probabilities(shots, ties, params)
+    for shot, probable, rival, with_others in zip(shots, probable_of, rivals, others, strict=True):
         if shot.best is None:
             out.append(None)
             continue
         best, bars = replace(shot.best, probability=probable), params
         if probable > shot.probability:  # what it lacks itself, those that it is tied to show
             bars = replace(params, verdict=replace(params.verdict, min_inliers=0))
-        rival = rival_of([best, *shot.judged[1:]], params)
-        out.append((best, rival * with_others[len(out)], bars))
+        out.append((best, rival * with_others, bars))
     return out
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmap.geometry.rotations import matrices_to_quats, multiply_quats
+from gsmap.geometry.rotations import conjugate_quats, matrices_to_quats, multiply_quats
 from gsmap.types.localization import Keypoints, SceneFeatures
 
 
@@ -38,6 +38,11 @@ def in_scene(found: SceneFeatures, rows: np.ndarray, view: np.ndarray) -> np.nda
     return out
 
 
+def of_camera(in_scene: np.ndarray, in_camera: np.ndarray) -> np.ndarray:
+    """(K, 4) how the camera was turned in the scene, as matches say: their frames in the scene and in the camera."""
+    return multiply_quats(in_scene, conjugate_quats(in_camera))
+
+
 def frames(pixels: np.ndarray, angles_rad: np.ndarray, intrinsics_px: np.ndarray) -> np.ndarray:
     """(N, 4) quaternions ``wxyz`` of the frames of features in that of their camera.
 
@@ -54,7 +59,7 @@ def frames(pixels: np.ndarray, angles_rad: np.ndarray, intrinsics_px: np.ndarray
 
 def rolled(turn: np.ndarray, said: np.ndarray) -> np.ndarray:
     """A camera's quaternion (1, 4) rolled about its axis, as most of what others say of it (N, 4) have it."""
-    off = multiply_quats(np.broadcast_to(turn * np.array([1.0, -1, -1, -1]), said.shape), said)
+    off = multiply_quats(conjugate_quats(turn), said)
     twist = (off[:, 0] + 1j * off[:, 3]) ** 2  # of twice the half angle, so that a quaternion and its negative are one
     half = np.angle(twist.sum()) / 2
     out: np.ndarray = multiply_quats(turn, np.array([[np.cos(half), 0.0, 0.0, np.sin(half)]]))

@@ -4,6 +4,7 @@
 #include <nanobind/stl/tuple.h>
 
 #include <climits>
+#include <memory>
 #include <stdexcept>
 #include <tuple>
 #include <vector>
@@ -36,10 +37,11 @@ void bind_matches(nb::module_ &m) {
                 nb::gil_scoped_release release;
                 const std::size_t columns = (std::size_t(other.count) + 15) / 16 * 16;
                 const std::size_t width = (std::size_t(one.width) + 3) / 4 * 4;
-                std::vector<float> room((one.count + columns) * width + one.count);
+                const std::unique_ptr<unsigned char[]> room(
+                    new unsigned char[sizeof(float) * ((one.count + columns) * width + one.count)]);
                 std::vector<int32_t> row_column(one.count), column_row(columns);
                 std::vector<float> row_top(one.count), row_next(one.count), column_top(columns);
-                kernels->nearest(one, other, room.data(),
+                kernels->nearest(one, other, room.get(),
                                  {row_column.data(), row_top.data(), row_next.data(), column_row.data(), column_top.data()});
                 for (int i = 0; i < one.count; ++i) {
                     const int j = row_column[i];

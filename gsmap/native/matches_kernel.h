@@ -8,13 +8,7 @@ using namespace gsmap;
 
 typedef I IU __attribute__((aligned(4), may_alias));
 
-#if GSMAP_AVX512
-constexpr int kAtOnce = 8;
-#elif GSMAP_AVX2
-constexpr int kAtOnce = 6;
-#else
-constexpr int kAtOnce = 4;
-#endif
+constexpr int kAtOnce = W == 16 ? 8 : W == 8 ? 6 : 4;  // rows, as registers allow
 
 // What is known of a row after some of the columns, by lane.
 struct Best {
