@@ -47,14 +47,14 @@ class Hidden:
         least_m: no translation is known better than this, and no rotation over the overlap's radius.
     """
 
-    shown: float = 0.655
-    by_colour: float = 0.904
-    swell_by_colour: float = 1.64
+    shown: float = 0.644
+    by_colour: float = 0.867
+    swell_by_colour: float = 2.18
     shift_m: float = 0.0
-    swell_m: float = 0.0021
+    swell_m: float = 0.0043
     field_m: float = 0.002
-    field_power: float = 2.68
-    shift_by_swell: float = 0.104
+    field_power: float = 2.11
+    shift_by_swell: float = 0.141
     turn_by_shift: float = 1.0
     most_swell: float = 0.02
     least_m: float = 1e-4

@@ -12,9 +12,9 @@ class Params:
     """What is believed of sources that may be in metres.
 
     Args:
-        drift_sigma: log scale by which two such sources differ: metres of phones and of SLAM drift by one to three
-            percent.
-        rigid_sigmas: the scale is taken for 1 where it is measured to be within this many standard deviations of it.
+        drift_sigma: log scale by which two such sources differ, if they do: metres of phones and of SLAM drift by one
+            to three percent.
+        rigid_odds: how many times as probable it is, before it is measured, that they do not.
         disagree_sigmas: two sources that were told to be in metres and measure further from 1 than this are noted.
         bend_sigmas: surfaces that are taken for metres and measure further from 1 than this many times what their
             residuals explain are bent, which is noted ...
@@ -22,7 +22,7 @@ class Params:
     """
 
     drift_sigma: float = 0.02
-    rigid_sigmas: float = 3.0
+    rigid_odds: float = 3.0
     disagree_sigmas: float = 5.0
     bend_sigmas: float = 3.0
     least_bend: float = 0.002
@@ -50,16 +50,20 @@ class Belief:
 def believe(log_scale: float, sigma: float, params: Params | None = None, *, told: bool = False) -> Belief:
     """Whether a measured log scale is 1 or what was measured, and how sure that is.
 
-    Before it is measured the log scale is ``N(0, drift_sigma^2)``, the measurement is ``N(log scale, sigma^2)``; how
-    sure a scale of 1 is, is the root mean square of what Bayes' rule makes of both: of a scale that the surfaces do not
-    fix no more is known than that metres drift. What was ``told`` is taken whatever is measured, and its standard
-    deviation then says how far that is from the measurement.
+    The measurement is ``N(log scale, sigma^2)``, and the log scale 0 or ``N(0, drift_sigma^2)``: it is taken for 0
+    where that is the more probable (two hypotheses, by their likelihoods and ``rigid_odds``), so that what
+    is measured well must be nearer to 1, but may be more sigmas off, than what is not.
+
+    How sure a scale of 1 is, is the root mean square of what Bayes' rule makes of a drift and the measurement: of a
+    scale that the surfaces do not fix no more is known than that metres drift. What was ``told`` is taken whatever is
+    measured, and its standard deviation then says how far that is from the measurement.
     """
     params = params or Params()
     off = abs(log_scale) / sigma
-    if not told and off > params.rigid_sigmas:
-        return Belief(False, log_scale, sigma, sigma)
     weight = params.drift_sigma**2 / (params.drift_sigma**2 + sigma**2)
+    log_odds = np.log(params.rigid_odds) + 0.5 * np.log1p((params.drift_sigma / sigma) ** 2) - 0.5 * weight * off**2
+    if not told and log_odds < 0:
+        return Belief(False, log_scale, sigma, sigma)
     log_scale_sigma = float(np.sqrt(weight * sigma**2 + (weight * log_scale) ** 2))
     note = ""
     if off > params.disagree_sigmas:

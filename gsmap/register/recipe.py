@@ -12,7 +12,7 @@ from gsmap.register.params import Params
 from gsmap.register.refinement import refiner_for
 from gsmap.types.plain import plain
 
-VERSION = 11
+VERSION = 12
 
 _RENDER_BACKEND = "native"  # the one that all renders of this room are pinned to
 

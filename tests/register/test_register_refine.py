@@ -427,17 +427,22 @@ def test_a_small_overlap_knows_angles_and_scale_less_well(world, surfaces):
 
 
 def test_a_measured_scale_is_one_or_what_was_measured():
-    """One within three sigma of it; and then as sure as Bayes' rule, written out, makes it."""
-    params = metres.Params(drift_sigma=0.02)
+    """One where that is more probable than a drift; and then as sure as Bayes' rule, written out, makes it."""
+    params = metres.Params(drift_sigma=0.02, rigid_odds=3.0)
     grid = np.linspace(-0.2, 0.2, 400_001)
-    for log_scale, sigma in [(0.0, 0.001), (0.002, 0.001), (-0.0029, 0.001), (0.02, 0.02), (0.0, 0.2)]:
+    said = set()
+    for log_scale, sigma in [(0.0, 0.001), (-0.0028, 0.001), (-0.0029, 0.001), (0.00034, 1e-4), (0.00037, 1e-4),
+                             (0.0114, 0.005), (0.0118, 0.005), (0.02, 0.02), (0.0, 0.2), (-0.02, 0.0005)]:  # fmt: skip
         found = metres.believe(log_scale, sigma, params)
-        posterior = norm.pdf(grid, 0, 0.02) * norm.pdf(log_scale, grid, sigma)
-        posterior /= posterior.sum()
-        assert found.rigid
-        assert found.log_scale_sigma == pytest.approx(np.sqrt(posterior @ grid**2), rel=1e-3)
-    for log_scale, sigma in [(0.0031, 0.001), (-0.02, 0.0005)]:
-        assert metres.believe(log_scale, sigma, params) == metres.Belief(False, log_scale, sigma, sigma)
+        drifts = norm.pdf(grid, 0, 0.02) * norm.pdf(log_scale, grid, sigma)
+        share = 3 * norm.pdf(log_scale, 0, sigma) / (drifts.sum() * (grid[1] - grid[0]))
+        said.add(found.rigid)
+        assert found.rigid == (share > 1)
+        if found.rigid:
+            assert found.log_scale_sigma == pytest.approx(np.sqrt(drifts @ grid**2 / drifts.sum()), rel=1e-3)
+        else:
+            assert found == metres.Belief(False, log_scale, sigma, sigma)
+    assert said == {True, False}
 
 
 def test_sources_that_were_told_to_be_metric_stay_so_and_disagreement_is_said():
