@@ -36,6 +36,7 @@ class TileRecipe:
         uncompressed: whether the content of ``3dtiles`` is float32 rather than SPZ.
         dates: when each scene was captured, by scene id, if the merger uses dates; None if it does not.
         without: names what of each scene is left out, by scene id, where something is.
+        photos: names the photographs that a tile is to look like, by its component and name, where there are any.
 
     Raises:
         ConfigError: a format that cannot be written, or one that cannot be had with provenance or uncompressed.
@@ -48,6 +49,7 @@ class TileRecipe:
     uncompressed: bool = False
     dates: Mapping[str, str | None] | None = None
     without: Mapping[str, str] = field(default_factory=dict)
+    photos: Mapping[tuple[int, str], str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.format not in _TREES and f".{self.format}" not in formats.known("write"):
@@ -96,6 +98,8 @@ class TileRecipe:
         if self.dates is not None:
             inputs += [f"captured_at {scene} {self.dates.get(scene)}" for scene in scenes]
         inputs += [f"without {scene} {self.without[scene]}" for scene in scenes if self.without.get(scene)]
+        if photos := self.photos.get((planned.component, planned.name)):
+            inputs.append(f"photos {photos}")
         return self.merge.of(*inputs).digest
 
 
@@ -130,7 +134,7 @@ def _what_changed(planned: PlannedTile, tile: Tile, recipe: TileRecipe) -> str:
             return f"another {part} of the merge method: {_difference(before.get(part), now[part])}"
     if set(tile.poses) != set(planned.poses):
         return "other scenes"
-    return "another date of a scene, format, budget, extent, metre or provenance"
+    return "another date of a scene, format, budget, extent, metre or provenance, or other photographs"
 
 
 def _difference(before: Any, now: Any) -> str:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from gsmap import change as changing
 from gsmap import describe as describing
 from gsmap import localize as localizing
 from gsmap import register as registering
+from gsmap.errors import CorruptError
 from gsmap.export import PlannedTile
 from gsmap.geometry.metres import in_metres, resized
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -25,8 +28,10 @@ from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.methods import family
 from gsmap.register import SceneView
 from gsmap.store import Store, branches, homes, sqlite
-from gsmap.types import ChangeReport, Gaussians, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
+from gsmap.store.photos import StoredPhoto
+from gsmap.types import Cameras, ChangeReport, Gaussians, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
 from gsmap.types.localization import SceneFeatures
+from gsmap.types.merging import KeptPhoto
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress
 
@@ -122,6 +127,28 @@ def _without(path: str, scene_id: str, passing: Passing) -> np.ndarray:
     return persisting.rows(_store(path), scene_id, passing)
 
 
+def _kept(path: str, photo: StoredPhoto) -> KeptPhoto:
+    """A photo in the frame of its scene."""
+    one = photo.sighting
+    camera = Cameras(one.T_scene_camera[None], one.intrinsics_px[None], np.array([one.size_px]))
+    turn, shift = (
+        float(np.sqrt(np.linalg.eigvalsh(one.covariance[part, part])[-1].clip(0))) for part in (slice(3), slice(3, 6))
+    )
+    return KeptPhoto(camera, partial(_picture, path, photo.number), turn, shift)
+
+
+def _picture(path: str, number: int) -> np.ndarray:
+    """(H, W, 3) uint8 of a photo as it is kept."""
+    try:
+        with Image.open(io.BytesIO(_store(path).photos.jpeg(number))) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise CorruptError(
+            f"what the map keeps of photo p{number} is no picture ({error}): take it back (gsmap remove MAP p{number} "
+            "--photo) and add it again"
+        ) from error
+
+
 @dataclass(frozen=True, eq=False)
 class TileMaker:
     """Makes the content of a tile, wherever it is called.
@@ -135,6 +162,7 @@ class TileMaker:
         captured_at: the date of each of its scenes.
         store: where what views show is kept for other tiles.
         passing: what of each of its scenes is left out, by scene id.
+        photos: that it is to look like, by scene id, the newest first.
     """
 
     location: str
@@ -146,6 +174,7 @@ class TileMaker:
     captured_at: Mapping[str, str | None]
     store: SightStore
     passing: Mapping[str, Passing] = field(default_factory=dict)
+    photos: Mapping[str, Sequence[StoredPhoto]] = field(default_factory=dict)
 
     def __call__(self, progress: Progress) -> MergeResult:
         """Merged in metres, in the map's unit when it is done."""
@@ -160,6 +189,7 @@ class TileMaker:
                 self.store,
                 "" if (left := self.passing.get(scene)) is None else left.digest,
                 partial(_read_within, self.location, scene, self.passing.get(scene)),
+                tuple(_kept(self.location, photo) for photo in self.photos.get(scene, ())),
             )
             for scene, pose in self.tile.poses.items()
         ]

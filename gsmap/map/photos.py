@@ -24,7 +24,7 @@ from gsmap.types.localization import Photo
 from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
 from gsmap.types.rows.localize import LocalizeRow, PhotoChangeRow, PhotoRow
 
-_SIDE_PX = 640  # of the picture that is kept: to be shown
+_SIDE_PX = 960  # of the picture that is kept: as large as captures are rendered for the merged map to look like
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def digest_of(file: str, photo: Photo) -> str:
 
 
 def small_jpeg(photo: Photo) -> bytes:
-    """The photo as it is kept to be shown."""
+    """The photo as it is kept."""
     image = Image.fromarray(photo.rgb)
     image.thumbnail((_SIDE_PX, _SIDE_PX))
     for quality in (82, 60, 30):

@@ -34,6 +34,7 @@ __all__ = [
     "merge",
     "merger",
     "methods",
+    "photos_m",
     "reach_m",
     "recipe_key",
     "uses_dates",
@@ -102,6 +103,13 @@ def checked_params(method: str, params: Any) -> Any:
 def reach_m(method: str, params: Any = None) -> float:
     """How far beyond a tile's border the Gaussians of scenes decide what is in it, in metres."""
     return merger(method).reach_m(checked_params(method, params))
+
+
+def photos_m(method: str, params: Any = None) -> float | None:
+    """How far beyond a tile's border kept photographs are looked for, in metres; None where none are reproduced."""
+    asked = getattr(merger(method), "photos_m", None)
+    found: float | None = None if asked is None else asked(checked_params(method, params))
+    return found
 
 
 def uses_dates(method: str, params: Any = None) -> bool:

@@ -13,6 +13,7 @@ from gsmap.geometry.sh import SH_C0, rgb_of_sh0, sh0_of_rgb
 from gsmap.merge.placed import overlapping, share_in_view
 from gsmap.render import render
 from gsmap.types import Cameras, Gaussians, PlacedScene
+from gsmap.types.merging import KeptPhoto
 
 
 @dataclass(frozen=True)
@@ -54,10 +55,20 @@ def balance_exposure(
     if np.abs(log_gains).max(initial=0) < params.negligible_log_gain:
         return list(scenes), np.zeros_like(log_gains)
     balanced = [
-        replace(scene, gaussians=apply_gain(scene.gaussians, np.exp(gain)))
+        replace(
+            scene,
+            gaussians=apply_gain(scene.gaussians, np.exp(gain)),
+            photos=tuple(_beside(photo, np.exp(gain)) for photo in scene.photos),
+        )
         for scene, gain in zip(scenes, log_gains, strict=True)
     ]
     return balanced, log_gains
+
+
+def _beside(photo: KeptPhoto, gain: np.ndarray) -> KeptPhoto:
+    """A photograph that is brought to the colours of what is around it, in other colours."""
+    around = photo.around
+    return photo if around is None else replace(photo, around=lambda: apply_gain(around(), gain))
 
 
 def apply_gain(gaussians: Gaussians, gain: np.ndarray) -> Gaussians:

@@ -1,15 +1,17 @@
-"""What the merged map must look like: renders of each capture, alone, from its own cameras."""
+"""What the merged map must look like: renders of each capture, alone, from its own cameras, and kept photographs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmap import compare
 from gsmap.errors import ConfigError
 from gsmap.geometry.boxes import inside
 from gsmap.geometry.projection import in_image, project
+from gsmap.merge import photos
 from gsmap.merge.changes import Settled, newest_first
 from gsmap.merge.placed import share_in_view
 from gsmap.merge.sights import surface_axes
@@ -31,12 +33,14 @@ class Params:
         margin_px: pictures are cropped to what counts and this much around it, for the windows of SSIM.
         max_views: of more views than that, those are reproduced that together see the tile best, newer ones first; so
             that neither memory (3 MB a view of 960 pixels) nor time grows with the captures of a place.
+        photos: which photographs are reproduced as well.
     """
 
     min_share: float = 0.02
     enough_share: float = 0.25
     margin_px: int = 6
     max_views: int = 360
+    photos: photos.Params = field(default_factory=photos.Params)
 
     def __post_init__(self) -> None:
         if self.max_views < 1:
@@ -52,10 +56,11 @@ class References:
         images: V pictures (H, W, 3) uint8.
         weights: V maps (H, W) uint8, 255 where the picture is to be believed and 0 where it says nothing: where the
             capture saw nothing, and outside the tile.
-        scene: (V,) which scene each was rendered from.
-        view_weights: (V,) how often to use each view in one pass over all, in (0, 1].
+        scene: (V,) which scene each was rendered from, or shows what it shows.
+        view_weights: (V,) how often to use each view in one pass over all; at most once what was rendered.
         visible_pixels: per scene (N,) float32: in how many pixels of its own views each Gaussian dominates; where
             it dominates none, `WEIGHT_UNIT` times its largest weight in any pixel; 1 for all where there are no views.
+        num_photos: how many of the pictures are photographs.
     """
 
     cameras: Cameras
@@ -64,6 +69,7 @@ class References:
     scene: np.ndarray
     view_weights: np.ndarray
     visible_pixels: list[np.ndarray]
+    num_photos: int = 0
 
     def __len__(self) -> int:
         return len(self.images)
@@ -77,6 +83,7 @@ def render_references(
     settled: Settled | None,
     progress: Progress,
     params: Params | None = None,
+    comparing: compare.Params | None = None,
 ) -> References:
     """Render each scene from its own cameras; keep the views that show enough of the tile.
 
@@ -84,9 +91,13 @@ def render_references(
     covers them. For a tile they count where the surface seen lies inside it or within half the halo, so that what is
     at the border is held from both sides, and they show what lies within the halo alone: what glimmers through from
     beyond is not there when the tile is fitted, and must not be made up for. ``settled`` (`gsmap.merge.changes`) knows
-    where the pictures of a scene are overruled.
+    where the pictures of a scene are overruled. Photographs count where they show what their scene shows
+    (`gsmap.merge.photos`).
+
+    Args:
+        comparing: what counts as showing something else.
     """
-    params = params or Params()
+    params, comparing = params or Params(), comparing or compare.Params()
     near = [inside(scene.gaussians.means, bounds, halo_m) for scene in scenes]
     pieces = [scene.gaussians if n.all() else scene.gaussians[n] for scene, n in zip(scenes, near, strict=True)]
     todo = [
@@ -140,17 +151,56 @@ def render_references(
         weights.append(np.round(np.clip(weight, 0, 1) * 255).astype(np.uint8))
         kept.append(i)
         shares.append(share)
+    num_rendered = len(kept)
+    for i, one in _photos(scenes, pieces, longest_side_px, params.photos, comparing):
+        counts = one.counts & inside_pixels(one.camera, one.depth, bounds, halo_m / 2)
+        if settled is not None and settled.is_disputed(i):
+            counts &= ~settled.overruled_pixels(i, one.camera)
+        share = float(counts.mean())
+        if share < params.min_share:
+            continue
+        window = _window(counts, params.margin_px)
+        cameras.append(_cropped(one.camera, window))
+        images.append(np.ascontiguousarray(one.image[window]))
+        weights.append(np.where(counts[window], 255, 0).astype(np.uint8))
+        kept.append(i)
+        shares.append(share)
+    often = np.minimum(1.0, np.array(shares) / params.enough_share)
+    often[num_rendered:] *= params.photos.share
     return References(
         _joined(cameras),
         images,
         weights,
         scene=np.array(kept, dtype=np.int64),
-        view_weights=np.minimum(1.0, np.array(shares) / params.enough_share),
+        view_weights=often,
         visible_pixels=[
             _visible_pixels(np.where(s > 0, p, 0) if shared is None else p, w, whole=bounds is None)
             for p, s, w, shared in zip(pixels, sure, largest, sights, strict=True)
         ],
+        num_photos=len(kept) - num_rendered,
     )
+
+
+def _photos(
+    scenes: Sequence[PlacedScene],
+    pieces: Sequence[Gaussians],
+    longest_side_px: int,
+    params: photos.Params,
+    comparing: compare.Params,
+) -> Iterator[tuple[int, photos.Shown]]:
+    """Photographs that may show the tile and are to be believed, with the scene of each."""
+    if not params.share:
+        return
+    asked = [
+        (i, photo)
+        for i, (scene, piece) in enumerate(zip(scenes, pieces, strict=True))
+        for photo in scene.photos
+        if share_in_view(photo.camera, piece.means)[0] > 0
+    ]
+    for i, photo in asked[: params.max_photos]:
+        one = photos.shown(photo, scenes[i], longest_side_px, params, comparing)
+        if one is not None:
+            yield i, one
 
 
 _SAMPLE = 600  # points by which views are chosen, where there are too many

@@ -16,6 +16,7 @@ from gsmap.merge import checked_params, merge, merger
 from gsmap.merge.placed import overlapping
 from gsmap.merge.sights import PlacedSights, Sights, SightStore, keys_of
 from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
+from gsmap.types.merging import KeptPhoto
 from gsmap.types.progress import Progress
 
 
@@ -32,6 +33,7 @@ class LazyScene:
         store: where what its views show is kept for other tiles.
         without: names what ``load`` leaves out of it; empty where that is nothing.
         load_within: as ``load`` of a box, but no more than asked for, where that is cheaper.
+        photos: kept photographs that show it, its frame and unit; those that are to take part, the newest first.
     """
 
     scene_id: str
@@ -42,6 +44,7 @@ class LazyScene:
     store: SightStore = field(default_factory=SightStore)
     without: str = ""
     load_within: Callable[[np.ndarray], Gaussians] | None = None
+    photos: tuple[KeptPhoto, ...] = ()
 
     def centroid(self) -> np.ndarray | None:
         """(3,) mean of all of its means, map frame; None where it holds nothing."""
@@ -103,7 +106,10 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
     S = scene.S_map_scene
     cameras = None if scene.cameras is None else transform_cameras(scene.cameras, S)
     if bounds is None:
-        return PlacedScene(transform_gaussians(scene.load(None), S), cameras, scene.scene_id, scene.captured_at)
+        photos = tuple(_placed(photo, S) for photo in scene.photos)
+        whole = transform_gaussians(scene.load(None), S)
+        return PlacedScene(whole, cameras, scene.scene_id, scene.captured_at, photos=photos)
+    around_m = reading.looking_m + reading.reach_m + float((bounds[1] - bounds[0]).max())
     box = np.array([bounds[0] - reading.reading_m, bounds[1] + reading.reading_m])
     rows = None
     if cameras is not None:
@@ -120,10 +126,21 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
     read = read if inner.all() else read[inner]
     sights = None
     if rows is not None:
-        around_m = reading.looking_m + reading.reach_m + float((bounds[1] - bounds[0]).max())
         sights = partial(_sights, scene, around_m, rows, keys_of(read.means))
     moved = transform_gaussians(read, S)
-    return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights)
+    photos = tuple(replace(_placed(p, S), around=partial(_around, scene, p, around_m)) for p in scene.photos)
+    return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights, photos)
+
+
+def _placed(photo: KeptPhoto, S: Sim3) -> KeptPhoto:
+    return replace(photo, camera=transform_cameras(photo.camera, S), sigma_m=photo.sigma_m * S.scale)
+
+
+def _around(scene: LazyScene, photo: KeptPhoto, around_m: float) -> Gaussians:
+    """What lies so near to a photograph's camera, map frame: whatever else of its scene the tile reads."""
+    centre, far = photo.camera.centers[0], around_m / scene.S_map_scene.scale
+    found = scene.load(np.array([centre - far, centre + far]))
+    return transform_gaussians(found, scene.S_map_scene)
 
 
 def _sights(

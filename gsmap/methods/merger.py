@@ -17,6 +17,10 @@ class Merger(Protocol):
     All lengths are in metres of the map frame. Importing a merger must not import torch: recipes are computed of
     settings alone. The same scenes, params and bounds give the same bits, whatever the order of the scenes was and for
     any number of threads; ``budget_s`` is the one exception, and a result that it cut short says so.
+
+    One that reproduces kept photographs (`PlacedScene.photos`) has ``photos_m(params)`` as well: how far beyond a tile
+    they are looked for, in metres, or None. The others are given none, and a photograph makes no tile of theirs
+    dirty.
     """
 
     Params: type

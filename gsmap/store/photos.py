@@ -23,7 +23,7 @@ from gsmap.store.schema import photo_sightings
 from gsmap.types.photo_sighting import PhotoSighting, ThingInPhoto
 
 KIND = "photos"
-MAX_BYTES = 1 << 19  # of a photo's JPEG: it is there to be shown, not to be measured in
+MAX_BYTES = 1 << 19  # of a photo's JPEG: the merged map is to look like it, and no sharper
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,25 @@ from gsmap.types.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
+class KeptPhoto:
+    """A photograph that a map keeps, in the map frame.
+
+    Args:
+        camera: one, of the size of the picture that is kept.
+        read: reads that, (H, W, 3) uint8.
+        sigma_rad, sigma_m: how well its rotation and its place are known (standard deviation of the least known).
+        around: the Gaussians of its capture around its camera, map frame; None where those of the scene it is given
+            with are all there are.
+    """
+
+    camera: Cameras
+    read: Callable[[], np.ndarray]
+    sigma_rad: float = 0.0
+    sigma_m: float = 0.0
+    around: Callable[[], Gaussians] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class PlacedScene:
     """One capture, or the piece of it that lies near a tile, in the map frame.
 
@@ -25,6 +44,7 @@ class PlacedScene:
             given where `gaussians` is only a piece of it. See `whole_centroid`.
         sights: what its views show (`gsmap.merge.sights.PlacedSights`), given the longest side of a picture; None where
             it is to be rendered from `gaussians`.
+        photos: photographs that show the place as this capture does, each as far as it does.
     """
 
     gaussians: Gaussians
@@ -33,6 +53,7 @@ class PlacedScene:
     captured_at: str | None = None
     centroid: Callable[[], np.ndarray | None] | None = None
     sights: Callable[[int], Any] | None = None
+    photos: tuple[KeptPhoto, ...] = ()
 
     def whole_centroid(self) -> np.ndarray | None:
         """(3,) float64 unweighted mean of the means of the whole capture, map frame; None where it holds nothing.

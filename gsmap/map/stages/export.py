@@ -30,13 +30,15 @@ from gsmap.map.persisting import notes as persisting_notes
 from gsmap.map.settings import Settings
 from gsmap.map.sharing import noting
 from gsmap.map.world import InWorld, in_world, world_notes
-from gsmap.merge import reach_m, recipe_key, uses_dates, with_prefer, with_steps
+from gsmap.merge import photos_m, reach_m, recipe_key, uses_dates, with_prefer, with_steps
 from gsmap.merge.sights import SightStore
+from gsmap.methods import text_digest
 from gsmap.store import Store
+from gsmap.store.photos import StoredPhoto
 from gsmap.texts import escaped
 from gsmap.types import Cameras, PoseGraph, Scene, ScenePose, Tile
 from gsmap.types.metre import Metre
-from gsmap.types.plain import plain
+from gsmap.types.plain import canonical, plain
 from gsmap.types.progress import Progress
 
 _log = logging.getLogger("gsmap.export")
@@ -111,6 +113,7 @@ class Planned:
         metres: how long a metre is in the frame of each component of the poses.
         world: where those lie that are tied to the world.
         passing: what of each scene is left out.
+        photos: photographs that tiles are to look like, by the component and the name of the tile.
     """
 
     revision: int | None
@@ -123,6 +126,7 @@ class Planned:
     metres: Mapping[int, Metre] = field(default_factory=dict)
     world: Mapping[int, InWorld] = field(default_factory=dict)
     passing: Mapping[str, Passing] = field(default_factory=dict)
+    photos: Mapping[tuple[int, str], Sequence[StoredPhoto]] = field(default_factory=dict)
 
 
 def plan(store: Store, request: Request, settings: Settings, known: Known | None = None) -> Planned:
@@ -173,7 +177,50 @@ def plan(store: Store, request: Request, settings: Settings, known: Known | None
         metres_per_unit={component: metre.metres_per_unit for component, metre in metres.items()},
         max_tiles=settings.export.max_tiles,
     )
-    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing)
+    photos = _photos(store, tiles, photos_m(method, params), request.as_of)
+    recipe = replace(recipe, photos={tile: _digest(kept) for tile, kept in photos.items()})
+    return Planned(revision, scenes, method, params, recipe, tiles, notes, metres, world, passing, photos)
+
+
+def _photos(
+    store: Store, tiles: Sequence[PlannedTile], within_m: float | None, as_of: str | None
+) -> dict[tuple[int, str], list[StoredPhoto]]:
+    """The photographs that may show each tile, the newest first; of tiles that there are none of nothing.
+
+    Args:
+        within_m: of a tile's bounds cameras are looked for; None where the merger takes no photographs.
+    """
+    if within_m is None:
+        return {}
+    kept = sorted(store.photos.list(), key=lambda photo: photo.sighting.captured_at or "", reverse=True)
+    if as_of is not None:
+        until = last_of(as_of)
+        kept = [photo for photo in kept if is_until(photo.sighting.captured_at, until)]
+    out = {}
+    for tile in tiles if kept else ():
+        far = within_m / tile.metres_per_unit
+        box = np.array([tile.bounds[0] - far, tile.bounds[1] + far])
+        near = [photo for photo in kept if _stands_in(box, photo, tile)]
+        if near:
+            out[tile.component, tile.name] = near
+    return out
+
+
+def _stands_in(box: np.ndarray, photo: StoredPhoto, tile: PlannedTile) -> bool:
+    one = photo.sighting
+    if one.scene not in tile.poses:
+        return False
+    at = tile.poses[one.scene].apply(one.T_scene_camera[:3, 3])
+    return bool(((at >= box[0]) & (at <= box[1])).all())
+
+
+def _digest(kept: Sequence[StoredPhoto]) -> str:
+    """Names photographs, where they stand in their scenes, and how well that is known."""
+    rows = [
+        [one.digest, one.scene, one.T_scene_camera, one.covariance, one.intrinsics_px, one.size_px]
+        for one in (photo.sighting for photo in kept)
+    ]
+    return text_digest(canonical(plain(rows)))[:32]
 
 
 def export(
@@ -295,7 +342,13 @@ def _maker(
         captured_at={scene: planned.scenes[scene].captured_at for scene in tile.poses},
         store=SightStore(folder, settings.export.shared_bytes),
         passing={scene: planned.passing[scene] for scene in tile.poses if scene in planned.passing},
+        photos=_by_scene(planned.photos.get((tile.component, tile.name), ())),
     )
+
+
+def _by_scene(photos: Sequence[StoredPhoto]) -> dict[str, tuple[StoredPhoto, ...]]:
+    scenes = {photo.sighting.scene for photo in photos}
+    return {scene: tuple(photo for photo in photos if photo.sighting.scene == scene) for scene in scenes}
 
 
 def _cameras(store: Store, planned: Planned, component: int) -> Cameras | None:

@@ -173,6 +173,10 @@ def min_cameras(params: Params) -> int:
     return params.min_cameras
 
 
+def photos_m(params: Params) -> float | None:
+    return looking_m(params) if params.references.photos.share > 0 else None
+
+
 def uses_dates(params: Params) -> bool:
     return params.prefer != "both"
 
@@ -202,20 +206,23 @@ def merge(
         settled,
         lambda fraction, text: progress(0.2 * fraction, text),
         params.references,
+        params.compare,
     )
-    # One capture alone shows nothing twice and is what its pictures show: thinned or fitted it could but lose.
+    # One capture alone shows nothing twice and is what its pictures show: thinned or fitted to them it could but lose.
     alone = sum(bool(inside(scene.gaussians.means, bounds, params.halo_m).any()) for scene in scenes) < 2
     start, origin, new = _start(scenes, wanted, settled, replace(params, keep=1.0) if alone else params, bounds)
     if len(wanted) == 0 or not inside(start.means, bounds).any():
         notes.append("nothing to optimise: no camera sees it")
         return MergeResult(start, origin, notes=tuple(notes))
-    if alone:
+    if alone and not wanted.num_photos:
         mine = inside(start.means, bounds)
         return MergeResult(start[mine], origin[mine], notes=tuple(notes))
     # The near half of the halo is fitted along, then dropped: were it frozen, what is at the border would make up for
     # neighbours that are going to be refined too.
     # What is new was fitted to photographs, and has no other capture to agree with.
     frozen = ~inside(start.means, bounds, params.halo_m / 2) | new
+    if wanted.num_photos:
+        notes.append(f"{wanted.num_photos} photographs were reproduced as well")
     fitted, steps, truncated = _fit(start, frozen, wanted, params, deadline, progress)
     # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
     mine = inside(start.means, bounds)
