@@ -72,11 +72,11 @@ def test_a_picture_of_something_else_or_from_who_knows_where_is_left_out():
 
 
 def test_before_a_plain_wall_a_picture_of_another_place_is_told_by_following_nothing():
-    plain = wall(0, -1.5, 0.5, colour=lambda x, y: 0.5 + 0.15 * (texture(x, y) - 0.5))
+    plain = wall(0, -1.5, 0.5, colour=lambda x, y: 0.5 + 0.3 * (texture(x, y) - 0.5))
     scene = PlacedScene(plain, cameras_facing([-0.5]), "a")
     shows = np.round(np.clip(render(plain, cameras_facing([-0.5])).colour[0], 0, 1) * 255).astype(np.uint8)
     assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows), scene) is not None
-    assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows[:, ::-1].copy()), scene) is None
+    assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows[..., ::-1].copy()), scene) is None
 
 
 def test_a_larger_picture_is_reduced_and_a_smaller_one_taken_as_it_is():
