@@ -101,7 +101,7 @@ def psnr_db(gaussians: Gaussians, one: Taken, *, gained: bool) -> float:
     shown = np.clip(render(gaussians, one.camera).colour[0], 0, 1)
     wanted = read_image(one.path)
     if gained:
-        shown = np.clip(shown * ((shown * wanted).sum((0, 1)) / (shown**2).sum((0, 1))), 0, 1)
+        shown = np.clip(shown * ((shown * wanted).sum((0, 1)) / np.maximum((shown**2).sum((0, 1)), 1e-9)), 0, 1)
     return float(-10 * np.log10(np.mean((shown - wanted) ** 2)))
 
 

@@ -73,7 +73,10 @@ def command(
         str | None, typer.Option("--pictures", metavar="DIR", help="With --changes: draw these parts, in this folder.")
     ] = None,
     add: Annotated[
-        bool, typer.Option("--add", help="Keep placed photos in the map: evidence of what stood there, and when.")
+        bool,
+        typer.Option(
+            "--add", help="Keep placed photos: evidence of what stood there, and what merged captures are to look like."
+        ),
     ] = False,
     captured_at: Annotated[
         str | None,

@@ -165,7 +165,7 @@ def test_a_tile_reads_what_is_around_a_photograph_in_its_scenes_own_frame():
     placed = merge([replace(a, photos=(photo_at(-0.5),)), b], "tto", params, bounds=bounds)
     photo = moved(photo_at(-0.5), S)
     read = merge_tile([lazy(a, S, asked, photo), lazy(b, S, [])], "tto", params, bounds=bounds)
-    assert "1 photographs were reproduced as well" in read.notes
+    assert "1 photograph was reproduced as well" in read.notes
     assert error(read.gaussians, [-0.5]) == pytest.approx(error(placed.gaussians, [-0.5]), rel=0.1)
     bare = merge([a, b], "tto", params, bounds=bounds)
     assert error(placed.gaussians, [-0.5]) < 0.9 * error(bare.gaussians, [-0.5])
@@ -181,4 +181,4 @@ def test_how_well_a_photograph_is_known_in_the_unit_of_its_scene():
         S = Sim3(np.eye(3), np.zeros(3), scale)
         photo = moved(replace(photo_at(-0.5), sigma_m=sigma), S)
         notes = merge_tile([lazy(a, S, [], photo), lazy(b, S, [])], "tto", params).notes
-        assert ("1 photographs were reproduced as well" in notes) == taken
+        assert ("1 photograph was reproduced as well" in notes) == taken

@@ -222,7 +222,8 @@ def merge(
     # What is new was fitted to photographs, and has no other capture to agree with.
     frozen = ~inside(start.means, bounds, params.halo_m / 2) | new
     if wanted.num_photos:
-        notes.append(f"{wanted.num_photos} photographs were reproduced as well")
+        many = wanted.num_photos > 1
+        notes.append(f"{wanted.num_photos} photograph{'s were' if many else ' was'} reproduced as well")
     fitted, steps, truncated = _fit(start, frozen, wanted, params, deadline, progress)
     # A Gaussian stays with the tile it started in: one that crossed the border would be lost to both or kept by both.
     mine = inside(start.means, bounds)
