@@ -35,8 +35,7 @@ from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.ingest import read_captures
 from gsmap.merge import default_params, merge
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians, PlacedScene
-from gsmap.types.merging import KeptPhoto
+from gsmap.types import Cameras, Gaussians, KeptPhoto, PlacedScene
 
 OFF_DEG, OFF_M = 0.15, 0.009
 SEEN = 0.6  # of a made photo, that a capture must show for it to be scored

@@ -29,11 +29,22 @@ from gsmap.methods import family
 from gsmap.register import SceneView
 from gsmap.store import Store, branches, homes, sqlite
 from gsmap.store.photos import StoredPhoto
-from gsmap.types import Cameras, ChangeReport, Gaussians, MergeResult, PlacedScene, Registration, SceneGraph, Sim3
+from gsmap.types import (
+    Cameras,
+    ChangeReport,
+    Gaussians,
+    KeptPhoto,
+    MergeResult,
+    PlacedScene,
+    Registration,
+    SceneGraph,
+    Sim3,
+)
 from gsmap.types.localization import SceneFeatures
-from gsmap.types.merging import KeptPhoto
 from gsmap.types.model import ModelSpec
 from gsmap.types.progress import Progress
+
+_LARGEST_PX = 4096  # of a kept photo's longer side
 
 
 def _store(path: str) -> Store:
@@ -141,6 +152,8 @@ def _picture(path: str, number: int) -> np.ndarray:
     """(H, W, 3) uint8 of a photo as it is kept."""
     try:
         with Image.open(io.BytesIO(_store(path).photos.jpeg(number))) as picture:
+            if max(picture.size) > _LARGEST_PX:  # so few bytes can claim any number of pixels
+                raise ValueError(f"it claims {picture.size[0]} by {picture.size[1]} pixels")
             return np.asarray(picture.convert("RGB"))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise CorruptError(

@@ -12,8 +12,7 @@ from gsmap.compare.colours import FLOOR
 from gsmap.geometry.sh import SH_C0, rgb_of_sh0, sh0_of_rgb
 from gsmap.merge.placed import overlapping, share_in_view
 from gsmap.render import render
-from gsmap.types import Cameras, Gaussians, PlacedScene
-from gsmap.types.merging import KeptPhoto
+from gsmap.types import Cameras, Gaussians, KeptPhoto, PlacedScene
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from gsmap.compare import colours
 from gsmap.compare import params as comparing
 from gsmap.compare.neighbourhoods import grown
 from gsmap.render import render
-from gsmap.types import Cameras, PlacedScene
-from gsmap.types.merging import KeptPhoto
+from gsmap.types import Cameras, KeptPhoto, PlacedScene
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Params:
     Args:
         share: how often one is used in every pass over all views, as often as so many views that a capture renders; 0
             leaves all of them out.
-        max_photos: at most, of each scene the newest first.
+        max_photos: at most; those in which most of the tile lies.
         max_sigma_px: one whose pose is known less well than so many pixels, at a picture of 480, is left out.
         min_alpha: a pixel counts where the capture is as opaque ...
         min_agreeing: ... and a photograph where it shows so large a share of what the capture shows there.

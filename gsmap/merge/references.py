@@ -192,12 +192,15 @@ def _photos(
     if not params.share:
         return
     asked = [
-        (i, photo)
+        (i, photo, share)
         for i, (scene, piece) in enumerate(zip(scenes, pieces, strict=True))
         for photo in scene.photos
-        if share_in_view(photo.camera, piece.means)[0] > 0
+        if (share := float(share_in_view(photo.camera, piece.means)[0])) > 0
     ]
-    for i, photo in asked[: params.max_photos]:
+    if len(asked) > params.max_photos:
+        most = np.argsort([-share for _, _, share in asked], kind="stable")[: params.max_photos]
+        asked = [asked[row] for row in sorted(most)]
+    for i, photo, _ in asked:
         one = photos.shown(photo, scenes[i], longest_side_px, params, comparing)
         if one is not None:
             yield i, one

@@ -167,7 +167,7 @@ class Sights:
 
     def cell(self, camera: int) -> tuple[int, ...]:
         """By which cameras are taken together."""
-        return tuple(int(v) for v in np.floor(self.cameras.centers[camera] / (_CELL * self.around)))
+        return cell_of(self.cameras.centers[camera], self.around)
 
     def _seen(self, camera: int) -> Sight:
         gaussians, keys = self._around(camera)
@@ -185,8 +185,7 @@ class Sights:
         cell = self.cell(camera)
         if self._near is None or self._near[0] != cell:
             self._near = None  # two of them need not be held at once
-            low = np.array(cell) * _CELL * self.around
-            box = np.array([low - self.around, low + (1 + _CELL) * self.around])
+            box = box_around_cell(cell, self.around)
             found = self.load(box)
             found = found[inside(found.means, box)]
             self._near = cell, found, keys_of(found.means)
@@ -243,6 +242,17 @@ class PlacedSights:
         rows, at = self.order[known], at[known]
         pixels[rows] += sight.pixels[at]
         largest[rows] = np.maximum(largest[rows], sight.largest[at])
+
+
+def cell_of(centre: np.ndarray, around: float) -> tuple[int, ...]:
+    """The cell that a camera (3,) stands in, which looks so far around itself."""
+    return tuple(int(v) for v in np.floor(centre / (_CELL * around)))
+
+
+def box_around_cell(cell: tuple[int, ...], around: float) -> np.ndarray:
+    """(2, 3) what lies at least so near to any camera of a cell."""
+    low = np.array(cell) * _CELL * around
+    return np.array([low - around, low + (1 + _CELL) * around])
 
 
 def keys_of(means: np.ndarray) -> np.ndarray:

@@ -14,9 +14,8 @@ from gsmap.geometry.boxes import inside, moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import checked_params, merge, merger
 from gsmap.merge.placed import overlapping
-from gsmap.merge.sights import PlacedSights, Sights, SightStore, keys_of
-from gsmap.types import Cameras, Gaussians, MergeResult, PlacedScene, Sim3
-from gsmap.types.merging import KeptPhoto
+from gsmap.merge.sights import PlacedSights, Sights, SightStore, box_around_cell, cell_of, keys_of
+from gsmap.types import Cameras, Gaussians, KeptPhoto, MergeResult, PlacedScene, Sim3
 from gsmap.types.progress import Progress
 
 
@@ -128,7 +127,8 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
     if rows is not None:
         sights = partial(_sights, scene, around_m, rows, keys_of(read.means))
     moved = transform_gaussians(read, S)
-    photos = tuple(replace(_placed(p, S), around=partial(_around, scene, p, around_m)) for p in scene.photos)
+    place = _Around(scene, around_m / S.scale)
+    photos = tuple(replace(_placed(p, S), around=partial(place.of, p.camera.centers[0])) for p in scene.photos)
     return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights, photos)
 
 
@@ -136,11 +136,22 @@ def _placed(photo: KeptPhoto, S: Sim3) -> KeptPhoto:
     return replace(photo, camera=transform_cameras(photo.camera, S), sigma_m=photo.sigma_m * S.scale)
 
 
-def _around(scene: LazyScene, photo: KeptPhoto, around_m: float) -> Gaussians:
-    """What lies so near to a photograph's camera, map frame: whatever else of its scene the tile reads."""
-    centre, far = photo.camera.centers[0], around_m / scene.S_map_scene.scale
-    found = scene.load(np.array([centre - far, centre + far]))
-    return transform_gaussians(found, scene.S_map_scene)
+@dataclass(eq=False)
+class _Around:
+    """What of a scene lies at least so near to a camera (its unit), map frame: whatever else of it the tile reads."""
+
+    scene: LazyScene
+    around: float
+    _near: tuple[tuple[int, ...], Gaussians] | None = None
+
+    def of(self, centre: np.ndarray) -> Gaussians:
+        """Around a camera (3,) in the scene's frame; read once for those that stand near each other."""
+        cell = cell_of(centre, self.around)
+        if self._near is None or self._near[0] != cell:
+            self._near = None  # two of them need not be held at once
+            found = self.scene.load(box_around_cell(cell, self.around))
+            self._near = cell, transform_gaussians(found, self.scene.S_map_scene)
+        return self._near[1]
 
 
 def _sights(

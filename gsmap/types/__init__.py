@@ -5,7 +5,7 @@ from gsmap.types.change import CHANGE_KINDS, Change, ChangeKind, ChangeReport
 from gsmap.types.file_info import FileInfo
 from gsmap.types.gaussians import Gaussians
 from gsmap.types.map_object import SIGHTING_STATES, MapObject, ObjectWords, Sighting, SightingState
-from gsmap.types.merging import MergeResult, PlacedScene
+from gsmap.types.merging import KeptPhoto, MergeResult, PlacedScene
 from gsmap.types.pose_graph import Edge, EdgeOutcome, PoseChange, PoseGraph, Prior, Provenance, ScenePose
 from gsmap.types.registration import Proposal, Registration
 from gsmap.types.room import Room
@@ -28,6 +28,7 @@ __all__ = [
     "FileInfo",
     "GaussianSource",
     "Gaussians",
+    "KeptPhoto",
     "MapObject",
     "MergeResult",
     "NodeLayer",

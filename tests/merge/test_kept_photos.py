@@ -8,14 +8,13 @@ from synthetic_walls import cameras_facing, texture, two_scenes, wall
 
 from gsmap import compare
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
-from gsmap.merge import PlacedScene, default_params, merge, photos_m
+from gsmap.merge import PlacedScene, default_params, merge, photos_m, references
 from gsmap.merge.exposure import apply_gain, balance_exposure
 from gsmap.merge.photos import Params, shown
 from gsmap.merge.references import render_references
 from gsmap.merge.tile import LazyScene, merge_tile
 from gsmap.render import render
-from gsmap.types import Gaussians, Sim3
-from gsmap.types.merging import KeptPhoto
+from gsmap.types import Gaussians, KeptPhoto, Sim3
 
 WIDTH, GRAIN = 64, 0.05
 TRUTH = wall(9, -1.8, 1.8, spacing=0.02)  # finer than what was trained
@@ -182,3 +181,24 @@ def test_how_well_a_photograph_is_known_in_the_unit_of_its_scene():
         photo = moved(replace(photo_at(-0.5), sigma_m=sigma), S)
         notes = merge_tile([lazy(a, S, [], photo), lazy(b, S, [])], "tto", params).notes
         assert ("1 photograph was reproduced as well" in notes) == taken
+
+
+def test_of_too_many_photographs_those_that_show_most_are_reproduced():
+    a, b = two_scenes(grain=GRAIN)
+    scenes = [replace(a, photos=(photo_at(-1.4), photo_at(-0.9))), replace(b, photos=(photo_at(0.6),))]
+    params = references.Params(photos=Params(max_photos=2))
+    found = render_references(scenes, None, 0.0, 64, None, quiet, params)
+    assert found.num_photos == 2
+    assert sorted(found.cameras.centers[-2:, 0].tolist()) == [-0.9, 0.6]
+
+
+def test_what_is_around_photographs_that_stand_together_is_read_once():
+    a, b = two_scenes(grain=GRAIN)
+    with_photos, without, S = [], [], Sim3.identity()
+    photos = [moved(photo_at(x), S) for x in (-0.9, -0.8, -0.7)]
+    params = replace(default_params("tto"), steps=0)
+    bounds = np.array([[-1.5, -2, -2], [0.5, 2, 2]])
+    merge_tile([lazy(a, S, without), lazy(b, S, [])], "tto", params, bounds=bounds)
+    notes = merge_tile([lazy(a, S, with_photos, *photos), lazy(b, S, [])], "tto", params, bounds=bounds).notes
+    assert "3 photographs were reproduced as well" in notes
+    assert len(with_photos) - len(without) == 1
