@@ -7,12 +7,13 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from multiprocessing import current_process
 from typing import Any
 
 from gsmap.methods import MethodParams, family
 from gsmap.methods.executor import SetAside, Workers
 
-__all__ = ["Kept", "Params", "SetAside", "run_jobs"]
+__all__ = ["Kept", "Params", "SetAside", "is_beginning", "run_jobs"]
 
 AUTO = "auto"
 
@@ -43,6 +44,11 @@ class Params:
         name = self.executor if self.executor != AUTO else os.environ.get("GSMAP_EXECUTOR") or "local"
         family("executor").get(name)
         return name, self.executors[name]
+
+
+def is_beginning() -> bool:
+    """Whether this process is a worker that still reads the script it was started by: nothing there may start work."""
+    return bool(getattr(current_process(), "_inheriting", False))
 
 
 def run_jobs(

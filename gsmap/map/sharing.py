@@ -12,8 +12,8 @@ from collections.abc import Callable, Collection, Generator, Iterable, Iterator,
 from contextlib import closing, contextmanager, suppress
 from typing import Any
 
-from gsmap.engine import SetAside
-from gsmap.errors import GsmapError
+from gsmap.engine import SetAside, is_beginning
+from gsmap.errors import ConfigError, GsmapError
 from gsmap.store import Store
 from gsmap.types.progress import StageProgress
 
@@ -89,6 +89,11 @@ class SharedJobs:
 
         Whoever is killed loses that much work, who is interrupted or fails none.
         """
+        if self._todo and is_beginning():  # its parent, who does these jobs, waits for it to have begun
+            raise ConfigError(
+                "a worker process reads the script that started it, and comes to what starts workers: put what the "
+                'script does below `if __name__ == "__main__":`'
+            )
         together_s = TOGETHER_S if together_s is None else together_s
         while self._todo:
             begun: list[str] = []

@@ -152,3 +152,16 @@ def test_who_is_interrupted_says_what_is_kept(site: Path, start: Start, stage: s
     assert int(said[1]) == (graphs if stage == "graph" else edges)
     assert int(said[1]) >= after
     assert leases == 0
+
+
+def test_a_script_without_its_guard_ends_and_says_so(site: Path, tmp_path: Path) -> None:
+    """Its workers read it, come to the same update, and would wait for the process that waits for them."""
+    script = tmp_path / "script.py"
+    script.write_text(f"import gsmap.map\nwith gsmap.map.open({str(site)!r}) as m:\n    m.describe()\n")
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "GSMAP_WORKERS": "2"}
+    ended = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, env=env, timeout=60, check=False
+    )
+    assert ended.returncode == 1
+    assert 'put what the script does below `if __name__ == "__main__":`' in ended.stderr
+    assert "worker processes end before they do anything" in ended.stderr
