@@ -14,6 +14,7 @@ import numpy as np
 from gsmap.compare import colours
 from gsmap.compare import params as comparing
 from gsmap.compare.neighbourhoods import grown
+from gsmap.errors import ConfigError
 from gsmap.render import render
 from gsmap.types import Cameras, KeptPhoto, PlacedScene
 
@@ -43,6 +44,11 @@ class Params:
     margin_px: int = 2
     max_spread: float = 0.03
     min_slope: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("share", "max_photos", "max_sigma_px", "margin_px", "max_spread"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import pytest
 from synthetic_walls import cameras_facing, texture, two_scenes, wall
 
 from gsmap import compare
+from gsmap.errors import ConfigError
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import PlacedScene, default_params, merge, photos_m, references
 from gsmap.merge.exposure import apply_gain, balance_exposure
@@ -76,6 +77,11 @@ def test_before_a_plain_wall_a_picture_of_another_place_is_told_by_following_not
     shows = np.round(np.clip(render(plain, cameras_facing([-0.5])).colour[0], 0, 1) * 255).astype(np.uint8)
     assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows), scene) is not None
     assert ask(KeptPhoto(cameras_facing([-0.5]), lambda: shows[..., ::-1].copy()), scene) is None
+
+
+def test_settings_that_cannot_be_are_refused():
+    with pytest.raises(ConfigError, match="share must not be negative, got -1"):
+        Params(share=-1.0)
 
 
 def test_a_larger_picture_is_reduced_and_a_smaller_one_taken_as_it_is():
