@@ -29,6 +29,7 @@ import numpy as np
 from bench_merge import true_pose
 from PIL import Image
 
+from gsmap.evaluate.images import psnr
 from gsmap.evaluate.renders import find_images, read_image
 from gsmap.geometry.rotations import exp_so3
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
@@ -101,7 +102,7 @@ def psnr_db(gaussians: Gaussians, one: Taken, *, gained: bool) -> float:
     wanted = read_image(one.path)
     if gained:
         shown = np.clip(shown * ((shown * wanted).sum((0, 1)) / np.maximum((shown**2).sum((0, 1)), 1e-9)), 0, 1)
-    return float(-10 * np.log10(np.mean((shown - wanted) ** 2)))
+    return psnr(shown, wanted)
 
 
 def measure(

@@ -323,7 +323,8 @@ def report(title: str, pairs: list[Pair], hidden: Hidden) -> None:
     """Normalised squared errors (NEES) of poses with their scale, and of rigid ones.
 
     "Beyond 3 sigma" are those that a chi-square would exceed as rarely as a normal variable three standard deviations;
-    "cost" is minus the mean log likelihood, less what no covariance changes.
+    "cost" is minus the mean log likelihood, less what no covariance changes. Taken for another scale should be none of
+    the made pairs, which all are of one metre.
     """
     both = [pair.under(hidden) for pair in pairs]
     said = []
@@ -336,7 +337,9 @@ def report(title: str, pairs: list[Pair], hidden: Hidden) -> None:
             said.append(f"{dof} dof: median {middle:.1f} ({chi2.ppf(0.5, dof):.1f}), 95 % {high:.1f} "
                         f"({chi2.ppf(0.95, dof):.1f}), most {max(values):.0f}, beyond 3 sigma {out}, "
                         f"cost {cost:.2f}")  # fmt: skip
-    print(f"{title}, {len(pairs)} pairs: NEES " + "; ".join(said))
+    scales = [(float(np.log(pair.scale)), pair.told(hidden).log_scale_sigma) for pair in pairs]
+    others = sum(not believe(log_scale, sigma).rigid for log_scale, sigma in scales)
+    print(f"{title}, {len(pairs)} pairs: NEES " + "; ".join(said) + f"; taken for another scale {others}")
     if len(pairs) > 2:
         print("    correlated with how far poses are shifted: " + ", ".join(
             f"{name} {value:.2f}" for name, value in foretold(pairs).items()

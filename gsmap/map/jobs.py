@@ -20,6 +20,7 @@ from gsmap.errors import CorruptError
 from gsmap.export import PlannedTile
 from gsmap.geometry.metres import in_metres, resized
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
+from gsmap.localize.localizing import sigmas_of
 from gsmap.map import persisting
 from gsmap.map.persisting import Passing
 from gsmap.merge.placed import pulled_inside
@@ -142,10 +143,7 @@ def _kept(path: str, photo: StoredPhoto) -> KeptPhoto:
     """A photo in the frame of its scene."""
     one = photo.sighting
     camera = Cameras(one.T_scene_camera[None], one.intrinsics_px[None], np.array([one.size_px]))
-    turn, shift = (
-        float(np.sqrt(np.linalg.eigvalsh(one.covariance[part, part])[-1].clip(0))) for part in (slice(3), slice(3, 6))
-    )
-    return KeptPhoto(camera, partial(_picture, path, photo.number), turn, shift)
+    return KeptPhoto(camera, partial(_picture, path, photo.number), *sigmas_of(one.covariance))
 
 
 def _picture(path: str, number: int) -> np.ndarray:
@@ -175,7 +173,7 @@ class TileMaker:
         captured_at: the date of each of its scenes.
         store: where what views show is kept for other tiles.
         passing: what of each of its scenes is left out, by scene id.
-        photos: that it is to look like, by scene id, the newest first.
+        photos: that it is to look like, by scene id.
     """
 
     location: str

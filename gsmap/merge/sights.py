@@ -13,8 +13,10 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -139,6 +141,36 @@ _HELD: OrderedDict[tuple[str, str], Sight] = OrderedDict()
 _WRITTEN: Counter[str] = Counter()  # bytes since a folder was last looked at
 
 
+T = TypeVar("T")
+
+
+@dataclass(eq=False)
+class Nearby(Generic[T]):
+    """What lies around cameras, made once for those of one cell; the last place is remembered.
+
+    Args:
+        make: of a box (2, 3), what lies in it, or more.
+        around: length, in the unit of the box: what lies at least so near to a camera on each axis is in it.
+    """
+
+    make: Callable[[np.ndarray], T]
+    around: float
+    _last: tuple[tuple[int, ...], T] | None = None
+
+    def cell(self, centre: np.ndarray) -> tuple[int, ...]:
+        """By which cameras (3,) are taken together."""
+        return tuple(int(v) for v in np.floor(centre / (_CELL * self.around)))
+
+    def of(self, centre: np.ndarray) -> T:
+        """What lies around a camera (3,)."""
+        cell = self.cell(centre)
+        if self._last is None or self._last[0] != cell:
+            self._last = None  # two of them need not be held at once
+            low = np.array(cell) * _CELL * self.around
+            self._last = cell, self.make(np.array([low - self.around, low + (1 + _CELL) * self.around]))
+        return self._last[1]
+
+
 @dataclass(eq=False)
 class Sights:
     """The views of one capture.
@@ -158,7 +190,10 @@ class Sights:
     around: float
     longest_side_px: int
     store: SightStore
-    _near: tuple[tuple[int, ...], Gaussians, np.ndarray] | None = None
+
+    @cached_property
+    def _nearby(self) -> Nearby[tuple[Gaussians, np.ndarray]]:
+        return Nearby(self._with_keys, self.around)
 
     def of(self, camera: int) -> Sight:
         """What one of the cameras sees."""
@@ -167,10 +202,10 @@ class Sights:
 
     def cell(self, camera: int) -> tuple[int, ...]:
         """By which cameras are taken together."""
-        return cell_of(self.cameras.centers[camera], self.around)
+        return self._nearby.cell(self.cameras.centers[camera])
 
     def _seen(self, camera: int) -> Sight:
-        gaussians, keys = self._around(camera)
+        gaussians, keys = self._nearby.of(self.cameras.centers[camera])
         view = self.cameras[camera].resized(self.longest_side_px)
         seen = render(gaussians, view, max_weight=True)
         dominant = seen.dominant_id[0]
@@ -180,16 +215,10 @@ class Sights:
         depth = np.ascontiguousarray(seen.depth[0])
         return Sight(_box_of(view, depth), keys[rows], pixels[rows].astype(np.int32), seen.max_weight[rows], depth)
 
-    def _around(self, camera: int) -> tuple[Gaussians, np.ndarray]:
-        """What lies around a camera, with keys; the last place is remembered."""
-        cell = self.cell(camera)
-        if self._near is None or self._near[0] != cell:
-            self._near = None  # two of them need not be held at once
-            box = box_around_cell(cell, self.around)
-            found = self.load(box)
-            found = found[inside(found.means, box)]
-            self._near = cell, found, keys_of(found.means)
-        return self._near[1:]
+    def _with_keys(self, box: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+        found = self.load(box)
+        found = found[inside(found.means, box)]
+        return found, keys_of(found.means)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,17 +271,6 @@ class PlacedSights:
         rows, at = self.order[known], at[known]
         pixels[rows] += sight.pixels[at]
         largest[rows] = np.maximum(largest[rows], sight.largest[at])
-
-
-def cell_of(centre: np.ndarray, around: float) -> tuple[int, ...]:
-    """The cell that a camera (3,) stands in, which looks so far around itself."""
-    return tuple(int(v) for v in np.floor(centre / (_CELL * around)))
-
-
-def box_around_cell(cell: tuple[int, ...], around: float) -> np.ndarray:
-    """(2, 3) what lies at least so near to any camera of a cell."""
-    low = np.array(cell) * _CELL * around
-    return np.array([low - around, low + (1 + _CELL) * around])
 
 
 def keys_of(means: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from gsmap.geometry.boxes import inside, moved_box
 from gsmap.geometry.transforms import transform_cameras, transform_gaussians
 from gsmap.merge import checked_params, merge, merger
 from gsmap.merge.placed import overlapping
-from gsmap.merge.sights import PlacedSights, Sights, SightStore, box_around_cell, cell_of, keys_of
+from gsmap.merge.sights import Nearby, PlacedSights, Sights, SightStore, keys_of
 from gsmap.types import Cameras, Gaussians, KeptPhoto, MergeResult, PlacedScene, Sim3
 from gsmap.types.progress import Progress
 
@@ -32,7 +32,7 @@ class LazyScene:
         store: where what its views show is kept for other tiles.
         without: names what ``load`` leaves out of it; empty where that is nothing.
         load_within: as ``load`` of a box, but no more than asked for, where that is cheaper.
-        photos: kept photographs that show it, its frame and unit; those that are to take part, the newest first.
+        photos: kept photographs that show it and are to take part, its frame and unit.
     """
 
     scene_id: str
@@ -127,31 +127,13 @@ def _read(scene: LazyScene, bounds: np.ndarray | None, reading: _Reading) -> Pla
     if rows is not None:
         sights = partial(_sights, scene, around_m, rows, keys_of(read.means))
     moved = transform_gaussians(read, S)
-    place = _Around(scene, around_m / S.scale)
+    place = Nearby(lambda near: transform_gaussians(scene.load(near), S), around_m / S.scale)
     photos = tuple(replace(_placed(p, S), around=partial(place.of, p.camera.centers[0])) for p in scene.photos)
     return PlacedScene(moved, cameras, scene.scene_id, scene.captured_at, scene.centroid, sights, photos)
 
 
 def _placed(photo: KeptPhoto, S: Sim3) -> KeptPhoto:
     return replace(photo, camera=transform_cameras(photo.camera, S), sigma_m=photo.sigma_m * S.scale)
-
-
-@dataclass(eq=False)
-class _Around:
-    """What of a scene lies at least so near to a camera (its unit), map frame: whatever else of it the tile reads."""
-
-    scene: LazyScene
-    around: float
-    _near: tuple[tuple[int, ...], Gaussians] | None = None
-
-    def of(self, centre: np.ndarray) -> Gaussians:
-        """Around a camera (3,) in the scene's frame; read once for those that stand near each other."""
-        cell = cell_of(centre, self.around)
-        if self._near is None or self._near[0] != cell:
-            self._near = None  # two of them need not be held at once
-            found = self.scene.load(box_around_cell(cell, self.around))
-            self._near = cell, transform_gaussians(found, self.scene.S_map_scene)
-        return self._near[1]
 
 
 def _sights(

@@ -34,11 +34,13 @@ class StoredPhoto:
         number: of its row.
         sighting: what it says.
         created_at: when it was added.
+        picture: digest of what is kept of its picture.
     """
 
     number: int
     sighting: PhotoSighting
     created_at: str
+    picture: str = ""
 
 
 class Photos:
@@ -193,4 +195,4 @@ def _stored(row: Row[Any]) -> StoredPhoto:
             f"the catalog holds a photo, in photo_sightings row {row.number}, that makes no sense ({error}): gsmap did "
             "not write that; restore the catalog from a backup"
         ) from error
-    return StoredPhoto(row.number, sighting, row.created_at)
+    return StoredPhoto(row.number, sighting, row.created_at, row.group_id or "")

@@ -14,13 +14,13 @@ from gsmap.types.gaussians import Gaussians
 
 @dataclass(frozen=True, eq=False)
 class KeptPhoto:
-    """A photograph that a map keeps, in the map frame.
+    """A photograph that a map keeps, in the frame of the map (`PlacedScene`) or of its scene, and in the unit of that.
 
     Args:
-        camera: one, of the size of the picture that is kept.
-        read: reads that, (H, W, 3) uint8.
+        camera: one; the picture that is kept may be smaller than it says.
+        read: reads that picture, (H, W, 3) uint8.
         sigma_rad, sigma_m: how well its rotation and its place are known (standard deviation of the least known).
-        around: the Gaussians of its capture around its camera, map frame; None where those of the scene it is given
+        around: the Gaussians of its capture around its camera, same frame; None where those of the scene it is given
             with are all there are.
     """
 

@@ -56,14 +56,22 @@ def cameras(scale: float) -> Cameras:
     return Cameras(poses, np.tile(LENS, (3, 1)), np.tile(SIZE, (3, 1)))
 
 
-def keep(m: Map, number: int = 1, *, name: str = "may", at=(0.1, 0.0, -1.8), when: str | None = "2026-05-20") -> None:
+def keep(
+    m: Map,
+    number: int = 1,
+    *,
+    name: str = "may",
+    at=(0.1, 0.0, -1.8),
+    when: str | None = "2026-05-20",
+    quality: int = 95,
+) -> None:
     """A photograph of the wall as a capture shows it, in a darker exposure."""
     pose = np.eye(4)
     pose[:3, 3] = at
     scale = 2.0 if name == "june" else 1.0
     seen = render(wall(9, scale), Cameras((scale_of(pose, scale))[None], LENS[None], np.array([SIZE]))).colour[0]
     content = io.BytesIO()
-    Image.fromarray((np.clip(0.8 * seen, 0, 1) * 255).astype(np.uint8)).save(content, "JPEG", quality=95)
+    Image.fromarray((np.clip(0.8 * seen, 0, 1) * 255).astype(np.uint8)).save(content, "JPEG", quality=quality)
     m.store.photos.add(sighting(m, number, name, scale_of(pose, scale), when), content.getvalue())
 
 
@@ -105,6 +113,21 @@ def test_a_photograph_makes_the_tile_again_and_one_that_is_taken_back_too(site: 
         site.store.photos.remove(site.store.photos.find(f"photo{number}.jpg").number)
     last = export(site, tmp_path / "out")
     assert (last.recomputed, last.tiles[0].sha256) == (1, first.tiles[0].sha256)
+
+
+def test_a_tile_is_named_by_pictures_as_they_are_kept_in_whatever_order_they_came(site: Map, tmp_path: Path) -> None:
+    keep(site, 1, when=None)
+    keep(site, 2, name="june", at=(-0.2, 0.1, -1.7), when=None)
+    first = export(site, tmp_path / "out")
+    for number in (2, 1):
+        site.store.photos.remove(site.store.photos.find(f"photo{number}.jpg").number)
+    keep(site, 2, name="june", at=(-0.2, 0.1, -1.7), when=None)
+    keep(site, 1, when=None)
+    assert export(site, tmp_path / "out").recomputed == 0
+    site.store.photos.remove(site.store.photos.find("photo1.jpg").number)
+    keep(site, 1, when=None, quality=30)  # the same photo and pose, another picture of it
+    again = export(site, tmp_path / "out")
+    assert (again.recomputed, again.tiles[0].sha256 != first.tiles[0].sha256) == (1, True)
 
 
 def test_only_tiles_near_it_and_mergers_that_use_it_know_of_it(site: Map, tmp_path: Path) -> None:

@@ -185,14 +185,15 @@ def plan(store: Store, request: Request, settings: Settings, known: Known | None
 def _photos(
     store: Store, tiles: Sequence[PlannedTile], within_m: float | None, as_of: str | None
 ) -> dict[tuple[int, str], list[StoredPhoto]]:
-    """The photographs that may show each tile, the newest first; of tiles that there are none of nothing.
+    """The photographs that may show each tile, of those tiles that there are any of; in whatever order they were added,
+    in one order.
 
     Args:
         within_m: of a tile's bounds cameras are looked for; None where the merger takes no photographs.
     """
     if within_m is None:
         return {}
-    kept = sorted(store.photos.list(), key=lambda photo: photo.sighting.captured_at or "", reverse=True)
+    kept = sorted(store.photos.list(), key=lambda photo: photo.sighting.digest)
     if as_of is not None:
         until = last_of(as_of)
         kept = [photo for photo in kept if is_until(photo.sighting.captured_at, until)]
@@ -215,10 +216,10 @@ def _stands_in(box: np.ndarray, photo: StoredPhoto, tile: PlannedTile) -> bool:
 
 
 def _digest(kept: Sequence[StoredPhoto]) -> str:
-    """Names photographs, where they stand in their scenes, and how well that is known."""
+    """Names pictures as they are kept, where they stand in their scenes, and how well that is known."""
     rows = [
-        [one.digest, one.scene, one.T_scene_camera, one.covariance, one.intrinsics_px, one.size_px]
-        for one in (photo.sighting for photo in kept)
+        [photo.picture, one.scene, one.T_scene_camera, one.covariance, one.intrinsics_px, one.size_px]
+        for photo, one in ((photo, photo.sighting) for photo in kept)
     ]
     return text_digest(canonical(plain(rows)))[:32]
 
