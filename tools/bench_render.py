@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from gsmap import _native
-from gsmap.render import ChunkIndex, Fitter, LearningRates, native, num_threads, render, set_num_threads
+from gsmap.render import ChunkIndex, LearningRates, native, num_threads, render, set_num_threads
+from gsmap.render.native_fit import NativeFitter
 from gsmap.types import Cameras, Gaussians
 
 BLACK = np.zeros(3, np.float32)
@@ -138,7 +139,7 @@ def optimisation_steps(gaussians: Gaussians, cameras: Cameras, steps: int) -> di
         ("wall_ms_per_step", None, time.perf_counter),
     ):
         set_num_threads(threads)
-        fitter = Fitter(moved, LearningRates(means=1e-5))
+        fitter = NativeFitter(moved, LearningRates(means=1e-5))
         for i in range(3):
             fitter.step(cameras[[i % len(cameras)]], targets[[i % len(cameras)]])
         times = []

@@ -18,7 +18,7 @@ from gsmap.errors import ConfigError
 from gsmap.formats import tiles3d
 from gsmap.geometry.projection import in_image, project
 from gsmap.render import render
-from gsmap.render.fit import Fitter, LearningRates
+from gsmap.render.fit import FitOptions, LearningRates, make_fitter
 from gsmap.types import Cameras, Gaussians
 
 VERSION = 4
@@ -159,7 +159,8 @@ def _fitted(
     seen = _seen_at(views, depths, footprint)
     wanted = [_picture(finer, camera) for camera in seen]
     size = float(np.exp(np.median(start.log_scales.max(1))))
-    fitter = Fitter(start, ssim_weight=0.2)
+    fitter = make_fitter(start, options=FitOptions(ssim_weight=0.2))
+    pictures = [fitter.load(picture[None]) for picture in wanted]
     rng = np.random.default_rng(0)
     turns = -(-params.steps // len(seen))
     order = np.concatenate([rng.permutation(len(seen)) for _ in range(turns)] or [np.zeros(0, int)])[: params.steps]
@@ -167,7 +168,7 @@ def _fitted(
         share = _LAST ** (step / params.steps)
         rates = {name: rate * share for name, rate in vars(_FIRST).items()}
         fitter.learning_rates = LearningRates(**rates | {"means": rates["means"] * size})
-        fitter.step(seen[v], wanted[v][None])
+        fitter.step(seen[v], pictures[v])
     return fitter.gaussians()
 
 

@@ -79,7 +79,8 @@ class ViewCache:
     def render(self, row: int) -> Rendered:
         """Colour, alpha and depth (1, H, W) of the view of one camera."""
         if row not in self._renders:
-            # On the CPU everywhere: a verdict is the same bits on every machine and in every run.
+            # On the CPU everywhere: a verdict is the same bits on every machine and in every run, and pictures this
+            # small gain nothing on a GPU (docs/how-to/gpu.md).
             self._renders[row] = render(self.gaussians, self.cameras[[row]], dominant_id=False, backend="native")
             while len(self._renders) > _KEPT:
                 self._renders.popitem(last=False)

@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from gsmap.render.backends import backend
-from gsmap.render.fit import Fitter, LearningRates
+from gsmap.render.fit import FitOptions, Fitter, LearningRates, make_fitter
 from gsmap.render.index import ChunkIndex
 from gsmap.render.native import num_threads, set_num_threads
 from gsmap.render.outputs import Rendered
@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ChunkIndex",
+    "FitOptions",
     "Fitter",
     "GaussianTensors",
     "LearningRates",
     "Rendered",
     "backend",
+    "make_fitter",
     "num_threads",
     "render",
     "set_num_threads",

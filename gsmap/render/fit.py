@@ -1,18 +1,16 @@
-"""Optimisation of Gaussians against images: render, loss, backward pass and Adam, all native."""
+"""Optimization of Gaussians against images of known cameras: the contract of a fitter, and the fitter of a backend."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from gsmap._native import fit_step, image_loss
 from gsmap.errors import InputError
-from gsmap.render import native
-from gsmap.render.outputs import image_size
+from gsmap.render.backends import backend as resolved
 from gsmap.types import Cameras, Gaussians
-
-_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
 @dataclass(frozen=True)
@@ -27,33 +25,60 @@ class LearningRates:
     sh_rest: float = 1.25e-4
 
 
-class Fitter:
+@dataclass(frozen=True)
+class FitOptions:
+    """How a fitter steps.
+
+    Args:
+        ssim_weight: share of ``1 - SSIM`` in the loss; the rest is Huber's of the colours.
+        huber_delta: differences of colours below this count by their square (Huber's loss); 0 is L1.
+        background: colour behind everything.
+        statistics: also keep what a densifier or pruner needs (about a tenth slower): see `Statistics`.
+        betas, epsilon: Adam's (Kingma & Ba 2015).
+    """
+
+    ssim_weight: float = 0.0
+    huber_delta: float = 0.0
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    statistics: bool = False
+    betas: tuple[float, float] = (0.9, 0.999)
+    epsilon: float = 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What a densifier or pruner needs to know of N Gaussians.
+
+    Args:
+        gradient_norm: (N,) float32, sum over views of the norm of dL/d(projected centre), in halves of the image's
+            sides as 3DGS counts it (its threshold is 2e-4 per view).
+        seen: (N,) int32, views in which the Gaussian had a gradient.
+        max_weight: (N,) float32, largest blending weight in any pixel.
+    """
+
+    gradient_norm: np.ndarray
+    seen: np.ndarray
+    max_weight: np.ndarray
+
+
+class Fitter(ABC):
     """Fits Gaussians to images of known cameras, one Adam step at a time.
 
     ::
 
-        fitter = Fitter(gaussians, LearningRates(means=1e-4), frozen=halo)
+        fitter = make_fitter(gaussians, LearningRates(means=1e-4), frozen=halo)
         for i in schedule:
             loss = fitter.step(cameras[i], images[i : i + 1])
         result = fitter.gaussians()
 
     Each Gaussian counts its own Adam updates: one that contributes to no pixel of a step's images is not moved by that
     step (stale momentum does not carry it away unseen); where all are seen every step this is `torch.optim.Adam`.
-    The arrays ``means quats log_scales logit_opacities sh`` are live and may be edited in place between steps (to reset
-    opacities, say). The same inputs give the same bits for any number of threads.
 
     Args:
         gaussians: where to start; copied.
         learning_rates: may be replaced between steps (``fitter.learning_rates = ...``).
         frozen: (N,) bool, Gaussians that are rendered but never changed.
-        ssim_weight: share of ``1 - SSIM`` in the loss; the rest is Huber's of the colours.
-        huber_delta: differences of colours below this count by their square (Huber's loss); 0 is L1.
-        background: colour behind everything.
-        statistics: also keep what a densifier or pruner needs (about a tenth slower):
-            ``gradient_norm`` (N,) float32, sum over views of the norm of dL/d(projected centre), in halves of the
-            image's sides as 3DGS counts it (its threshold is 2e-4 per view); ``seen`` (N,) int32, views in which the
-            Gaussian had a gradient; ``max_weight`` (N,) float32, largest blending weight in any pixel. All since the
-            last `reset_statistics` or change of N.
+        options: losses and Adam.
 
     Raises:
         InputError: arrays that do not fit together.
@@ -65,140 +90,88 @@ class Fitter:
         learning_rates: LearningRates | None = None,
         *,
         frozen: np.ndarray | None = None,
-        ssim_weight: float = 0.0,
-        huber_delta: float = 0.0,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        statistics: bool = False,
-        betas: tuple[float, float] = (0.9, 0.999),
-        epsilon: float = 1e-15,
+        options: FitOptions | None = None,
     ) -> None:
         self.learning_rates = learning_rates or LearningRates()
-        self.ssim_weight, self.huber_delta = float(ssim_weight), float(huber_delta)
-        self.statistics = statistics
-        self._background = np.asarray(background, np.float32)
-        self._betas, self._epsilon = betas, epsilon
-        self._views: list[native.View] = []
-        self._set([a.copy() for a in native.arrays_of(gaussians)])
-        self._moments = [[np.zeros_like(a) for a in self._values] for _ in range(2)]
-        self._updates = np.zeros(len(self), np.uint32)
-        self.frozen = _mask(frozen, len(self))
+        self.options = options or FitOptions()
 
-    def __len__(self) -> int:
-        return len(self.means)
+    @abstractmethod
+    def __len__(self) -> int: ...
 
-    def _set(self, values: list[np.ndarray]) -> None:
-        self._values = values
-        self.means, self.quats, self.log_scales, self.logit_opacities, self.sh = values
-        self.reset_statistics()
-
-    def reset_statistics(self) -> None:
-        """Start counting ``gradient_norm``, ``seen`` and ``max_weight`` anew."""
-        n = len(self)
-        self.gradient_norm = np.zeros(n, np.float32)
-        self.seen = np.zeros(n, np.int32)
-        self.max_weight = np.zeros(n, np.float32)
-
+    @abstractmethod
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now (a copy)."""
-        return Gaussians(*(a.copy() for a in self._values))
 
-    def step(self, cameras: Cameras, images: np.ndarray, masks: np.ndarray | None = None) -> float:
+    @abstractmethod
+    def step(self, cameras: Cameras, images: Any, masks: Any = None) -> Any:
         """Render, compare, step; returns the loss before the step (its mean over the views).
+
+        The loss is a number, or becomes one by ``float``, which waits for the GPU.
 
         Args:
             cameras: V views of one size, usually one; memory grows by 64 bytes per visible Gaussian and view.
-            images: (V, H, W, 3) float32 in [0, 1], or uint8.
-            masks: (V, H, W) weights of the pixels, bool or float32; a view without any weight adds nothing.
+            images: (V, H, W, 3) float32 in [0, 1], or uint8; or what `load` made of them.
+            masks: (V, H, W) weights of the pixels, bool, float32 or uint8; a view without any weight adds nothing.
 
         Raises:
             InputError: shapes that differ from the cameras'.
         """
-        width, height = image_size(cameras)
-        count = len(cameras)
-        images = _pixels(images, (count, height, width, 3), "images")
-        masks = None if masks is None else _pixels(masks, (count, height, width), "masks")
-        if count == 0:
-            return 0.0
-        while len(self._views) < count:
-            self._views.append(native.View())
-        out = native.allocate(count, height, width, 0, False, False, False)
-        out["max_weight"] = self.max_weight if self.statistics else None
-        gradient = np.empty_like(out["colour"])
-        arrays = tuple(self._values)
-        loss = 0.0
-        for i in range(count):
-            pose, intrinsics = cameras.T_camera_frame[i], cameras.intrinsics_px[i]
-            mask = None if masks is None else masks[i]
-            looked_at = None if self.statistics else mask  # statistics are of whole pictures
-            native.forward(self._views[i], arrays, pose, intrinsics, self._background, out, i, None, looked_at)
-            loss += (
-                image_loss(out["colour"][i], images[i], mask, self.ssim_weight, self.huber_delta, gradient[i]) / count
-            )
-        if count > 1:
-            gradient /= count
-        rates = self.learning_rates
-        fit_step(
-            self._views[:count],
-            background=self._background,
-            colour=out["colour"],
-            alpha=out["alpha"],
-            g_colour=gradient,
-            values=self._values,
-            m=self._moments[0],
-            v=self._moments[1],
-            updates=self._updates,
-            frozen=None if self.frozen is None else self.frozen.view(np.uint8),
-            rates=[
-                rates.means,
-                rates.quats,
-                rates.log_scales,
-                rates.logit_opacities,
-                rates.sh_base,
-                rates.sh_rest,
-            ],
-            beta1=self._betas[0],
-            beta2=self._betas[1],
-            epsilon=self._epsilon,
-            gradient_norm=self.gradient_norm if self.statistics else None,
-            seen=self.seen if self.statistics else None,
-        )
-        return loss
 
+    def load(self, array: np.ndarray) -> Any:
+        """Move images or masks of many steps to where the fitter computes, as long as there is memory for them."""
+        return array
+
+    @abstractmethod
     def keep(self, rows: np.ndarray) -> None:
         """Keep only these Gaussians (boolean mask or indices), with their optimiser state."""
-        self._moments = [[a[rows] for a in moment] for moment in self._moments]
-        self._updates = self._updates[rows]
-        self.frozen = None if self.frozen is None else self.frozen[rows]
-        self._set([np.ascontiguousarray(a[rows]) for a in self._values])
 
+    @abstractmethod
     def append(self, gaussians: Gaussians, frozen: np.ndarray | None = None) -> None:
         """Add Gaussians behind the others, with fresh optimiser state.
 
         Raises:
             InputError: another SH degree.
         """
-        if gaussians.sh.shape[1] != self.sh.shape[1]:
-            raise InputError(f"appended Gaussians have {gaussians.sh.shape[1]} SH coefficients, not {self.sh.shape[1]}")
-        before, more = len(self), len(gaussians)
-        added = _mask(frozen, more)
-        if self.frozen is not None or added is not None:
-            old = np.zeros(before, bool) if self.frozen is None else self.frozen
-            self.frozen = np.concatenate([old, np.zeros(more, bool) if added is None else added])
-        new = native.arrays_of(gaussians)
-        self._moments = [
-            [np.concatenate([a, np.zeros_like(b)]) for a, b in zip(moment, new, strict=True)]
-            for moment in self._moments
-        ]
-        self._updates = np.concatenate([self._updates, np.zeros(more, np.uint32)])
-        self._set([np.concatenate([a, b]) for a, b in zip(self._values, new, strict=True)])
 
-    def reset_state(self, attribute: str, rows: np.ndarray | slice = slice(None)) -> None:
-        """Forget Adam's moments of one attribute (``means``, ``logit_opacities``, ...), after editing its values."""
-        for moment in self._moments:
-            moment[_NAMES.index(attribute)][rows] = 0
+    @abstractmethod
+    def reset_statistics(self) -> None:
+        """Start counting `Statistics` anew; a change of N does so too."""
+
+    @abstractmethod
+    def statistics(self) -> Statistics:
+        """What was counted since the last reset; all zeros unless ``options.statistics``."""
 
 
-def _mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:
+def make_fitter(
+    gaussians: Gaussians,
+    learning_rates: LearningRates | None = None,
+    *,
+    frozen: np.ndarray | None = None,
+    options: FitOptions | None = None,
+    backend: str = "auto",
+) -> Fitter:
+    """The fitter of a backend; see `Fitter`.
+
+    Args:
+        backend: as for `gsmap.render.render`. The native one gives the same bits for any number of threads; gsplat adds
+            gradients up in another order in every run.
+
+    Raises:
+        ConfigError: an unknown backend.
+        InputError: arrays that do not fit together.
+        MissingDependencyError: gsplat is asked for and not installed.
+    """
+    if resolved(backend) == "gsplat":
+        from gsmap.render.gsplat_fit import GsplatFitter
+
+        return GsplatFitter(gaussians, learning_rates, frozen=frozen, options=options)
+    from gsmap.render.native_fit import NativeFitter
+
+    return NativeFitter(gaussians, learning_rates, frozen=frozen, options=options)
+
+
+def checked_mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:
+    """(N,) bool of ``frozen``, or None."""
     if mask is None:
         return None
     mask = np.ascontiguousarray(mask, dtype=bool)
@@ -207,10 +180,13 @@ def _mask(mask: np.ndarray | None, n: int) -> np.ndarray | None:
     return mask
 
 
-def _pixels(values: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
-    values = np.asarray(values)
-    if values.shape != shape:
-        raise InputError(f"{name} must have the cameras' shape {shape}, got {values.shape}")
-    if values.dtype == np.uint8:
-        return values.astype(np.float32) / np.float32(255.0)
-    return np.ascontiguousarray(values, dtype=np.float32)
+def check_pixels(values: Any, shape: tuple[int, ...], name: str) -> None:
+    """Raise InputError where images or masks differ from the cameras' shape."""
+    if tuple(values.shape) != shape:
+        raise InputError(f"{name} must have the cameras' shape {shape}, got {tuple(values.shape)}")
+
+
+def check_appended(gaussians: Gaussians, num_sh: int) -> None:
+    """Raise InputError where Gaussians to be appended have another SH degree."""
+    if gaussians.sh.shape[1] != num_sh:
+        raise InputError(f"appended Gaussians have {gaussians.sh.shape[1]} SH coefficients, not {num_sh}")

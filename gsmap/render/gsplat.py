@@ -1,28 +1,234 @@
-"""The CUDA backend: nerfstudio's gsplat, an optional dependency (``pip install gsmap[cuda]``)."""
+"""The CUDA backend: nerfstudio's gsplat, an optional dependency (the extra ``cuda``)."""
 
 from __future__ import annotations
 
+import functools
+import logging
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
 from gsmap.errors import MissingDependencyError
+from gsmap.render.blending_weights import TILE_PX, TileLists, blending_weights
 from gsmap.render.outputs import Rendered, image_size
 from gsmap.render.tensors import GaussianTensors
 from gsmap.types import Cameras, Gaussians
 
+logger = logging.getLogger(__name__)
 
-def render_numpy(
-    gaussians: Gaussians, cameras: Cameras, background: np.ndarray, depth: bool, dominant_id: bool, max_weight: bool
-) -> Rendered:
-    """`gsmap.render.render` for numpy Gaussians, by way of the GPU."""
-    with torch.no_grad():
-        tensors = GaussianTensors.of(gaussians, device="cuda")
-        pose = torch.from_numpy(cameras.T_camera_frame)
-        out = render_tensors(tensors, cameras, pose, background, depth, dominant_id, max_weight)
-    names = ("colour", "alpha", "depth", "dominant_id", "max_weight")
-    return Rendered(*(None if getattr(out, n) is None else getattr(out, n).cpu().numpy() for n in names))
+NEAR_PLANE = 0.01
+DILATION_PX2 = 0.3
+SH_DEGREE = {1: 0, 4: 1, 9: 2, 16: 3}
+
+# A batch of cameras is as large as fits into this; more gains nothing, for a batch fills the GPU long before.
+_BATCH_BYTES = 1 << 31
+_BYTES_PER_PIXEL, _BYTES_PER_GAUSSIAN = 64, 48  # of a view: images, projections and tile lists, measured on rooms
+
+
+class DeviceMemoryError(Exception):
+    """One view needs more memory than the GPU has left."""
+
+
+def device() -> torch.device:
+    """The device that gsplat renders on."""
+    return torch.device("cuda")
+
+
+@functools.cache
+def load() -> Any:
+    """The package, with its kernels.
+
+    Raises:
+        MissingDependencyError: gsplat or its CUDA kernels are missing.
+    """
+    try:
+        import gsplat
+        import gsplat.cuda._backend as built
+    except ImportError as error:
+        raise MissingDependencyError("rendering on CUDA needs gsplat: pip install 'gsmap[cuda]'") from error
+    if built._C is None:
+        raise MissingDependencyError(
+            "gsplat is installed without its CUDA kernels, and could not build them: install the CUDA toolkit (nvcc) "
+            "of torch's CUDA version, or a gsplat wheel built for it (docs/how-to/gpu.md)"
+        )
+    return gsplat
+
+
+@dataclass(frozen=True, eq=False)
+class DrawableGaussians:
+    """Gaussians on the GPU with activated attributes, without those that cannot be drawn.
+
+    Args:
+        means: (M, 3).
+        quats: (M, 4), none of them zero.
+        scales: (M, 3) standard deviations.
+        opacities: (M,) in [0, 1].
+        sh: (M, K, 3).
+        rows: (M,) index of each among all N.
+        num_all: N.
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    sh: torch.Tensor
+    rows: torch.Tensor
+    num_all: int
+
+    @classmethod
+    def of(cls, tensors: GaussianTensors) -> DrawableGaussians:
+        """Activate tensors that lie on the GPU; differentiable."""
+        means, quats, log_scales, logits, sh = tensors.tensors()
+        n = len(means)
+        # gsplat has no word for a Gaussian that cannot be drawn; the native backend leaves it out.
+        sound = drawable(means, quats, log_scales, logits) & torch.isfinite(sh).flatten(1).all(1)
+        rows = torch.nonzero(sound)[:, 0]
+        if len(rows) < n:
+            means, quats, log_scales, logits, sh = (t[rows] for t in (means, quats, log_scales, logits, sh))
+        return cls(means, unit_or_identity(quats), log_scales.exp(), torch.sigmoid(logits), sh, rows, n)
+
+    @property
+    def nbytes(self) -> int:
+        parts = (self.means, self.quats, self.scales, self.opacities, self.sh, self.rows)
+        return sum(t.numel() * t.element_size() for t in parts)
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceViews:
+    """C cameras of one size on the GPU.
+
+    Args:
+        T_camera_frame: (C, 4, 4).
+        K: (C, 3, 3).
+        centers: (C, 3) in the frame.
+    """
+
+    T_camera_frame: torch.Tensor
+    K: torch.Tensor
+    centers: torch.Tensor
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, cameras: Cameras, T_camera_frame: torch.Tensor | None = None) -> DeviceViews:
+        """Move cameras to the GPU, in one copy; a pose that is given takes the place of theirs, differentiable."""
+        width, height = image_size(cameras)
+        count = len(cameras)
+        parts = (cameras.T_camera_frame, cameras.K, cameras.centers)
+        flat = np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
+        pose, K, centers = torch.from_numpy(flat).to(device()).split([16 * count, 9 * count, 3 * count])
+        if T_camera_frame is None:
+            return cls(pose.view(-1, 4, 4), K.view(-1, 3, 3), centers.view(-1, 3), width, height)
+        given = T_camera_frame.to(device=device(), dtype=torch.float32)
+        rotation, translation = given[:, :3, :3], given[:, :3, 3:]
+        return cls(given, K.view(-1, 3, 3), -(rotation.transpose(1, 2) @ translation)[..., 0], width, height)
+
+
+def drawable(means: torch.Tensor, quats: torch.Tensor, log_scales: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
+    """(N,) whether position, rotation, size and opacity are numbers that float32 can draw."""
+    sound = torch.isfinite(means).all(1) & torch.isfinite(quats).all(1)
+    return sound & ~(torch.isnan(log_scales) | (log_scales >= 80)).any(1) & ~torch.isnan(logits)
+
+
+def unit_or_identity(quats: torch.Tensor) -> torch.Tensor:
+    """(N, 4) quaternions, the identity in place of those of length zero."""
+    identity = quats.new_tensor([1.0, 0, 0, 0])
+    return torch.where(quats.square().sum(1, keepdim=True) > 1e-30, quats, identity)
+
+
+class _Kept:
+    """Gaussians that were rendered lately, on the GPU: a scene is rendered through many cameras, one after another.
+
+    They are known by the object that holds them; Gaussians are not changed in place after they were rendered.
+    """
+
+    def __init__(self) -> None:
+        self._entries: OrderedDict[int, tuple[weakref.ref[Gaussians], DrawableGaussians]] = OrderedDict()
+
+    def get(self, gaussians: Gaussians) -> DrawableGaussians:
+        key = id(gaussians)
+        if key in self._entries:
+            self._entries.move_to_end(key)
+            return self._entries[key][1]
+        moved = DrawableGaussians.of(GaussianTensors.of(gaussians, device=str(device())))
+        self._entries[key] = weakref.ref(gaussians, lambda _: self._entries.pop(key, None)), moved
+        while len(self._entries) > 1 and sum(d.nbytes for _, d in self._entries.values()) > _kept_bytes():
+            self._entries.popitem(last=False)
+        return moved
+
+    def clear(self) -> None:
+        self._entries.clear()
+
+
+_kept = _Kept()
+
+
+def _kept_bytes() -> int:
+    if device().type != "cuda":
+        return 1 << 30
+    return int(torch.cuda.get_device_properties(device()).total_memory) // 8
+
+
+@torch.no_grad()
+def render_numpy(gaussians: Gaussians, cameras: Cameras, background: np.ndarray, images: dict[str, Any]) -> None:
+    """Render numpy Gaussians on the GPU into arrays as `gsmap.render.native.allocate` makes them.
+
+    Cameras are rendered in batches, smaller ones where memory is short.
+
+    Raises:
+        DeviceMemoryError: a single view does not fit.
+    """
+    load()
+    views, height, width = images["alpha"].shape
+    if images["dominant_id"] is not None:
+        images["dominant_id"].fill(-1)
+    if views == 0 or len(gaussians) == 0:
+        images["colour"][:] = background
+        for name in ("alpha", "depth"):
+            if images[name] is not None:
+                images[name].fill(0)
+        return
+    wants = {name: images[name] is not None for name in ("depth", "dominant_id", "max_weight")}
+
+    def draw(first: int, last: int) -> None:
+        scene = _kept.get(gaussians)
+        found = _draw(scene, DeviceViews.of(cameras[first:last]), background, **wants)
+        for name in ("colour", "alpha", "depth", "dominant_id"):
+            if images[name] is not None:
+                torch.from_numpy(images[name][first:last]).copy_(getattr(found, name))
+        if found.max_weight is not None:
+            np.maximum(images["max_weight"], found.max_weight.cpu().numpy(), out=images["max_weight"])
+
+    per_view = height * width * _BYTES_PER_PIXEL + len(gaussians) * _BYTES_PER_GAUSSIAN
+    in_batches(views, max(1, _BATCH_BYTES // per_view), draw)
+
+
+def in_batches(count: int, size: int, do: Callable[[int, int], None]) -> None:
+    """Call ``do(first, last)`` for ranges that cover ``count``, each half as large where the GPU's memory runs out.
+
+    Raises:
+        DeviceMemoryError: one at a time does not fit.
+    """
+    first = 0
+    while first < count:
+        last = min(first + size, count)
+        try:
+            do(first, last)
+        except torch.OutOfMemoryError as error:
+            _kept.clear()
+            if device().type == "cuda":
+                torch.cuda.empty_cache()
+            if size == 1:
+                raise DeviceMemoryError(str(error)) from error
+            size = max(1, (last - first) // 2)
+        else:
+            first = last
 
 
 def render_tensors(
@@ -35,106 +241,104 @@ def render_tensors(
     max_weight: bool,
 ) -> Rendered:
     """`gsmap.render.render` for tensors; those on the CPU go to the GPU and the answer comes back."""
-    try:
-        from gsplat import rasterization
-    except ImportError as error:
-        raise MissingDependencyError("rendering on CUDA needs gsplat: pip install 'gsmap[cuda]'") from error
+    load()
     width, height = image_size(cameras)
     home = gaussians.means.device
-    device = home if home.type == "cuda" else torch.device("cuda")
-    means, quats, log_scales, logits, sh = (t.to(device) for t in gaussians.tensors())
-    views, n = len(T_camera_frame), len(means)
+    views, n = len(T_camera_frame), len(gaussians)
     if views == 0 or n == 0:
         return _nothing(views, height, width, n, background, depth, dominant_id, max_weight, home)
-    # gsplat has no word for a Gaussian that cannot be drawn; the native backend leaves it out.
-    sound = torch.isfinite(torch.cat([means, quats, sh.flatten(1)], 1)).all(1)
-    sound &= ~(torch.isnan(log_scales) | (log_scales >= 80)).any(1) & ~torch.isnan(logits)
-    rows = torch.nonzero(sound)[:, 0]
-    if len(rows) < n:
-        means, quats, log_scales, logits, sh = (t[rows] for t in (means, quats, log_scales, logits, sh))
-    identity = torch.tensor([1.0, 0, 0, 0], device=device)
-    quats = torch.where(quats.square().sum(1, keepdim=True) > 1e-30, quats, identity)
-    image, alpha, meta = rasterization(
-        means,
-        quats,
-        log_scales.exp(),
-        torch.sigmoid(logits),
-        sh,
-        T_camera_frame.to(device=device, dtype=torch.float32),
-        torch.tensor(cameras.K, device=device, dtype=torch.float32),
-        width,
-        height,
-        near_plane=0.01,
-        eps2d=0.3,
-        sh_degree={1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]],
-        packed=False,
-        render_mode="RGB+ED" if depth else "RGB",
-    )
-    behind = torch.tensor(background, device=device)
-    colour = image[..., :3] + (1 - alpha) * behind
-    ids: torch.Tensor | None = None
-    weights: torch.Tensor | None = None
+    moved = GaussianTensors(*(t.to(device()) for t in gaussians.tensors()))
+    views_there = DeviceViews.of(cameras, T_camera_frame)
+    found = _draw(DrawableGaussians.of(moved), views_there, background, depth, dominant_id, max_weight)
+    return Rendered(*(None if t is None else t.to(home) for t in vars(found).values()))
+
+
+def _draw(
+    scene: DrawableGaussians,
+    views: DeviceViews,
+    background: np.ndarray,
+    depth: bool,
+    dominant_id: bool,
+    max_weight: bool,
+) -> Rendered:
+    """Render on the GPU; every tensor of the answer lies there."""
+    colour, alpha, depths, lists = rasterize(scene, views, depth)
+    if background.any():
+        colour = colour + (1 - alpha) * torch.tensor(background, device=alpha.device)
+    ids = weights = None
     if dominant_id or max_weight:
-        found = _weights(meta, views, height, width, rows, n)
-        ids, weights = found[0].to(home) if dominant_id else None, found[1].to(home) if max_weight else None
-    return Rendered(
-        colour.to(home),
-        alpha[..., 0].to(home),
-        image[..., 3].to(home) if depth else None,
-        ids,
-        weights,
-    )
+        ids, weights = blending_weights(lists, views.height, views.width, len(scene.means), max_weight)
+        if len(scene.means) < scene.num_all:
+            ids = torch.where(ids >= 0, scene.rows.to(torch.int32)[ids.clamp_min(0)], ids)
+            if weights is not None:
+                weights = weights.new_zeros(scene.num_all).index_copy(0, scene.rows, weights)
+    return Rendered(colour, alpha[..., 0], depths, ids if dominant_id else None, weights if max_weight else None)
 
 
-@torch.no_grad()
-def _weights(
-    meta: dict[str, Any], views: int, height: int, width: int, rows: torch.Tensor, n: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Dominant Gaussian (C, H, W) int32 of every pixel and largest weight (N,) of every Gaussian.
+def rasterize(
+    scene: DrawableGaussians, views: DeviceViews, depth: bool
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, TileLists]:
+    """Project, sort into tiles and blend, by gsplat's functions; differentiable.
 
-    gsplat lists the Gaussians of each pixel, near to far; their weights are computed again from what it projected.
+    What `gsplat.rasterization` does, less what a call of it costs the CPU: inverted matrices, checks, concatenations.
+    Several views are packed: each then takes memory for what it sees, not for the whole scene.
+
+    Returns:
+        Colour (C, H, W, 3), alpha (C, H, W, 1), expected depth (C, H, W) or None, and what was blended.
     """
-    from gsplat.cuda._wrapper import rasterize_to_indices_in_range
-
-    means2d, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
-    clear = torch.ones(views, height, width, device=means2d.device)
-    gaussian, pixel, image = rasterize_to_indices_in_range(
-        0,
-        1 << 30,
-        clear,
-        means2d,
-        conics,
-        opacities.expand(views, -1),
+    gs = load()
+    count, width, height = len(views.T_camera_frame), views.width, views.height
+    packed = count > 1
+    projected = gs.fully_fused_projection(
+        scene.means,
+        None,
+        scene.quats,
+        scene.scales,
+        views.T_camera_frame,
+        views.K,
         width,
         height,
-        meta["tile_size"],
-        meta["isect_offsets"],
-        meta["flatten_ids"],
+        eps2d=DILATION_PX2,
+        near_plane=NEAR_PLANE,
+        packed=packed,
+        opacities=scene.opacities,
     )
-    ids = torch.full((views * height * width,), -1, dtype=torch.int32, device=means2d.device)
-    weights = torch.zeros(n, device=means2d.device)
-    if len(gaussian) == 0:
-        return ids.reshape(views, height, width), weights
-    cell = image * (height * width) + pixel
-    order = torch.argsort(cell, stable=True)  # stable: near to far within a pixel
-    gaussian, pixel, image, cell = gaussian[order], pixel[order], image[order], cell[order]
-    centre = torch.stack([pixel % width, pixel // width], 1) + 0.5
-    d = centre - means2d[image, gaussian]
-    a, b, c = conics[image, gaussian].unbind(1)
-    power = 0.5 * (a * d[:, 0] ** 2 + c * d[:, 1] ** 2) + b * d[:, 0] * d[:, 1]
-    alpha = (opacities.expand(views, -1)[image, gaussian] * torch.exp(-power)).clamp_max(0.99).double()
-    # Transmittance before each: a running sum of logarithms, less its value where the pixel begins.
-    log_t = torch.log1p(-alpha)
-    before = torch.cumsum(log_t, 0) - log_t
-    first = torch.cat([cell.new_ones(1, dtype=torch.bool), cell[1:] != cell[:-1]])
-    start = torch.cummax(torch.where(first, torch.arange(len(cell), device=cell.device), 0), 0).values
-    weight = (alpha * torch.exp(before - before[start])).float()
-    weights.scatter_reduce_(0, rows[gaussian], weight, "amax")
-    best = torch.zeros(len(ids), device=ids.device).scatter_reduce_(0, cell, weight, "amax")
-    # Reversed, so that the nearest of equals is written last.
-    winner = torch.nonzero(weight == best[cell])[:, 0].flip(0)
-    ids[cell[winner]] = rows[gaussian[winner]].to(torch.int32)
-    return ids.reshape(views, height, width), weights
+    if packed:
+        _, camera, gaussian, radii, means2d, depths, conics, _ = projected
+        opacities = scene.opacities[gaussian]
+        directions = scene.means[gaussian] - views.centers[camera]
+        coefficients, mask = scene.sh[gaussian], None
+    else:
+        camera = gaussian = None
+        radii, means2d, depths, conics, _ = projected
+        opacities = scene.opacities[None]
+        directions = scene.means[None] - views.centers[:, None]
+        coefficients, mask = scene.sh[None], (radii > 0).all(-1)
+    colours = gs.spherical_harmonics(SH_DEGREE[scene.sh.shape[1]], directions, coefficients, masks=mask)
+    colours = torch.clamp_min(colours + 0.5, 0)
+    if depth:
+        colours = torch.cat([colours, depths[..., None]], -1)
+    down, across = -(-height // TILE_PX), -(-width // TILE_PX)
+    _, crossings, listed = gs.isect_tiles(
+        means2d,
+        radii,
+        depths,
+        TILE_PX,
+        across,
+        down,
+        packed=packed,
+        n_images=count,
+        image_ids=camera,
+        gaussian_ids=gaussian,
+    )
+    starts = gs.isect_offset_encode(crossings, count, across, down)
+    image, alpha = gs.rasterize_to_pixels(
+        means2d, conics, colours, opacities, width, height, TILE_PX, starts, listed, packed=packed
+    )
+    lists = TileLists(means2d, conics, opacities, gaussian, starts, listed)
+    if not depth:
+        return image, alpha, None, lists
+    return image[..., :3], alpha, image[..., 3] / alpha[..., 0].clamp_min(1e-10), lists
 
 
 def _nothing(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     import torch
 
     from gsmap.render.tensors import GaussianTensors
+
+logger = logging.getLogger(__name__)
 
 
 def render(
@@ -47,8 +50,9 @@ def render(
         index: boxes of chunks of the Gaussians, to skip what no camera sees (see `ChunkIndex`).
         T_camera_frame: (C, 4, 4) tensor of view matrices that replaces the cameras' poses, where the pose is to be
             optimised. The viewing direction is taken from the centre ``-R^T t``.
-        backend: ``native`` (CPU), ``gsplat`` (CUDA; not the same bits in every run), or ``auto``: gsplat where it is
-            installed and torch sees a GPU, else native.
+        backend: ``native`` (CPU), ``gsplat`` (CUDA; gradients are not the same bits in every run), or ``auto``: gsplat
+            where it is installed and torch sees a GPU, else native. What the GPU's memory cannot hold is rendered in
+            batches of fewer cameras, at last on the CPU with a warning.
 
     Raises:
         InputError: shapes or dtypes that do not fit, cameras of several sizes, a view matrix with NaN.
@@ -63,11 +67,20 @@ def render(
     if isinstance(gaussians, Gaussians):
         if T_camera_frame is not None:
             raise InputError("T_camera_frame goes with GaussianTensors; for numpy, put the pose into the cameras")
+        images = native.allocate(len(cameras), height, width, len(gaussians), depth, dominant_id, max_weight)
         if chosen == "gsplat":
             from gsmap.render import gsplat
 
-            return gsplat.render_numpy(gaussians, cameras, colour, depth, dominant_id, max_weight)
-        images = native.allocate(len(cameras), height, width, len(gaussians), depth, dominant_id, max_weight)
+            try:
+                gsplat.render_numpy(gaussians, cameras, colour, images)
+                return Rendered(**images)
+            except gsplat.DeviceMemoryError as error:
+                logger.warning(
+                    "the GPU's memory cannot hold a view of %d Gaussians at %d x %d pixels; rendering on the CPU: %s",
+                    *(len(gaussians), width, height, error),
+                )
+                if max_weight:
+                    images["max_weight"].fill(0)
         arrays, poses = native.arrays_of(gaussians), cameras.T_camera_frame
         with native.workspace() as view:
             for i in range(len(cameras)):

@@ -41,14 +41,15 @@ def train(
 
     Step sizes follow the Gaussians' own size, so any unit of length trains alike, and fall to a tenth in the end.
     """
-    from gsmap.render.fit import Fitter, LearningRates
+    from gsmap.render.fit import FitOptions, LearningRates, make_fitter
 
     params = params or Params()
     unit = float(np.median(gaussians.scales.max(1)))
     first = LearningRates(
         means=0.04 * unit, quats=0.012, log_scales=0.06, logit_opacities=0.18, sh_base=0.06, sh_rest=0.003
     )
-    fitter = Fitter(gaussians, first, ssim_weight=params.ssim_weight, statistics=params.splits > 0)
+    options = FitOptions(ssim_weight=params.ssim_weight, statistics=params.splits > 0)
+    fitter = make_fitter(gaussians, first, options=options)
     rng = np.random.default_rng([seed, 7])
     # No splits in the last third: what is new needs time to settle.
     moments = set(np.linspace(0, 2 / 3 * params.steps, params.splits + 1).astype(int)[1:].tolist())
@@ -61,7 +62,7 @@ def train(
         fitter.learning_rates = _scaled(first, 0.1 ** (step / params.steps))
         loss = fitter.step(frames.cameras[i], frames.images[i : i + 1])
         if progress and step % 20 == 0:
-            progress(step / params.steps, f"training, step {step}/{params.steps}, loss {loss:.3f}")
+            progress(step / params.steps, f"training, step {step}/{params.steps}, loss {float(loss):.3f}")
     return _tidy(fitter.gaussians())
 
 
@@ -71,9 +72,10 @@ def _scaled(rates, factor: float):
 
 def _split_the_worst(fitter, count: int) -> None:
     """Drop Gaussians that no pixel shows; split the ``count`` whose places in the pictures are least settled."""
-    need = fitter.gradient_norm / np.maximum(fitter.seen, 1)
+    counted = fitter.statistics()
+    need = counted.gradient_norm / np.maximum(counted.seen, 1)
     split = np.argsort(-need, kind="stable")[:count]
-    gone = fitter.max_weight < 0.02
+    gone = counted.max_weight < 0.02
     gone[split] = True
     parents = fitter.gaussians()[split]
     fitter.keep(~gone)

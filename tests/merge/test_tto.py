@@ -14,6 +14,7 @@ from gsmap.merge.exposure import apply_gain
 from gsmap.merge.mergers import tto
 from gsmap.merge.selection import one_owner_per_cell
 from gsmap.render import render
+from gsmap.render.native_fit import NativeFitter
 from gsmap.types import Gaussians
 
 Params = type(default_params("tto"))
@@ -144,7 +145,7 @@ def test_of_too_many_the_most_alike_become_one(watched):
     assert np.abs(wanted - shown)[:, 12:36, 16:48].mean() < 0.03
 
 
-class WatchedFitter(tto.Fitter):
+class WatchedFitter(NativeFitter):
     """A fitter that remembers what it was given and what its steps cost."""
 
     def __init__(self, start, **settings):
@@ -160,7 +161,7 @@ class WatchedFitter(tto.Fitter):
 
 @pytest.fixture
 def watched(monkeypatch):
-    monkeypatch.setattr(tto, "Fitter", WatchedFitter)
+    monkeypatch.setattr(tto, "make_fitter", WatchedFitter)
     return WatchedFitter
 
 

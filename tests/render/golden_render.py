@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gsmap.render import Fitter, LearningRates, render
+from gsmap.render import FitOptions, LearningRates, make_fitter, render
 from gsmap.types import Cameras, Gaussians
 
 
@@ -35,7 +35,7 @@ def _render() -> dict[str, np.ndarray]:
 def _fit() -> dict[str, np.ndarray]:
     gaussians, cameras = _scene()
     target = render(gaussians, cameras, backend="native").colour[:, ::-1].copy()
-    fitter = Fitter(gaussians, LearningRates(), ssim_weight=0.2)
+    fitter = make_fitter(gaussians, LearningRates(), options=FitOptions(ssim_weight=0.2), backend="native")
     losses = np.array([fitter.step(cameras, target) for _ in range(3)])
     fitted = fitter.gaussians()
     return {"losses": losses, "means": fitted.means, "sh": fitted.sh, "logit_opacities": fitted.logit_opacities}

@@ -24,12 +24,15 @@ def test_auto_is_gsplat_where_it_can_be_used(monkeypatch, there, chosen):
 def test_what_is_told_is_what_renders(monkeypatch, tensors):
     gaussians, cameras = _scene()
     monkeypatch.setattr(backends, "gsplat_available", lambda: True)
+    asked = []
     for name in ("render_numpy", "render_tensors"):
-        monkeypatch.setattr(gsplat, name, lambda *_, name=name: name)
+        monkeypatch.setattr(gsplat, name, lambda *_, name=name: asked.append(name))
     given = GaussianTensors.of(gaussians) if tensors else gaussians
-    assert render(given, cameras) == ("render_tensors" if tensors else "render_numpy")
+    render(given, cameras)
+    assert asked == ["render_tensors" if tensors else "render_numpy"]
     native = render(given, cameras, backend="native")
     assert np.isfinite(np.asarray(native.colour)).all()
+    assert len(asked) == 1
 
 
 def test_telling_the_backend_imports_no_torch_where_gsplat_is_missing():

@@ -8,7 +8,8 @@ from test_render_parity import random_scene
 
 from gsmap._native import image_loss
 from gsmap.errors import InputError
-from gsmap.render import Fitter, GaussianTensors, LearningRates, render, set_num_threads
+from gsmap.render import FitOptions, GaussianTensors, LearningRates, render, set_num_threads
+from gsmap.render.native_fit import NativeFitter
 from gsmap.types import Gaussians
 
 
@@ -29,7 +30,8 @@ def test_steps_equal_torch_adam(ssim_weight, delta, momentum):
     target = np.random.default_rng(0).uniform(size=(1, 70, 100, 3)).astype(np.float32)
     rates = LearningRates(means=1e-3)
     betas = momentum, 0.999
-    fitter = Fitter(gaussians, rates, ssim_weight=ssim_weight, huber_delta=delta, betas=betas, epsilon=1e-8)
+    options = FitOptions(ssim_weight=ssim_weight, huber_delta=delta, betas=betas, epsilon=1e-8)
+    fitter = NativeFitter(gaussians, rates, options=options)
     tensors = GaussianTensors.of(gaussians, requires_grad=True)
     base = tensors.sh.detach()[:, :1].clone().requires_grad_()
     rest = tensors.sh.detach()[:, 1:].clone().requires_grad_()
@@ -100,7 +102,7 @@ def test_fit_brings_back_the_image_and_leaves_frozen_ones_alone():
     results = []
     for threads in (1, 3):
         set_num_threads(threads)
-        fitter = Fitter(off, LearningRates(means=1e-3, sh_base=1e-2), frozen=frozen)
+        fitter = NativeFitter(off, LearningRates(means=1e-3, sh_base=1e-2), frozen=frozen)
         losses = [fitter.step(cameras, target) for _ in range(60)]
         assert losses[-1] < 0.5 * losses[0]
         results.append(fitter.gaussians())
@@ -118,7 +120,7 @@ def test_masked_pixels_do_not_matter():
     mask[:, :, :50] = True
     spoiled = target.copy()
     spoiled[:, :, 50:] = 7.0
-    a, b = Fitter(gaussians), Fitter(gaussians)
+    a, b = NativeFitter(gaussians), NativeFitter(gaussians)
     assert a.step(cameras, target, mask) == b.step(cameras, spoiled, mask)
     assert np.array_equal(a.means, b.means)
     before = a.gaussians()
@@ -133,7 +135,9 @@ def test_what_no_window_of_the_loss_reaches_is_not_drawn_and_nothing_else_differ
     mask = np.zeros((1, 70, 100), np.float32)
     mask[0, 21:24, 50:53] = 1.0  # their windows reach over the borders of blocks of 8 pixels, on all sides
     mask[0, 69, 99] = 0.5
-    some, all_drawn = (Fitter(gaussians, ssim_weight=0.5, statistics=whole) for whole in (False, True))
+    some, all_drawn = (
+        NativeFitter(gaussians, options=FitOptions(ssim_weight=0.5, statistics=whole)) for whole in (False, True)
+    )
     for _ in range(3):
         assert some.step(cameras, target, mask) == all_drawn.step(cameras, target, mask)
     for ours, theirs in zip(some._values, all_drawn._values, strict=True):
@@ -147,7 +151,7 @@ def test_what_is_frozen_changes_no_step_of_the_others():
     gaussians, cameras = random_scene(4, n=400)
     target = np.random.default_rng(0).uniform(size=(1, 70, 100, 3)).astype(np.float32)
     frozen = np.arange(400) % 3 == 0
-    held, free = Fitter(gaussians, frozen=frozen), Fitter(gaussians)
+    held, free = NativeFitter(gaussians, frozen=frozen), NativeFitter(gaussians)
     assert held.step(cameras, target) == free.step(cameras, target)
     moved = (free.means != gaussians.means).any(1)
     assert (moved & frozen).sum() > 50
@@ -161,19 +165,20 @@ def test_several_views_and_statistics():
     two = cameras[[0, 0]]
     target = np.random.default_rng(0).integers(0, 255, size=(2, 70, 100, 3)).astype(np.uint8)
     target[1] = target[0]
-    one, both = Fitter(gaussians, statistics=True), Fitter(gaussians, statistics=True)
+    one, both = (NativeFitter(gaussians, options=FitOptions(statistics=True)) for _ in range(2))
     assert one.step(cameras, target[:1]) == pytest.approx(both.step(two, target), rel=1e-6)
     assert np.abs(one.means - both.means).max() < 1e-6
-    assert np.array_equal(both.seen, 2 * one.seen)
-    assert one.seen.max() == 1
-    assert np.allclose(one.gradient_norm, both.gradient_norm, rtol=1e-4)
-    assert np.array_equal(one.max_weight, render(gaussians, cameras, max_weight=True).max_weight)
+    once, twice = one.statistics(), both.statistics()
+    assert np.array_equal(twice.seen, 2 * once.seen)
+    assert once.seen.max() == 1
+    assert np.allclose(once.gradient_norm, twice.gradient_norm, rtol=1e-4)
+    assert np.array_equal(once.max_weight, render(gaussians, cameras, max_weight=True).max_weight)
 
 
 def test_keep_and_append_carry_the_state():
     gaussians, cameras = random_scene(4, n=300)
     target = np.zeros((1, 70, 100, 3), np.float32)
-    fitter = Fitter(gaussians, frozen=np.arange(300) < 10)
+    fitter = NativeFitter(gaussians, frozen=np.arange(300) < 10)
     fitter.step(cameras, target)
     rows = np.arange(300) % 2 == 0
     m = fitter._moments[0][4].copy()

@@ -1,54 +1,269 @@
-"""The CUDA backend against the native one, where there is a GPU and gsplat."""
+"""The CUDA backend against the native one: on a GPU where there is one, and everywhere on gsplat's torch functions."""
+
+import importlib.util
 
 import numpy as np
 import pytest
 import torch
+from gsplat_reference import gsplat_on_cpu
 from test_render_parity import random_scene
 
 from gsmap.errors import MissingDependencyError
-from gsmap.render import GaussianTensors, render
+from gsmap.render import (
+    FitOptions,
+    GaussianTensors,
+    LearningRates,
+    backend,
+    blending_weights,
+    gsplat,
+    make_fitter,
+    render,
+)
 from gsmap.render.backends import gsplat_available
+from gsmap.render.gsplat_fit import GsplatFitter
+from gsmap.render.image_loss import image_loss
+from gsmap.types import Cameras, Gaussians
+
+__all__ = ["gsplat_on_cpu"]
 
 needs_gpu = pytest.mark.skipif(not gsplat_available(), reason="needs gsplat and a CUDA GPU")
 
 
-@needs_gpu
-@pytest.mark.parametrize("k", [1, 4, 9, 16])
-def test_images_match_the_native_backend(k):
-    gaussians, cameras = random_scene(k)
-    options = {"background": (0.1, 0.2, 0.3), "max_weight": True}
-    ours = render(gaussians, cameras, backend="native", **options)
-    theirs = render(gaussians, cameras, backend="gsplat", **options)
+@pytest.fixture(params=["reference", pytest.param("cuda", marks=needs_gpu)])
+def device(request):
+    """Where gsplat renders: ``cpu`` by its reference functions, ``cuda`` by its kernels."""
+    if request.param == "reference":
+        request.getfixturevalue("gsplat_on_cpu")
+    return "cpu" if request.param == "reference" else "cuda"
+
+
+def scene(k=4, n=250, views=1, size=(100, 70), opaque=3.5):
+    """Gaussians none of which is so opaque that the two backends' clamps of alpha (0.99 and 0.999) differ."""
+    gaussians, cameras = random_scene(k, n=n)
+    gaussians.logit_opacities[:] = np.minimum(gaussians.logit_opacities, opaque)
+    pose = np.repeat(cameras.T_frame_camera, views, 0)
+    pose[1:, :3, 3] += np.random.default_rng(0).normal(size=(views - 1, 3)) * 0.3
+
+    return gaussians, Cameras(pose, np.repeat(cameras.intrinsics_px, views, 0), np.repeat([size], views, 0))
+
+
+def elsewhere(cameras):
+    """The cameras, moved to where they see nothing."""
+    pose = cameras.T_frame_camera.copy()
+    pose[:, 2, 3] += 100
+    return Cameras(pose, cameras.intrinsics_px, cameras.sizes_px)
+
+
+def alike(ours, theirs, most=1e-4):
     for name, scale in (("colour", 1.0), ("alpha", 1.0), ("depth", 4.0)):
         error = np.abs(getattr(ours, name) - getattr(theirs, name)) / scale
-        assert np.quantile(error, 0.999) < 1e-4, name
-    assert (ours.dominant_id != theirs.dominant_id).mean() < 0.01
+        assert np.quantile(error, 0.999) < most, name
+    assert (ours.dominant_id != theirs.dominant_id).mean() < 2e-3
     assert np.quantile(np.abs(ours.max_weight - theirs.max_weight), 0.99) < 1e-3
 
 
-@needs_gpu
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_gradients_match_the_native_backend(device):
-    gaussians, cameras = random_scene(4)
+# Non-square images whose principal point lies off the centre, one and several cameras, every SH degree.
+@pytest.mark.parametrize(
+    ("k", "views", "size"), [(1, 1, (100, 70)), (4, 3, (64, 48)), (9, 1, (33, 90)), (16, 2, (70, 40))]
+)
+def test_images_match_the_native_backend(device, k, views, size):
+    gaussians, cameras = scene(k, views=views, size=size)
+    options = {"background": (0.1, 0.2, 0.3), "max_weight": True}
+    ours = render(gaussians, cameras, backend="native", **options)
+    alike(ours, render(gaussians, cameras, backend="gsplat", **options))
+    assert backend("auto") == "gsplat"
+
+
+def test_gaussians_more_opaque_than_the_native_clamp_differ_by_less_than_a_hundredth(device):
+    gaussians, cameras = scene(n=100, opaque=np.inf)
+    gaussians.logit_opacities[:] = 9.0
+    ours, theirs = (render(gaussians, cameras, backend=name) for name in ("native", "gsplat"))
+    error = np.abs(ours.colour - theirs.colour)
+    assert 1e-4 < error.max() < 0.03
+
+
+def test_views_of_nothing_and_gaussians_that_cannot_be_drawn(device):
+    gaussians, cameras = scene(views=2)
+    away = elsewhere(cameras)
+    for g, c in ((gaussians, away), (gaussians, away[0]), (gaussians[:0], cameras), (gaussians, cameras[:0])):
+        shown = render(g, c, background=(0.1, 0.2, 0.3), max_weight=True, backend="gsplat")
+        assert np.allclose(shown.colour, [0.1, 0.2, 0.3])
+        assert not shown.alpha.any()
+        assert not shown.depth.any()
+        assert (shown.dominant_id == -1).all()
+        assert not shown.max_weight.any()
+    broken = Gaussians(*(a.copy() for a in vars(gaussians).values()))
+    broken.means[30], broken.log_scales[31, 1], broken.logit_opacities[32], broken.sh[33, 1, 2] = (
+        np.nan,
+        90,
+        np.nan,
+        np.inf,
+    )
+    broken.quats[34] = np.nan
+    ours, theirs = (render(broken, cameras, max_weight=True, backend=name) for name in ("native", "gsplat"))
+    alike(ours, theirs)
+    assert not theirs.max_weight[30:35].any()
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_gradients_match_the_native_backend(device, views):
+    gaussians, cameras = scene(views=views, size=(60, 44))
     gradients = []
-    for backend, where in (("native", "cpu"), ("gsplat", device)):
+    for name, where in (("native", "cpu"), ("gsplat", device)):
         tensors = GaussianTensors.of(gaussians, device=where, requires_grad=True)
         pose = torch.tensor(cameras.T_camera_frame, dtype=torch.float32, device=where, requires_grad=True)
-        image = render(tensors, cameras, T_camera_frame=pose, backend=backend)
+        image = render(tensors, cameras, T_camera_frame=pose, backend=name)
         assert image.colour.device.type == where
         (image.colour.square().sum() + image.alpha.sum() + 0.1 * image.depth.sum()).backward()
         # A pose moves on SE(3) only: compare the gradient along rotations and translations.
-        R = torch.tensor(cameras.T_camera_frame[0, :3, :3], dtype=torch.float32)
-        g = pose.grad[0, :3].cpu()
-        turn = g[:, :3] @ R.T + torch.outer(g[:, 3], torch.tensor(cameras.T_camera_frame[0, :3, 3]).float())
-        pose_gradient = torch.cat([(turn - turn.T).flatten(), g[:, 3]])
+        R = torch.tensor(cameras.T_camera_frame[:, :3, :3], dtype=torch.float32)
+        g, t = pose.grad[:, :3].cpu(), torch.tensor(cameras.T_camera_frame[:, :3, 3]).float()
+        turn = g[:, :, :3] @ R.transpose(1, 2) + g[:, :, 3:] * t[:, None]
+        pose_gradient = torch.cat([(turn - turn.transpose(1, 2)).flatten(), g[:, :, 3].flatten()])
         gradients.append([t.grad.cpu() for t in tensors.tensors()] + [pose_gradient])
     for a, b in zip(*gradients, strict=True):
-        assert (a - b).norm() / a.norm() < 1e-2
+        assert (a - b).norm() / a.norm() < 1e-3
+
+
+@pytest.mark.parametrize(("ssim_weight", "delta", "masked"), [(0.0, 0.0, False), (0.2, 0.05, True), (1.0, 0.0, False)])
+def test_the_loss_and_its_gradient_are_the_native_ones(device, ssim_weight, delta, masked):
+    from gsmap._native import image_loss as native_loss
+
+    rng = np.random.default_rng(3)
+    ours, wanted = rng.uniform(size=(2, 2, 37, 50, 3)).astype(np.float32)
+    masks = rng.uniform(size=(2, 37, 50)).astype(np.float32) * [[[1.0]], [[0.0]]] if masked else None
+    masks = None if masks is None else masks.astype(np.float32)
+    args = (torch.from_numpy(a).to(device) if a is not None else None for a in (ours, wanted, masks))
+    losses, gradients = image_loss(*args, ssim_weight, delta)
+    for i in range(2):
+        gradient = np.empty_like(ours[i])
+        mask = None if masks is None else masks[i]
+        assert losses[i].item() == pytest.approx(
+            native_loss(ours[i], wanted[i], mask, ssim_weight, delta, gradient), abs=1e-6
+        )
+        assert np.abs(2 * gradients[i].cpu().numpy() - gradient).max() <= 1e-4 * np.abs(gradient).max()
+
+
+@pytest.mark.parametrize(
+    ("k", "views", "masked", "frozen"),
+    [(1, 1, False, False), (4, 1, True, True), (9, 2, False, True), (16, 1, True, False)],
+)
+def test_ten_steps_match_the_native_fitter(device, k, views, masked, frozen):
+    gaussians, cameras = scene(k, n=120, views=views, size=(48, 33))
+    rng = np.random.default_rng(1)
+    # What is rendered, moved a little: an image of noise has gradients that cancel, and Adam makes their signs count.
+    target = np.clip(render(gaussians, cameras, backend="native").colour + 0.1, 0, 1)
+    masks = (rng.uniform(size=target.shape[:3]) < 0.7).astype(np.uint8) * 255 if masked else None
+    held = np.arange(120) % 3 == 0 if frozen else None
+    options = FitOptions(ssim_weight=0.2, huber_delta=0.05, statistics=True, betas=(0.5, 0.999), epsilon=1e-6)
+    rates = LearningRates(means=1e-3)
+    native, other = (
+        make_fitter(gaussians, rates, frozen=held, options=options, backend=name) for name in ("native", "gsplat")
+    )
+    assert isinstance(other, GsplatFitter)
+    images, weights = other.load(target), None if masks is None else other.load(masks)
+    for _ in range(10):
+        a, b = native.step(cameras, target, masks), float(other.step(cameras, images, weights))
+        assert a == pytest.approx(b, rel=1e-3)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
+        ours, theirs, start = (getattr(g, name) for g in (native.gaussians(), other.gaussians(), gaussians))
+        moved = np.linalg.norm(ours - start)
+        assert moved > 0
+        assert np.linalg.norm(ours - theirs) < 0.02 * moved, name
+        assert np.median(np.abs(ours - theirs)) < 1e-3 * np.abs(ours - start).max(), name
+        if held is not None:
+            assert np.array_equal(theirs[held], start[held])
+    ours, theirs = native.statistics(), other.statistics()
+    assert (ours.seen != theirs.seen).mean() < 0.02
+    assert np.allclose(ours.max_weight, theirs.max_weight, atol=0.02)
+    assert np.linalg.norm(ours.gradient_norm - theirs.gradient_norm) < 0.02 * np.linalg.norm(ours.gradient_norm)
+
+
+def test_what_no_camera_sees_stays_where_it_is(device):
+    gaussians, cameras = scene(n=120, size=(48, 33))
+    away = elsewhere(cameras)
+    fitter = make_fitter(gaussians, options=FitOptions(statistics=True), backend="gsplat")
+    image = np.zeros((1, 33, 48, 3), np.float32)
+    behind = (gaussians.means[:, 2] < 0).nonzero()[0]
+    assert float(fitter.step(cameras, image)) > 0
+    assert np.array_equal(fitter.gaussians().means[behind], gaussians.means[behind])
+    assert (fitter.gaussians().means != gaussians.means).any()
+    before = fitter.gaussians()
+    fitter.step(away[0], image, np.zeros((1, 33, 48), np.uint8))
+    fitter.step(cameras, image, np.zeros((1, 33, 48), np.uint8))
+    for name, value in vars(before).items():
+        assert np.array_equal(value, getattr(fitter.gaussians(), name))
+
+
+def test_keep_and_append_carry_the_state(device):
+    gaussians, cameras = scene(n=120, size=(48, 33))
+    image = np.zeros((1, 33, 48, 3), np.float32)
+    fitters = [make_fitter(gaussians, frozen=np.arange(120) < 30, backend=name) for name in ("native", "gsplat")]
+    rows = np.arange(120) % 2 == 0
+    for fitter in fitters:
+        fitter.step(cameras, image)
+        fitter.keep(rows)
+        fitter.append(gaussians[~rows])
+        assert len(fitter) == 120
+        fitter.step(cameras, image)
+    ours, theirs = (fitter.gaussians() for fitter in fitters)
+    assert np.linalg.norm(ours.means - theirs.means) < 1e-2 * np.linalg.norm(
+        ours.means - np.r_[gaussians.means[rows], gaussians.means[~rows]]
+    )
+    assert np.array_equal(theirs.means[:15], gaussians.means[rows][:15])
+
+
+def test_batches_shrink_where_memory_runs_out_and_the_answer_stays(device, monkeypatch, caplog):
+    gaussians, cameras = scene(views=5, size=(48, 33))
+    whole = render(gaussians, cameras, max_weight=True, backend="gsplat")
+    drawn, most = [], 2
+    draw = gsplat._draw
+
+    def short_of_memory(scene, views, *rest, **options):
+        if len(views.K) > most:
+            raise torch.OutOfMemoryError("no memory")
+        drawn.append(len(views.K))
+        return draw(scene, views, *rest, **options)
+
+    monkeypatch.setattr(gsplat, "_draw", short_of_memory)
+    pieces = render(gaussians, cameras, max_weight=True, backend="gsplat")
+    assert drawn == [2, 2, 1]
+    alike(whole, pieces, 1e-5)
+    most = 0
+    on_cpu = render(gaussians, cameras, max_weight=True, backend="gsplat")
+    native = render(gaussians, cameras, max_weight=True, backend="native")
+    assert np.array_equal(on_cpu.colour, native.colour)
+    assert np.array_equal(on_cpu.max_weight, native.max_weight)
+    assert "rendering on the CPU" in caplog.text
+
+
+def test_a_scene_is_moved_once_and_forgotten_with_the_object(device):
+    gaussians, cameras = scene(views=2, size=(48, 33))
+    gsplat._kept.clear()
+    render(gaussians, cameras[0], backend="gsplat")
+    moved = gsplat._kept.get(gaussians)
+    render(gaussians, cameras[1], backend="gsplat")
+    assert gsplat._kept.get(gaussians) is moved
+    del gaussians
+    assert not gsplat._kept._entries
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="needs Triton")
+@pytest.mark.skipif(not gsplat_available(), reason="needs gsplat and a CUDA GPU")
+def test_the_triton_kernel_finds_the_weights_that_torch_finds(monkeypatch):
+    gaussians, cameras = scene(views=3)
+    ours = render(gaussians, cameras, max_weight=True, backend="gsplat")
+    monkeypatch.setattr(blending_weights, "_by_triton", blending_weights._by_torch)
+    theirs = render(gaussians, cameras, max_weight=True, backend="gsplat")
+    assert (ours.dominant_id != theirs.dominant_id).mean() < 1e-3
+    assert np.allclose(ours.max_weight, theirs.max_weight, atol=1e-5)
 
 
 @pytest.mark.skipif(gsplat_available(), reason="gsplat is there")
-def test_without_gsplat_the_error_names_the_extra():
+def test_without_gsplat_the_error_names_the_extra(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "gsplat", None)
     gaussians, cameras = random_scene(1)
     with pytest.raises(MissingDependencyError, match="cuda"):
         render(GaussianTensors.of(gaussians), cameras, backend="gsplat")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from gsmap.merge.exposure import balance_exposure
 from gsmap.merge.placed import pulled_inside, united
 from gsmap.merge.references import WEIGHT_UNIT, References, render_references, view_schedule
 from gsmap.merge.selection import beside, one_owner_per_cell
-from gsmap.render.fit import Fitter, LearningRates
+from gsmap.render.fit import FitOptions, LearningRates, make_fitter
 from gsmap.types import Gaussians, MergeResult, PlacedScene
 from gsmap.types.progress import Progress
 
@@ -290,31 +291,34 @@ def _fit(
     stopping = params.stopping
     one_pass = max(stopping.min_pass_steps, round(wanted.view_weights.sum()))
     steps = params.steps if params.steps is not None else round(params.passes * one_pass)
-    fitter = Fitter(
-        start,
-        frozen=frozen,
-        ssim_weight=params.ssim_weight,
-        huber_delta=params.huber_delta,
-        betas=(params.rates.momentum, 0.999),
+    options = FitOptions(
+        ssim_weight=params.ssim_weight, huber_delta=params.huber_delta, betas=(params.rates.momentum, 0.999)
     )
+    fitter = make_fitter(start, frozen=frozen, options=options)
     cameras = [wanted.cameras[v] for v in range(len(wanted))]
+    pictures = [fitter.load(image[None]) for image in wanted.images]
+    weights = [fitter.load(weight[None]) for weight in wanted.weights]
     size_m = float(np.exp(np.median(start.log_scales.max(1))))
-    losses: list[float] = []
+    losses: list[Any] = []  # as the fitter returns them: numbers, once somebody asks
     for step, view in enumerate(view_schedule(wanted.view_weights, steps, params.seed)):
         if deadline is not None and time.monotonic() > deadline:
             return fitter.gaussians(), step, True
         fitter.learning_rates = params.rates.at(step / steps, size_m)
-        losses.append(fitter.step(cameras[view], wanted.images[view][None], wanted.weights[view][None]))
+        losses.append(fitter.step(cameras[view], pictures[view], weights[view]))
         if step % 20 == 0:
-            progress(0.2 + 0.8 * step / steps, f"optimising, loss {np.mean(losses[-20:]):.4f}")
+            progress(0.2 + 0.8 * step / steps, f"optimising, loss {_mean(losses[-20:]):.4f}")
         if params.steps is None and step > stopping.sure_share * steps and _gains_nothing(losses, one_pass, stopping):
             break
     return fitter.gaussians(), len(losses), False
 
 
-def _gains_nothing(losses: list[float], one_pass: int, stopping: Stopping) -> bool:
+def _mean(losses: list[Any]) -> float:
+    return float(np.mean([float(loss) for loss in losses]))
+
+
+def _gains_nothing(losses: list[Any], one_pass: int, stopping: Stopping) -> bool:
     """Whether the last pass over all views was hardly better than the one before."""
     if len(losses) % one_pass or len(losses) < 2 * one_pass:
         return False
-    before, now = np.mean(losses[-2 * one_pass : -one_pass]), np.mean(losses[-one_pass:])
-    return bool(now > (1 - stopping.min_gain) * before)
+    before, now = _mean(losses[-2 * one_pass : -one_pass]), _mean(losses[-one_pass:])
+    return now > (1 - stopping.min_gain) * before

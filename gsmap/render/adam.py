@@ -1,0 +1,127 @@
+"""Adam (Kingma & Ba 2015) on the GPU, each Gaussian with a count of its own updates."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+
+import torch
+
+from gsmap.render.fit import LearningRates
+
+HAS_TRITON = importlib.util.find_spec("triton") is not None
+_ROWS = 64
+
+
+class Corrections:
+    """Bias corrections by the number of updates: (T, 2), of the mean and of the root of the mean square."""
+
+    def __init__(self, betas: tuple[float, float], device: torch.device) -> None:
+        self.betas, self._device, self._steps = betas, device, 0
+        self._table = self._upto(256)
+
+    def _upto(self, count: int) -> torch.Tensor:
+        t = torch.arange(count, dtype=torch.float64).clamp_min(1)
+        beta1, beta2 = self.betas
+        return torch.stack([1 / (1 - beta1**t), 1 / (1 - beta2**t).sqrt()], 1).float().to(self._device)
+
+    def next(self) -> torch.Tensor:
+        """The table for one step more than before: no Gaussian was updated more often than there were steps."""
+        self._steps += 1
+        if self._steps >= len(self._table):
+            self._table = self._upto(2 * len(self._table))
+        return self._table
+
+
+def touched(gradients: Sequence[torch.Tensor]) -> torch.Tensor:
+    """(N,) whether anything was added to the gradient of a Gaussian; of colours the mean tells."""
+    means, quats, scales, opacities, sh = gradients
+    found = (means != 0).any(1) | (quats != 0).any(1) | (scales != 0).any(1) | (opacities != 0)
+    return found | (sh[:, 0] != 0).any(1)
+
+
+@torch.no_grad()
+def step(
+    values: list[torch.Tensor],
+    gradients: list[torch.Tensor],
+    moments: list[list[torch.Tensor]],
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    frozen: torch.Tensor,
+    updates: torch.Tensor,
+    corrections: Corrections,
+    rates: LearningRates,
+    epsilon: float,
+) -> None:
+    """Step every Gaussian that has a gradient and is not frozen, in place.
+
+    Args:
+        values: means, quats, log_scales, logit_opacities, sh.
+        gradients: with respect to means, quats, ``scales``, ``opacities`` and sh.
+        moments: two lists, as the values.
+        updates: (N,) int32, how often each was stepped; counted on.
+    """
+    table = corrections.next()
+    by = _by_triton if values[0].is_cuda and HAS_TRITON else _by_torch
+    by(values, gradients, moments, scales, opacities, frozen, updates, table, rates, corrections.betas, epsilon)
+
+
+def _by_torch(
+    values: list[torch.Tensor],
+    gradients: list[torch.Tensor],
+    moments: list[list[torch.Tensor]],
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    frozen: torch.Tensor,
+    updates: torch.Tensor,
+    table: torch.Tensor,
+    rates: LearningRates,
+    betas: tuple[float, float],
+    epsilon: float,
+) -> None:
+    rows = torch.nonzero(touched(gradients) & ~frozen)[:, 0]
+    updates[rows] += 1
+    first, second = table[updates[rows].long()].unbind(1)
+    sh_rate = torch.full((values[4].shape[1], 1), rates.sh_rest, device=values[4].device)
+    sh_rate[0] = rates.sh_base
+    steps = (rates.means, rates.quats, rates.log_scales, rates.logit_opacities, sh_rate)
+    chain = (None, None, scales, opacities * (1 - opacities), None)  # to logarithms and logits
+    for value, gradient, m, v, rate, inner in zip(values, gradients, *moments, steps, chain, strict=True):
+        g = gradient[rows] if inner is None else gradient[rows] * inner[rows]
+        mean, square = torch.lerp(g, m[rows], betas[0]), torch.lerp(g.square(), v[rows], betas[1])
+        m[rows], v[rows] = mean, square
+        shape = (-1, *[1] * (value.ndim - 1))
+        value[rows] -= rate * first.view(shape) * mean / (square.sqrt() * second.view(shape) + epsilon)
+
+
+def _by_triton(
+    values: list[torch.Tensor],
+    gradients: list[torch.Tensor],
+    moments: list[list[torch.Tensor]],
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    frozen: torch.Tensor,
+    updates: torch.Tensor,
+    table: torch.Tensor,
+    rates: LearningRates,
+    betas: tuple[float, float],
+    epsilon: float,
+) -> None:
+    """As `_by_torch`, in one launch."""
+    from gsmap.render.triton_kernels import adam_rows
+
+    n, columns = len(values[0]), 3 * values[4].shape[1]
+    counted = torch.empty_like(updates)
+    adam_rows[(-(-n // _ROWS),)](
+        *values,
+        *(gradient.contiguous() for gradient in gradients),
+        *moments[0],
+        *moments[1],
+        *(scales, opacities, frozen.view(torch.uint8), updates, counted, table, n),
+        *(rates.means, rates.quats, rates.log_scales, rates.logit_opacities, rates.sh_base, rates.sh_rest),
+        *(*betas, epsilon),
+        SH=columns,
+        SH_PADDED=1 << (columns - 1).bit_length(),
+        ROWS=_ROWS,
+    )
+    updates.copy_(counted)

@@ -1,0 +1,188 @@
+"""The fitter on a GPU: gsplat renders and differentiates, the loss and Adam are a kernel each."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsmap.render import adam, gsplat, native
+from gsmap.render.blending_weights import TileLists, blending_weights
+from gsmap.render.fit import FitOptions, Fitter, LearningRates, Statistics, check_appended, check_pixels, checked_mask
+from gsmap.render.image_loss import image_loss
+from gsmap.render.outputs import image_size
+from gsmap.types import Cameras, Gaussians
+
+
+class GsplatFitter(Fitter):
+    """See `gsmap.render.fit.Fitter`. Gradients are added up in another order in every run."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        learning_rates: LearningRates | None = None,
+        *,
+        frozen: np.ndarray | None = None,
+        options: FitOptions | None = None,
+    ) -> None:
+        super().__init__(gaussians, learning_rates, options=options)
+        gsplat.load()
+        self._device = gsplat.device()
+        held = checked_mask(frozen, len(gaussians))
+        self._background = torch.tensor(self.options.background, dtype=torch.float32, device=self._device)
+        self._views: weakref.WeakKeyDictionary[Cameras, gsplat.DeviceViews] = weakref.WeakKeyDictionary()
+        self._corrections = adam.Corrections(self.options.betas, self._device)
+        self._set(
+            self._moved(gaussians),
+            [[torch.zeros_like(value) for value in self._moved(gaussians)] for _ in range(2)],
+            torch.zeros(len(gaussians), dtype=torch.int32, device=self._device),
+            torch.tensor(np.zeros(len(gaussians), bool) if held is None else held, device=self._device),
+        )
+
+    def _moved(self, gaussians: Gaussians) -> list[torch.Tensor]:
+        return [torch.tensor(a, device=self._device) for a in native.arrays_of(gaussians)]
+
+    def __len__(self) -> int:
+        return len(self._values[0])
+
+    def _set(
+        self,
+        values: list[torch.Tensor],
+        moments: list[list[torch.Tensor]],
+        updates: torch.Tensor,
+        frozen: torch.Tensor,
+    ) -> None:
+        self._values, self._moments, self._updates, self._frozen = values, moments, updates, frozen
+        means, quats, log_scales, logits, sh = values
+        hidden = ~(gsplat.drawable(means, quats, log_scales, logits) & torch.isfinite(sh).flatten(1).all(1))
+        # Those that cannot be drawn stay as they are, and are drawn as something that no pixel shows.
+        self._hidden = hidden if bool(hidden.any()) else None
+        self.reset_statistics()
+
+    def reset_statistics(self) -> None:
+        n = len(self)
+        self._gradient_norm = torch.zeros(n, device=self._device)
+        self._seen = torch.zeros(n, dtype=torch.int32, device=self._device)
+        self._max_weight = torch.zeros(n, device=self._device)
+
+    def statistics(self) -> Statistics:
+        counted = (self._gradient_norm, self._seen, self._max_weight)
+        return Statistics(*(t.cpu().numpy().copy() for t in counted))
+
+    def gaussians(self) -> Gaussians:
+        return Gaussians(*(t.cpu().numpy().copy() for t in self._values))
+
+    def load(self, array: np.ndarray) -> Any:
+        try:
+            return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
+        except torch.OutOfMemoryError:
+            return array  # it is sent at every step
+
+    def step(self, cameras: Cameras, images: Any, masks: Any = None) -> torch.Tensor | float:
+        width, height = image_size(cameras)
+        count, options = len(cameras), self.options
+        targets = self._pixels(images, (count, height, width, 3), "images")
+        weights = None if masks is None else self._pixels(masks, (count, height, width), "masks")
+        if count == 0:
+            return 0.0
+        drawn = self._drawn()
+        colour, alpha, _, lists = gsplat.rasterize(drawn, self._seen_from(cameras), depth=False)
+        if any(options.background):
+            colour = colour + (1 - alpha) * self._background
+        if options.statistics:
+            lists.means2d.retain_grad()
+        losses, gradient = image_loss(colour.detach(), targets, weights, options.ssim_weight, options.huber_delta)
+        if len(lists.listed):
+            colour.backward(gradient)
+            leaves = (drawn.means, drawn.quats, drawn.scales, drawn.opacities, drawn.sh)
+            gradients = [leaf.grad for leaf in leaves if leaf.grad is not None]
+            if options.statistics:
+                self._count(gradients, lists, width, height)
+            adam.step(
+                self._values,
+                gradients,
+                self._moments,
+                drawn.scales,
+                drawn.opacities,
+                self._frozen,
+                self._updates,
+                self._corrections,
+                self.learning_rates,
+                options.epsilon,
+            )
+        return losses.mean() if count > 1 else losses[0]
+
+    @torch.no_grad()
+    def _drawn(self) -> gsplat.DrawableGaussians:
+        """The Gaussians as they are drawn; leaves of a new graph."""
+        means, quats, log_scales, logits, sh = self._values
+        scales, opacities = log_scales.exp(), torch.sigmoid(logits)
+        if self._hidden is not None:
+            hidden = self._hidden[:, None]
+            means, quats, scales = (torch.where(hidden, 1.0, t) for t in (means, quats, scales))
+            opacities, sh = torch.where(self._hidden, 0.0, opacities), torch.where(hidden[..., None], 0.0, sh)
+        return gsplat.DrawableGaussians(
+            means.detach().requires_grad_(),
+            gsplat.unit_or_identity(quats).requires_grad_(),
+            scales.requires_grad_(),
+            opacities.requires_grad_(),
+            sh.detach().requires_grad_(),
+            rows=self._updates,
+            num_all=len(means),
+        )
+
+    def _seen_from(self, cameras: Cameras) -> gsplat.DeviceViews:
+        """The cameras on the GPU, moved there once: a schedule uses the same ones again and again."""
+        if cameras not in self._views:
+            self._views[cameras] = gsplat.DeviceViews.of(cameras)
+        return self._views[cameras]
+
+    @torch.no_grad()
+    def _count(self, gradients: list[torch.Tensor], lists: TileLists, width: int, height: int) -> None:
+        """Add a step's views to the statistics."""
+        _, weights = blending_weights(lists, height, width, len(self), max_weight=True)
+        assert weights is not None
+        self._max_weight = torch.maximum(self._max_weight, weights)
+        gradient = lists.means2d.grad
+        assert gradient is not None
+        norm = (gradient * gradient.new_tensor([width / 2, height / 2])).norm(dim=-1)
+        if lists.gaussian is None:
+            seen, norm = adam.touched(gradients).int(), norm[0]
+        else:  # packed: a row for each Gaussian and view
+            owner = lists.gaussian.long()
+            seen = self._seen.new_zeros(len(self)).index_add(0, owner, (norm > 0).int())
+            norm = norm.new_zeros(len(self)).index_add(0, owner, norm)
+        self._gradient_norm += norm * ~self._frozen
+        self._seen += seen * ~self._frozen
+
+    def keep(self, rows: np.ndarray) -> None:
+        at = torch.as_tensor(rows, device=self._device)
+        self._set(
+            [value[at] for value in self._values],
+            [[value[at] for value in moment] for moment in self._moments],
+            self._updates[at],
+            self._frozen[at],
+        )
+
+    def append(self, gaussians: Gaussians, frozen: np.ndarray | None = None) -> None:
+        check_appended(gaussians, self._values[4].shape[1])
+        added = checked_mask(frozen, len(gaussians))
+        new = self._moved(gaussians)
+        more = torch.tensor(np.zeros(len(gaussians), bool) if added is None else added, device=self._device)
+        self._set(
+            [torch.cat([a, b]) for a, b in zip(self._values, new, strict=True)],
+            [[torch.cat([a, torch.zeros_like(b)]) for a, b in zip(m, new, strict=True)] for m in self._moments],
+            torch.cat([self._updates, self._updates.new_zeros(len(gaussians))]),
+            torch.cat([self._frozen, more]),
+        )
+
+    def _pixels(self, values: Any, shape: tuple[int, ...], name: str) -> torch.Tensor:
+        """Images or masks on the GPU, bytes or float32."""
+        check_pixels(values, shape, name)
+        if not isinstance(values, torch.Tensor):
+            values = torch.from_numpy(np.ascontiguousarray(values))
+        values = values.to(self._device)
+        out: torch.Tensor = values if values.dtype == torch.uint8 else values.float()
+        return out
