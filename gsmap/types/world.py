@@ -1,10 +1,10 @@
 """What ties a map to the world: a coordinate reference system, observations of where things lie in it, and the answer.
 
 World coordinates are in a *CRS*: longitude or easting first, then latitude or northing, then height (what PROJ calls
-``always_xy``), with the height in the CRS's own vertical axis, ellipsoidal where it has none. No graph is solved in
-them: a projection bends and stretches lengths, and eight digits before the point cost the last of float64. The *world
-frame* is Euclidean, metres along east, north and up at an origin near the data (`WorldFrame`); ``S_world_map`` maps a
-component of the map into it.
+``always_xy``), with the height in the CRS's own vertical axis; where it has none, above the ellipsoid, in the unit of
+easting and northing. No graph is solved in them: a projection bends and stretches lengths, and eight digits before the
+point cost the last of float64. The *world frame* is Euclidean, metres along east, north and up at an origin near the
+data (`WorldFrame`); ``S_world_map`` maps a component of the map into it.
 """
 
 from __future__ import annotations
