@@ -30,7 +30,11 @@ def command(
     ] = None,
     exif: Annotated[
         str | None,
-        typer.Option("--exif", metavar="DIR", help="Photos of the captures whose EXIF says where they were taken."),
+        typer.Option(
+            "--exif",
+            metavar="DIR",
+            help="Photos of the captures with positions in EXIF, in folders called as the scenes where names repeat.",
+        ),
     ] = None,
     scale_bar: Annotated[
         tuple[str, str, float] | None,

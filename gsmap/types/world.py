@@ -195,6 +195,9 @@ class Survey:
 
 # --- what was solved --------------------------------------------------------------------------------------------------
 
+UNSOLVED = "the observations have no solution: they contradict each other, or the registrations, beyond measure"
+"""The problem of a component whose least squares diverge or are singular; its poses are then those of its edges."""
+
 RESIDUAL_KINDS = ("point", "image", "fix", "bar")
 RESIDUAL_USES = ("used", "outlier", "check", "unused")
 

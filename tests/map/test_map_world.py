@@ -12,7 +12,8 @@ import pytest
 
 import gsmap
 from gsmap.errors import ConfigError, InputError, NotFoundError
-from gsmap.map.stages.georeference import PlacedPhoto, Request
+from gsmap.map.placed_photos import PlacedPhoto
+from gsmap.map.stages.georeference import Request
 from gsmap_synthetic.surveyed import Site, SiteParams, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
