@@ -38,7 +38,8 @@ def match_photos(photos: Collection[str], names: Mapping[str, Sequence[str]], wh
 
     A photo is a camera where the file name, with or without suffix, is the same. If several are, the one counts whose
     scene is a folder above the photo, and then the one with which more of the path agrees. In a scene whose photos lie
-    in a folder of its name, or of which folders tell the cameras apart, photos of other folders do not count.
+    in a folder of its name, or of which folders tell the cameras apart, photos of other folders do not count; and where
+    folders are called as scenes, a photo in another folder is no camera by its file name alone.
 
     Args:
         photos: paths, as long as they are known; ``/`` and ``\\`` part folders.
@@ -76,11 +77,7 @@ def match_photos(photos: Collection[str], names: Mapping[str, Sequence[str]], wh
             )
         chosen[photo] = several[0]
     left_out |= _one_photo_each(chosen, ranked, names, where)
-    bare = tuple(
-        photo
-        for photo, camera in chosen.items()
-        if not ranked[photo][camera][0] and ranked[photo][camera][2] == 1 and camera[0] not in _parts(photo)[-1]
-    )
+    bare = tuple(photo for photo, camera in chosen.items() if _is_bare(photo, camera[0], ranked[photo][camera]))
     return PhotoMatches(chosen, left_out, bare)
 
 
@@ -102,17 +99,24 @@ def _drop_other_folders(ranked: dict[str, dict[_Camera, _Rank]]) -> dict[str, st
         for (scene, _), rank in ranks.items() if len(_parts(photo)) > 1 else ():
             if scene not in best or rank[:2] > best[scene][0]:
                 best[scene] = rank[:2], photo
+    in_scene = next((photo for (own, _), photo in best.values() if own), None)  # here folders are called as scenes
     left_out = {}
     for photo, ranks in list(ranked.items()):
         if len(_parts(photo)) == 1:
             continue  # no folder, so nothing that speaks against any
-        kept = {camera: rank for camera, rank in ranks.items() if rank[:2] == best[camera[0]][0]}
+        near = {camera: rank for camera, rank in ranks.items() if rank[:2] == best[camera[0]][0]}
+        kept = {c: rank for c, rank in near.items() if in_scene is None or not _is_bare(photo, c[0], rank)}
         if kept:
             ranked[photo] = kept
         else:
-            left_out[photo] = best[max(ranks, key=lambda camera: ranks[camera])[0]][1]
+            left_out[photo] = in_scene or best[max(ranks, key=lambda camera: ranks[camera])[0]][1]
             del ranked[photo]
     return left_out
+
+
+def _is_bare(photo: str, scene: str, rank: _Rank) -> bool:
+    """Whether neither a folder nor the file name tells that a photo is of a scene."""
+    return not rank[0] and rank[2] == 1 and scene not in _parts(photo)[-1]
 
 
 def _one_photo_each(

@@ -49,6 +49,14 @@ def matched(photos: list[str], **names: tuple[str, ...]) -> dict[str, str]:
         (["/p/a/DJI_0009.JPG"], {"a": DRONE, "b": ("DJI_0009.JPG",)}, [""]),
         # A flight that is not in the map, beside one that is; contested cameras and others.
         (["/p/a/DJI_0001.JPG", "/p/c/DJI_0001.JPG", "/p/c/DJI_0002.JPG"], {"a": DRONE}, ["a:DJI_0001.JPG", "", ""]),
+        # The same under names that only another scene has, whose own photos are not there.
+        (["/p/a/DJI_0001.JPG", "/p/c/DJI_0009.JPG"], {"a": DRONE, "b": ("DJI_0009.JPG",)}, ["a:DJI_0001.JPG", ""]),
+        (["/p/a/DJI_0001.JPG", "/p/c/b_9.JPG"], {"a": DRONE, "b": ("b_9.JPG",)}, ["a:DJI_0001.JPG", "b:b_9.JPG"]),
+        (
+            ["a/DJI_0001.JPG", "DJI_0009.JPG"],
+            {"a": DRONE, "b": ("DJI_0009.JPG",)},
+            ["a:DJI_0001.JPG", "b:DJI_0009.JPG"],
+        ),
         # A rig, and the same of two scenes.
         (["/p/cam0/000000.JPG", "/p/cam1/000000.JPG"], {"a": RIG}, ["a:cam0/000000.JPG", "a:cam1/000000.JPG"]),
         (["/p/b/cam1/000000.JPG"], {"a": RIG, "b": RIG}, ["b:cam1/000000.JPG"]),
