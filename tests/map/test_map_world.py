@@ -418,6 +418,8 @@ def test_positions_in_exif_tie_a_map(tmp_path: Path) -> None:
         assert tie.num_outliers == 0
         sigma = np.sqrt(np.diag(tie.covariance))[3:6] * tie.metres_per_unit
         assert sigma.max() > 5, "forty metres of geoid, of which nine flights know no better"
+        assert any("above sea level" in note for note in report.notes)
+        assert any("above sea level" in note for note in m.georeference().notes), "as long as it is so"
         found = {row.scene_name: row.world for row in m.pose_rows()}
         want = of_frame(site.frame, site.truth[4].translation[None])[0]
         assert np.linalg.norm(found[site.names[4]][:2] - want[:2]) < 4

@@ -12,7 +12,7 @@ from gsmap.map.reports.common import names
 from gsmap.store import Store
 from gsmap.types import ScenePose
 from gsmap.types.rows.world import ResidualRow, TieRow, WorldReport
-from gsmap.types.world import Residual, WorldTie
+from gsmap.types.world import Residual, Survey, WorldTie
 
 
 @of_one_state
@@ -44,8 +44,20 @@ def world_report(store: Store, *, stale: bool, notes: Sequence[str] = ()) -> Wor
         unseen=tuple(point.name for point in survey.points if point.name not in shown),
         revision=store.revisions.current(),
         stale=stale,
-        notes=tuple(notes),
+        notes=(*notes, *_sea_level_note(survey)),
     )
+
+
+def _sea_level_note(survey: Survey) -> list[str]:
+    """A remark where nothing but EXIF heights above sea level tells how high a map lies."""
+    sigmas = [fix.sea_level_sigma_m for fix in survey.fixes]
+    if not sigmas or min(sigmas) == 0 or any(not point.check for point in survey.points):
+        return []
+    return [
+        "heights come from EXIF alone, which counts them above sea level (the geoid): as heights above the ellipsoid "
+        f"they may be off by tens of metres, all alike (taken as {max(sigmas):g} m); a control point, or photos with "
+        "heights above the ellipsoid, settle it"
+    ]
 
 
 def _tie_row(tie: WorldTie, num_scenes: int, name_of: Mapping[str, str]) -> TieRow:

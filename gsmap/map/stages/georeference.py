@@ -314,13 +314,11 @@ def _read_exif(store: Store, folder: Path, settings: Settings, noted: _Noted) ->
     # Photos without a position take part: they may be those that a camera is of.
     matches = cameras.match(dict.fromkeys(positions, str(folder)))
     placed = {photo: one for photo, one in positions.items() if one is not None and photo in matches.cameras}
-    sea_level_m = 0.0
     for photo, one in placed.items():
         if one.height_m is None:
             continue
         scene, camera = cameras[matches.cameras[photo]]
         sigma, common, sea_level = one.sigmas(settings.world)
-        sea_level_m = max(sea_level_m, sea_level)
         position = np.array([one.longitude_deg, one.latitude_deg, one.height_m])
         noted.items.append(Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level))
     strangers = [photo for photo in positions if photo not in matches.cameras and photo not in matches.left_out]
@@ -350,11 +348,6 @@ def _read_exif(store: Store, folder: Path, settings: Settings, noted: _Noted) ->
         told.append(
             f"{len(bare)} photos were matched to cameras of {some} by file name alone: photos of another flight that "
             "are numbered alike would tie the map to a wrong place; folders called as the scenes rule that out"
-        )
-    if sea_level_m:
-        told.append(
-            "the EXIF counts heights above sea level (the geoid); they are taken as above the ellipsoid, with a "
-            f"standard deviation of {sea_level_m:g} m for all photos together"
         )
     noted.notes += told
 
