@@ -193,6 +193,10 @@ def test_a_flight_that_is_not_in_the_map_does_not_tie_it_elsewhere(site: Site, t
         (row,) = m.pose_rows("EPSG:4979")
         want = of_frame(site.frame, site.truth[0].translation[None], "EPSG:4979")[0]
         assert np.abs((row.world - want) * [7e4, 1.1e5, 1]).max() < 0.1
+        with pytest.raises(
+            InputError, match=r"DJI_\d+.JPG has the file name of camera DJI_\d+.JPG, .* [789]\d(\.\d)? m away"
+        ):
+            m.georeference(Request(exif=tmp_path / "unclear" / "card1"))
         # Alone, nothing tells them from the flight's own photos: that is said.
         told = m.georeference(Request(exif=tmp_path / "unclear" / "card0")).notes
         assert any("flight0 by file name alone" in note for note in told)

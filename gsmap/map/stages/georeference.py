@@ -23,6 +23,7 @@ from gsmap.types import Cameras
 from gsmap.types.world import UNSOLVED, ControlPoint, Fix, ImagePoint, ScaleBar, Survey, WorldFrame
 from gsmap.world.crs import WGS84, crs
 from gsmap.world.exif import read_folder
+from gsmap.world.frame import frame_at, of_frame, to_frame
 from gsmap.world.survey import check_area, frame_for, in_frame
 
 SURVEYED = "survey"
@@ -85,7 +86,7 @@ def georeference(
     if request.gcp is not None:
         _read_gcp(store, Path(request.gcp), request, settings, localise, noted)
     if request.exif is not None:
-        _read_exif(store, Path(request.exif), settings, noted)
+        _read_exif(store, Path(request.exif), settings, before, noted)
     for one in request.bars:
         noted.items.append(_bar(store, *one, request.bar_sigma_m, settings))
     if request.check is not None:
@@ -161,8 +162,6 @@ def _refuse_unreachable(before: Survey, frame: WorldFrame | None, new: Sequence[
 
 
 def _origin(frame: WorldFrame) -> np.ndarray:
-    from gsmap.world.frame import of_frame
-
     return of_frame(frame, np.zeros((1, 3)))
 
 
@@ -309,22 +308,27 @@ def _hold_out(before: Survey, names: set[str], noted: _Noted) -> None:
 # --- positions and lengths --------------------------------------------------------------------------------------------
 
 
-def _read_exif(store: Store, folder: Path, settings: Settings, noted: _Noted) -> None:
+def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, noted: _Noted) -> None:
     cameras, positions = _Cameras(store), read_folder(folder)
     # Photos without a position take part: they may be those that a camera is of.
     matches = cameras.match(dict.fromkeys(positions, str(folder)))
     placed = {photo: one for photo, one in positions.items() if one is not None and photo in matches.cameras}
+    bare = {photo for photo in matches.by_file_name if photo in placed}
+    by_file_name: list[tuple[str, Fix]] = []
     for photo, one in placed.items():
         if one.height_m is None:
             continue
         scene, camera = cameras[matches.cameras[photo]]
         sigma, common, sea_level = one.sigmas(settings.world)
         position = np.array([one.longitude_deg, one.latitude_deg, one.height_m])
-        noted.items.append(Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level))
+        fix = Fix(camera.names[0], scene, camera.centers[0], WGS84, position, sigma, common, sea_level)
+        noted.items.append(fix)
+        if photo in bare:
+            by_file_name.append((photo, fix))
+    _refuse_moved(before, by_file_name)
     strangers = [photo for photo in positions if photo not in matches.cameras and photo not in matches.left_out]
     nowhere = [photo for photo in matches.cameras if photo not in placed]
     without_height = [photo for photo, one in placed.items() if one.height_m is None]
-    bare = [photo for photo in matches.by_file_name if photo in placed]
     notes = [
         (strangers, "are in no scene of this map and were left out"),
         (nowhere, "have no position in their EXIF (WGS 84, with N or S and E or W) and were left out"),
@@ -350,6 +354,25 @@ def _read_exif(store: Store, folder: Path, settings: Settings, noted: _Noted) ->
             "are numbered alike would tie the map to a wrong place; folders called as the scenes rule that out"
         )
     noted.notes += told
+
+
+def _refuse_moved(before: Survey, photos: Sequence[tuple[str, Fix]]) -> None:
+    """Raise where a photo that only its file name ties to a camera lies far from where that camera is known to be."""
+    known = {(fix.name, fix.scene): fix for fix in before.fixes if fix.crs == WGS84}
+    again = [(photo, known[fix.name, fix.scene], fix) for photo, fix in photos if (fix.name, fix.scene) in known]
+    if not again:
+        return
+    places = np.array([[old.position, new.position] for _, old, new in again])
+    metres = to_frame(frame_at(WGS84, places[:, 1]), places.reshape(-1, 3)).reshape(-1, 2, 3)
+    off = np.linalg.norm(metres[:, 1, :2] - metres[:, 0, :2], axis=1)
+    reach = [5 * sum(fix.sigma_m[0] + fix.common_sigma_m[0] for fix in (old, new)) for _, old, new in again]
+    worst = int(np.argmax(off - reach))
+    if off[worst] > reach[worst]:
+        photo, old, _ = again[worst]
+        raise InputError(
+            f"{photo} has the file name of camera {old.name}, which is known to be {off[worst]:.3g} m away: if it is "
+            "that camera's photo, let a folder be called as the scene; if it is of another flight, leave it out"
+        )
 
 
 def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None, settings: Settings) -> ScaleBar:
