@@ -115,7 +115,9 @@ def test_file_names_alone_are_told_of() -> None:
 # --- in a map ---------------------------------------------------------------------------------------------------------
 
 
-def photo(path: Path, place: np.ndarray | None, sigma_m: float = 0.03, reference: bytes = b"\2") -> None:
+def photo(
+    path: Path, place: np.ndarray | None, sigma_m: float = 0.03, reference: bytes = b"\2", taken: str = ""
+) -> None:
     """A small picture taken at longitude, latitude and height, by default above the ellipsoid."""
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = Image.new("RGB", (16, 12))
@@ -126,6 +128,8 @@ def photo(path: Path, place: np.ndarray | None, sigma_m: float = 0.03, reference
             minutes = value % 1 * 60
             gps[tag], gps[tag + 1] = letter, (float(int(value)), float(int(minutes)), round(minutes % 1 * 60, 6))
         gps[5], gps[6], gps[31] = reference, round(float(place[2]), 3), sigma_m
+    if taken:
+        exif.get_ifd(0x8769)[0x9003] = taken
     picture.save(path, exif=exif)
 
 
@@ -200,6 +204,21 @@ def test_a_flight_that_is_not_in_the_map_does_not_tie_it_elsewhere(site: Site, t
         # Alone, nothing tells them from the flight's own photos: that is said.
         told = m.georeference(Request(exif=tmp_path / "unclear" / "card0")).notes
         assert any("flight0 by file name alone" in note for note in told)
+
+
+def test_photos_of_another_day_are_refused_where_only_file_names_tell(site: Site, tmp_path: Path) -> None:
+    for name, place in zip(DRONE, places(site, 1), strict=True):
+        photo(tmp_path / "card" / name, place, taken="2026:05:31 14:00:00")
+        photo(tmp_path / "flight0" / name, place, taken="2026:05:31 14:00:00")
+    with flights(tmp_path / "m.gsmap", site, [DRONE], ["flight0"]) as m:
+        m.edit("flight0", captured_at="2026-06-02T20:00:00Z")
+        with pytest.raises(InputError, match=r"DJI_0001.JPG .* of flight0 and was taken 2 days from it, as were all 8"):
+            m.georeference(Request(exif=tmp_path / "card"))
+        assert not m.store.world.survey()
+        # Of a capture that began on their day, or in a folder of its name, they are its photos.
+        m.georeference(Request(exif=tmp_path / "flight0"))
+        m.edit("flight0", captured_at="2026-06-01T20:00:00Z")
+        m.georeference(Request(exif=tmp_path / "card"))
 
 
 def test_photos_of_a_list_are_told_apart_too(site: Site, tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ import numpy as np
 
 from gsmap.errors import ConfigError, GsmapError, InputError, NotFoundError
 from gsmap.formats import gcp_list
+from gsmap.ingest.dates import photo_date
+from gsmap.map.dates import parsed
 from gsmap.map.photo_names import PhotoMatches, match_photos
 from gsmap.map.placed_photos import Localise
 from gsmap.map.places import Place, place_in_scene
@@ -28,6 +30,9 @@ from gsmap.world.survey import check_area, frame_for, in_frame
 
 SURVEYED = "survey"
 """The name of a fix that says where a scene's origin lies."""
+
+
+_OTHER_DAYS = 2  # more than clocks and zones are off, and than a night that a survey goes over
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,6 +331,7 @@ def _read_exif(store: Store, folder: Path, settings: Settings, before: Survey, n
         if photo in bare:
             by_file_name.append((photo, fix))
     _refuse_moved(before, by_file_name)
+    _refuse_other_days(store, by_file_name)
     strangers = [photo for photo in positions if photo not in matches.cameras and photo not in matches.left_out]
     nowhere = [photo for photo in matches.cameras if photo not in placed]
     without_height = [photo for photo, one in placed.items() if one.height_m is None]
@@ -373,6 +379,30 @@ def _refuse_moved(before: Survey, photos: Sequence[tuple[str, Fix]]) -> None:
             f"{photo} has the file name of camera {old.name}, which is known to be {off[worst]:.3g} m away: if it is "
             "that camera's photo, let a folder be called as the scene; if it is of another flight, leave it out"
         )
+
+
+def _refuse_other_days(store: Store, photos: Sequence[tuple[str, Fix]]) -> None:
+    """Raise where all photos that only file names tie to a scene were taken days before or after it."""
+    of_scene: dict[str, list[str]] = {}
+    for photo, fix in photos:
+        of_scene.setdefault(fix.scene, []).append(photo)
+    for scene in map(store.scenes.get, of_scene):
+        if scene.captured_at is None:
+            continue
+        captured, off = parsed(scene.captured_at), dict[str, int]()
+        for photo in of_scene[scene.id]:
+            if (taken := photo_date(photo).when) is not None:
+                off[photo] = abs(parsed(taken) - captured).days
+                if off[photo] < _OTHER_DAYS:
+                    break
+        else:
+            if off:
+                photo, days = min(off.items(), key=lambda one: one[1])
+                raise InputError(
+                    f"{photo} has the file name of a camera of {scene.name} and was taken {days} days from it, as were "
+                    f"all {len(off)} with a date: if they are its photos, let a folder be called {scene.name}; if they "
+                    "are of another flight, leave them out"
+                )
 
 
 def _bar(store: Store, a: str, b: str, metres: float, sigma_m: float | None, settings: Settings) -> ScaleBar:
