@@ -34,6 +34,7 @@ class GcpLine:
         position: x, y, z in the file's system.
         pixel: column, row.
         image: name of the photo.
+        is_named: whether the file names the point.
     """
 
     line: int
@@ -41,6 +42,7 @@ class GcpLine:
     position: tuple[float, float, float]
     pixel: tuple[float, float]
     image: str
+    is_named: bool = True
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ def _with_names(found: list[GcpLine], lines: list[str]) -> list[GcpLine]:
     named = {one.position: one.name for one in reversed(found) if one.name}
     for one, line in zip(found, lines, strict=True):
         named.setdefault(one.position, "_".join(line.split(None, 3)[:3]))
-    return [one if one.name else replace(one, name=named[one.position]) for one in found]
+    return [one if one.name else replace(one, name=named[one.position], is_named=False) for one in found]
 
 
 def _is_number(text: str) -> bool:

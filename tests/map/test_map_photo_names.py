@@ -22,6 +22,7 @@ from gsmap.world.frame import of_frame
 from gsmap_synthetic.surveyed import Site, SiteParams, ground, surveyed_site
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "world"))
+from made_sites import made_map
 
 DRONE = tuple(f"DJI_{k + 1:04d}.JPG" for k in range(8))
 RIG = tuple(f"cam{k % 2}/{k // 2:06d}.JPG" for k in range(8))
@@ -239,6 +240,21 @@ def test_photos_of_a_list_are_told_apart_too(site: Site, tmp_path: Path) -> None
         ids = {scene.name: scene.id for scene in m.scenes()}
         seen = {(one.point, ids_name, one.image) for one in m.store.world.survey().images for ids_name in [one.scene]}
         assert seen == {(one.name, ids[one.image.split("/")[0]], one.image.split("/")[1]) for one in lines}
+
+
+def test_a_place_without_a_name_is_one_point_in_every_list(site: Site, tmp_path: Path) -> None:
+    """Written with four digits and then with seven, of which three are zeros."""
+    with made_map(tmp_path / "m.gsmap", site) as m:
+        for digits in (4, 7):
+            rows = [
+                " ".join([*(f"{round(v, 4):.{digits}f}" for v in (*one.position, *one.pixel)), one.image])
+                for one in site.gcp_lines()
+            ]
+            (tmp_path / "g.txt").write_text("\n".join(["EPSG:25832", *rows]))
+            m.georeference(Request(gcp=tmp_path / "g.txt"))
+            survey = m.store.world.survey()
+            assert len(survey.points) == len(site.marks)
+            assert len(survey.images) == len(rows)
 
 
 # --- observations without a solution ----------------------------------------------------------------------------------

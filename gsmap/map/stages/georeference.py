@@ -89,7 +89,7 @@ def georeference(
     if request.crs is not None:
         crs(request.crs)
     if request.gcp is not None:
-        _read_gcp(store, Path(request.gcp), request, settings, localise, noted)
+        _read_gcp(store, Path(request.gcp), request, settings, localise, before, noted)
     if request.exif is not None:
         _read_exif(store, Path(request.exif), settings, before, noted)
     for one in request.bars:
@@ -189,10 +189,20 @@ def _frame(before: Survey, crs_text: str | None, new: Sequence[ControlPoint | Fi
 
 
 def _read_gcp(
-    store: Store, path: Path, request: Request, settings: Settings, localise: Localise | None, noted: _Noted
+    store: Store,
+    path: Path,
+    request: Request,
+    settings: Settings,
+    localise: Localise | None,
+    before: Survey,
+    noted: _Noted,
 ) -> None:
     found = gcp_list.read(path)
     crs(found.crs)
+    # A place without a name is the point that it was when it was given before, written otherwise.
+    known = {tuple(point.position): point.name for point in before.points if point.crs == found.crs}
+    names_known = [one if one.is_named else replace(one, name=known.get(one.position, one.name)) for one in found.lines]
+    found = replace(found, lines=tuple(names_known))
     params = settings.world
     sigma = request.sigma_m or (params.gcp_sigma_m, params.gcp_sigma_m)
     held = set(request.check or ())
@@ -223,8 +233,8 @@ def _read_gcp(
         else:
             missing.add(line.image)
             continue
-        if (before := picked.setdefault((line.name, scene, named), where)) is not where:
-            raise InputError(f"{where}: point {line.name} in {line.image} again, as on {before}")
+        if (earlier := picked.setdefault((line.name, scene, named), where)) is not where:
+            raise InputError(f"{where}: point {line.name} in {line.image} again, as on {earlier}")
         seen.append(
             ImagePoint(
                 line.name, named, scene, pixel, params.pixel_sigma_px, np.array(pose), np.array(intrinsics), covariance
